@@ -27,6 +27,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
 from magbridge.columns import CHANNELS
 from magbridge.correction import Correction
 from magbridge.field.igrf import magnitude
@@ -199,7 +200,7 @@ def run(name: str, seed: int, length: float, size: float) -> Row:
     return Row(
         fixed=float(np.std((fixed.total - truth)[late])) / floor,
         published=float(np.std(error[late])) / floor,
-        sigma=float(np.std((error / seen.sigma)[after])),
+        sigma=rms((error / seen.sigma)[after]),
         delay=until / optimal if cause else np.nan,
         among=np.nan if not cause else float(found is not None and cause in found[1]),
         alone=np.nan if not cause else float(found is not None and found[1] == (cause,)),

@@ -5,6 +5,7 @@ them, a :mod:`.judge` compares what the calibrations predict, and :mod:`.doubt` 
 data.
 """
 
-from magbridge.learning.learner import Learner, Notice
+from magbridge.learning.learner import Learner
+from magbridge.learning.report import Notice
 
 __all__ = ["Learner", "Notice"]

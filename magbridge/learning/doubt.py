@@ -102,6 +102,8 @@ class Alarm(NamedTuple):
         nT, root mean square of what it adds to the total field.
     amplitude : float
         nT, of the offset that would be as large: what the estimator has to be opened by.
+    strength : float
+        L of the likeliest.
     """
 
     causes: tuple[str, ...]
@@ -109,6 +111,7 @@ class Alarm(NamedTuple):
     since: float
     size: float
     amplitude: float
+    strength: float
 
 
 class Doubt:
@@ -222,4 +225,5 @@ class Doubt:
             since=float(self._onset[best]),
             size=size,
             amplitude=max(size, min(spread, 10.0 * size)),
+            strength=float(self.statistic[best]),
         )

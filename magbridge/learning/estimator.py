@@ -18,9 +18,10 @@ from math import exp, sqrt
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
+from magbridge.errors import CalibrationError
 from magbridge.learning.nuisance import STATES, Nuisance
 
-__all__ = ["Estimator"]
+__all__ = ["Estimator", "constant_offsets"]
 
 TELLING = 0.01
 """Share of a prediction's variance that comes from the coefficients and varies along the track: from here on
@@ -151,3 +152,27 @@ class Estimator:
     def sigma(self) -> float:
         """1-sigma of the innovation, nT."""
         return sqrt(self.variance)
+
+
+def constant_offsets(tensor: FloatArray) -> IndexArray:
+    """Return which coefficients are the constant offset of x, y and z, and nothing else.
+
+    Parameters
+    ----------
+    tensor : (K, m, 9) array
+        As :func:`~magbridge.calibration.compilation.coefficient_tensor`.
+
+    Raises
+    ------
+    CalibrationError
+        There is none for an axis.
+    """
+    found = []
+    for axis in range(3):
+        only = np.zeros(tensor.shape[1:])
+        only[0, 6 + axis] = 1.0
+        same = np.flatnonzero((tensor == only).all(axis=(1, 2)))
+        if not same.size:
+            raise CalibrationError("a calibration without a constant offset is not learned")
+        found.append(int(same[0]))
+    return np.array(found)

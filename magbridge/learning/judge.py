@@ -99,10 +99,14 @@ class Judge:
         """Whether the candidate has had its time, and another one should be judged."""
         return self._age >= self._period and (self.better < PROMISING or self._age >= 4 * self._period)
 
-    def challenge(self, states: FloatArray) -> None:
-        """Begin with a new candidate, which takes what is not the calibration's to be `states` (3,)."""
+    def challenge(self, states: FloatArray, *, soon: bool) -> None:
+        """Begin with a new candidate, which takes what is not the calibration's to be `states` (3,).
+
+        The next one comes `soon` where the calibration changes.
+        """
         self._m[:, CANDIDATE] = states
-        self.better, self._age, self._period = 0.0, 0, min(2 * self._period, LONGEST)
+        longest = 4 * SHORTEST if soon else LONGEST
+        self.better, self._age, self._period = 0.0, 0, min(2 * self._period, longest)
 
     def hurry(self) -> None:
         """Take the next candidates soon: something has changed."""

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import isnan, nan
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
-from magbridge.arrays import FloatArray, IndexArray
+from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
-from magbridge.errors import CalibrationError
 from magbridge.field.geodesy import separation
 from magbridge.learning.doubt import Alarm, Doubt, Signs
-from magbridge.learning.estimator import Estimator
+from magbridge.learning.estimator import Estimator, constant_offsets
 from magbridge.learning.judge import CANDIDATE, FIXED, PUBLISHED, Judge
 from magbridge.learning.nuisance import STATES, Nuisance
 from magbridge.learning.observation import Observation, observe
+from magbridge.learning.report import Notice, State
 from magbridge.records import Quality, Vector
 
-__all__ = ["Learner", "Notice", "State"]
+__all__ = ["Learner"]
 
 UNFIT: Final = int(
     Quality.STALE_TELEMETRY | Quality.MOVING | Quality.SATURATED | Quality.LATE_JOIN | Quality.UNCALIBRATED
@@ -30,39 +30,20 @@ UNFIT: Final = int(
 CREEP: Final = 3.0 / 86_400.0**0.5
 """nT per square root of a second: an offset walks by 3 nT a day."""
 FASTER: Final = 10.0
-"""Times faster while the data are not explained."""
-QUIET_S: Final = 1800.0
+"""Times faster while the data are not explained, and for some time after."""
+CREEPING: Final = frozenset({"offset_drift", "temperature_offset"})
+"""Causes that go on after their first part was learned."""
+MORE: Final = 2.0
+"""By which an alarm's log-likelihood ratio has to grow to be news."""
 QUIET: Final = 300
-"""s, and telling samples, without an alarm after which its cause is gone."""
+"""Telling samples without an alarm after which its cause is gone."""
+STEADY: Final = 2000
+"""Telling samples without one after which offsets creep no faster than usual."""
 OUTLIER: Final = 5.0
 AGREE: Final = 3
 """An innovation beyond so many sigmas is not learned from, unless it is the third in a row."""
 SHORT_US: Final = 3_600_000_000
 """µs without a sample to learn from after which that is told."""
-
-
-class Notice(NamedTuple):
-    """A change to announce, and when (s); `grave` where someone should look."""
-
-    text: str
-    time: float
-    grave: bool = False
-
-    @property
-    def date(self) -> str:
-        """The time, UTC."""
-        return f"{np.datetime64(round(self.time), 's')}Z"
-
-
-class State(NamedTuple):
-    """What MAG_LEARNING says: see there."""
-
-    learned_samples: int
-    rms: tuple[float, float, float]
-    better: float
-    causes: tuple[str, ...]
-    since_us: int
-    size: float
 
 
 class Learner:
@@ -114,7 +95,7 @@ class Learner:
         self.first = self.calibration = calibration
         self._tensor = coefficient_tensor(calibration)[0]
         self._flat = self._tensor.reshape(len(self._tensor), -1)
-        self._offsets = _offsets(self._tensor)
+        self._offsets = constant_offsets(self._tensor)
         self._turn_on = turn_on
         self._nuisance = Nuisance(calibration.noise, spread)
         self._kappa = 0.0
@@ -266,6 +247,12 @@ class Learner:
         self._judge.judge(*self._nuisance.over(metres, seconds), e, live.s)
         self._learn(live, phi, signs)
         self._decide()
+        self._aged(seconds)
+
+    def _aged(self, seconds: float) -> None:
+        """Let what is published age, while offsets creep faster than its sigma knows."""
+        if self._alarm is None and self._estimator.creep > CREEP:
+            self.variance += (self._estimator.creep**2 - CREEP**2) * seconds
 
     def _nothing(self, time_us: int) -> None:
         """Say once an hour or more passes without a sample to learn from."""
@@ -312,41 +299,41 @@ class Learner:
         far = abs(estimator.residual) > OUTLIER * estimator.sigma
         self._outliers = self._outliers + 1 if far else 0
         alarm = self._doubt.test(estimator, signs)
-        if alarm is not None:
-            self._raise(alarm)
+        if alarm is not None and self._raise(alarm):
             estimator.open(alarm.amplitude**2)
             estimator.predict(live.e, live.s, by_coefficients)
         if far and self._outliers < AGREE and alarm is None:
             return
         learn = estimator.telling and not self.frozen
         self._doubt.updated(estimator.update(learn=learn))
-        if alarm is not None:
-            self._doubt.restart()
         self.samples += learn
         self._quiet += learn
 
-    def _raise(self, alarm: Alarm) -> None:
-        """Begin to doubt, or go on."""
-        self._quiet = 0
+    def _raise(self, alarm: Alarm) -> bool:
+        """Begin to doubt, or know better what is doubted; return whether there is anything new."""
         standing = self._alarm
+        if standing is not None and alarm.strength < standing.strength + MORE:
+            return False
+        self._quiet = 0
+        self._alarm = alarm
+        self._estimator.creep = FASTER * CREEP
+        self.flags, self.variance = int(Quality.UNEXPLAINED), alarm.size**2
         if standing is None:
-            self._alarm = alarm
-            self._estimator.creep = FASTER * CREEP
             self._judge.hurry()
             names = " or ".join(alarm.causes[:2]).replace("_", " ")
             self._notify(f"unexplained: {alarm.size:.0f} nT, {names}", grave=True)
-        else:
-            self._alarm = standing._replace(size=max(standing.size, alarm.size))
-        assert self._alarm is not None
-        self.flags, self.variance = int(Quality.UNEXPLAINED), self._alarm.size**2
+        elif standing.causes != alarm.causes and len(alarm.causes) == 1:
+            self._notify(f"unexplained: it is {alarm.causes[0].replace('_', ' ')}", grave=True)
+        return True
 
     def _settle(self, how: str) -> None:
         """End the doubt."""
         if self._alarm is None:
             return
+        if not set(self._alarm.causes) & CREEPING:
+            self._estimator.creep = CREEP
         self._alarm = None
         self.flags, self.variance = 0, 0.0
-        self._estimator.creep = CREEP
         self._doubt.restart()
         self._notify(f"explained again: {how}")
 
@@ -361,32 +348,24 @@ class Learner:
             self._settle("learned")
         elif judge.stale and not self.frozen:
             self._challenge()
-        elif self._alarm is not None and self._quiet > QUIET and judge.better < 1.0:
+        if self._quiet > STEADY and self._estimator.creep > CREEP:
+            self._estimator.creep = CREEP
+            self.variance = 0.0 if self._alarm is None else self.variance
+        if self._alarm is not None and self._quiet > QUIET and judge.better < 1.0:
             self._settle("gone")
 
     def _challenge(self) -> None:
         """Let what is learned so far be the candidate."""
         self._candidate = self.learned()
         self._weights[CANDIDATE] = self._weights_of(self._candidate.coefficients)
-        self._judge.challenge(self._estimator.beside)
+        self._judge.challenge(self._estimator.beside, soon=self._estimator.creep > CREEP)
 
     def _publish(self, which: int, how: str) -> None:
         before, after = (float(value) ** 0.5 for value in self._judge.mean_square[[PUBLISHED, which]])
         self.calibration = self._candidate if which == CANDIDATE else self.first
         self._weights[PUBLISHED] = self._weights[which]
         self._judge.publish(which)
+        if self._alarm is None:
+            self.variance = 0.0
         name = calibration_id(self.calibration)
         self._notify(f"{how} {name:08x}: {before:.1f} to {after:.1f} nT")
-
-
-def _offsets(tensor: FloatArray) -> IndexArray:
-    """(3,) which coefficients are the constant offset of x, y and z and nothing else."""
-    found = []
-    for axis in range(3):
-        only = np.zeros(tensor.shape[1:])
-        only[0, 6 + axis] = 1.0
-        same = np.flatnonzero((tensor == only).all(axis=(1, 2)))
-        if not same.size:
-            raise CalibrationError("a calibration without a constant offset is not learned")
-        found.append(int(same[0]))
-    return np.array(found)
