@@ -18,7 +18,7 @@ from sitl.platform import MOUNTINGS, Mass, Vehicle
 from sitl.trajectory import Motion
 from sitl.world import Geology, Water
 
-__all__ = ["SCENARIOS", "Place", "Scenario", "Telemetry", "load"]
+__all__ = ["SCENARIOS", "Hidden", "Place", "Scenario", "Telemetry", "load"]
 
 SCENARIOS = Path(__file__).parent / "scenarios"
 """The scenarios that come with the package."""
@@ -59,6 +59,24 @@ class Telemetry(Table, frozen=True):
     map_altitude: NotNegative = 90.0
 
 
+class Hidden(Table, frozen=True):
+    """``[[hidden]]``: something happens that the calibration does not know.
+
+    Attributes
+    ----------
+    effect : str
+        Of :data:`sitl.inject.EFFECTS`.
+    size : float
+        In the effect's own unit: see its function.
+    segment : str
+        The part of the mission that it shows in.
+    """
+
+    effect: str
+    size: NotNegative
+    segment: str = "survey"
+
+
 class Scenario(Table, frozen=True):
     """A whole scenario file.
 
@@ -79,6 +97,8 @@ class Scenario(Table, frozen=True):
         The vehicle's limits where they differ from those of its kind of mass.
     world, motion, instrument, telemetry
         The tables of these names.
+    hidden : tuple of Hidden
+        What happens besides.
     mission : tuple
         Spirals, surveys and legs, one after the other; empty where a log is to drive the scenario.
     """
@@ -93,6 +113,7 @@ class Scenario(Table, frozen=True):
     motion: Motion = Motion()
     instrument: Instrument = Instrument()
     telemetry: Telemetry = Telemetry()
+    hidden: tuple[Hidden, ...] = ()
     mission: tuple[Part, ...] = ()
 
     @property
@@ -132,9 +153,19 @@ def load(path: str | Path) -> Scenario:
     for name in scenario.masses:
         if name not in MOUNTINGS:
             raise ConfigError(path, "masses", f"{name!r} is not one of {', '.join(MOUNTINGS)}")
+    if scenario.hidden:
+        _check_hidden(scenario.hidden, path)
     if scenario.calibration is None:
         return scenario
     calibration = path.parent / scenario.calibration
     if not calibration.is_file():
         raise ConfigError(path, "calibration", f"no such file: {calibration}")
     return scenario.replace(calibration=str(calibration))
+
+
+def _check_hidden(hidden: tuple[Hidden, ...], path: Path) -> None:
+    from sitl.inject.catalogue import EFFECTS  # noqa: PLC0415 - the effects simulate scenarios
+
+    for one in hidden:
+        if one.effect not in EFFECTS:
+            raise ConfigError(path, "hidden.effect", f"{one.effect!r} is not one of {', '.join(EFFECTS)}")

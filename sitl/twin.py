@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -245,7 +246,29 @@ def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
     twin = Twin.draw(scenario, seed)
     track = twin.fly()
     last = track.elapsed[-1] - max(scenario.instrument.channel_delay)
-    return twin.measure(track, np.arange(0.0, last, 1 / scenario.instrument.rate))
+    when = np.arange(0.0, last, 1 / scenario.instrument.rate)
+    if scenario.hidden:
+        return _with_hidden(twin, track, when)
+    return twin.measure(track, when)
+
+
+def _with_hidden(twin: Twin, track: Track, when: FloatArray) -> xr.Dataset:
+    """Measure twice, and take each effect's segment from where it is: the noise is the same in both."""
+    from sitl.inject import Hidden, disturb  # noqa: PLC0415 - the effects simulate with twins
+
+    out = disturb(twin, (), track, when, twin.seed)
+    spans = {name: (begin, end) for name, begin, end in json.loads(out.attrs["segments"])}
+    time = out["time"].to_numpy()
+    for number, one in enumerate(twin.scenario.hidden):
+        if one.segment not in spans:
+            raise WrongUse(f"scenario {twin.scenario.name!r}: no segment {one.segment!r}")
+        effect = Hidden(one.effect, one.size, twin.seed + number)
+        other = disturb(twin, (effect,), track, when, twin.seed)
+        begin, end = spans[one.segment]
+        there = (time >= begin) & (time <= end)
+        for name in other.data_vars:
+            out[name] = out[name].where(~there, other[name])
+    return out
 
 
 def _stream(seed: int, which: int) -> np.random.Generator:

@@ -84,8 +84,9 @@ def simulate(
     Parameters
     ----------
     scenario
-        A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider;
-        the last two need a log to drive them (--like).
+        A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider,
+        of which the last two need a log to drive them (--like); or turn_on, warming, bolt, pump and battery,
+        in which the vehicle changes after its calibration.
     output
         The file to write.
     seed

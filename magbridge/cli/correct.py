@@ -93,7 +93,6 @@ def correct(
     check_inputs((*files, output), picture)
 
     from magbridge.calibration.file import load
-    from magbridge.calibration.file import save as write_calibration
     from magbridge.correction import Correction, correct_rows
     from magbridge.logs import Writer, read_chunks
 
@@ -102,8 +101,7 @@ def correct(
         complain(doubt)
     if save is not None and not learn:
         raise WrongUse("--save writes what was learned: give --learn, too")
-    learner = _learner(known, calibration) if learn else None
-    correction, tally, whole = Correction(known, learner=learner), _Tally(), False
+    correction, tally, whole = Correction(known), _Tally(), False
     pieces: list[dict[str, Any]] = []
     drawn: list[xr.Dataset] = []
     with Writer(output) as writer:
@@ -111,13 +109,15 @@ def correct(
             if not pieces:
                 note_missing(known, part)
                 note_no_date(part)
+                if learn:
+                    correction.learner = _learner(known, part, calibration)
             pieces.append(part.attrs)
             sampled = part[list(CHANNELS)].to_array().notnull()
             corrected = _beside(part, correct_rows(correction, part), known, calibration)
             corrected = corrected.isel(time=sampled.any("variable").to_numpy())
             writer.append(corrected)
-            if learner is not None:
-                _tell(learner)
+            if correction.learner is not None:
+                _tell(correction.learner)
             if picture:
                 drawn.append(corrected[list(CORRECTED)])
             tally.add(corrected, part.sizes["time"])
@@ -138,16 +138,13 @@ def correct(
     if doubt := tally.doubt():
         complain(f"{calibration}: {doubt}")
     facts, summary = tally.facts(), tally.summary()
-    if learner is not None:
-        facts |= _learned(learner, known)
-        summary += f"; {facts['learned_samples']} learned from, calibration {facts['calibration_id']} at last"
-        if save is not None:
-            write_calibration(learner.calibration, save)
+    if correction.learner is not None:
+        summary += _keep_learned(correction.learner, known, facts, save)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
 
-def _learner(known: Calibration, file: Path) -> Learner:
-    """Return a learner with a bridge's settings."""
+def _learner(known: Calibration, log: xr.Dataset, file: Path) -> Learner:
+    """Return a learner with a bridge's settings, which knows of the currents in the log."""
     from magbridge.config import Align, Learning
     from magbridge.learning import Learner
 
@@ -158,6 +155,7 @@ def _learner(known: Calibration, file: Path) -> Learner:
             spread=align.reference_sigma,
             turn_on=align.turn_on_sigma,
             max_rate=settings.max_rate,
+            currents=tuple(str(name) for name in log.data_vars if log[name].attrs.get("units") == "A"),
         )
     except CalibrationError as error:
         raise CalibrationError(f"{file}: {error}") from error
@@ -170,17 +168,20 @@ def _tell(learner: Learner) -> None:
     learner.notices.clear()
 
 
-def _learned(learner: Learner, known: Calibration) -> dict[str, Any]:
-    """Return the numbers of learning to print as JSON."""
-    from magbridge.calibration.file import calibration_id
+def _keep_learned(learner: Learner, known: Calibration, facts: dict[str, Any], file: Path | None) -> str:
+    """Write what was published last, add to the facts to print as JSON, and return them in words."""
+    from magbridge.calibration.file import calibration_id, save
 
-    state = learner.state
-    return {
+    if file is not None:
+        save(learner.calibration, file)
+    state, name = learner.state, f"{calibration_id(learner.calibration):08x}"
+    facts |= {
         "learned_samples": state.learned_samples,
-        "calibration_id": f"{calibration_id(learner.calibration):08x}",
+        "calibration_id": name,
         "changed": learner.calibration is not known,
         "unexplained": list(state.causes),
     }
+    return f"; {state.learned_samples} learned from, calibration {name} at last"
 
 
 def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Path) -> xr.Dataset:

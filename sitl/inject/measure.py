@@ -90,12 +90,9 @@ def disturb(twin: Twin, hidden: tuple[Hidden, ...], track: Track, when: Array, s
     for one in hidden:
         effects[one.name](scene, one.size, np.random.default_rng([one.seed, 78]))
     out = twin.log(track, when, ambient.earth, _samples(scene, twin.instrument_rng()))
-    # `reference` is by how much the true field exceeds the logged reference
-    out["reference_field"] = (
-        "time",
-        out["reference_field"].to_numpy() - scene.reference,
-        out["reference_field"].attrs,
-    )
+    if "reference_field" in out:  # `reference` is by how much the true field exceeds it
+        known = out["reference_field"]
+        out["reference_field"] = "time", known.to_numpy() - scene.reference, known.attrs
     seen = np.clip(when - scene.late, 0.0, None)
     logged = dict(scene.logged)
     if scene.late:
