@@ -13,6 +13,7 @@ from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
     AS_THEY_SAY,
+    Base,
     Heading,
     Json,
     Output,
@@ -20,6 +21,7 @@ from magbridge.cli.common import (
     Reading,
     Whole,
     app,
+    by_base_station,
     check_inputs,
     complain,
     digest,
@@ -50,6 +52,7 @@ def calibrate(
     method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto",
     vehicle: Path | None = None,
     grid: Path | None = None,
+    base: Base = None,
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
@@ -84,6 +87,9 @@ def calibrate(
         A vehicle.toml with the positions of the moving masses relative to the sensor (method auto).
     grid
         An anomaly grid to add to the IGRF.
+    base
+        A base station's log (total_field, or a vector): by how much the Earth's field varied, to add to the
+        reference. So is that of an observatory (IAGA-2002) among the logs.
     site_bias
         1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
         the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
@@ -105,7 +111,7 @@ def calibrate(
     json
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
-    logs_to_read(files, output, vehicle, grid)
+    logs_to_read(files, output, vehicle, grid, base)
     check_inputs((*files, output), picture)
     if reading.compass == ALL:
         _each_compass(
@@ -114,7 +120,7 @@ def calibrate(
             reading,
             lambda one, name, of: calibrate(
                 *files, output=name, picture=picture and _of(picture, of), reading=one, parameter=parameter,
-                order=order, method=method, vehicle=vehicle, grid=grid, site_bias=site_bias,
+                order=order, method=method, vehicle=vehicle, grid=grid, base=base, site_bias=site_bias,
                 filter_corner=filter_corner, heading_reference=heading_reference, json=json,
             ),
         )  # fmt: skip
@@ -135,7 +141,7 @@ def calibrate(
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     anomalies = read_grid(grid) if grid else None
     with waiting("reading"):
-        logs = read_each(files, options=reading.options)
+        logs = by_base_station(read_each(files, options=reading.options), base)
         deployment = join(logs)
     require(deployment, (*CHANNELS, *parameter))
     deployment = with_true_heading(deployment, heading_reference)
@@ -143,7 +149,10 @@ def calibrate(
     note_unused_grid(grid, deployment)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     with _naming(deployment), waiting("fitting"):
-        data = replace(observations(deployment, parameter, grid=anomalies), inputs=_digests(files))
+        data = replace(
+            observations(deployment, parameter, grid=anomalies),
+            inputs=_digests((*files, *([base] if base else []))),
+        )
         for line in idle(logs, data):
             complain(line)
         if filter_corner:

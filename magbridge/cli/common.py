@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AS_THEY_SAY",
+    "Base",
     "Folder",
     "Grid",
     "Heading",
@@ -37,6 +38,7 @@ __all__ = [
     "Reading",
     "Whole",
     "app",
+    "by_base_station",
     "check_inputs",
     "complain",
     "digest",
@@ -163,6 +165,7 @@ Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_wr
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
+Base = Annotated[Path | None, Parameter(name=["--base-station", "--base"])]
 Heading = Annotated[Literal["true", "magnetic"] | None, Parameter(name="--heading-reference")]
 Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Whole = Annotated[int, Parameter(converter=_whole)]
@@ -228,6 +231,30 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
         complain(line)
     if len(lines) > NAMED:
         complain(f"and in {len(lines) - NAMED} places more")
+
+
+def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Dataset]:
+    """Return a vehicle's logs with what the field varied by.
+
+    That is by a file of its own, or by an observatory's log among the others.
+
+    Raises
+    ------
+    FormatError, DataError
+        The base station's log has no field, or not for the logs' time.
+    """
+    from magbridge.field.base_station import apart, with_daily_variation
+    from magbridge.logs import read
+    from magbridge.logs.deployment import join
+
+    own, stations = apart(logs)
+    if base is not None:
+        stations = [read(base)]
+    if not own or not stations:
+        return list(logs)
+    station = join(stations)
+    note_losses(station.attrs)
+    return with_daily_variation(own, station)
 
 
 def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:

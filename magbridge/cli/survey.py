@@ -10,12 +10,14 @@ from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
     AS_THEY_SAY,
+    Base,
     Json,
     Output,
     Picture,
     Reading,
     Whole,
     app,
+    by_base_station,
     check_inputs,
     complain,
     doubts_of,
@@ -45,7 +47,7 @@ def survey(
     calibration: tuple[Path, ...] = (),
     save: Written = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
-    base: Path | None = None,
+    base: Base = None,
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
     altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
     predict: Path | None = None,
@@ -81,7 +83,8 @@ def survey(
     position_sigma
         As of calibrate: by how many m dead-reckoned positions slowly drift, while the calibration is found.
     base
-        A base station's log (total_field): its variation is taken off.
+        A base station's log (total_field, or a vector): its variation is taken off. So is that of an
+        observatory (IAGA-2002) among the logs.
     spacing
         m between nodes of the map; by default an eighth of the rock's length.
     altitude
@@ -141,9 +144,9 @@ def _samples(
     """Return the corrected samples of all files."""
     from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS
-    from magbridge.logs import read, read_each
+    from magbridge.logs import read_each
     from magbridge.survey.read import is_table, joined, read_table
-    from magbridge.survey.run import samples_of, without_daily_variation
+    from magbridge.survey.run import samples_of
 
     tables = [path for path in files if is_table(path)]
     others = [path for path in files if path not in tables]
@@ -151,9 +154,8 @@ def _samples(
     if not others:
         return joined(parts)
     deployments = read_each(others, options=reading.options)
+    deployments = by_base_station(deployments, base)
     note_losses(*(one.attrs for one in deployments))
-    if base:
-        deployments = without_daily_variation(deployments, read(base))
     raw = [one for one in deployments if all(name in one for name in CHANNELS)]
     known = [load(path) for path in calibration]
     for path, one in zip(calibration, known, strict=True):

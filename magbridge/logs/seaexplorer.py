@@ -3,8 +3,8 @@
 Text with semicolons; positions are degrees and minutes written together, 9999 is a code for "not known". Of
 the navigation, ``LinPos`` (mm) and ``AngPos`` (deg) are where the battery is, ``BallastPos`` (cc) is the
 ballast: moving masses, as ``battpos``, ``battery_roll`` and ``ballast``. A payload's columns keep their names
-in small letters, but for the CTD's and a vector magnetometer's. Give both files: their rows are joined in
-time.
+in small letters, but for the CTD's and a vector magnetometer's. Its rows get attitude and masses from the
+navigation file of the same dive, where that lies beside it.
 
 Whether ``Heading`` is true or magnetic the file does not say. It is taken as true, and said; against the
 compass of an acoustic profiler on SEA063 it was 14 deg off (quartiles 12 and 16) where the declination was 6.
@@ -17,6 +17,7 @@ Names and units as pyglider reads them, https://pyglider.readthedocs.io
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,11 +28,16 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import deployment, sliced, with_losses
+from magbridge.logs.deployment import HISTORY, deployment, named_losses, sliced, with_losses
 from magbridge.logs.headings import aliases
+from magbridge.logs.resample import CIRCLES, linear
 
 __all__ = ["chunks"]
 
+PAYLOAD = re.compile(r"(?P<mission>.+)\.pld\d?\.\w+\.(?P<dive>\d+)(\.gz)?")
+"""Name of a payload's file: sea035.12.pld1.raw.36.gz. That of the navigation is sea035.12.gli.sub.36.gz."""
+MAX_GAP = 120.0
+"""s between two samples of the navigation, between which it is interpolated: it writes each 10 to 30 s."""
 CLOCKS = "Timestamp", "PLD_REALTIMECLOCK"
 DATE = "%d/%m/%Y %H:%M:%S"
 UNKNOWN = 9999.0
@@ -75,11 +81,45 @@ NAV_ONLY = {
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the file in pieces of at most `rows` rows; it is held whole.
 
+    The rows of a payload's file have what only the navigation file of its dive knows, which lies beside it:
+    attitude and masses, linearly between two samples of the navigation.
+
     Raises
     ------
     FormatError
         Not a SeaExplorer's file, or cut short while it was compressed.
     """
+    whole = _read(path)
+    if navigation := _navigation_of(path):
+        whole = _with_navigation(whole, _read(navigation), navigation)
+    yield from sliced(whole, rows)
+
+
+def _navigation_of(path: Path) -> Path | None:
+    """Return the navigation file of the dive whose payload a file holds; None where it is not beside it."""
+    if (named := PAYLOAD.fullmatch(path.name)) is None:
+        return None
+    dive = re.compile(rf"{re.escape(named['mission'])}\.gli\.\w+\.{named['dive']}(\.gz)?")
+    return min((file for file in path.parent.iterdir() if dive.fullmatch(file.name)), default=None)
+
+
+def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) -> xr.Dataset:
+    """Return the payload's rows with the columns that only the navigation has."""
+    order = np.argsort(navigation["time"].to_numpy(), kind="stable")
+    time, at = navigation["time"].to_numpy()[order], payload["time"].to_numpy()
+    taken = {
+        str(name): ("time", linear(at, time, column.to_numpy()[order], MAX_GAP, *CIRCLES.get(str(name), ())),
+                    column.attrs)
+        for name, column in navigation.data_vars.items()
+        if name not in payload
+    }  # fmt: skip
+    told = f"{' '.join(taken)} between the samples of {path.name}"
+    remarks = [line for line in named_losses(navigation.attrs) if "heading" in line]
+    return with_losses(payload.assign(taken).assign_attrs({HISTORY: told}), {}, remarks)
+
+
+def _read(path: Path) -> xr.Dataset:
+    """Return one file."""
     table, lost = _table(path)
     clock = next((name for name in CLOCKS if name in table), None)
     if clock is None:
@@ -101,7 +141,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     remarks = (
         [f"{path}: headings are taken as true, which the file does not say"] if "heading" in columns else []
     )
-    yield from sliced(with_losses(whole, {"rows_dropped": lost}, remarks), rows)
+    return with_losses(whole, {"rows_dropped": lost}, remarks)
 
 
 def _table(path: Path) -> tuple[pd.DataFrame, int]:

@@ -23,7 +23,7 @@ from magbridge.survey.samples import Samples
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Result", "facts", "samples_of", "summary", "survey", "without_daily_variation"]
+__all__ = ["Result", "facts", "samples_of", "summary", "survey"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,48 +118,6 @@ def survey(samples: Samples) -> Result:
     if (out := int((~found.kept).sum())) > 0.02 * len(residual):
         warnings.append(f"{out} of {len(residual)} samples are outliers and were left out of the map")
     return Result(samples, found, crossed, before, after, residual, tuple(warnings))
-
-
-def without_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[xr.Dataset]:
-    """Return the logs with a base station's variation taken into their reference.
-
-    Parameters
-    ----------
-    logs : sequence of Dataset
-        Of the survey.
-    base : Dataset
-        The base station's, with ``total_field`` (nT) or ``reference_field``, or a raw vector.
-
-    Raises
-    ------
-    FormatError
-        It has none of them.
-    DataError
-        It does not cover the logs' time.
-    """
-    total = _base_field(base)
-    known = np.isfinite(total)
-    time = base["time"].to_numpy()[known]
-    varied = total[known] - np.median(total[known])
-    out = []
-    for log in logs:
-        t = log["time"].to_numpy()
-        if not len(time) or t[0] < time[0] - 600.0 or t[-1] > time[-1] + 600.0:
-            source = base.attrs.get("source", "the base station's log")
-            raise DataError(f"{source}: does not cover the time of {log.attrs.get('source', 'the log')}")
-        out.append(log.assign(daily_variation=("time", np.interp(t, time, varied), {"units": "nT"})))
-    return out
-
-
-def _base_field(base: xr.Dataset) -> FloatArray:
-    for name in ("total_field", "reference_field"):
-        if name in base:
-            return np.asarray(base[name].to_numpy(), float)
-    if _has_vector(base):
-        return np.sqrt(sum(base[name].to_numpy() ** 2 for name in CHANNELS))
-    raise FormatError(
-        base.attrs.get("source", "the base station's log"), "expected total_field, or mag_x mag_y mag_z"
-    )
 
 
 def _has_vector(log: xr.Dataset) -> bool:

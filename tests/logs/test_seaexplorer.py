@@ -40,6 +40,22 @@ def test_navigation_of_a_seaexplorer(packed: bool, tmp_path: Path) -> None:
     assert "headings are taken as true" in back.attrs["losses"]
 
 
+@pytest.mark.parametrize("name", ["sea035.12.pld1.sub.36", "sea035.12.pld1.raw.36"])
+def test_the_payload_s_rows_know_where_the_masses_were(name: str, tmp_path: Path) -> None:
+    """Between the navigation's samples of the same dive, not of another."""
+    (tmp_path / "sea035.12.gli.sub.36.gz").write_bytes(gzip.compress(GLI.encode()))
+    (tmp_path / "sea035.12.gli.sub.3").write_text(GLI.replace("20.1", "99.9"))
+    (tmp_path / name).write_text(PLD)
+    back = logs.read(tmp_path / name)
+    assert back.sizes["time"] == 2
+    np.testing.assert_allclose(back["ballast"][0], 348.5 + (300.5 - 348.5) * 0.3737, rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(back["battpos"], [61.8, 61.8])
+    np.testing.assert_allclose(back["heading"], [116.68 + 2 * 0.3737, 118.68], rtol=0, atol=1e-4)
+    assert back["battpos"].attrs["units"] == "mm"
+    np.testing.assert_allclose(back["depth"], [3.424, 2.514])
+    assert "between the samples of sea035.12.gli.sub.36.gz" in back.attrs["history"]
+
+
 def test_payload_of_a_seaexplorer(tmp_path: Path) -> None:
     path = tmp_path / "sea035.12.pld1.sub.36"
     path.write_text(PLD)

@@ -1,0 +1,77 @@
+"""A base station's variation: calibrations and surveys of a day on which the field was not still."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import Command
+from scipy.spatial.transform import Rotation
+
+from magbridge.cli.common import by_base_station
+from magbridge.errors import DataError
+from magbridge.field.base_station import with_daily_variation
+from magbridge.field.igrf import igrf
+from magbridge.logs import read, write
+from magbridge.logs.deployment import deployment
+
+START = 1_700_000_040.0
+OFFSET = np.array([300.0, -200.0, 100.0])
+
+
+def varied(time: np.ndarray) -> np.ndarray:
+    """nT: a storm's."""
+    return 250.0 * np.sin(2 * np.pi * (time - START) / 5400.0)
+
+
+@pytest.fixture
+def storm(here: Path) -> Path:
+    """A vehicle's log, and the observatory's minutes of that day."""
+    time = START + 30.0 * np.arange(400.0)
+    earth = igrf(np.array([-63.0]), np.array([45.0]), np.array([0.0]), time[:1])[0]
+    field = earth * (1.0 + varied(time) / np.linalg.norm(earth))[:, None]
+    body = Rotation.random(len(time), rng=np.random.default_rng(3)).apply(field) + OFFSET
+    place = {"latitude": np.full(400, 45.0), "longitude": np.full(400, -63.0), "depth": np.zeros(400)}
+    write(
+        deployment("made", time, {f"mag_{axis}": body[:, k] for k, axis in enumerate("xyz")} | place),
+        "log.csv",
+    )
+    lines = [" Format                 IAGA-2002|", " IAGA Code              MDE|",
+             "DATE       TIME         DOY     MDEX      MDEY      MDEZ      MDEF   |"]  # fmt: skip
+    for t in START - 600.0 + 60.0 * np.arange(230.0):
+        stamp = datetime.fromtimestamp(t, UTC)
+        lines.append(f"{stamp:%Y-%m-%d %H:%M:%S}.000 {stamp:%j}     0.00 0.00 0.00 {50_000 + varied(t):.2f}")
+    (here / "mde.min").write_text("\n".join(lines) + "\n")
+    return here
+
+
+def test_a_calibration_on_a_day_of_storm(storm: Path, command: Command) -> None:
+    fit = "calibrate", "log.csv", "--method", "nominal", "-o", "cal.json", "--json"
+    bare, listed, named = (
+        json.loads(command(*fit, *more).out) for more in ([], ["mde.min"], ["--base-station", "mde.min"])
+    )
+    assert bare["rms_nT"] > 80
+    assert listed["rms_nT"] == named["rms_nT"] < 5
+    np.testing.assert_allclose(named["paper"]["T_nT"], OFFSET, rtol=0, atol=3)
+    assert named["samples"] == listed["samples"] == 400
+    assert json.loads((storm / "cal.json").read_text())["inputs"].keys() == {"log.csv", "mde.min"}
+
+
+def test_an_observatory_among_the_logs_of_a_survey(storm: Path) -> None:
+    """Or named: the vehicle's logs alone remain, with what the field varied by."""
+    log, station = read("log.csv"), read("mde.min")
+    for logs, base in (([log, station], None), ([log], Path("mde.min"))):
+        (found,) = by_base_station(logs, base)
+        variation = found["daily_variation"].to_numpy()
+        expected = varied(log["time"].to_numpy())
+        np.testing.assert_allclose(variation - variation.mean(), expected - expected.mean(), rtol=0, atol=0.5)
+    assert by_base_station([log], None) == [log]
+
+
+def test_a_station_of_another_day(storm: Path) -> None:
+    log, station = read("log.csv"), read("mde.min")
+    with pytest.raises(DataError, match=r"^mde\.min: does not cover the time of log\.csv$"):
+        with_daily_variation([log.assign_coords(time=log["time"] + 86_400.0)], station)
