@@ -32,6 +32,7 @@ from magbridge.logs.autopilot import Fields, Magnetometer, Run, Series, pieces, 
 from magbridge.logs.compasses import Compass, rate
 from magbridge.logs.dataflash import Records, read_binary
 from magbridge.logs.dataflash_text import read_text
+from magbridge.logs.gps_time import GPS_EPOCH, WEEK, leap_seconds
 from magbridge.logs.order import boots
 
 if TYPE_CHECKING:
@@ -39,10 +40,6 @@ if TYPE_CHECKING:
 
 __all__ = ["chunks"]
 
-EPOCH_GPS = 315_964_800
-WEEK = 604_800
-LEAP = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (0, 15))
-"""UTC (s) from which GPS time is ahead of UTC by this many s."""
 FIX = 3
 """Least ``GPS.Status`` of a fix in three dimensions."""
 TABLES = 8
@@ -202,11 +199,10 @@ def _utc_offset(records: dict[str, Records]) -> float | None:
     for gps in (one.fields for one in _instances(records, "GPS").values()):
         if {"GWk", "GMS"} <= gps.keys():
             fixed = (gps["GWk"] > 0) & (gps.get("Status", np.full(len(gps["GWk"]), FIX)) >= FIX)
-            ahead = EPOCH_GPS + gps["GWk"] * WEEK + gps["GMS"] * 1e-3 - gps["TimeUS"] * 1e-6
+            ahead = GPS_EPOCH + gps["GWk"] * WEEK + gps["GMS"] * 1e-3 - gps["TimeUS"] * 1e-6
             offsets.append(ahead[fixed])
     known = np.concatenate(offsets) if offsets else np.empty(0)
     if not len(known):
         return None
-    offset = float(np.median(known))
-    leap = next((seconds for since, seconds in LEAP if offset - seconds >= since), 0)
-    return offset - leap
+    offset = np.array([np.median(known)])
+    return float((offset - leap_seconds(offset))[0])

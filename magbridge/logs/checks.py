@@ -8,7 +8,6 @@ or in another order, and is refused.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise
@@ -21,6 +20,7 @@ from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import CHANNEL_TIMES, usual
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
+from magbridge.logs.order import in_order
 
 __all__ = ["checked", "increasing"]
 
@@ -231,29 +231,9 @@ def _kept(time: FloatArray, after: float) -> IndexArray:
     """
     index = np.flatnonzero((time > after) & (np.abs(time) < YEAR_10000))
     if (np.diff(time[index]) < 0).any():
-        index = index[_longest(time[index])]
+        index = index[in_order(time[index], strictly=False)]
     apart = np.flatnonzero(np.diff(time[index]) > FAR) + 1
     if len(index) >= MANY and len(apart):
         groups = [group for group in np.split(index, apart) if len(group) >= ALONE]
         index = np.concatenate(groups) if groups else index
     return index
-
-
-def _longest(time: FloatArray) -> IndexArray:
-    """Return the indices of the longest series of `time` (n,) that does not decrease.
-
-    Fredman 1975, "On computing the length of longest increasing subsequences", Discrete Mathematics 11, 29.
-    """
-    rank = np.empty(len(time), int)  # which tells equal times apart by their order
-    rank[np.argsort(time, kind="stable")] = np.arange(len(time))
-    starts: list[int] = []  # by length of a series: minus the largest rank with which one starts,
-    at: list[int] = []  # where that is,
-    after = np.full(len(time), -1)  # and, for each time, where its series goes on
-    for k, one in reversed(list(enumerate(rank.tolist()))):  # from the end: of equals, the first is kept
-        length = bisect_left(starts, -one)
-        after[k] = at[length - 1] if length else -1
-        starts[length : length + 1], at[length : length + 1] = [-one], [k]
-    series = at[-1:]
-    while (k := int(after[series[-1]])) >= 0:
-        series.append(k)
-    return np.array(series)

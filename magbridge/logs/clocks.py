@@ -15,21 +15,11 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import FloatArray
+from magbridge.logs.gps_time import GPS_EPOCH, leap_seconds
 
 __all__ = ["Clock", "clock_of", "seconds"]
 
 DAY = 86_400.0
-GPS_EPOCH = 315_964_800.0
-"""s since 1970 of 1980-01-06, where GPS weeks begin."""
-LEAPS = (
-    (1_483_228_800, 18),
-    (1_435_708_800, 17),
-    (1_341_100_800, 16),
-    (1_230_768_000, 15),
-    (1_136_073_600, 14),
-    (0, 13),
-)
-"""From when on (s since 1970) GPS time is ahead of UTC by how many s; IERS Bulletin C 52, from 1999 on."""
 EPOCHS = {
     "s": (0.0, 1.0),
     "ms": (0.0, 1e-3),
@@ -187,7 +177,7 @@ def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
     if clock.kind in EPOCHS:
         start, scale = EPOCHS[clock.kind]
         times: FloatArray = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64) * scale + start
-        return times - _leap(times) if clock.kind == "gps" else times
+        return times - leap_seconds(times) if clock.kind == "gps" else times
     texts = cells.astype("string").str.strip()
     if clock.kind == "iso":
         stamps = pd.to_datetime(texts, format="ISO8601", errors="coerce", utc=zone is None)
@@ -209,10 +199,3 @@ def _epoch(stamps: pd.Series) -> FloatArray:
     whole = counts.astype("datetime64[s]")
     times = whole.astype(np.int64) + (counts - whole).astype(np.int64) * 1e-9
     return np.asarray(np.where(np.isnat(counts), np.nan, times), np.float64)
-
-
-def _leap(gps: FloatArray) -> FloatArray:
-    leap = np.zeros(len(gps))
-    for since, ahead in reversed(LEAPS):
-        leap[gps - ahead >= since] = ahead
-    return leap

@@ -28,7 +28,7 @@ def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
     time : (n,) array of float
         s, in the order of the file; NaN is never kept.
     strictly : bool
-        Of several rows with one time, only one is kept.
+        Of several rows with one time, only the first is kept.
 
     Returns
     -------
@@ -36,29 +36,30 @@ def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
 
     Notes
     -----
-    The longest increasing subsequence, by patience sorting: C. Schensted (1961), Canad. J. Math. 13, 179.
+    The longest increasing subsequence, by patience sorting from the end, so that of equals the first is kept:
+    C. Schensted (1961), Canad. J. Math. 13, 179.
     """
     known = np.isfinite(time)
     steps = np.diff(time[known])
     if (steps > 0 if strictly else steps >= 0).all():
         return known
-    rows, place = np.flatnonzero(known).tolist(), bisect_left if strictly else bisect_right
-    ends: list[float] = []  # ends[k]: the least last time of an increasing sequence of k + 1
-    last: list[int] = []
-    before: list[int] = [-1] * len(time)
-    for row, one in zip(rows, time[known].tolist(), strict=True):
-        k = place(ends, one)
-        if k == len(ends):
-            ends.append(one)
-            last.append(row)
+    rows, place = np.flatnonzero(known)[::-1], bisect_left if strictly else bisect_right
+    starts: list[float] = []  # starts[k]: minus the greatest first time of an increasing sequence of k + 1,
+    first: list[int] = []  # and its row
+    after: list[int] = [-1] * len(time)
+    for row, one in zip(rows.tolist(), (-time[rows]).tolist(), strict=True):
+        k = place(starts, one)
+        if k == len(starts):
+            starts.append(one)
+            first.append(row)
         else:
-            ends[k], last[k] = one, row
-        before[row] = last[k - 1] if k else -1
+            starts[k], first[k] = one, row
+        after[row] = first[k - 1] if k else -1
     keep = np.zeros(len(time), dtype=bool)
-    row = last[-1] if last else -1
+    row = first[-1] if first else -1
     while row >= 0:
         keep[row] = True
-        row = before[row]
+        row = after[row]
     return keep
 
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.errors import FormatError
-from magbridge.logs.checks import _longest, checked
+from magbridge.logs.checks import checked
 from magbridge.logs.deployment import deployment, named_losses, passed_over
+from magbridge.logs.order import in_order
 
 T0 = 1.7e9
 
@@ -82,7 +83,7 @@ def test_no_longer_series_of_times_could_be_kept(time: list[int]) -> None:
     for k, now in enumerate(time):
         best[k] += max((best[j] for j in range(k) if time[j] <= now), default=0)
     if time:
-        series = _longest(np.array(time, float))
+        series = np.flatnonzero(in_order(np.array(time, float), strictly=False))
         assert len(series) == max(best)
         assert (np.diff(series) > 0).all()
         assert (np.diff(np.array(time)[series]) >= 0).all()
