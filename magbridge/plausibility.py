@@ -77,7 +77,8 @@ HOLD_US: Final = 60_000_000
 LONG_US: Final = 3_600_000_000
 LONGEST_US: Final = 86_400_000_000
 """µs for which a fault that is over is remembered: first, where the level was wrong or a mass's move did not
-explain what was seen, and at most. Each time it comes again it is remembered four times longer."""
+explain what was seen, and at most. Each time it comes again it is remembered four times longer, but no more
+than an hour where no mass has moved; and a jump that came back, as long as it lasted."""
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 UNSTEADY: Final = int(Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
 AXES: Final = "xyz"
@@ -315,13 +316,14 @@ class Plausibility:
         if self._moved * self._moved <= GATE * GATE * max(self._variance, self._floor):
             self._moved_us = time_us  # from here on it is another level
         elif time_us - self._moved_us > LASTING_US:
-            self._until_us = max(self._until_us, time_us + 6 * LONG_US)
+            away_us = time_us - self._moved_us
+            self._until_us = max(self._until_us, time_us + min(away_us, LONG_US))
         self._moved += by
         self._mark = nan
         self._largest = max(self._largest, abs(self._moved), abs(by))
-        hold = (LONG_US if moved else HOLD_US) << min(2 * self._jumps, 20)
+        hold, most = (LONG_US, LONGEST_US) if moved else (HOLD_US, LONG_US)
+        self._until_us = max(self._until_us, time_us + min(hold << min(2 * self._jumps, 20), most))
         self._jumps += 1
-        self._until_us = max(self._until_us, time_us + min(hold, LONGEST_US))
         if moved:
             self._notify(
                 "move", f"field jumps by {by:+.0f} nT as a mass moves: calibration or telemetry wrong"

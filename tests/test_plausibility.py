@@ -110,7 +110,14 @@ def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() ->
     flight.raw[515:1000] += along(flight.raw[515:1000], 200.0)
     flags, sigma, _ = flight.judge()
     assert (flags[500:1000] == IMPLAUSIBLE).all()
-    assert (sigma[1000:] > 100.0).all()  # what is right again may not be
+    assert (sigma[1000:1400] > 100.0).all()  # what is right again may not be
+    flight = Flight(n=2500)
+    flight.raw[500:1000] += along(flight.raw[500:1000], 200.0)
+    flags, sigma, _ = flight.judge()
+    assert (flags[500:1000] == IMPLAUSIBLE).all()
+    assert (sigma[1000:1400] > 100.0).all()
+    assert not flags[2000:].any()
+    assert (sigma[2000:] == SIGMA).all(), "after an hour at the latest"
 
 
 def test_a_mass_that_moves_is_no_jump_if_the_field_stays_and_one_if_it_does_not() -> None:

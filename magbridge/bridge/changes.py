@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from magbridge.bridge.position import CLOCK_SET_US
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.link.announcer import Announcer
 from magbridge.mavlink import Codec, spec
@@ -42,6 +43,7 @@ class Changes:
         self._codec, self._announcer, self._sensor = codec, announcer, sensor
         self.log_state, self.log_lost = MAG_LOG_STATE.OFF, 0
         self.since_us = self.until_us = 0
+        self._clock_unset = False
 
     def hear(self, data: bytes, time_us: int) -> None:
         """Take frames that came at `time_us`."""
@@ -50,6 +52,7 @@ class Changes:
                 self._codec.utc_offset_us += message["step"]
                 step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
                 self._announcer.say(step, MAV_SEVERITY.NOTICE)
+                self.check_clock()
             elif message.id == BESIDE:  # in a replay
                 self._codec.skip(message["count"])
             elif message.id == NOTICE:
@@ -59,6 +62,15 @@ class Changes:
             elif message.id == PORT:
                 well = message["state"] == MAG_PORT_STATE.OK
                 self._port(message["port"], well, message["reason"], message["dropped"], time_us)
+
+    def check_clock(self) -> None:
+        """Announce that the host's clock was never set, as on a computer without a battery for it."""
+        unset = self._codec.utc_us < CLOCK_SET_US
+        if unset or self._clock_unset:
+            text = "host clock was never set: no date, no main field" if unset else "host clock is set"
+            severity = MAV_SEVERITY.WARNING if unset else MAV_SEVERITY.INFO
+            self._announcer.state("clock", text, severity)
+        self._clock_unset = unset
 
     def _stood_still(self, time_us: int, duration_us: int) -> None:
         if time_us > self.until_us:  # else one more of a row of them

@@ -139,7 +139,7 @@ def open_navigation(
     Raises
     ------
     ConfigError
-        A fix message or an option that does not exist.
+        A fix message or an option that does not exist, or a rate too low for the receiver.
     FormatError, OutOfRange
         The map cannot be read.
     """
@@ -150,6 +150,11 @@ def open_navigation(
         options = informed(options, calibration, calibration.noise.sensor)
     kind = FIXES[wanted.fix]
     if wanted.rate is not None:
+        if wanted.rate < kind.least:
+            expected = (
+                f"expected at least {kind.least:g} Hz, or nothing: the autopilot drops slower {wanted.fix}"
+            )
+            raise ConfigError(config.path, "navigation.rate", f"{expected}, not {wanted.rate:g}")
         kind = kind._replace(rate=wanted.rate)
     dives = np.linspace(0.0, wanted.depth)
     return partial(Navigation, *at_depth(read_grid(config.resolve(wanted.map)), options, dives), kind)

@@ -276,6 +276,7 @@ class Pipeline:
         """Record what a replay needs, and announce the calibration in use."""
         for frame in self.beginning(start.parameters):
             self.journal.state(start.time_us, frame)
+        self._changes.check_clock()
         say = self.component.announcer.say
         if foreign:
             say(f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR)

@@ -12,11 +12,13 @@ from magbridge.mavlink import Message, spec
 if TYPE_CHECKING:
     from magbridge.field.nearby import NearbyField
 
-__all__ = ["Position"]
+__all__ = ["CLOCK_SET_US", "Position"]
 
 POSITION = spec("GLOBAL_POSITION_INT")
 MAX_AGE_US: Final = 60_000_000
 """µs: a glider makes 20 m in a minute, over which the main field changes by less than 0.1 nT."""
+CLOCK_SET_US: Final = 10**15
+"""µs since 1970, in 2001: a host whose clock says less has none that was set, and the date is not known."""
 AGAIN_US: Final = 1_000_000
 """µs after which the main field is computed anew."""
 
@@ -52,14 +54,14 @@ class Position:
         return self._where[:2] if self._where is not None else None
 
     def main_field(self, time_us: int, utc_us: int) -> float:
-        """Return the IGRF's total field in nT; NaN where the position is not known, or no model covers it.
+        """Return the IGRF's total field in nT; NaN where position or date is not known, or no model holds.
 
         Parameters
         ----------
         time_us, utc_us : int
             µs of event time, and of UNIX time by the host's clock as it is set now.
         """
-        if self._where is None or abs(time_us - self._when_us) > MAX_AGE_US:
+        if self._where is None or utc_us < CLOCK_SET_US or abs(time_us - self._when_us) > MAX_AGE_US:
             return nan
         if abs(utc_us - self._evaluated_us) > AGAIN_US:
             self._evaluated_us = utc_us

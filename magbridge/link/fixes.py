@@ -220,6 +220,8 @@ class Kind(NamedTuple):
         It holds a :class:`Pose`.
     trusted_to : float
         m: the receiver takes a larger sigma for this one.
+    least : float
+        Hz below which the receiver takes the source for dead.
     """
 
     send: Callable[[Outbox, Fix, int, int], Any]
@@ -228,6 +230,7 @@ class Kind(NamedTuple):
     fused: bool
     local: bool = False
     trusted_to: float = inf
+    least: float = 0.0
 
 
 FIXES: dict[str, Kind] = {
@@ -240,12 +243,13 @@ FIXES: dict[str, Kind] = {
     ),
     "ODOMETRY": Kind(
         odometry,
-        5.0,  # below 4 Hz ArduPilot calls it unhealthy (AP_VisualOdom_Backend.cpp)
+        5.0,
         # EKF2's EV position learns our offset as a bias, and drops what comes 0.25 s late (ev_control.cpp)
         {MAV_AUTOPILOT.PX4: "PX4 makes a bias of ODOMETRY: use GLOBAL_POSITION_SENSOR"},
         fused=True,
         local=True,
         trusted_to=10.0,  # AP_NavEKF3_PosVelFusion.cpp: constrain_ftype(posErr, 0.01f, 10.0f)
+        least=4.0,  # AP_VisualOdom_Backend.cpp: unhealthy 300 ms after the last
     ),
 }
 """What ``[navigation] fix`` may name."""

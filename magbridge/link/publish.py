@@ -132,7 +132,7 @@ class Publisher:
         x_count, y_count, z_count = counts or NO_COUNTS
         x_late, y_late, z_late = reading.channel_delay
         return RAW.struct.pack(
-            sample.reading_us + self._codec.utc_offset_us, (sequence or 0) & MASK,
+            since_1970(sample.reading_us + self._codec.utc_offset_us), (sequence or 0) & MASK,
             x, y, z, x_count, y_count, z_count,
             nearest(x_late * 1e6), nearest(y_late * 1e6), nearest(z_late * 1e6),
             reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, 0, flags,
@@ -143,7 +143,7 @@ class Publisher:
         x, y, z = corrected.field
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
         payload = FIELD.struct.pack(
-            sample.time_us + self._codec.utc_offset_us, corrected.total_field,
+            since_1970(sample.time_us + self._codec.utc_offset_us), corrected.total_field,
             self.samples & MASK, self.calibration_id, corrected.total_field_sigma,
             x, y, z, x_sigma, y_sigma, z_sigma, sample.anomaly, sample.telemetry_age,
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
@@ -152,7 +152,7 @@ class Publisher:
 
     def _imu(self, sample: Sample) -> None:
         x, y, z = sample.corrected.field
-        time_us = sample.time_us + self._codec.utc_offset_us
+        time_us = since_1970(sample.time_us + self._codec.utc_offset_us)
         payload = IMU_FIELD.pack(time_us, x * GAUSS, y * GAUSS, z * GAUSS, MAGNETOMETER, 0)
         self._outbox.put(IMU, payload)
 
@@ -167,9 +167,14 @@ class Publisher:
 
     def _vector(self, sample: Sample) -> None:
         payload = VECTOR.struct.pack(
-            sample.time_us + self._codec.utc_offset_us, *sample.corrected.field, b"mag_field"
+            since_1970(sample.time_us + self._codec.utc_offset_us), *sample.corrected.field, b"mag_field"
         )
         self._outbox.put(VECTOR, payload)
+
+
+def since_1970(time_us: int) -> int:
+    """Return a time (µs) that a message can hold: a host whose clock was never set begins at 0."""
+    return time_us if time_us > 0 else 0
 
 
 PUBLISHED: dict[str, str] = {

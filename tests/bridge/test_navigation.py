@@ -233,6 +233,7 @@ def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:
     ("old", "new", "line"),
     [
         ('"FIX"', '"TELEPATHY"', "navigation.fix: expected one of EXTERNAL_POSITION_ESTIMATE"),
+        ("options = {start", "rate = 2\noptions = {start", "navigation.rate: expected at least 4 Hz"),
         ("start_sigma", "start_sgma", "navigation.options.start_sgma: unknown key"),
     ],
 )

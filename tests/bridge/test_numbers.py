@@ -10,7 +10,9 @@ from small import START, small_bridge
 
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.states import clock_step
 from magbridge.calibration.model import Parameter
+from magbridge.config import Align
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Quality
 
@@ -60,3 +62,37 @@ def fields(sent: list[tuple[int, bytes]]) -> list[Message]:
     """Return each MAG_FIELD that was said."""
     messages = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
     return [one for one in messages if one.name == "MAG_FIELD"]
+
+
+def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
+    """It begins at 1970, where a filter's delay leads to before it: one line, and no main field."""
+    battery = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
+    published = ["MAG_RAW", "MAG_FIELD", "HIGHRES_IMU", "DEBUG_VECT"]
+    pipeline = small_bridge(tmp_path, Start(0), battery, published)
+    settings = Align(filter_delay=0.5)
+    pipeline._correction.aligner.tune(settings, {})
+    autopilot = Codec(1, 1)
+    sent: list[tuple[int, bytes]] = []
+    for k in range(20):
+        frame = autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=0.1)
+        frame += autopilot.pack("GLOBAL_POSITION_INT", lat=495_000_000, lon=-579_000_000)
+        sent += pipeline.feed(Event(100_000 * k, Channel.LINK, frame))
+        line = f"20000 -100 40000 4 {0.1 * k:.1f} {k}\n".encode()
+        sent += pipeline.feed(Event(100_000 * k + 4, Channel.SENSOR, line))
+    samples = fields(sent)
+    assert [one["time_usec"] for one in samples[:3]] == [0, 0, 0]
+    assert all(isnan(one["anomaly"]) for one in samples)
+    assert [text for text in texts(sent) if "clock" in text] == [
+        "host clock was never set: no date, no main field"
+    ]
+    step = clock_step(3_000_000, START)
+    sent = pipeline.feed(Event(3_000_000, Channel.STATE, step)) + pipeline.feed(
+        Event(4_000_000, Channel.STATE, b"")
+    )
+    assert "host clock is set" in texts(sent)
+
+
+def texts(sent: list[tuple[int, bytes]]) -> list[str]:
+    """Return each text that was said."""
+    heard = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
+    return [one["text"] for one in heard if one.name == "STATUSTEXT"]

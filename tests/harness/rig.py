@@ -64,6 +64,9 @@ STALE_BY = 0.2
 """s that the machine may stand still, of the last second, before telemetry can be stale for it: 0.5 s
 is `max_age`."""
 
+PATIENCE = 60.0
+"""s that an event is waited for: on a busy machine a bridge takes many to start."""
+
 
 class Heard(NamedTuple):
     """A message of the bridge, and when it came (s, monotonic)."""
@@ -180,7 +183,7 @@ class Rig:
         end = time.monotonic() if end is None else end
         return end - begun - self.machine.seconds(begun, end)
 
-    def until(self, condition: Callable[[], object], timeout: float = 15.0) -> float:
+    def until(self, condition: Callable[[], object], timeout: float = PATIENCE) -> float:
         """Play sensor and autopilot until `condition` holds; return the s it took, as in :meth:`since`."""
         begun = time.monotonic()
         while not condition():
@@ -227,13 +230,13 @@ class Rig:
         self.until(well)
         return self.since(begun, run())
 
-    def until_status(self, condition: Callable[[Message], object], timeout: float = 15.0) -> Message:
+    def until_status(self, condition: Callable[[Message], object], timeout: float = PATIENCE) -> Message:
         """Wait for a MAG_STATUS from now on for which `condition` holds; return it."""
         mark = self.mark
         self.until(lambda: any(map(condition, self.of("MAG_STATUS", mark))), timeout)
         return next(status for status in self.of("MAG_STATUS", mark) if condition(status))
 
-    def until_said(self, text: str, mark: int, timeout: float = 15.0) -> float:
+    def until_said(self, text: str, mark: int, timeout: float = PATIENCE) -> float:
         """Wait until a STATUSTEXT since `mark` contains `text`; return the s that it took."""
         return self.until(lambda: any(text in line for line in self.said(mark)), timeout)
 
