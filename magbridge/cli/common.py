@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, time
 from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -115,10 +115,10 @@ def _whole(_: Any, tokens: Sequence[Token]) -> int:
         raise ValueError(f"expected a whole number, not {tokens[0].value}.") from None
 
 
-def _day(_: Any, tokens: Sequence[Token]) -> date:
+def _day(_: Any, tokens: Sequence[Token]) -> dt.date:
     """Read a date; cyclopts would also take a time of day, which no log counts from."""
     try:
-        return date.fromisoformat(tokens[0].value)
+        return dt.date.fromisoformat(tokens[0].value)
     except ValueError:
         raise ValueError(f"expected YYYY-MM-DD, not {tokens[0].value}.") from None
 
@@ -144,7 +144,7 @@ class Reading:
         to.
     """
 
-    date: Annotated[date | None, Parameter(converter=_day)] = None
+    date: Annotated[dt.date | None, Parameter(converter=_day)] = None
     compass: str | None = None
     strict: bool = False
     column: tuple[str, ...] = ()
@@ -153,7 +153,7 @@ class Reading:
     @property
     def options(self) -> Options:
         """The same for :mod:`magbridge.logs`."""
-        boot = None if self.date is None else datetime.combine(self.date, time(), UTC).timestamp()
+        boot = None if self.date is None else dt.datetime.combine(self.date, dt.time(), dt.UTC).timestamp()
         return Options(self.strict, boot, self.compass, self.column, self.columns)
 
 

@@ -140,7 +140,7 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     if log.attrs.get("time_reference") == "boot":
         hints.append("times count from a start that the log does not tell: --date says when it was")
     if "heading" in log and "heading_reference" not in log.attrs:
-        hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass'")
+        hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
     if moving := telemetry(log):
         hints.append(f"may move the field, for --parameter: {' '.join(moving)}")
     empty = [one["name"] for one in columns if not one["known"]]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from contextlib import suppress
 from pathlib import Path
 from struct import pack
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from ulogs import Said, ulog_of
 
 from magbridge import logs
 from magbridge.errors import FormatError
@@ -234,33 +234,6 @@ def test_quaternion_of_known_attitudes() -> None:
     )
 
 
-Said = list[tuple[str, int, tuple[Any, ...]]]
-"""Topic, instance and values of each message."""
-
-
-def _ulog(topics: dict[str, tuple[str, str]], parameters: dict[str, float], said: Said) -> bytes:
-    """Return a ULog of topics (definition, struct), each an instance, with parameters and messages."""
-
-    def message(kind: str, body: bytes) -> bytes:
-        return pack("<HB", len(body), ord(kind)) + body
-
-    data = b"ULog\x01\x12\x35\x01" + pack("<Q", 0) + message("B", bytes(40))
-    for name, (definition, _) in topics.items():
-        data += message("F", f"{name}:{definition}".encode())
-    for name, value in parameters.items():
-        whole = isinstance(value, int)
-        key = f"{'int32_t' if whole else 'float'} {name}".encode()
-        data += message("P", bytes([len(key)]) + key + pack("<i" if whole else "<f", value))
-    numbers: dict[tuple[str, int], int] = {}
-    for name, instance, _ in said:
-        if (name, instance) not in numbers:
-            numbers[name, instance] = len(numbers)
-            data += message("A", pack("<BH", instance, numbers[name, instance]) + name.encode())
-    for name, instance, values in said:
-        data += message("D", pack("<H", numbers[name, instance]) + pack(topics[name][1], *values))
-    return data
-
-
 def test_the_compass_that_vehicle_magnetometer_names(tmp_path: Path) -> None:
     """The first is disabled; that in use is taken at its full rate, with PX4's calibration undone."""
     pytest.importorskip("pyulog")
@@ -283,7 +256,7 @@ def test_the_compass_that_vehicle_magnetometer_names(tmp_path: Path) -> None:
             said += [("sensor_mag", 0, (us, 11, 9, 9, 9)), ("sensor_mag", 1, (us, 22, 0.2, 0.1, -0.4))]
         said.append(("vehicle_magnetometer", 0, (us, 22, 1.25 * (0.2 - 0.05), 0.1, -0.4)))
     path = tmp_path / "log.ulg"
-    path.write_bytes(_ulog(topics, parameters, said))
+    path.write_bytes(ulog_of(topics, parameters, said))
     back = logs.read(path)
     assert back.sizes["time"] == 20
     np.testing.assert_allclose(back["mag_x"], 20_000, rtol=1e-6)
@@ -317,7 +290,7 @@ def test_an_old_log_has_its_field_in_sensor_combined(tmp_path: Path) -> None:
             ("sensor_combined", 0, (us, 0.2, 0.1, -0.4)),
         ]
     path = tmp_path / "log.ulg"
-    path.write_bytes(_ulog(topics, {}, said))
+    path.write_bytes(ulog_of(topics, {}, said))
     back = logs.read(path)
     np.testing.assert_allclose(back["mag_x"], 20_000, rtol=1e-6)
     np.testing.assert_allclose(back["time"], UTC + 1 + 0.1 * np.arange(20), rtol=0, atol=1e-5)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
+from segments import CRC, segment
 
 from magbridge import logs
 from magbridge.errors import FormatError
@@ -16,35 +15,6 @@ from magbridge.logs.deployment import named_losses, passed_over
 dbdreader = pytest.importorskip("dbdreader")
 
 T0 = 1_704_067_200.0
-CRC = "ab12cd34"
-
-
-def segment(path: Path, cycles: Mapping[str, np.ndarray], *, factored: bool = False) -> None:
-    """Write a file in which every sensor of `cycles` is updated in every cycle.
-
-    Eight bytes a value; a cycle is ``d``, two bits a sensor (2: updated), the values. With `factored`, the
-    list of sensors is left out: it is in a ``.cac``.
-    """
-    names = list(cycles)
-    sensors = "".join(f"s: T {k} {k} 8 {name} unit\n" for k, name in enumerate(names))
-    state = (len(names) + 3) // 4
-    tags = {
-        "dbd_label": "DBD(dinkum_binary_data)file", "encoding_ver": 5, "num_ascii_tags": 14, "all_sensors": 0,
-        "the8x3_filename": "00010000", "full_filename": path.stem, "filename_extension": path.suffix[1:],
-        "mission_name": "MADE.MI", "fileopen_time": "Mon_Jan__1_00:00:00_2024",
-        "total_num_sensors": len(names), "sensors_per_cycle": len(names), "state_bytes_per_cycle": state,
-        "sensor_list_crc": CRC.upper(),
-        "sensor_list_factored": int(factored),
-    }  # fmt: skip
-    data = "".join(f"{name}:    {value}\n" for name, value in tags.items()).encode()
-    data += b"" if factored else sensors.encode()
-    data += b"sa" + struct.pack("<hfd", 0x1234, 123.456, 123456789.12345)
-    for row in zip(*cycles.values(), strict=True):
-        bits = int.from_bytes(b"\xaa" * state, "big") & ~((1 << 2 * (4 * state - len(row))) - 1)
-        data += b"d" + bits.to_bytes(state, "big") + struct.pack(f"<{len(row)}d", *row)
-    path.write_bytes(data + b"X")
-    if factored:
-        path.with_name(f"{CRC}.cac").write_text(sensors)
 
 
 def flight(n: int = 50, start: float = T0) -> dict[str, np.ndarray]:

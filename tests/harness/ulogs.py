@@ -1,0 +1,34 @@
+"""PX4's logs made here, after its description of ULog."""
+
+from __future__ import annotations
+
+from struct import pack
+from typing import Any
+
+__all__ = ["Said", "ulog_of"]
+
+Said = list[tuple[str, int, tuple[Any, ...]]]
+"""Topic, instance and values of each message."""
+
+
+def ulog_of(topics: dict[str, tuple[str, str]], parameters: dict[str, float], said: Said) -> bytes:
+    """Return a ULog of topics (definition, struct), each an instance, with parameters and messages."""
+
+    def message(kind: str, body: bytes) -> bytes:
+        return pack("<HB", len(body), ord(kind)) + body
+
+    data = b"ULog\x01\x12\x35\x01" + pack("<Q", 0) + message("B", bytes(40))
+    for name, (definition, _) in topics.items():
+        data += message("F", f"{name}:{definition}".encode())
+    for name, value in parameters.items():
+        whole = isinstance(value, int)
+        key = f"{'int32_t' if whole else 'float'} {name}".encode()
+        data += message("P", bytes([len(key)]) + key + pack("<i" if whole else "<f", value))
+    numbers: dict[tuple[str, int], int] = {}
+    for name, instance, _ in said:
+        if (name, instance) not in numbers:
+            numbers[name, instance] = len(numbers)
+            data += message("A", pack("<BH", instance, numbers[name, instance]) + name.encode())
+    for name, instance, values in said:
+        data += message("D", pack("<H", numbers[name, instance]) + pack(topics[name][1], *values))
+    return data
