@@ -30,6 +30,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
+from magbridge.columns import CHANNELS
 from magbridge.errors import FormatError
 from magbridge.field.igrf import total_field
 from magbridge.logs.cf import floats
@@ -97,9 +98,16 @@ class Dive:
 
 
 def dive(path: Path, known: Dive) -> xr.Dataset:
-    """Return one dive as a deployment; FormatError: it has no magnetometer."""
+    """Return one dive as a deployment, without the field, and said, where the compass was not logged raw.
+
+    Raises
+    ------
+    FormatError
+        One of the compass' axes is there, and another is not.
+    """
+    raw = [name for name in CHANNELS if name in known.sampled]
     for axis in "xyz":
-        if f"mag_{axis}" not in known.sampled:
+        if raw and f"mag_{axis}" not in raw:
             raise FormatError(
                 path,
                 "expected this variable, as of a Seaglider with a raw compass",
@@ -123,10 +131,13 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
     for motor, _ in MASSES.values():
         if (current := _current(known, motor)) is not None:
             columns[f"{motor}_current"], units[f"{motor}_current"] = current, "A"
-    count, remarks = _count(path, known, columns)
-    for axis in "xyz":
-        columns[f"mag_{axis}"] = columns[f"mag_{axis}"] * count
-    attrs: dict[str, Any] = {"heading_reference": "magnetic", "mag_scale_nT_per_count": count}
+    attrs: dict[str, Any] = {"heading_reference": "magnetic"}
+    if raw:
+        count, remarks = _count(path, known, columns)
+        columns |= {name: columns[name] * count for name in raw}
+        attrs["mag_scale_nT_per_count"] = count
+    else:
+        remarks = [f"{path}: no raw compass (eng_mag_x eng_mag_y eng_mag_z): attitude and masses are read"]
     if (declination := known.settings.get("magnetic_variation")) is not None:
         attrs["magnetic_variation_deg"] = declination
     return with_losses(deployment(path, known.time, columns, units, attrs), {}, remarks)

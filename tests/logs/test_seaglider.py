@@ -63,6 +63,15 @@ def test_variables_of_another_length_than_their_times_are_left_out(tmp_path: Pat
         dive(path, eng_mag_y=short)
 
 
+def test_a_dive_whose_compass_was_not_logged_raw(tmp_path: Path) -> None:
+    """Most Seagliders': attitude and masses can still be planned with, and simulated."""
+    short = dict.fromkeys((f"eng_mag_{axis}" for axis in "xyz"), ("gc_event", np.zeros(2)))
+    read = dive(tmp_path / "p1670001.nc", **short)
+    assert {"heading", "longitude", "vbd_current"} <= set(read)
+    assert not {"mag_x", "mag_y", "mag_z"} & set(read)
+    assert "no raw compass" in "".join(named_losses(read.attrs))
+
+
 def device(number: float, use: float = 4.0) -> dict[str, tuple[str, np.ndarray]]:
     return {"log_COMPASS_DEVICE": ("", np.array(number)), "log_COMPASS_USE": ("", np.array(use))}
 
