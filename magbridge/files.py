@@ -7,11 +7,12 @@ import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from hashlib import file_digest, sha256
 from pathlib import Path
 
 from magbridge.errors import FormatError, MagbridgeError, WriteError
 
-__all__ = ["atomic_path", "existing", "new_folder", "systems_reason"]
+__all__ = ["atomic_path", "digest", "existing", "new_folder", "systems_reason"]
 
 ROOM = 1 << 20
 """Bytes written to learn why a write failed: more than a library writes at a time."""
@@ -55,6 +56,15 @@ def existing(path: Path) -> Path:
         what = "not a pipe or a device" if path.exists() else "there is none"
         raise FormatError(path, f"expected a file, {what}")
     return path
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file or folder; a calibration keeps those of what it was fitted to."""
+    if path.is_dir():  # a bag: one log in several files
+        parts = [digest(file) for file in sorted(path.iterdir()) if file.is_file()]
+        return sha256("".join(parts).encode()).hexdigest()
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 @contextmanager

@@ -23,6 +23,7 @@ __all__ = [
     "VOLUME_SPREAD",
     "Calibrated",
     "Mass",
+    "Matrix",
     "Mounting",
     "Vehicle",
     "draw_vehicle",

@@ -22,6 +22,7 @@ from magbridge.cli import (
     correct,
     diagnose,
     export,
+    fleet,
     info,
     navigate,
     survey,
@@ -38,6 +39,7 @@ __all__ = [
     "correct",
     "diagnose",
     "export",
+    "fleet",
     "info",
     "main",
     "navigate",
@@ -62,6 +64,7 @@ EXTRAS = {
     "harmonica": "grids",
     "pymavlink": "dialect",
     "nicegui": "monitor",
+    **dict.fromkeys(["polars", "distributed"], "fleet"),
 }
 """Package to the extra that installs it."""
 ENDS = (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))

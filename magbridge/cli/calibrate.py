@@ -24,13 +24,13 @@ from magbridge.cli.common import (
     by_base_station,
     check_inputs,
     complain,
-    digest,
     logs_to_read,
     note_losses,
     note_unused_grid,
     print_result,
 )
 from magbridge.errors import CalibrationError, DataError, OutOfRange, WrongUse
+from magbridge.files import digest
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.calibration.fitting.observations import Observations
+    from magbridge.fleet.start import Start
 
 ALL = "all"
 """``--compass all``: a calibration for each compass."""
@@ -56,6 +57,9 @@ def calibrate(
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
+    fleet: Path | None = None,
+    member: str = "",
+    refit: str = "",
     heading_reference: Heading = None,
     picture: Picture = None,
     reading: Reading = AS_THEY_SAY,
@@ -101,6 +105,13 @@ def calibrate(
     filter_corner
         Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
         undone; 0: no filter.
+    fleet
+        A fleet's catalogue: the fit starts from what the vehicle's earlier deployments and its fleet let
+        expect, and it is said what that is worth (method auto). Two runs are then often enough.
+    member
+        Which of the fleet's vehicles this is; of logs that are catalogued, it is known.
+    refit
+        Which refit it flies with, if its logs are not catalogued; by default a new one.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
     picture
@@ -121,7 +132,8 @@ def calibrate(
             lambda one, name, of: calibrate(
                 *files, output=name, picture=picture and _of(picture, of), reading=one, parameter=parameter,
                 order=order, method=method, vehicle=vehicle, grid=grid, base=base, site_bias=site_bias,
-                filter_corner=filter_corner, heading_reference=heading_reference, json=json,
+                filter_corner=filter_corner, fleet=fleet, member=member, refit=refit,
+                heading_reference=heading_reference, json=json,
             ),
         )  # fmt: skip
         return
@@ -139,6 +151,10 @@ def calibrate(
 
     if vehicle and method != "auto":
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
+    if fleet and (vehicle or method != "auto"):
+        raise WrongUse("--fleet: goes with method auto, and without --vehicle")
+    began = _began(fleet, member, refit, files) if fleet else None
+    parameter = parameter or (began.names if began else ())
     anomalies = read_grid(grid) if grid else None
     with waiting("reading"):
         logs = by_base_station(read_each(files, options=reading.options), base)
@@ -157,11 +173,11 @@ def calibrate(
             complain(line)
         if filter_corner:
             data = unfiltered(data, filter_corner)
-        if position_sigma:
-            if not (data.lacks_rock and method in ("auto", "survey")):
-                raise WrongUse("--position-sigma: positions matter where the rock is found, by method survey")
-            options["position_sigma"] = position_sigma
-        found, doubt = _fitted(logs, data, method, order, site_bias=site_bias, **options)
+        options |= _drifting(position_sigma, data, method)
+        if began:
+            found, doubt, worth = _from_fleet(began, data, order, site_bias=site_bias, **options)
+        else:
+            found, doubt, worth = *_fitted(logs, data, method, order, site_bias=site_bias, **options), {}
     save(found.calibration, output)
     if picture:
         from magbridge.calibration.fitting.draw import draw_fit
@@ -171,7 +187,7 @@ def calibrate(
         complain(warning)
     left_out = deployment.sizes["time"] - len(data)
     print_result(
-        {"file": str(output), "method": method, **_facts(found, len(data)), "left_out": left_out},
+        {"file": str(output), "method": method, **_facts(found, len(data)), "left_out": left_out, **worth},
         f"{output}: {method}, {_summary(found, len(data))}"
         + (f"; {left_out} row{'s' * (left_out > 1)} without every value left out" if left_out else ""),
         json,
@@ -244,6 +260,37 @@ def _undeclared(deployment: xr.Dataset, data: Observations, found: Fit) -> list[
     rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
     others = [name for name in telemetry(deployment) if name not in data.names]
     return undeclared(found.calibration, data, {name: deployment[name].to_numpy()[rows] for name in others})
+
+
+def _drifting(position_sigma: float, data: Observations, method: str) -> dict[str, float]:
+    """Return the option by which positions drift; WrongUse: the fit has no use for positions."""
+    if position_sigma and not (data.lacks_rock and method in ("auto", "survey")):
+        raise WrongUse("--position-sigma: positions matter where the rock is found, by method survey")
+    return {"position_sigma": position_sigma} if position_sigma else {}
+
+
+def _began(fleet: Path, member: str, refit: str, files: tuple[Path, ...]) -> Start:
+    """Return what a fleet lets expect of these logs."""
+    from magbridge.fleet.start import start
+
+    with waiting("learning"):
+        return start(fleet, member, refit, {digest(file) for file in files})
+
+
+def _from_fleet(
+    began: Start, data: Observations, order: int, **options: Any
+) -> tuple[Fit, list[str], dict[str, Any]]:
+    """Return the fit that starts there, and what that is worth against one that does not: lines, facts."""
+    from magbridge.calibration.fitting.fit import fit
+    from magbridge.fleet.start import gained
+
+    found = fit(data, order=order, known=began.known, **options)
+    try:
+        alone = fit(data, order=order, **options)
+    except CalibrationError:
+        alone = None
+    facts, lines = gained(found, alone, began)
+    return found, lines, {"fleet": facts}
 
 
 def _facts(found: Fit, samples: int) -> dict[str, Any]:

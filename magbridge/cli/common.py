@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -41,7 +40,6 @@ __all__ = [
     "by_base_station",
     "check_inputs",
     "complain",
-    "digest",
     "doubts_of",
     "file_to_write",
     "folder_to_write",
@@ -197,15 +195,6 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
     for path in check_inputs(files, output, *others):
         if not is_bag(path):
             existing(path)
-
-
-def digest(path: Path) -> str:
-    """Return the SHA-256 of a file or folder; a calibration keeps those of what it was fitted to."""
-    if path.is_dir():  # a bag: one log in several files
-        parts = [digest(file) for file in sorted(path.iterdir()) if file.is_file()]
-        return sha256("".join(parts).encode()).hexdigest()
-    with path.open("rb") as file:
-        return file_digest(file, "sha256").hexdigest()
 
 
 def doubts_of(calibration: Calibration, file: Path) -> list[str]:

@@ -15,13 +15,13 @@ from magbridge.cli.common import (
     Reading,
     app,
     complain,
-    digest,
     doubts_of,
     logs_to_read,
     note_losses,
     note_unused_grid,
     print_result,
 )
+from magbridge.files import digest
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:

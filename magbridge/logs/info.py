@@ -14,7 +14,7 @@ from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_of
 from magbridge.logs.deployment import MEANING, noted, passed_over
 
-__all__ = ["USES", "info", "lacking", "telemetry"]
+__all__ = ["GAP", "USES", "info", "lacking", "telemetry"]
 
 POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")

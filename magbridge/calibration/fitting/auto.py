@@ -16,9 +16,7 @@ predicts those better, it is taken.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -26,21 +24,20 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.ends import flown
 from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fitting.fit import Fit, assemble
+from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.left_out import LeftOut, leave_out
-from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_prior
 from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise, memory
 from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, starts
-from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.prior import Prior, PriorFamily, polynomial_prior
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.pose import Vehicle, pose
+from magbridge.calibration.fitting.prior import Prior, PriorFamily
 from magbridge.calibration.fitting.solve import Solution, covariance_of, gauss_newton
 from magbridge.calibration.residual import Samples, Whitening, jacobian, residuals, residuals_of
-from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 
 __all__ = ["fit_auto"]
 
 
-Vehicle = Mapping[str, Mounting | Mapping[str, Any]]
 ENOUGH, BLOCK = 6000, 50
 """Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
 ROUNDS = 16
@@ -59,7 +56,9 @@ class _Answer:
     score: float
 
 
-def fit_auto(data: Observations, order: int = 3, *, vehicle: Vehicle | None = None) -> Fit:
+def fit_auto(
+    data: Observations, order: int = 3, *, vehicle: Vehicle | None = None, known: Known | None = None
+) -> Fit:
     """Fit polynomials of all orders up to `order` with physical priors; see the module's notes.
 
     Parameters
@@ -70,18 +69,20 @@ def fit_auto(data: Observations, order: int = 3, *, vehicle: Vehicle | None = No
         Highest total degree.
     vehicle : mapping of Mounting (or of its fields), optional
         Where the masses sit, by parameter: their coefficients' prior is then that of dipoles there.
+    known : Known, optional
+        What the coefficients are expected to be, instead of physical widths.
 
     Raises
     ------
     CalibrationError
         No start reached a maximum, or the best one collapsed.
     """
-    ranges = data.ranges()
-    exponents, samples, family = _posed(data, order, vehicle)
+    posed = pose(data, order, vehicle, known)
+    samples, family = posed.samples, posed.family
     best = _best(samples, family)
     kept = flown(residuals_of(samples, best.family.at(best.widths.eta).coefficients(best.solution.z)))
     if not kept.all():
-        found = fit_auto(data.part(kept), order, vehicle=vehicle)
+        found = fit_auto(data.part(kept), order, vehicle=vehicle, known=known)
         inner = found.details.pop("flown", None)
         if inner is not None:
             kept[kept] = inner
@@ -92,13 +93,14 @@ def fit_auto(data: Observations, order: int = 3, *, vehicle: Vehicle | None = No
     coefficients = prior.coefficients(best.solution.z)
     check_scales(samples, coefficients)
     left = leave_out(samples, prior, best.solution.z, best.noise, data.runs)
-    if left.ratio > 1.0 and (simpler := _simpler(data, left)) is not None:
+    if left.ratio > 1.0 and known is None and (simpler := _simpler(data, left)) is not None:
         return simpler
     covariance = prior.E @ covariance_of(precision) @ prior.E.T
     return assemble(
-        data, samples, ranges, exponents, coefficients, covariance, best.noise, "auto", left, details={
+        data, samples, posed.ranges, posed.exponents, coefficients, covariance, best.noise, "auto", left,
+        prior=prior, details={
             "log_evidence": best.score,
-            "next_order": _gained(data, order, vehicle) if ranges and order < USUAL else 0.0,
+            "next_order": _gained(data, order, vehicle) if _may_gain(data, order, known) else 0.0,
             "determined": best.widths.determined,
             "outliers": best.noise.rejected,
             "widths_nT": dict(zip(family.names, np.exp(best.widths.eta).tolist(), strict=True)),
@@ -115,24 +117,17 @@ def _simpler(data: Observations, left: LeftOut) -> Fit | None:
     return one if one.details["left_out_nT"] < left.rms else None
 
 
-def _posed(
-    data: Observations, order: int, vehicle: Vehicle | None
-) -> tuple[tuple[tuple[int, ...], ...], Samples, PriorFamily]:
-    """Return the exponents of an order, the samples with its monomials, and the prior of its coefficients."""
-    ranges = data.ranges()
-    exponents = full_order(len(ranges), order)
-    samples = polynomial_samples(data, exponents)
-    family = polynomial_prior(exponents, data.names, samples.F_0)
-    return exponents, samples, mounted_prior(family, exponents, ranges, vehicle) if vehicle else family
+def _may_gain(data: Observations, order: int, known: Known | None) -> bool:
+    return known is None and bool(data.names) and order < USUAL
 
 
 def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
     """Log evidence that one more order gains, on as many samples as choose a start; none if it has no fit."""
     scores = []
     for n in (order, order + 1):
-        _, samples, family = _posed(data, n, vehicle)
+        posed = pose(data, n, vehicle)
         try:
-            scores.append(_best(_thinned(samples), family).score)
+            scores.append(_best(_thinned(posed.samples), posed.family).score)
         except CalibrationError:
             return 0.0
     return scores[1] - scores[0]
@@ -143,7 +138,7 @@ def _best(samples: Samples, family: PriorFamily) -> _Answer:
     few = _thinned(samples)
     answers = []
     for start in starts(few):
-        z = family.E[:9].T @ start
+        z = family.near(start)
         answers += [_climb(few, family, z, family.centre + shift * family.spread) for shift in (0.0, 1.5)]
     for answer in sorted(answers, key=lambda answer: -answer.score):
         last = answer

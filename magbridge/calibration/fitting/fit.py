@@ -13,10 +13,12 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import find_boresight
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
+from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.left_out import LeftOut
 from magbridge.calibration.fitting.level import apart_from_level, with_level
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
 from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
@@ -71,6 +73,8 @@ class Fit:
         The data as fitted, for :mod:`.identify`.
     open : tuple of str
         What the track leaves open, which is a reason for an error that is large.
+    information : Information or None
+        What the data alone say of the coefficients; None where the method's prior is none of all of them.
     """
 
     calibration: Calibration
@@ -79,6 +83,7 @@ class Fit:
     details: dict[str, Any]
     samples: Samples
     open: tuple[str, ...] = ()
+    information: Information | None = None
 
     def __repr__(self) -> str:
         doubts = f", {len(self.calibration.doubts)} doubts" if self.calibration.doubts else ""
@@ -177,7 +182,8 @@ def _biased(found: Fit, sigma: float) -> Fit:
     v[:, 6:] = 0.0
     P = calibration.covariance + sigma**2 * np.outer(v, v)
     wider = replace(calibration, covariance=P)
-    return replace(found, calibration=with_level(wider, found.samples, 0.0, sigma))
+    told = found.information and found.information.blurred(v.ravel(), sigma)
+    return replace(found, calibration=with_level(wider, found.samples, 0.0, sigma), information=told)
 
 
 def _refuse_one_attitude(data: Observations) -> None:
@@ -279,6 +285,7 @@ def assemble(
     noise: NoiseModel,
     method: str,
     left_out: LeftOut | None = None,
+    prior: Prior | None = None,
     details: dict[str, Any] | None = None,
 ) -> Fit:
     """Return the fit: its numbers as a calibration with a table of runs, and its residuals.
@@ -297,9 +304,13 @@ def assemble(
         As :class:`Fit` and its calibration have them.
     left_out : LeftOut, optional
         What the fit is worth on parts left out: the sigmas grow by its ratio.
+    prior : Prior, optional
+        Of all coefficients, as they were fitted with it.
     """
     e = residuals_of(samples, coefficients)
+    information = Information.left_by(prior, coefficients, covariance) if prior is not None else None
     if left_out is not None:
+        information = information and information.divided(left_out.ratio)
         noise, covariance = replace(noise, sigma=noise.sigma * left_out.ratio), covariance * left_out.ratio**2
         details = {**(details or {}), "left_out_nT": left_out.rms, "left_out_ratio": left_out.ratio}
     steps = np.diff(data.time)
@@ -322,7 +333,7 @@ def assemble(
         inputs=dict(data.inputs),
         software=f"magbridge {__version__}",
     )
-    return Fit(calibration, e, (), details or {}, samples)
+    return Fit(calibration, e, (), details or {}, samples, information=information)
 
 
 def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:

@@ -19,7 +19,6 @@ and the noise's autocorrelation by that of the whole (:mod:`.field_search`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,17 +39,17 @@ from magbridge.calibration.fitting.field_search import (
 )
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
+from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.latent import Group, slow_functions, with_groups
 from magbridge.calibration.fitting.level import with_level
-from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_prior
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.nominal import check_scales, starts
-from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.prior import PriorFamily, polynomial_prior
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.pose import Vehicle, pose
+from magbridge.calibration.fitting.prior import Prior, PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
 from magbridge.calibration.residual import Samples, residuals_of, robust_scale
-from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
 from magbridge.field.place.matern import Matern
 
@@ -74,8 +73,6 @@ SHORTEST = 1e-3
 """Part of a step, below which it is not shortened further."""
 SEARCHED = 12_000
 """Samples that the field's size and length are searched with, at most."""
-
-Vehicle = Mapping[str, Mounting | Mapping[str, Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +129,7 @@ def fit_survey(
     level: float,
     vehicle: Vehicle | None = None,
     position_sigma: float = 0.0,
+    known: Known | None = None,
 ) -> tuple[Fit, InPlace]:
     """Fit coefficients, level, slow changes and the field in place.
 
@@ -143,7 +141,7 @@ def fit_survey(
         Highest total degree of the polynomials in the masses' positions.
     level : float
         nT, 1-sigma of the reference's error that is the same everywhere.
-    vehicle : mapping, optional
+    vehicle, known : optional
         As for :func:`~.auto.fit_auto`.
     position_sigma : float
         m, by which dead-reckoned positions slowly drift; the track is then bent to where the rock repeats.
@@ -160,12 +158,8 @@ def fit_survey(
     far = far_off(data.place[:, :2])
     if far.any():
         data = data.part(~far)
-    ranges = data.ranges()
-    exponents = full_order(len(ranges), order)
-    samples = polynomial_samples(data, exponents)
-    own = polynomial_prior(exponents, data.names, samples.F_0)
-    if vehicle:
-        own = mounted_prior(own, exponents, ranges, vehicle)
+    posed = pose(data, order, vehicle, known)
+    samples, own = posed.samples, posed.family
     q = own.E.shape[1]
     survey = SurveySamples(data, samples, _groups(data, level), _drift(data, position_sigma))
     found = _Rounds(survey, with_groups(own, survey.groups), q).settle()
@@ -175,12 +169,12 @@ def fit_survey(
     sigma, choice = found.widths.sigma, found.choice
     covariance = covariance_of(found.reduced.quadratic.H / sigma**2 + prior.precision)
     P = prior.E @ covariance @ prior.E.T
-    known = replace(samples, reference=samples.reference + found.lacking)
+    lifted = replace(samples, reference=samples.reference + found.lacking)
     fit = assemble(
-        data, known, ranges, exponents, coefficients, P,
-        NoiseModel(sigma, choice.rho), "survey", details=_details(found, survey),
+        data, lifted, posed.ranges, posed.exponents, coefficients, P, NoiseModel(sigma, choice.rho), "survey",
+        prior=Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset), details=_details(found, survey),
     )  # fmt: skip
-    stated = with_level(fit.calibration, known, float(found.z[q]), level) if level else fit.calibration
+    stated = with_level(fit.calibration, lifted, float(found.z[q]), level) if level else fit.calibration
     fit = replace(
         fit,
         calibration=stated,
@@ -350,7 +344,7 @@ def _start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, floa
     samples, prior = survey.samples, family.at(family.centre)
     found: list[tuple[float, FloatArray]] = []
     for start in starts(samples):
-        z = family.E[:9].T @ start
+        z = family.near(start)
         sigma = np.inf
         for _ in range(5):
             e = residuals_of(samples, prior.coefficients(z))

@@ -223,8 +223,15 @@ def monomials(
     return np.stack([np.prod(x ** np.array(powers), axis=1) for powers in exponents], axis=1)
 
 
-def polynomial_samples(data: Observations, exponents: tuple[Exponents, ...], kappa: float = 0.0) -> Samples:
-    """Return the samples of `data` with the monomials of their scaled positions; `kappa` as in Samples."""
-    ranges = data.ranges()
-    phi = monomials(data.parameters, ranges, exponents)
+def polynomial_samples(
+    data: Observations,
+    exponents: tuple[Exponents, ...],
+    kappa: float = 0.0,
+    ranges: Sequence[Parameter] | None = None,
+) -> Samples:
+    """Return the samples of `data` with the monomials of their positions; `kappa` as in Samples.
+
+    The positions are scaled to the range seen, unless `ranges` are given.
+    """
+    phi = monomials(data.parameters, data.ranges() if ranges is None else ranges, exponents)
     return Samples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)

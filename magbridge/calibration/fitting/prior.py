@@ -89,6 +89,10 @@ class PriorFamily:
         """(q,) prior 1-sigma of z at `eta` (h,)."""
         return np.asarray(np.exp(self.constant + self.design @ eta))
 
+    def near(self, start: FloatArray) -> FloatArray:
+        """Return the smallest z (q,) whose constant terms are `start` (9,), nT."""
+        return np.asarray(np.linalg.lstsq(self.E[:9], start - self.offset[:9], rcond=None)[0])
+
     def at(self, eta: FloatArray) -> Prior:
         """Return the family's prior at `eta` (h,)."""
         return Prior(np.diag(self.widths(eta) ** -2.0), self.E, self.offset)

@@ -1,0 +1,277 @@
+"""Many vehicles, many logs: catalogue them, process what is new, show what changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import App, Parameter, validators
+
+from magbridge.cli.common import Json, Output, Whole, app, complain, file_to_write, print_result
+from magbridge.errors import DataError, WrongUse
+from magbridge.progress import track, waiting
+
+if TYPE_CHECKING:
+    from magbridge.fleet.drift import History
+
+fleet = App(
+    name="fleet",
+    help="Many vehicles, many logs, one memory: catalogue, process, learn from them, watch them.",
+)
+app.command(fleet)
+Folder = Annotated[Path, Parameter(name="--catalogue")]
+HERE = Path("fleet")
+
+
+@fleet.command(usage="Usage: magbridge fleet add FILE... [--vehicle NAME --deployment NAME] [OPTIONS]")
+def add(
+    *files: Path,
+    vehicle: str = "",
+    deployment: str = "",
+    refit: str = "",
+    parameter: tuple[str, ...] = (),
+    serial: str = "",
+    sensor: str = "",
+    catalogue: Folder = HERE,
+    json: Json = False,
+) -> None:
+    """Put vehicles and logs on record. What is there already is not added again.
+
+    Parameters
+    ----------
+    files
+        A fleet.toml with vehicles, deployments and patterns of logs; or the logs of one deployment.
+    vehicle
+        The logs' vehicle. It is new where --parameter is given.
+    deployment
+        The logs' deployment; the same vehicle may have several.
+    refit
+        Which refit it flew with, any name. By default each deployment counts as its own.
+    parameter
+        A column that moves one of the vehicle's masses; may be repeated.
+    serial
+        The vehicle's serial number: tells two of one name apart.
+    sensor
+        Its sensor: logs of another are refused.
+    catalogue
+        The catalogue's folder, made where it is not there.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.register import Vehicle, add_logs, add_vehicle, logs_of, read_fleet
+
+    if not files and not (vehicle and parameter):
+        raise WrongUse("expected a fleet.toml or logs, or --vehicle with its --parameter")
+    described = [file for file in files if file.suffix.lower() == ".toml"]
+    logs = [file for file in files if file not in described]
+    if logs and not (vehicle and deployment):
+        raise WrongUse("logs: say --vehicle and --deployment, or put them into a fleet.toml")
+    plans = {file: read_fleet(file) for file in described}
+    there = Catalogue(catalogue, create=True)
+    added, new, lines = 0, 0, list[str]()
+    if vehicle and (parameter or serial or sensor):
+        added += add_vehicle(there, vehicle, Vehicle(parameters=parameter, serial=serial, sensor=sensor))
+    with waiting("reading"):
+        for file, named in plans.items():
+            for name, one in named.items():
+                added += add_vehicle(there, name, one)
+                for part in one.deployment:
+                    count, said = add_logs(there, name, part.name, part.refit, logs_of(file, part))
+                    new, lines = new + count, lines + said
+        if logs:
+            count, said = add_logs(there, vehicle, deployment, refit, logs)
+            new, lines = new + count, lines + said
+    for line in lines:
+        complain(line)
+    print_result(
+        {"catalogue": str(catalogue), "vehicles": added, "logs": new, "remarks": lines},
+        f"{catalogue}: {added} vehicles and {new} logs added",
+        json,
+    )
+
+
+@fleet.command
+def process(
+    *,
+    catalogue: Folder = HERE,
+    diagnose: bool = False,
+    maps: bool = False,
+    workers: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=1024))] = 2,
+    memory: str = "4 GiB",
+    scheduler: str = "",
+    json: Json = False,
+) -> None:
+    """Read, check, calibrate and correct what is new; begin again where it was interrupted.
+
+    A deployment's logs are calibrated together: against a known field where they have reference_field, else
+    with the rock below (as calibrate does). What is wrong with one log is a line, and the rest goes on.
+
+    Parameters
+    ----------
+    catalogue
+        The catalogue's folder; corrected logs and maps go to its folder results.
+    diagnose
+        Also diagnose each deployment.
+    maps
+        Also make each deployment's anomaly map.
+    workers
+        Processes on this machine.
+    memory
+        What each of them may use.
+    scheduler
+        Address of a dask scheduler to use instead, as tcp://host:8786. Its workers see the same folders.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.process import client_of, jobs, new_jobs
+    from magbridge.fleet.process import process as run
+
+    there = Catalogue(catalogue)
+    every = jobs(there, diagnose=diagnose, maps=maps)
+    todo = new_jobs(there, every)
+    failures: list[str] = []
+    if todo:
+        with client_of(scheduler, workers, memory) as client:
+            for outcome in track(run(there, todo, client), "deployments", len(todo)):
+                failures += outcome.failures
+                for line in outcome.failures:
+                    complain(line)
+    result = {"deployments": len(every), "processed": len(todo), "failures": failures}
+    print_result(
+        result,
+        f"{catalogue}: {len(todo)} of {len(every)} deployments were new, {len(failures)} failures",
+        json,
+    )
+    if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
+        raise DataError(f"{catalogue}: not one deployment could be calibrated")
+
+
+@fleet.command
+def status(*, catalogue: Folder = HERE, json: Json = False) -> None:
+    """Say what is catalogued, what is done, and what failed.
+
+    Parameters
+    ----------
+    catalogue
+        The catalogue's folder.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.status import status as of
+
+    found = of(Catalogue(catalogue))
+    for line in found["failures"]:
+        complain(line)
+    rows = "\n".join(
+        f"  {one['vehicle']}: {one['deployments']} deployments, {one['logs']} logs, {one['calibrated']} "
+        f"calibrated, {one['failed']} failed, {one['new']} new"
+        for one in found["vehicles"]
+    )
+    print_result(found, f"{catalogue}: {len(found['vehicles'])} vehicles\n{rows}".rstrip(), json)
+
+
+@fleet.command
+def show(
+    vehicle: str = "",
+    /,
+    *,
+    catalogue: Folder = HERE,
+    html: Annotated[Path | None, Parameter(validator=file_to_write(".html"))] = None,
+    json: Json = False,
+) -> None:
+    """Say how a vehicle's coefficients went from deployment to deployment, and when they changed.
+
+    Parameters
+    ----------
+    vehicle
+        Its name; all vehicles, if none is given.
+    catalogue
+        The catalogue's folder.
+    html
+        A page to write, with a picture of each vehicle.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.drift import facts, history
+    from magbridge.fleet.memory import fleet_of
+    from magbridge.fleet.register import vehicles
+
+    there = Catalogue(catalogue)
+    names = [vehicle] if vehicle else list(vehicles(there))
+    found: dict[str, History] = {}
+    with waiting("learning") as step:
+        for name in names:
+            step(name)
+            try:
+                found[name] = history(fleet_of(there, name), name)
+            except DataError as error:
+                complain(f"{name}: {error}")
+    if not found:
+        raise DataError(f"{catalogue}: nothing to show: no deployment has been calibrated")
+    if html:
+        from magbridge.fleet.page import write_page
+
+        write_page(found, html)
+    told = {name: facts(one) for name, one in found.items()}
+    print_result({"vehicles": told}, "\n".join(_lines(told)), json)
+
+
+@fleet.command
+def export(
+    vehicle: str,
+    /,
+    *,
+    output: Output,
+    refit: str = "",
+    catalogue: Folder = HERE,
+    json: Json = False,
+) -> None:
+    """Write what is expected of a vehicle's next deployment as a calibration, before any run is flown.
+
+    Parameters
+    ----------
+    vehicle
+        Its name.
+    output
+        The calibration to write (cal.json).
+    refit
+        The refit it will fly with; by default a new one.
+    catalogue
+        The catalogue's folder.
+    json
+        Print the result as JSON.
+    """
+    from magbridge.calibration.file import save
+    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.memory import fleet_of
+    from magbridge.fleet.unflown import unflown
+
+    with waiting("learning"):
+        learnt = fleet_of(Catalogue(catalogue), vehicle)
+        calibration = unflown(learnt, vehicle, refit)
+    save(calibration, output)
+    count = sum(one.vehicle == vehicle for one in learnt.lessons)
+    others = len(learnt.lessons) - count
+    print_result(
+        {"file": str(output), "vehicle": vehicle, "deployments": count},
+        f"{output}: what {count} deployments of {vehicle} and {others} of its fleet let expect",
+        json,
+    )
+
+
+def _lines(told: dict[str, dict[str, Any]]) -> list[str]:
+    """Return a line for each vehicle, and for each change of it."""
+    lines = []
+    for name, one in told.items():
+        changes = [(part, change) for part in one["deployments"] for change in part["changes"]]
+        lines.append(f"{name}: {len(one['deployments'])} deployments, {len(changes)} changes")
+        lines += [
+            f"  {part['date']} {part['deployment']} (refit {part['refit']}): {change['what']} moved by "
+            f"{change['by_nT']:+.0f} nT, {change['sigmas']:.1f} sigma"
+            for part, change in changes
+        ]
+    return lines

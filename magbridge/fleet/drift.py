@@ -1,0 +1,146 @@
+r"""What changed on a vehicle, and when.
+
+Each deployment is compared with what its vehicle's earlier ones, and the fleet, let expect: a Gaussian
+:math:`N(m, S)` that is wider where the vehicle was refitted. With its own data the coefficients move to
+:math:`N(m', P)`, and under the model the move has the covariance
+
+.. math:: \mathrm{Cov}(m' - m) = S - P,
+
+so each coefficient's move over its own sigma is a standard normal number, whatever the runs determine. A
+change is told where one is beyond :data:`ALARM` for as many coefficients as are looked at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from magbridge.arrays import FloatArray
+from magbridge.fleet.learn import Fleet, Lesson
+
+__all__ = ["Change", "History", "facts", "history"]
+
+ALARM = 1e-3
+"""Chance of a false alarm in a deployment, over all its coefficients."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One coefficient that left its band.
+
+    Attributes
+    ----------
+    what : str
+        As a technician would say it.
+    by : float
+        nT.
+    sigmas : float
+        Of the move.
+    chance : float
+        Of one as large in any coefficient of a deployment like the others.
+    """
+
+    what: str
+    by: float
+    sigmas: float
+    chance: float
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """A vehicle's coefficients from deployment to deployment.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the k that are looked at: hard iron, and what each mass changes over half its range.
+    lessons : tuple of Lesson
+        In the order of time.
+    expected, expected_sigma : (n, k) arrays
+        nT, from what was before.
+    found, found_sigma : (n, k) arrays
+        nT, with its own data.
+    changes : tuple of tuple of Change
+        Of each deployment.
+    """
+
+    names: tuple[str, ...]
+    lessons: tuple[Lesson, ...]
+    expected: FloatArray
+    expected_sigma: FloatArray
+    found: FloatArray
+    found_sigma: FloatArray
+    changes: tuple[tuple[Change, ...], ...]
+
+
+def history(fleet: Fleet, vehicle: str) -> History:
+    """Return how a vehicle's coefficients went, and where they left their bands."""
+    mine = tuple(one for one in fleet.lessons if one.vehicle == vehicle)
+    names, places = _looked_at(fleet)
+    rows: list[tuple[FloatArray, ...]] = []
+    changes = []
+    for lesson in mine:
+        before = fleet.known(vehicle, lesson.refit, lesson.time)
+        told = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
+        S = before.covariance
+        gain = np.linalg.solve(np.eye(len(S)) + S @ told.precision, S)  # (S^-1 + J)^-1
+        P = 0.5 * (gain + gain.T)
+        after = P @ told.vector + np.linalg.solve(np.eye(len(S)) + S @ told.precision, before.mean)
+        moved = np.maximum(np.diag(S) - np.diag(P), 0.0)[places]
+        rows.append(
+            (before.mean[places], np.sqrt(np.diag(S))[places], after[places], np.sqrt(np.diag(P))[places])
+        )
+        changes.append(tuple(_beyond(names, (after - before.mean)[places], np.sqrt(moved), len(rows) > 1)))
+    expected, sigma, found, left = np.array(rows).reshape(len(mine), 4, len(places)).swapaxes(0, 1)
+    return History(names, mine, expected, sigma, found, left, tuple(changes))
+
+
+def facts(history: History) -> dict[str, Any]:
+    """Return a history as a dictionary that JSON can hold; nT."""
+    columns = history.expected, history.expected_sigma, history.found, history.found_sigma
+    keys = "expected_nT", "expected_sigma_nT", "found_nT", "found_sigma_nT"
+    return {
+        "coefficients": list(history.names),
+        "deployments": [
+            {
+                "deployment": lesson.deployment, "refit": lesson.refit,
+                "date": datetime.fromtimestamp(lesson.time, UTC).date().isoformat(),
+                **{key: column[k].tolist() for key, column in zip(keys, columns, strict=True)},
+                "changes": [
+                    {"what": one.what, "by_nT": one.by, "sigmas": one.sigmas, "chance": one.chance}
+                    for one in history.changes[k]
+                ],
+            }
+            for k, lesson in enumerate(history.lessons)
+        ],
+    }  # fmt: skip
+
+
+def _beyond(names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, has_past: bool) -> list[Change]:
+    """Return the moves (k,) beyond their sigmas (k,), the farthest first; none where there is no past."""
+    if not has_past:
+        return []
+    found = []
+    for name, move, sigma in zip(names, moves, sigmas, strict=True):
+        z = abs(move) / max(sigma, 1e-12)
+        chance = min(2.0 * float(norm.sf(z)) * len(names), 1.0)
+        if chance < ALARM:
+            found.append(Change(name, float(move), float(z), chance))
+    return sorted(found, key=lambda one: -one.sigmas)
+
+
+def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
+    """Return names and places among the coefficients of those that a technician can do something about."""
+    names, places = [], []
+    for m, powers in enumerate(fleet.exponents):
+        if sum(powers) > 1:
+            continue
+        mass = next((one.name for one, power in zip(fleet.parameters, powers, strict=True) if power), "")
+        for k, axis in enumerate("xyz"):
+            names.append(f"{mass or 'hard iron'}, {axis}")
+            places.append(9 * m + 6 + k)
+    return tuple(names), places

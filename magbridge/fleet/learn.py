@@ -1,0 +1,148 @@
+"""From calibrations of single deployments to what their fleet expects of the next.
+
+All deployments are brought to one scale of the positions and one F_0 (:func:`.rescaling`), and to units of
+the coefficients' physical widths (:mod:`magbridge.calibration.fitting.prior`). Coefficients that share a
+monomial and are of one kind (A or T; for the constant: gain, soft iron, hard iron) share their variances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.known import Information, Known, rescaling
+from magbridge.calibration.fitting.prior import polynomial_prior
+from magbridge.calibration.model import Parameter
+from magbridge.calibration.terms import Exponents
+from magbridge.errors import DataError
+from magbridge.fleet.hierarchy import Observed, Population, learn
+
+__all__ = ["Fleet", "Lesson", "learn_fleet"]
+
+FIELD = 50_000.0
+"""nT, the F_0 that a fleet's coefficients refer to."""
+
+
+class Lesson(NamedTuple):
+    """One deployment's calibration as its own data determine it, without any prior.
+
+    `time` is when it began, s since 1970; the others as in :class:`.Known` and :class:`.Information`.
+    """
+
+    vehicle: str
+    refit: str
+    deployment: str
+    time: float
+    parameters: tuple[Parameter, ...]
+    exponents: tuple[Exponents, ...]
+    field: float
+    information: Information
+
+    def brought(self, parameters: tuple[Parameter, ...], basis: FloatArray) -> Information:
+        """Return the information of z: with ``c_own = B z``, ``J = B^T I B`` and ``h = B^T i``.
+
+        Parameters
+        ----------
+        parameters : tuple of Parameter
+            The scales of the positions to bring it to; the F_0 is :data:`FIELD`.
+        basis : (9 m, q) array
+            nT, coefficients there of z.
+        """
+        B = rescaling(self.exponents, parameters, self.parameters, FIELD, self.field) @ basis
+        return Information(B.T @ self.information.precision @ B, B.T @ self.information.vector)
+
+
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """What a fleet of vehicles with the same moving masses has taught.
+
+    Attributes
+    ----------
+    parameters : tuple of Parameter
+        The scale that all are brought to: the whole range seen.
+    exponents : tuple of tuple of int
+        The m monomials.
+    basis : (9 m, 9 m) array
+        nT; coefficients of z, which is in units of the physical widths.
+    population : Population
+    lessons : tuple of Lesson
+        In the order of time.
+    observed : tuple of Observed
+        The same, of z.
+    """
+
+    parameters: tuple[Parameter, ...]
+    exponents: tuple[Exponents, ...]
+    basis: FloatArray
+    population: Population
+    lessons: tuple[Lesson, ...]
+    observed: tuple[Observed, ...]
+
+    def known(self, vehicle: str, refit: str, before: float = np.inf) -> Known:
+        """Return what is expected of a vehicle's next deployment.
+
+        Parameters
+        ----------
+        vehicle : str
+            May be new to the fleet.
+        refit : str
+            The refit it flies with: one it had before, or a new one.
+        before : float
+            s since 1970: only its own deployments that began before count.
+        """
+        past = [
+            seen
+            for lesson, seen in zip(self.lessons, self.observed, strict=True)
+            if lesson.vehicle == vehicle and lesson.time < before
+        ]
+        mean, P = self.population.expected(vehicle, past, refit)
+        E = self.basis
+        return Known(self.parameters, self.exponents, FIELD, E @ mean, E @ P @ E.T)
+
+
+def learn_fleet(lessons: Sequence[Lesson]) -> Fleet:
+    """Learn from deployments of vehicles whose masses have the same names, fitted to the same order.
+
+    Raises
+    ------
+    DataError
+        There is none.
+    """
+    if not lessons:
+        raise DataError("nothing to learn from: no deployment of such a vehicle has been calibrated")
+    lessons = sorted(lessons, key=lambda one: (one.time, one.vehicle, one.deployment))
+    exponents = lessons[0].exponents
+    parameters = _whole_range(lessons)
+    family = polynomial_prior(exponents, tuple(one.name for one in parameters), FIELD)
+    basis = np.asarray(family.E * family.widths(family.centre))
+    with threadpool_limits(1, "blas"):
+        observed = tuple(Observed(one.vehicle, one.refit, one.brought(parameters, basis)) for one in lessons)
+        population = learn(observed, _groups(exponents))
+    return Fleet(parameters, exponents, basis, population, tuple(lessons), observed)
+
+
+def _whole_range(lessons: Sequence[Lesson]) -> tuple[Parameter, ...]:
+    """Return the parameters, scaled to the range that any deployment saw."""
+    whole = []
+    for seen in zip(*(lesson.parameters for lesson in lessons), strict=True):
+        low, high = min(one.low for one in seen), max(one.high for one in seen)
+        half = (high - low) / 2 or seen[0].scale
+        whole.append(Parameter(seen[0].name, seen[0].unit, low, high, (low + high) / 2, half))
+    return tuple(whole)
+
+
+def _groups(exponents: Sequence[Exponents]) -> IndexArray:
+    """Return the number (9 m,) of the group whose variances each coefficient shares."""
+    names: list[tuple[object, str]] = []
+    for powers in exponents:
+        moved = sum(power > 0 for power in powers)
+        which: object = "cross" if moved > 1 else powers
+        kinds = ["gain", *["soft"] * 5, *["T"] * 3] if not moved else [*["A"] * 6, *["T"] * 3]
+        names += [(which, kind) for kind in kinds]
+    order = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    return np.array([order[name] for name in names], np.intp)

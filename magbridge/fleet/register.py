@@ -1,0 +1,174 @@
+"""Put vehicles and logs on record: from options, or from a fleet.toml.
+
+::
+
+    [vehicle.comet]
+    serial = "U-213"                        # tells two vehicles of one name apart
+    sensor = "HMR2300 0153"                 # refuses another sensor's logs
+    parameters = ["battpos", "ballast"]
+
+    [[vehicle.comet.deployment]]
+    name = "2026-05"
+    refit = "2026-04"                       # of which refit; if not given, each deployment is its own
+    logs = ["comet/2026-05/*.nc"]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
+
+from magbridge.errors import ConfigError, FormatError, WrongUse
+from magbridge.files import digest, existing
+from magbridge.fleet.catalogue import Catalogue, Row
+from magbridge.toml import Table, check_entries, convert, load_toml
+
+__all__ = [
+    "Deployment",
+    "Vehicle",
+    "add_logs",
+    "add_vehicle",
+    "current_files",
+    "logs_of",
+    "read_fleet",
+    "vehicles",
+]
+
+
+class Deployment(Table, frozen=True):
+    """``[[vehicle.NAME.deployment]]``: a deployment, the refit it flew with, patterns of its logs."""
+
+    name: str
+    logs: tuple[str, ...]
+    refit: str = ""
+
+
+class Vehicle(Table, frozen=True):
+    """``[vehicle.NAME]``: a vehicle, its sensor, and the columns that move its masses."""
+
+    parameters: tuple[str, ...] = ()
+    serial: str = ""
+    sensor: str = ""
+    order: Annotated[int, Meta(ge=1, le=6)] = 3
+    deployment: tuple[Deployment, ...] = ()
+
+
+class _File(Table, frozen=True):
+    vehicle: dict[str, Vehicle]
+
+
+def read_fleet(path: Path) -> dict[str, Vehicle]:
+    """Read a fleet.toml; return vehicles by name.
+
+    Raises
+    ------
+    ConfigError
+        The file, a key or a type is not as expected.
+    """
+    table = load_toml(path)
+    check_entries(table, "vehicle", Vehicle, path)
+    return convert(table, _File, path).vehicle
+
+
+def vehicles(catalogue: Catalogue) -> dict[str, Row]:
+    """Return the vehicles by name.
+
+    Raises
+    ------
+    FormatError
+        Two have one name.
+    """
+    found: dict[str, Row] = {}
+    for row in catalogue.rows("vehicles"):
+        if row["vehicle"] in found:
+            both = " and ".join(_told(one) for one in (found[row["vehicle"]], row))
+            raise FormatError(
+                catalogue.folder / "vehicles",
+                f"two vehicles are named {row['vehicle']!r}: {both}; remove the file of one of them",
+            )
+        found[row["vehicle"]] = row
+    return found
+
+
+def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
+    """Put a vehicle on record, unless it is; return how many were added.
+
+    Raises
+    ------
+    WrongUse
+        Another has that name.
+    """
+    row = {"vehicle": name, **{key: getattr(vehicle, key) for key in ("serial", "sensor", "order")}}
+    row["parameters"] = list(vehicle.parameters)
+    known = vehicles(catalogue).get(name)
+    if known is not None and known != row:
+        raise WrongUse(
+            f"{name}: {catalogue.folder} has another vehicle of that name: {_told(known)}, not {_told(row)}"
+        )
+    return catalogue.add("vehicles", [row])
+
+
+def add_logs(
+    catalogue: Catalogue, vehicle: str, deployment: str, refit: str, logs: Sequence[Path]
+) -> tuple[int, list[str]]:
+    """Put a deployment's logs on record; return how many are new, and a line for each that cannot be.
+
+    Raises
+    ------
+    WrongUse
+        There is no such vehicle.
+    """
+    if vehicle not in (known := vehicles(catalogue)):
+        there = ", ".join(known) or "none yet"
+        raise WrongUse(f"{vehicle}: not a vehicle of {catalogue.folder} ({there})")
+    before = catalogue.rows("files")
+    newest = {row["path"]: row for row in current_files(before)}
+    rows, lines = [], []
+    for log in logs:
+        try:
+            sha, size = digest(existing(log)), log.stat().st_size
+        except (FormatError, OSError) as error:
+            lines.append(str(error))
+            continue
+        path = str(log.resolve())
+        last = newest.get(path)
+        where = {"vehicle": vehicle, "deployment": deployment, "refit": refit or deployment}
+        content = {**where, "path": path, "sha256": sha, "size": size}
+        if last is not None and content == {key: last[key] for key in content}:
+            continue
+        if last is not None and last["sha256"] != sha:
+            lines.append(f"{log}: has changed since it was catalogued; what it holds now counts")
+        rows.append({**content, "version": 1 if last is None else last["version"] + 1})
+    return catalogue.add("files", rows), lines
+
+
+def current_files(rows: Iterable[Row]) -> list[Row]:
+    """Return the newest version of each path."""
+    newest: dict[str, Row] = {}
+    for row in sorted(rows, key=lambda row: row["version"]):
+        newest[row["path"]] = row
+    return sorted(newest.values(), key=lambda row: (row["vehicle"], row["deployment"], row["path"]))
+
+
+def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
+    """Return the logs that a deployment's patterns name, beside the fleet.toml.
+
+    Raises
+    ------
+    ConfigError
+        A pattern names none.
+    """
+    found: list[Path] = []
+    for pattern in deployment.logs:
+        if not (named := sorted(fleet.parent.glob(pattern))):
+            raise ConfigError(fleet, f"deployment {deployment.name}: logs", f"nothing is named {pattern}")
+        found += named
+    return found
+
+
+def _told(row: Row) -> str:
+    masses = ", ".join(row["parameters"]) or "no moving masses"
+    return f"serial {row['serial'] or 'not given'}, sensor {row['sensor'] or 'not given'}, {masses}"

@@ -1,0 +1,89 @@
+"""Where a new calibration starts: what a vehicle's past and its fleet let expect; and what that is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from magbridge.calibration.fitting.fit import Fit
+from magbridge.calibration.fitting.known import DEPARTURE, Known
+from magbridge.fleet.catalogue import Catalogue
+from magbridge.fleet.memory import fleet_of, owner
+
+__all__ = ["UNLIKE", "Start", "gained", "start"]
+
+UNLIKE = 3.0
+"""Times as wide as expected, from which on a deployment is not as its vehicle's past lets expect."""
+
+
+class Start(NamedTuple):
+    """What is known before; of how many deployments of the vehicle itself, and of others."""
+
+    known: Known
+    vehicle: str
+    refit: str
+    own: int
+    others: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns that move its masses."""
+        return tuple(one.name for one in self.known.parameters)
+
+
+def start(folder: Path, member: str, refit: str, digests: Collection[str]) -> Start:
+    """Return what a catalogue lets expect of logs.
+
+    Parameters
+    ----------
+    folder : path
+        The catalogue.
+    member, refit : str
+        The logs' vehicle, and which refit it flew with; empty: as the catalogue has them.
+    digests : collection of str
+        SHA-256 of the logs: what was learnt from them does not count.
+
+    Raises
+    ------
+    WrongUse
+        There is no such vehicle, or the logs' is not known.
+    DataError
+        Nothing has been calibrated yet.
+    """
+    catalogue = Catalogue(folder)
+    if not member:
+        member, on_record = owner(catalogue, digests)
+        refit = refit or on_record
+    fleet = fleet_of(catalogue, member, without=digests)
+    own = sum(one.vehicle == member for one in fleet.lessons)
+    return Start(fleet.known(member, refit), member, refit, own, len(fleet.lessons) - own)
+
+
+def gained(found: Fit, alone: Fit | None, began: Start) -> tuple[dict[str, Any], list[str]]:
+    """Return what the fleet was worth, for machines and as lines.
+
+    Parameters
+    ----------
+    found, alone : Fit
+        With the fleet, and by its own data; None where those allow no fit.
+    began : Start
+        Where the first began.
+    """
+    with_it, without = (
+        one and one.details["expected_over_noise"] * one.calibration.noise.sensor for one in (found, alone)
+    )
+    departure = found.details.get("widths_nT", {}).get(DEPARTURE, 1.0)
+    facts = {
+        "vehicle": began.vehicle, "deployments": began.own, "deployments_of_others": began.others,
+        "expected_nT": with_it, "expected_alone_nT": without, "departure": departure,
+    }  # fmt: skip
+    otherwise = f"instead of {without:.1f}" if without is not None else "where these runs alone allow no fit"
+    past = f"{began.own} deployments of {began.vehicle} and {began.others} of its fleet"
+    lines = [f"{past}: expect {with_it:.1f} nT of error {otherwise}"]
+    if departure > UNLIKE:
+        lines.append(
+            f"{began.vehicle} is not as its past lets expect, by {departure:.1f} times: another vehicle, or "
+            "something on it has changed"
+        )
+    return facts, lines

@@ -1,0 +1,32 @@
+"""A calibration from what a fleet lets expect, before any run is flown."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magbridge.calibration.model import Calibration, Noise, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.fleet.learn import Fleet
+from magbridge.version import __version__
+
+__all__ = ["unflown"]
+
+
+def unflown(fleet: Fleet, vehicle: str, refit: str = "", noise: float = 0.0) -> Calibration:
+    """Return what is expected of a vehicle's next deployment as a calibration.
+
+    Parameters
+    ----------
+    fleet : Fleet
+        What has been learnt.
+    vehicle, refit : str
+        As for :meth:`Fleet.known`.
+    noise : float
+        nT, of a sample.
+    """
+    known = fleet.known(vehicle, refit)
+    return Calibration(
+        known.parameters, (Polynomial(exponents=known.exponents),), np.asarray(known.mean), known.covariance,
+        Noise(noise), Reference(known.field), method="fleet", software=f"magbridge {__version__}",
+        doubts=("no run of this deployment: its coefficients are what its fleet lets expect",),
+    )  # fmt: skip

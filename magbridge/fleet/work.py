@@ -1,0 +1,227 @@
+"""One deployment, from its logs to rows of the catalogue: what a worker does.
+
+A worker writes corrected logs and maps, nothing else; the rows are written by the one who asked. What is
+wrong with a log is a failure on record, and the deployment's others go on. What is wrong with the moment (a
+file that is gone or has changed, a full disk) is told, not recorded, and the deployment is tried again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
+import numpy as np
+import xarray as xr
+from threadpoolctl import threadpool_limits
+
+from magbridge.calibration.file import encode_calibration
+from magbridge.calibration.fitting.fit import Fit, fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.columns import CHANNELS, counts_from_boot, require
+from magbridge.correction import Correction, correct_rows
+from magbridge.diagnose.run import diagnose
+from magbridge.errors import DataError, FormatError, MagbridgeError, WriteError
+from magbridge.files import digest
+from magbridge.logs import Writer, read
+from magbridge.logs.deployment import join, passed_over, sliced
+from magbridge.logs.info import GAP
+from magbridge.records import Quality
+from magbridge.survey.maps import anomaly_map
+from magbridge.survey.run import samples_of, survey
+
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
+    from magbridge.fleet.catalogue import Row
+
+__all__ = ["Done", "Job", "work"]
+
+PIECE = 20_000
+"""Rows that are corrected at a time."""
+
+
+class Job(NamedTuple):
+    """A deployment to process: its vehicle's row, and those of its logs."""
+
+    vehicle: Row
+    deployment: str
+    refit: str
+    files: tuple[Row, ...]
+    diagnose: bool = False
+    map: bool = False
+
+    @property
+    def name(self) -> str:
+        """What its results are made of, as 32 hexadecimal digits: other logs or parameters, another name."""
+        made_of = (
+            self.vehicle["vehicle"], self.deployment, self.refit, self.vehicle["sensor"],
+            self.vehicle["parameters"], self.vehicle["order"], sorted({row["sha256"] for row in self.files}),
+        )  # fmt: skip
+        return sha256(msgspec.json.encode(made_of)).hexdigest()[:32]
+
+
+class Done(NamedTuple):
+    """Rows for each table, and what stood in the way at the moment (empty: nothing)."""
+
+    tables: dict[str, list[Row]]
+    hindrance: str = ""
+
+
+def work(job: Job, results: Path) -> Done:
+    """Read, check, calibrate, correct and, where that is asked for, diagnose a deployment.
+
+    Parameters
+    ----------
+    job : Job
+        The deployment.
+    results : path
+        Folder of corrected logs and maps.
+    """
+    tables: dict[str, list[Row]] = {}
+    try:
+        with threadpool_limits(1, "blas"):
+            _deployment(job, results, tables)
+    except (WriteError, OSError, MemoryError) as error:
+        return Done({}, f"{_named(job)}: {error}")
+    except MagbridgeError as error:
+        tables.setdefault("failures", []).append(_failure(job, str(error)))
+    return Done(tables)
+
+
+def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
+    """Fill `tables`, one after the other, until something is in the way."""
+    logs: dict[str, xr.Dataset] = {}
+    for row in {row["sha256"]: row for row in job.files}.values():
+        path = Path(row["path"])
+        if digest(path) != row["sha256"]:
+            raise OSError(f"{path} has changed since it was catalogued: add it again")
+        try:
+            logs[row["sha256"]] = log = _checked(path, job)
+        except MagbridgeError as error:
+            tables.setdefault("failures", []).append(_failure(job, str(error)))
+            continue
+        tables.setdefault("logs", []).append(_log(log, row["sha256"]))
+    if not logs:
+        raise DataError("none of its logs can be used")
+    together = join(list(logs.values()))
+    require(together, (*CHANNELS, *job.vehicle["parameters"]))
+    data = observations(together, tuple(job.vehicle["parameters"]))
+    inputs = {Path(row["path"]).name: row["sha256"] for row in job.files if row["sha256"] in logs}
+    found = fit(replace(data, inputs=inputs), order=job.vehicle["order"])
+    start = float(together["time"][0])
+    tables["calibrations"] = [_calibration(job, found, start)]
+    folder = results / job.vehicle["vehicle"] / job.deployment
+    stems = {row["sha256"]: Path(row["path"]).stem for row in job.files}
+    for sha, log in logs.items():
+        path = folder / f"{stems[sha]}-{sha[:8]}.nc"
+        tables.setdefault("corrected", []).append(_correct(job, found.calibration, log, sha, path))
+    if job.diagnose:
+        tables["findings"] = list(_findings(job, together, found.calibration))
+    if job.map:
+        tables["maps"] = [
+            _map(job, list(logs.values()), found.calibration, folder / f"map-{job.name[:8]}.nc")
+        ]
+
+
+def _checked(path: Path, job: Job) -> xr.Dataset:
+    """Read a log; refuse one of no date, or of another sensor."""
+    log = read(path, required=CHANNELS)
+    if counts_from_boot(log):
+        first = str(np.datetime64(int(log["time"][0]), "s"))
+        raise FormatError(path, f"its clock says {first}: give it a date (magbridge convert --date)")
+    sensor, expected = str(log.attrs.get("sensor", "")), job.vehicle["sensor"]
+    if "" not in (sensor, expected) and sensor != expected:
+        raise FormatError(path, f"sensor {sensor!r}, but {job.vehicle['vehicle']} carries {expected!r}")
+    return log
+
+
+def _log(log: xr.Dataset, sha: str) -> Row:
+    time = log["time"].to_numpy()
+    steps = np.diff(time)
+    middle = {
+        name: float(np.nanmedian(log[name])) if name in log and log[name].notnull().any() else None
+        for name in ("latitude", "longitude")
+    }
+    return {
+        "sha256": sha, "start": float(time[0]), "end": float(time[-1]), "rows": len(time),
+        "samples": int(log[list(CHANNELS)].to_array().notnull().all("variable").sum()),
+        "gaps": int((steps > GAP * np.median(steps)).sum()) if len(steps) else 0,
+        "losses": sum(passed_over(log.attrs).values()), "sensor": str(log.attrs.get("sensor", "")), **middle,
+    }  # fmt: skip
+
+
+def _calibration(job: Job, found: Fit, start: float) -> Row:
+    calibration, told = found.calibration, found.information
+    return {
+        "job": job.name, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment, "refit": job.refit,
+        "start": start, "method": calibration.method, "rms": found.rms, "noise": calibration.noise.sensor,
+        "expected": found.details["expected_over_noise"] * calibration.noise.sensor,
+        "supported": found.supported, "warnings": list(found.warnings),
+        "calibration": encode_calibration(calibration).decode(),
+        "precision": told.precision.ravel().tolist() if told else [],
+        "vector": told.vector.tolist() if told else [],
+    }  # fmt: skip
+
+
+def _correct(job: Job, calibration: Calibration, log: xr.Dataset, sha: str, path: Path) -> Row:
+    """Write a log's corrected field; return its row."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    correction = Correction(calibration)
+    samples, flagged, variances = 0, 0, 0.0
+    with Writer(path) as writer:
+        for piece in sliced(log, PIECE):
+            fixed = correct_rows(correction, piece)
+            writer.append(fixed)
+            doubtful = fixed["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0
+            sigma = fixed["total_field_sigma"].to_numpy()
+            good = ~doubtful & np.isfinite(sigma)
+            samples, flagged = samples + len(sigma), flagged + int(doubtful.sum())
+            variances += float((sigma[good] ** 2).sum())
+    return {
+        "job": job.name, "sha256": sha, "path": _relative(path), "samples": samples,
+        "flagged": flagged, "sigma": float(np.sqrt(variances / max(samples - flagged, 1))),
+    }  # fmt: skip
+
+
+def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> Iterator[Row]:
+    """Yield a row for each cause found, or one that says that there is none."""
+    found = diagnose([log], calibration, learned_from=[log])
+    nothing: dict[str, Any] = {"job": job.name, "verdict": found.verdict}
+    if not found.findings:
+        yield {**nothing, "cause": "", "channel": "", "signal_to_noise": None}
+    for one in found.findings:
+        yield {
+            **nothing, "cause": one.candidate.cause, "channel": one.candidate.channel or "",
+            "signal_to_noise": one.signal_to_noise,
+        }  # fmt: skip
+
+
+def _map(job: Job, logs: list[xr.Dataset], calibration: Calibration, path: Path) -> Row:
+    """Write the anomaly map of a deployment's corrected field; return its row."""
+    made = survey(samples_of(logs, [calibration]))
+    grid = anomaly_map(made.gridded, made.samples.origin, name=path.name)
+    grid.save(path)
+    return {
+        "job": job.name, "path": _relative(path), "rms": float(np.sqrt(np.mean(made.residual**2))),
+        "sigma": float(np.nanmedian(grid.sigma)),
+    }  # fmt: skip
+
+
+def _relative(path: Path) -> str:
+    """Return a result's path below the catalogue: results/VEHICLE/DEPLOYMENT/NAME."""
+    return "/".join(path.parts[-4:])
+
+
+def _failure(job: Job, line: str) -> Row:
+    whole = line if line.startswith("/") else f"{_named(job)}: {line}"
+    return {
+        "job": job.name, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment,
+        "line": " ".join(whole.split()),
+    }  # fmt: skip
+
+
+def _named(job: Job) -> str:
+    return f"{job.vehicle['vehicle']} {job.deployment}"

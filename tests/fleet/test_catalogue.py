@@ -1,0 +1,126 @@
+"""The catalogue: each row once, whoever writes it; newer and damaged ones are refused, in a line each."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from fleets import fly
+
+from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
+from magbridge.fleet import catalogue as room
+from magbridge.fleet.catalogue import Catalogue
+from magbridge.fleet.process import jobs
+from magbridge.fleet.register import Vehicle, add_logs, add_vehicle, current_files, read_fleet, vehicles
+
+
+@pytest.fixture
+def empty(tmp_path: Path) -> Catalogue:
+    return Catalogue(tmp_path / "fleet", create=True)
+
+
+def line(n: int) -> dict[str, str]:
+    return {"job": str(n), "vehicle": "v", "deployment": "d", "line": f"failure {n}"}
+
+
+def test_a_row_is_there_once(empty: Catalogue) -> None:
+    assert empty.add("failures", [line(1), line(2)]) == 2
+    assert empty.add("failures", [line(2), line(3), line(3)]) == 1
+    assert sorted(row["job"] for row in empty.rows("failures")) == ["1", "2", "3"]
+    assert {*empty.rows("failures", ["job"])[0]} == {"job"}
+
+
+def test_two_writers_of_the_same_rows_write_one_file(
+    empty: Catalogue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = Catalogue(empty.folder)
+    monkeypatch.setattr(other, "_keys", lambda _: set())  # it looked before the first had written
+    empty.add("failures", [line(1), line(2)])
+    other.add("failures", [line(2), line(1)])
+    other.add("failures", [line(2), line(3)])
+    assert len(list((empty.folder / "failures").iterdir())) == 2
+    assert len(empty.rows("failures")) == 3
+
+
+def test_many_files_become_one_and_say_the_same(empty: Catalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "MANY", 5)
+    for n in range(7):
+        empty.add("failures", [line(n)])
+    before = empty.rows("failures")
+    empty.compact()
+    assert len(list((empty.folder / "failures").iterdir())) == 1
+    assert empty.rows("failures") == before
+    empty.compact()
+    assert empty.add("failures", [line(3)]) == 0
+
+
+def test_a_newer_catalogue_is_refused_and_none_is_not_made(empty: Catalogue, tmp_path: Path) -> None:
+    (empty.folder / "catalogue.json").write_text(json.dumps({"format": 2}))
+    with pytest.raises(FormatError, match="format 2; this magbridge reads up to 1"):
+        Catalogue(empty.folder)
+    with pytest.raises(FormatError, match="expected a fleet's catalogue"):
+        Catalogue(tmp_path / "nothing")
+    assert not (tmp_path / "nothing").exists()
+    (empty.folder / "catalogue.json").write_text("{")
+    with pytest.raises(FormatError, match="expected"):
+        Catalogue(empty.folder)
+
+
+def test_a_damaged_file_is_named(empty: Catalogue) -> None:
+    empty.add("failures", [line(1)])
+    (damaged := next((empty.folder / "failures").iterdir())).write_bytes(b"PAR1 not so")
+    with pytest.raises(FormatError, match=damaged.name):
+        empty.rows("failures")
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(empty: Catalogue) -> None:
+    (empty.folder / "failures").write_text("a file where the table should be")
+    with pytest.raises((WriteError, FileExistsError)):
+        empty.add("failures", [line(1)])
+
+
+def test_two_vehicles_of_one_name(empty: Catalogue) -> None:
+    assert add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1")) == 1
+    assert add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1")) == 0
+    with pytest.raises(WrongUse, match=r"another vehicle of that name: serial 1, .* not serial 2"):
+        add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="2"))
+    # two people at once, who could not see each other
+    row = {"vehicle": "comet", "serial": "2", "sensor": "", "parameters": ["battpos"], "order": 3}
+    empty.add("vehicles", [row])
+    with pytest.raises(FormatError, match="two vehicles are named 'comet'"):
+        vehicles(empty)
+
+
+def test_a_log_that_changed_is_another_version(empty: Catalogue, tmp_path: Path) -> None:
+    log = fly(tmp_path / "log.nc", 1, 0)
+    add_vehicle(empty, "comet", Vehicle(parameters=("battpos",)))
+    assert add_logs(empty, "comet", "may", "", [log]) == (1, [])
+    assert add_logs(empty, "comet", "may", "", [log]) == (0, [])
+    first, kept = jobs(empty)[0].name, log.read_bytes()
+    fly(log, 1, 1)
+    count, (said,) = add_logs(empty, "comet", "may", "", [log])
+    assert count == 1
+    assert said.endswith("log.nc: has changed since it was catalogued; what it holds now counts")
+    (now,) = current_files(empty.rows("files"))
+    assert now["version"] == 2
+    assert jobs(empty)[0].name != first
+    log.write_bytes(kept)  # and back
+    add_logs(empty, "comet", "may", "", [log])
+    assert jobs(empty)[0].name == first
+
+
+def test_an_unknown_vehicle_and_a_missing_log(empty: Catalogue, tmp_path: Path) -> None:
+    with pytest.raises(WrongUse, match=r"nemo: not a vehicle of .* \(none yet\)"):
+        add_logs(empty, "nemo", "may", "", [])
+    add_vehicle(empty, "comet", Vehicle())
+    count, (said,) = add_logs(empty, "comet", "may", "", [tmp_path / "gone.nc"])
+    assert count == 0
+    assert "gone.nc: expected a file, there is none" in said
+
+
+def test_a_fleet_toml_names_what_is_wrong(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text('[vehicle.comet]\nparameter = ["battpos"]\n')
+    with pytest.raises(ConfigError, match=r"vehicle\.comet\.parameter: unknown key"):
+        read_fleet(path)

@@ -1,0 +1,97 @@
+"""The hierarchical model: a dense Gaussian's answer, ever likelier, honest, and what it was drawn from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.known import Information
+from magbridge.fleet import hierarchy
+from magbridge.fleet.hierarchy import Observed, Population, learn
+
+
+def observed(
+    rng: np.random.Generator, sigmas: tuple[float, ...], fleet: tuple[int, ...], K: int = 4
+) -> tuple[list[Observed], list[FloatArray]]:
+    """Draw a fleet; each deployment sees two random combinations of its K coefficients, to 0.05."""
+    out, truth = [], []
+    mean = rng.normal(size=K)
+    for v in range(fleet[0]):
+        vehicle = mean + sigmas[0] * rng.normal(size=K)
+        for r in range(fleet[1]):
+            refit = vehicle + sigmas[1] * rng.normal(size=K)
+            for _ in range(fleet[2]):
+                z = refit + sigmas[2] * rng.normal(size=K)
+                H = rng.normal(size=(2, K)) / 0.05
+                y = H @ z + rng.normal(size=2)
+                out.append(Observed(str(v), str(r), Information(H.T @ H, H.T @ y)))
+                truth.append(z)
+    return out, truth
+
+
+def test_what_is_expected_is_the_dense_gaussians_answer() -> None:
+    rng = np.random.default_rng(0)
+    seen, _ = observed(rng, (1.0, 0.3, 0.1), (2, 2, 2), K=3)
+    V = np.array([[1.0, 0.5, 2.0], [0.1, 0.2, 0.3], [0.01, 0.02, 0.03]])
+    population, _, _ = hierarchy._round(V, seen, np.arange(3))
+    mean, P = population.expected("1", [one for one in seen if one.vehicle == "1"], "0")
+    # the dense joint of all deployments and the next one, by its covariances
+    labels = [(one.vehicle, one.refit) for one in seen] + [("1", "0")]
+    shared = [[1.0 + V[0] * (a[0] == b[0]) + V[1] * (a == b) for b in labels] for a in labels]
+    S = np.block([[np.diag(block) for block in row] for row in shared])
+    S += np.kron(np.eye(len(labels)), np.diag(V[2]))
+    J, h = np.zeros_like(S), np.zeros(len(S))
+    for k, one in enumerate(seen):
+        J[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = one.information.precision
+        h[3 * k : 3 * k + 3] = one.information.vector
+    posterior = np.linalg.inv(np.linalg.inv(S) + J)
+    np.testing.assert_allclose(P, posterior[-3:, -3:], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(mean, (posterior @ h)[-3:], rtol=1e-6, atol=1e-9)
+
+
+def test_every_round_is_likelier(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen, _ = observed(np.random.default_rng(1), (1.0, 0.2, 0.05), (5, 2, 2))
+    scores = []
+    for rounds in (1, 2, 3, 5, 10, 30):
+        monkeypatch.setattr(hierarchy, "ROUNDS", rounds)
+        scores.append(learn(seen, np.zeros(4, int)).log_likelihood)
+    assert (np.diff(scores) >= -1e-9).all()
+    assert scores[-1] > scores[0]
+
+
+def test_the_variances_are_those_that_it_was_drawn_from() -> None:
+    sigmas = (0.8, 0.2, 0.05)
+    seen, _ = observed(np.random.default_rng(2), sigmas, (15, 3, 3))
+    found = np.sqrt(learn(seen, np.zeros(4, int)).variances[:, 0])
+    assert (np.abs(np.log(found / sigmas)) < 0.35).all()
+
+
+def test_the_next_deployment_is_where_it_is_expected_as_often_as_said() -> None:
+    sigmas = 1.0, 0.3, 0.1
+    rng = np.random.default_rng(3)
+    squares = []
+    for _ in range(30):
+        seen, truth = observed(rng, sigmas, (3, 2, 3))
+        V = np.square(sigmas)[:, None] * np.ones((1, 4))
+        last = len(seen) - 1
+        population, _, _ = hierarchy._round(V, seen[:last], np.zeros(4, int))
+        past = [one for one in seen[:last] if one.vehicle == "2"]
+        for refit in ("1", "new"):
+            mean, P = population.expected("2", past, refit)
+            if refit == "1":
+                off = truth[last] - mean
+                squares.append(off @ np.linalg.solve(P, off) / 4)
+            else:
+                wider = P
+        assert np.trace(wider) > np.trace(population.expected("2", past, "1")[1])
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.3)
+
+
+def test_a_vehicle_of_no_past_is_as_wide_as_the_fleet() -> None:
+    seen, _ = observed(np.random.default_rng(4), (1.0, 0.3, 0.1), (6, 2, 2))
+    population: Population = learn(seen, np.zeros(4, int))
+    _, new = population.expected("unknown", [], "first")
+    _, old = population.expected("0", [one for one in seen if one.vehicle == "0"], "0")
+    assert (np.diag(new) > population.variances.sum(axis=0)).all()
+    assert (np.diag(old) < np.diag(new)).all()

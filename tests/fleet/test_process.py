@@ -1,0 +1,178 @@
+"""Processing: a deployment's rows, what is wrong with a log, killed and begun again, and two workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fleets import fly
+
+from magbridge.calibration.file import decode_calibration, load
+from magbridge.cli import main
+from magbridge.fleet.catalogue import TABLES, Catalogue, Row
+from magbridge.fleet.process import client_of, jobs, new_jobs, process
+from magbridge.fleet.register import Vehicle, add_logs, add_vehicle
+from magbridge.fleet.work import work
+from magbridge.logs import read, write
+
+
+def catalogue_of(folder: Path, flown: Path) -> Catalogue:
+    assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", str(folder / "fleet")]) == 0
+    return Catalogue(folder / "fleet")
+
+
+def content(catalogue: Catalogue) -> dict[str, list[Row]]:
+    return {table: catalogue.rows(table) for table in TABLES}
+
+
+@pytest.fixture(scope="module")
+def done(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
+    """The fleet's catalogue, processed by two workers, one of which is killed on the way."""
+    catalogue = catalogue_of(tmp_path_factory.mktemp("done"), flown)
+    with client_of("", 2, "2 GiB") as client:
+        victim = next(iter(client.run(os.getpid).values()))
+        for number, outcome in enumerate(process(catalogue, jobs(catalogue), client)):
+            assert not outcome.failures
+            if not number:
+                os.kill(victim, signal.SIGKILL)
+    return catalogue
+
+
+def test_every_deployment_is_done_once(done: Catalogue) -> None:
+    found = content(done)
+    assert {(row["vehicle"], row["deployment"]) for row in found["calibrations"]} == {
+        ("one", "first"), ("one", "second"), ("two", "first"),
+    }  # fmt: skip
+    assert len(found["calibrations"]) == len(found["logs"]) == len(found["corrected"]) == 3
+    assert all((done.folder / row["path"]).is_file() for row in found["corrected"])
+    assert all(row["rms"] < 2.0 and row["flagged"] == 0 for row in found["calibrations"] if "flagged" in row)
+    assert not new_jobs(done, jobs(done))
+
+
+def test_killed_and_begun_again_is_the_same(done: Catalogue, flown: Path, tmp_path: Path) -> None:
+    again = catalogue_of(tmp_path, flown)
+    for turn in range(3):  # each time killed after one deployment, the last just before it was marked as done
+        job = new_jobs(again, jobs(again))[0]
+        tables = work(job, again.folder / "results").tables
+        for table, rows in tables.items():
+            again.add(table, rows)
+        if turn < 2:
+            again.add("done", [{"job": job.name, "diagnosed": False, "mapped": False}])
+    (left,) = new_jobs(again, jobs(again))
+    for table, rows in work(left, again.folder / "results").tables.items():
+        assert again.add(table, rows) == 0
+    again.add("done", [{"job": left.name, "diagnosed": False, "mapped": False}])
+    assert content(again) == content(done)
+
+
+def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(tmp_path: Path) -> None:
+    catalogue = Catalogue(tmp_path / "fleet", create=True)
+    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",), sensor="HMR 1"))
+    logs = [
+        fly(tmp_path / "good.nc", 1, 0, sensor="HMR 1"),
+        fly(tmp_path / "other.nc", 1, 0, sensor="HMR 2"),
+        fly(tmp_path / "boot.nc", 1, 0, start=100.0, sensor="HMR 1"),
+    ]
+    (tmp_path / "text.nc").write_text("no log")
+    add_logs(catalogue, "comet", "may", "", [*logs, tmp_path / "text.nc"])
+    (job,) = jobs(catalogue)
+    tables = work(job, tmp_path / "results").tables
+    assert len(tables["calibrations"]) == len(tables["corrected"]) == 1
+    lines = " | ".join(sorted(row["line"] for row in tables["failures"]))
+    assert "boot.nc: its clock says 1970-01-01T00:01:40: give it a date" in lines
+    assert "other.nc: sensor 'HMR 2', but comet carries 'HMR 1'" in lines
+    assert "text.nc" in lines
+    assert len(tables["failures"]) == 3
+
+
+def test_what_is_wrong_with_the_moment_is_not_on_record(tmp_path: Path) -> None:
+    catalogue = Catalogue(tmp_path / "fleet", create=True)
+    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
+    log = fly(tmp_path / "log.nc", 1, 0)
+    add_logs(catalogue, "comet", "may", "", [log])
+    (job,) = jobs(catalogue)
+    kept = log.read_bytes()
+    log.write_bytes(kept + b" ")
+    changed = work(job, tmp_path / "results")
+    assert changed == ({}, f"comet may: {log} has changed since it was catalogued: add it again")
+    log.unlink()
+    assert work(job, tmp_path / "results").tables == {}
+    log.write_bytes(kept)
+    blocked = tmp_path / "results" / "comet"
+    blocked.parent.mkdir(exist_ok=True)
+    blocked.write_text("where a folder should be")
+    refused = work(job, tmp_path / "results")
+    assert refused.tables == {}
+    assert "comet may" in refused.hindrance
+
+
+def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    catalogue = Catalogue(tmp_path / "fleet", create=True)
+    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
+    for number in range(5):
+        log = fly(tmp_path / f"{number}.nc", 1, number)
+        if number == 4:  # a magnetised screw
+            changed = read(log)
+            changed["mag_y"] = changed["mag_y"] + 400.0
+            write(changed, log)
+        add_logs(catalogue, "comet", f"d{number}", "spring", [log])
+    for job in jobs(catalogue):
+        for table, rows in work(job, tmp_path / "results").tables.items():
+            catalogue.add(table, rows)
+    place, page = str(catalogue.folder), tmp_path / "page.html"
+    assert main(["fleet", "show", "comet", "--catalogue", place, "--html", str(page)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == "comet: 5 deployments, 1 changes"
+    assert "d4 (refit spring): hard iron, y moved by +" in told[1]
+    text = page.read_text()
+    assert "<td class=changed>hard iron, y</td>" in text
+    assert "src=" not in text
+    assert 'href="http' not in text
+
+
+def test_a_calibration_starts_from_its_fleet(
+    done: Catalogue, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = str(done.folder)
+    log = fly(tmp_path / "third.nc", 1, 2)
+    few = read(log)
+    write(few.isel(time=np.isin(few["run"], np.unique(few["run"])[:2])), log)
+    arguments = ["calibrate", str(log), "--fleet", place, "-o", str(tmp_path / "cal.json"), "--json"]
+    assert main(arguments) == 2
+    assert "name the vehicle (--member)" in capsys.readouterr().err
+    assert main([*arguments, "--member", "one", "--refit", "spring"]) == 0
+    found = json.loads(capsys.readouterr().out)["fleet"]
+    assert (found["deployments"], found["deployments_of_others"]) == (2, 1)
+    assert found["expected_nT"] < 0.5 * found["expected_alone_nT"]
+    # a log that is catalogued has its vehicle there, and is not learnt from twice
+    again = ["calibrate", str(flown / "one/second.nc"), *arguments[2:]]
+    assert main(again) == 0
+    assert json.loads(capsys.readouterr().out)["fleet"]["deployments"] == 1
+
+
+def test_what_is_expected_is_a_calibration(done: Catalogue, tmp_path: Path) -> None:
+    cal = tmp_path / "cal.json"
+    assert main(["fleet", "export", "one", "--catalogue", str(done.folder), "-o", str(cal)]) == 0
+    known = load(cal)
+    assert known.method == "fleet"
+    assert known.doubts
+    (own, _) = (row for row in done.rows("calibrations") if row["vehicle"] == "one")
+    off = known.coefficients[6:9] - decode_calibration(own["calibration"].encode()).coefficients[6:9]
+    assert (np.abs(off) < 4.0 * np.sqrt(np.diag(known.covariance)[6:9])).all()
+
+
+def test_status_counts(done: Catalogue, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fleet", "status", "--catalogue", str(done.folder), "--json"]) == 0
+    one, two = json.loads(capsys.readouterr().out)["vehicles"]
+    assert (one["vehicle"], one["deployments"], one["logs"], one["calibrated"], one["new"]) == (
+        "one",
+        2,
+        2,
+        2,
+        0,
+    )
+    assert (two["vehicle"], two["deployments"], two["failed"]) == ("two", 1, 0)

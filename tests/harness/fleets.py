@@ -1,0 +1,50 @@
+"""Small vehicles with one moving mass, and a fleet.toml of two of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from gliders import make
+
+from magbridge.logs import write
+from magbridge.logs.deployment import deployment
+
+DAY = 86_400.0
+
+
+def fly(path: Path, vehicle: int, number: int, start: float | None = None, sensor: str = "") -> Path:
+    """Write a vehicle's calibration runs, one moving mass; each deployment has an offset of its own."""
+    runs = make(vehicle, masses=1).runs
+    rows = np.arange(0, len(runs), 2)
+    rng = np.random.default_rng([vehicle, number])
+    field = runs.field[rows] + rng.normal(0, 5, 3) + rng.normal(0, 1, (len(rows), 3))
+    when = runs.time[rows] + 30 * DAY * number if start is None else start + 8.0 * np.arange(len(rows))
+    columns = {f"mag_{axis}": field[:, k] for k, axis in enumerate("xyz")}
+    columns |= {"battpos": runs.parameters[rows, 0], "reference_field": runs.reference[rows]}
+    columns |= {"run": runs.runs[rows].astype(float)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    attrs = {"sensor": sensor} if sensor else {}
+    write(deployment(path, when, columns, {"battpos": "in"}, attrs), path)
+    return path
+
+
+FLEET = """
+[vehicle.one]
+parameters = ["battpos"]
+serial = "1"
+[[vehicle.one.deployment]]
+name = "first"
+refit = "spring"
+logs = ["one/first.nc"]
+[[vehicle.one.deployment]]
+name = "second"
+refit = "spring"
+logs = ["one/second.nc"]
+
+[vehicle.two]
+parameters = ["battpos"]
+[[vehicle.two.deployment]]
+name = "first"
+logs = ["two/*.nc"]
+"""

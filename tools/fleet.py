@@ -1,0 +1,209 @@
+"""What a fleet's memory is worth: the survey's error after two calibration runs, with it and without.
+
+Each vehicle of a simulated fleet is drawn at random and flies several deployments: ten runs, then a survey on
+another day. From one refit to the next its fixed iron, its masses' places and moments change (`--refit
+battery`: the battery pack is another one, with a moment of its own), from one power-up to the next the
+sensor's offsets. The fleet learns from all deployments but each vehicle's last. That one is calibrated with
+some of its runs, with the fleet's prior and without, and scored on its survey as tools/accuracy.py does.
+
+    python tools/fleet.py --vehicles 12 --deployments 8 --runs 0 2 10
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from multiprocessing import get_context
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import xarray as xr
+from rich.console import Console
+from terminal import command_line, table
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.known import Known
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration, Noise, Reference
+from magbridge.calibration.residual import rms
+from magbridge.calibration.terms import Polynomial
+from magbridge.errors import CalibrationError
+from magbridge.fleet.hierarchy import LEVELS
+from magbridge.fleet.learn import Lesson, learn_fleet
+from sitl import Twin, load, segments, simulate
+from sitl.bound import oracle
+from sitl.dataset import at_rest, corrected
+from sitl.platform import Matrix, Vehicle, draw_vehicle
+
+MASSES = ("battpos", "ballast")
+REFITTED = {"fixed iron": 50.0, "soft iron": 1e-3, "place": 0.005, "moment": 0.1}
+"""1-sigma of what a refit changes: nT an axis, nT a nT, m an axis, A m² an axis."""
+POWERED_UP = 5.0
+"""nT, 1-sigma of an axis' offset from one power-up to the next."""
+OFFSET = 1_000_000
+"""Between the seeds of vehicles and those of their deployments."""
+
+
+class Flight(NamedTuple):
+    """A deployment: vehicle and number, with the kind of refit, and how many deployments each refit has."""
+
+    vehicle: int
+    number: int
+    refit: str
+    every: int
+    seed: int
+
+    def state(self) -> Vehicle:
+        """Return the vehicle as it is in this deployment."""
+        known = draw_vehicle(np.random.default_rng([self.seed, self.vehicle]), MASSES)
+        rng = np.random.default_rng([self.seed, self.vehicle, 1 + self.number // self.every])
+        fresh = draw_vehicle(rng, MASSES)
+        mass = {}
+        for name, one in known.mass.items():
+            new = self.refit == "battery" and name == "battpos"
+            moment = fresh.mass[name].moment if new else tuple(rng.normal(one.moment, REFITTED["moment"]))
+            mass[name] = msgspec.structs.replace(
+                one, at=tuple(rng.normal(one.at, REFITTED["place"])), moment=moment
+            )
+        iron = rng.normal(known.hard_iron, REFITTED["fixed iron"])
+        soft = rng.normal(known.soft_iron, REFITTED["soft iron"])
+        up = np.random.default_rng([self.seed, self.vehicle, OFFSET + self.number])
+        return Vehicle(
+            hard_iron=tuple(up.normal(iron, POWERED_UP)),
+            soft_iron=msgspec.convert(soft.tolist(), Matrix),
+            mass=mass,
+        )
+
+    def fly(self) -> tuple[xr.Dataset, xr.Dataset, Vehicle]:
+        """Return calibration runs and survey, without the samples of masses in motion, and the vehicle."""
+        vehicle = self.state()
+        scenario = load("random_glider").replace(vehicle=vehicle, masses=MASSES)
+        seed = OFFSET * (1 + self.seed) + 1000 * self.vehicle + self.number
+        parts = segments(simulate(scenario, seed))
+        assert isinstance(Twin.draw(scenario, seed).vehicle, Vehicle)
+        return at_rest(parts["calibration"], MASSES), at_rest(parts["survey"], MASSES), vehicle
+
+
+class Row(NamedTuple):
+    """A calibration scored on its survey: error over the floor, deviation of the standardised error."""
+
+    runs: int
+    prior: str
+    ratio: float
+    sigma: float
+    failed: str = ""
+
+
+def lesson(flight: Flight) -> Lesson | str:
+    """Calibrate a deployment by its own runs."""
+    runs, _, _ = flight.fly()
+    try:
+        found = fit(observations(runs, MASSES))
+    except CalibrationError as error:
+        return str(error)
+    calibration, term = found.calibration, found.calibration.terms[0]
+    if found.information is None or not isinstance(term, Polynomial):
+        return f"{calibration.method}: has nothing to teach"
+    return Lesson(
+        f"vehicle {flight.vehicle}", f"refit {flight.number // flight.every}", str(flight.number),
+        float(runs["time"][0]), calibration.parameters, term.exponents, calibration.reference.field,
+        found.information,
+    )  # fmt: skip
+
+
+def score(flight: Flight, counts: list[int], known: Known) -> list[Row]:
+    """Calibrate a vehicle's last deployment with some of its runs, with and without its fleet."""
+    runs, survey, vehicle = flight.fly()
+    truth = survey["truth_total_field"].to_numpy()
+    floor = rms(oracle(vehicle, survey) - truth)
+    labels = np.unique(runs["run"])
+    rows = []
+    for count, (name, prior) in product(counts, {"none": None, "fleet": known}.items()):
+        part = runs.isel(time=np.isin(runs["run"], labels[:count]))
+        try:
+            if count:
+                calibration = (
+                    fit(observations(part, MASSES), known=prior).calibration
+                    if prior
+                    else fit(observations(part, MASSES)).calibration
+                )
+            elif prior:
+                calibration = unflown(prior)
+            else:
+                continue
+        except CalibrationError as error:
+            rows.append(Row(count, name, np.nan, np.nan, str(error)))
+            continue
+        after = corrected(survey, calibration)
+        off = after.total - truth
+        rows.append(Row(count, name, rms(off) / floor, float(np.std(off / after.sigma))))
+    return rows
+
+
+def unflown(known: Known) -> Calibration:
+    """Return what a fleet expects as a calibration, without any run."""
+    return Calibration(
+        known.parameters, (Polynomial(exponents=known.exponents),), known.mean, known.covariance,
+        Noise(1.0), Reference(known.field),
+    )  # fmt: skip
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--vehicles", type=int, default=12)
+    parser.add_argument("--deployments", type=int, default=8, help="of each vehicle; the last is scored")
+    parser.add_argument("--every", type=int, default=2, help="deployments of each refit")
+    parser.add_argument("--refit", choices=["usual", "battery"], default="usual")
+    parser.add_argument("--runs", type=int, nargs="+", default=[0, 2, 10])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    options = parser.parse_args()
+    flights = [
+        Flight(vehicle, number, options.refit, options.every, options.seed)
+        for vehicle in range(options.vehicles)
+        for number in range(options.deployments)
+    ]
+    last = options.deployments - 1
+    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        told = list(pool.map(lesson, [one for one in flights if one.number < last]))
+        fleet = learn_fleet([one for one in told if isinstance(one, Lesson)])
+        scored = [one for one in flights if one.number == last]
+        refit = f"refit {last // options.every}"
+        priors = [fleet.known(f"vehicle {one.vehicle}", refit) for one in scored]
+        rows = [row for some in pool.map(score, scored, [options.runs] * len(scored), priors) for row in some]
+    console = Console(width=110)
+    for error in (one for one in told if isinstance(one, str)):
+        console.print(f"not learnt from: {error}")
+    widths = np.sqrt(np.median(fleet.population.variances, axis=1))
+    console.print(
+        f"learnt in {fleet.population.rounds} rounds; median of the physical widths: "
+        + ", ".join(f"{name} {width:.2g}" for name, width in zip(LEVELS, widths, strict=True))
+    )
+    show(rows, options, console)
+
+
+def show(rows: list[Row], options: object, console: Console) -> None:
+    """Print the table."""
+    shown = table(
+        f"{options}", "runs", "prior", "over the floor: median", "95 %", "worst", "sigma: median", "failed"
+    )
+    for count, prior in dict.fromkeys((row.runs, row.prior) for row in rows):
+        mine = [row for row in rows if (row.runs, row.prior) == (count, prior)]
+        ratio: FloatArray = np.array([row.ratio for row in mine if not row.failed])
+        sigma = np.array([row.sigma for row in mine if not row.failed])
+        if not len(ratio):
+            shown.add_row(str(count), prior, *[""] * 4, f"{len(mine)}: {mine[0].failed}")
+            continue
+        shown.add_row(
+            str(count), prior, *(f"{value:.3f}" for value in (*np.quantile(ratio, [0.5, 0.95]), ratio.max())),
+            f"{np.median(sigma):.2f}", str(len(mine) - len(ratio)),
+        )  # fmt: skip
+    console.print(shown)
+
+
+if __name__ == "__main__":
+    main()
