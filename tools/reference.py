@@ -7,6 +7,7 @@ program.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args, get_type_hints
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
 ROOT = Path(__file__).resolve().parents[1]
+ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):(<code>)(?:~[\w.]*\.)?([\w.]+)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -35,6 +37,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, text in pages.items():
         files.append(File.generated(config, f"reference/{name}.md", content=text))
     return files
+
+
+def on_page_content(html: str, **_: object) -> str:
+    """Show a docstring's ``:func:`~a.b.c``` as the name alone."""
+    return ROLE.sub(r"\1\2", html)
 
 
 def commands() -> str:
@@ -57,7 +64,8 @@ def configuration() -> Iterator[str]:
     for name, held in get_type_hints(Config).items():
         table = next((one for one in (held, *get_args(held)) if _is_table(one)), None)
         if table is not None:
-            yield f"::: {table.__module__}.{table.__name__}\n"
+            options = f"{{heading: '{name}', show_bases: false}}"
+            yield f"::: {table.__module__}.{table.__name__}\n    options: {options}\n"
         elif name == "publish":
             yield from ("## publish", "", "Message = rate in Hz; 0 with every sample, negative never.", "")
     yield "## sensor.options\n\nThe keys that each driver has; `magbridge drivers NAME` prints them.\n"
