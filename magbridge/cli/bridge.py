@@ -34,6 +34,9 @@ def demo(
     *,
     out: Folder = Path("demo"),
     seed: Annotated[Whole, Parameter(validator=validators.Number(gte=0))] = 1,
+    live: bool = False,
+    port: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=65535))] = 8080,
+    show: Annotated[bool, Parameter(negative="--no-show")] = True,
     json: Json = False,
 ) -> None:
     """Do the main job end to end on a simulated glider: no hardware, no network, under a minute.
@@ -48,14 +51,38 @@ def demo(
         The folder to write to.
     seed
         Which random glider.
+    live
+        Fly the glider in real time instead, with its bridge on a pty and a socket, and show it in the ground
+        station's page until Ctrl-C.
+    port
+        With --live, the port to serve the page at.
+    show
+        With --live, open the page in a browser.
     json
         Print the result as JSON.
     """
+    if live:
+        _live(out, seed, port, show=show)
+        return
     from sitl import demo as demonstration
 
     with new_folder(out):
         result = demonstration.demo(out, seed, say=lambda text: print(text, file=sys.stderr))
     print_result(result, demonstration.summary(result), json)
+
+
+def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
+    """Fly the demonstration's glider into the page until interrupted."""
+    from magbridge.monitor.serve import serve
+    from sitl.live import flying
+
+    def say(text: str) -> None:
+        print(text, file=sys.stderr)
+
+    with new_folder(out):
+        out.mkdir(parents=True, exist_ok=True)
+        with flying(out, seed, say) as link:
+            serve(link, 0, "127.0.0.1", port, show=show)
 
 
 @app.command(usage="Usage: magbridge run --config bridge.toml [--check]")

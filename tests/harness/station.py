@@ -40,8 +40,10 @@ def served(clock: Path, *options: str, warned: bool = False) -> Iterator[Station
         if warned:
             assert process.stderr.readline().startswith(b"warning: the page is open to the network")
         place = line.rpartition(" ")[2].strip().replace("0.0.0.0", "127.0.0.1")
-        yield place if "?" in place else f"{place}/", ("127.0.0.1", link)
-        process.send_signal(signal.SIGINT)
+        try:
+            yield place if "?" in place else f"{place}/", ("127.0.0.1", link)
+        finally:
+            process.send_signal(signal.SIGINT)
         assert not process.stderr.read().strip()
     assert process.returncode == 0
 

@@ -122,4 +122,4 @@ def test_served_to_others_a_token_is_required(clock: Path) -> None:
         assert websocket(base, **known) == 101
         assert websocket(base, **known, Origin="http://evil.example") == 403
         assert status(base, Host="evil.example", **known).status == 421
-        assert status(base, Cookie='a="\x01; =;;;').status == 401
+        assert status(base, Cookie='a="; =;;;').status == 401

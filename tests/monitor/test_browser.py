@@ -1,0 +1,171 @@
+"""The page in a real browser: what a reader sees, does with the keyboard, and hears from a screen reader."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from zipfile import ZipFile
+
+import pytest
+from station import get, served
+
+from magbridge.mavlink import Codec
+
+pytest.importorskip("nicegui")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
+WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
+PATIENCE = 20_000
+"""ms that a loaded computer may take to show something."""
+
+
+def feed(link: tuple[str, int], stop: threading.Event) -> None:
+    """Send what two vehicles send, with one spike and a mass that moves."""
+    bridges, autopilot = (Codec(1, 191), Codec(2, 191)), Codec(1, 1)
+    begin = time.time() - 300.0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for k in range(100_000):
+            us = round((begin + k if k < 300 else time.time()) * 1e6)
+            place = {"lat": 495_000_000 + 200 * k, "lon": -579_000_000 + 300 * k}
+            total = 52_000.0 + 5.0 * math.sin(k / 20.0) + (9_000.0 if k == 150 else 0.0)
+            field = {"time_usec": us, "total_field": total, "total_field_sigma": 1.0}
+            frames = [
+                bridges[0].pack("MAG_FIELD", flags=1, **field),
+                bridges[1].pack("MAG_FIELD", **{**field, "total_field": 41_000.0}),
+                bridges[0].pack("MAG_RAW", time_usec=us, temperature=7.0),
+                autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=k // 40 % 2),
+                autopilot.pack("GLOBAL_POSITION_INT", **place),
+            ]
+            if k % 50 == 0:
+                covariance = {"covariance_nn": 9e3, "covariance_ne": 4e3, "covariance_ee": 5e3}
+                frames.append(bridges[0].pack("MAG_NAVIGATION", state=2, **place, **covariance))
+                frames.append(bridges[0].pack("STATUSTEXT", severity=4, text="<b>bold</b> ballast is stale"))
+                value = {"param_id": "MB_SETTLE_TIME", "param_value": 4.0, "param_count": 1}
+                frames.append(bridges[0].pack("PARAM_VALUE", **value))
+                frames.append(bridges[0].pack("MAG_STATUS", uptime=k, sensor_state=1, log_state=1))
+            for frame in frames:
+                sender.sendto(frame, link)
+            if stop.wait(0.002 if k < 300 else 0.5):
+                return
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    offset = tmp_path_factory.mktemp("clock") / "offset"
+    offset.write_text("0")
+    stop = threading.Event()
+    with served(offset) as (address, link):
+        get(address)
+        sender = threading.Thread(target=feed, args=(link, stop))
+        sender.start()
+        try:
+            yield address
+        finally:
+            stop.set()
+            sender.join()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as player:
+        opened = player.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+def visit(browser: Any, url: str, width: str = "desktop", scheme: str = "light") -> Any:
+    """Return the page once it shows the curve; what its console reports fails the test."""
+    size = dict(zip(("width", "height"), WIDTHS[width], strict=True))
+    page = browser.new_context(viewport=size, color_scheme=scheme, accept_downloads=True).new_page()
+    page.set_default_timeout(PATIENCE)
+    page.reports = []
+    page.on("pageerror", lambda error: page.reports.append(str(error)))
+    page.goto(url)
+    page.get_by_text("MB_SETTLE_TIME").wait_for()
+    page.wait_for_function(f"{CHART}?.getOption()?.series?.[2]?.data?.length > 200")
+    return page
+
+
+CHART = "magbridge.chart(document.querySelector('[data-chart]'))"
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_everybody_can_read_it(browser: Any, url: str, width: str, scheme: str) -> None:
+    """No violation that axe finds; nothing is wider than the window; no error."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    page = visit(browser, url, width, scheme)
+    found = axe.Axe().run(page).response["violations"]
+    assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= WIDTHS[width][0]
+    assert page.evaluate("document.body.classList.contains('body--dark')") is (scheme == "dark")
+    assert page.reports == []
+    page.context.close()
+
+
+def test_a_reader_zooms_with_keys_and_finds_the_day_again_after_a_reload(browser: Any, url: str) -> None:
+    page = visit(browser, url)
+    before = page.evaluate(f"{CHART}.getOption().series[2].data.length")
+    page.locator("[data-chart]").first.focus()
+    page.keyboard.press("+")
+    zoom = page.evaluate(f"{CHART}.getOption().dataZoom[0]")
+    assert (zoom["start"], zoom["end"]) == pytest.approx((25, 75))
+    page.wait_for_timeout(1500)  # what is drawn meanwhile leaves the reader's span alone
+    assert page.evaluate(f"{CHART}.getOption().dataZoom[0].start") == pytest.approx(25)
+    page.keyboard.press("0")
+    assert page.evaluate(f"{CHART}.getOption().dataZoom[0].end") == 100
+    page.reload()
+    page.wait_for_function(f"{CHART}?.getOption()?.series?.[2]?.data?.length >= {before}")
+    page.get_by_role("button", name="24 h").click()
+    page.wait_for_function(f"{CHART}.getOption().series[2].data.length < 10")
+    assert page.reports == []
+    page.context.close()
+
+
+def test_a_spike_is_marked_and_does_not_flatten_the_axis(browser: Any, url: str) -> None:
+    page = visit(browser, url)
+    axis = page.evaluate(f"{CHART}.getOption().yAxis[0]")
+    assert axis["max"] - axis["min"] < 100.0
+    marks = page.evaluate(f"{CHART}.getOption().series[3].data")
+    assert [round(mark["value"][2], -3) for mark in marks] == [61_000]
+    page.context.close()
+
+
+def test_alarms_vehicles_and_texts(browser: Any, url: str) -> None:
+    page = visit(browser, url)
+    seen = page.get_by_role("button", name=re.compile("Seen: A parameter of the calibration"))
+    seen.click()
+    seen.wait_for(state="detached")
+    assert page.get_by_text("<b>bold</b> ballast is stale").count()  # as text, not as HTML
+    page.get_by_role("button", name=re.compile("Vehicle 2, component 191")).click()
+    page.get_by_text("41\u202f000.00").wait_for()
+    assert page.reports == []
+    page.context.close()
+
+
+def test_a_picture_and_a_report_are_handed_out(browser: Any, url: str, tmp_path: Path) -> None:
+    page = visit(browser, url)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Picture").click()
+    picture = tmp_path / "page.png"
+    download.value.save_as(picture)
+    data = picture.read_bytes()
+    assert data.startswith(b"\x89PNG")
+    height = int.from_bytes(data[20:24])
+    assert height > 1500  # all charts, one below the other
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Report").click()
+    with ZipFile(BytesIO(Path(download.value.path()).read_bytes())) as archive:
+        assert len(archive.read("samples.csv").splitlines()) > 200
+        assert b"MB_SETTLE_TIME" in archive.read("parameters.csv")
+    assert page.reports == []
+    page.context.close()
