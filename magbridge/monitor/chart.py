@@ -18,6 +18,8 @@ BREAK = 10.0
 ROOM, TAIL = 3.0, 0.02
 """The axis holds all but the share `TAIL` of the points at either end, and `ROOM` times their range beyond. A
 step of the field is more than that share within seconds; a spike never is."""
+LEAST = 1e-5
+"""Of the value: an axis is not shorter."""
 ROUND = {"showMinLabel": False, "showMaxLabel": False, "color": GREY}
 """No labels at the ends of an axis: they would be written over the round numbers beside them."""
 APART = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
@@ -132,6 +134,8 @@ def axis_range(points: Sequence[Point]) -> dict[str, float]:
     within = inner[0] - room, inner[-1] + room
     low = max(within[0], min(point.low for point in points))
     high = min(within[1], max(point.high for point in points))
+    if high - low < LEAST * abs(low):  # what does not change is no mountain range
+        low, high = within
     step = 10.0 ** floor(log10(max(high - low, 1e-6)) - 0.5)
     return {"min": floor(low / step) * step, "max": ceil(high / step) * step}
 

@@ -16,7 +16,7 @@ from magbridge.monitor.link import StationLink, now
 from magbridge.monitor.panels import Figures, Flags, Health, Navigation, Parameters, Texts
 from magbridge.monitor.state import State
 from magbridge.monitor.track import Background
-from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, RED, STYLE, Changes
+from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, RED, STYLE, Changes, slanted
 from magbridge.monitor.words import measured, silence
 
 __all__ = ["Page"]
@@ -151,7 +151,8 @@ class Page:
         self._stream.set_text(trouble or ("live, flagged" if flagged else "live"))
         self._stream.style(f"background: {RED if trouble else AMBER if flagged else GREEN}")
         partly = "no field" in trouble or "no status" in trouble  # then the panels show which
-        self._body.style(f"opacity: {0.45 if trouble and not partly else 1}")
+        gone = bool(trouble) and not partly
+        self._body.style(f"{slanted(gone)}; filter: grayscale({int(gone)})")
 
     def _name(self) -> str:
         vehicle = "_{}_{}".format(*self._bridge) if self._bridge else ""

@@ -24,6 +24,7 @@ from magbridge.monitor.widgets import (
     clock,
     fact,
     nothing,
+    slanted,
 )
 from magbridge.monitor.words import FLAGS, ago, health, measured, silence, whereabouts
 
@@ -31,8 +32,6 @@ __all__ = ["Figures", "Flags", "Health", "Navigation", "Parameters", "Texts"]
 
 TUNABLES = {one.name: one for one in alignment(Align())}
 """Parameters that every bridge has, with the unit and range that a PARAM_VALUE does not carry."""
-FADED = 0.45
-"""Opacity of figures that are not the present ones."""
 
 
 class Figures:
@@ -55,7 +54,7 @@ class Figures:
         for labels, texts in zip(self._labels, measured(state).values(), strict=True):
             for label, text in zip(labels, texts, strict=True):
                 label.set_text(text)
-        self.box.style(f"opacity: {FADED if 'no field' in silence(state, now) else 1}")
+        self.box.style(slanted("no field" in silence(state, now)))
 
 
 class Flags:
@@ -93,10 +92,12 @@ class Health:
 
     def show(self, state: State, now: float) -> None:
         """Show the last status."""
-        opacity = FADED if "no status" in silence(state, now) else 1
+        old = "no status" in silence(state, now)
         for label, (text, well) in zip(self._labels, health(state, now).values(), strict=True):
             label.set_text(text if state.status else "–")
-            label.style(f"color: {INK if well or not state.status else RED}; opacity: {opacity}")
+            label.style(slanted(old))
+            if not old:
+                label.style(f"color: {INK if well or not state.status else RED}")
 
 
 class Navigation:

@@ -126,7 +126,7 @@ def extent(places: Iterable[tuple[float, float]]) -> tuple[float, float, float, 
 def options() -> dict[str, Any]:
     """Return the map, still empty."""
     label = {"color": GREY, "showMinLabel": False, "showMaxLabel": False, "hideOverlap": True}
-    degrees = {**label, ":formatter": "value => value.toFixed(3) + '\N{DEGREE SIGN}'"}
+    degrees = {**label, ":formatter": "value => value.toFixed(4) + '\N{DEGREE SIGN}'"}
     axis = {"type": "value", "axisLabel": degrees, "splitLine": {"show": False}}
     inside = {**INSIDE, "filterMode": "none"}
     feature = TOOLS["feature"]

@@ -13,6 +13,7 @@ from magbridge.monitor.link import now
 
 __all__ = [
     "AMBER",
+    "FADED",
     "GREEN",
     "GRID",
     "INK",
@@ -24,17 +25,20 @@ __all__ = [
     "clock",
     "fact",
     "nothing",
+    "slanted",
 ]
 
 STYLE = """
-:root, .q-header {--ink: #1e293b; --good: #15803d; --doubt: #b45309; --bad: #b91c1c}
-body.body--dark {--ink: #e2e8f0; --good: #4ade80; --doubt: #fbbf24; --bad: #f87171}
+:root, .q-header {--ink: #1e293b; --good: #15803d; --doubt: #b45309; --bad: #b91c1c; --faded: #64748b}
+body.body--dark {--ink: #e2e8f0; --good: #4ade80; --doubt: #fbbf24; --bad: #f87171; --faded: #94a3b8}
 body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
 [data-chart]:focus-visible {outline: 2px solid #3b82f6; outline-offset: 2px; border-radius: 4px}
 .q-header .q-btn, .q-header .q-toggle {color: white}
 """
 """Colours by day and, where the browser asks for it, by night; the header is the same at both."""
 INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--doubt)", "var(--bad)"
+FADED = "var(--faded)"
+"""Of figures that are not the present ones, which are also slanted; they stay legible."""
 MUTED = "text-slate-600 dark:text-slate-400"
 GRID = "w-full grid gap-4 grid-cols-1"
 
@@ -71,6 +75,11 @@ def fact(name: str) -> ui.label:
     with ui.row().classes("w-full justify-between text-sm gap-x-2"):
         ui.label(name).classes(MUTED)
         return ui.label().classes("font-medium tabular-nums")
+
+
+def slanted(old: bool) -> str:
+    """Return the style of figures that may be `old`: not the present ones."""
+    return f"font-style: {'italic' if old else 'normal'}; color: {FADED if old else INK}"
 
 
 def nothing(text: str = "None yet") -> None:
