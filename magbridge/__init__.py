@@ -10,24 +10,22 @@ From logs of calibration runs to corrected samples::
 
 What there is:
 
-===================  ==================================================================================
-``read``             a log, or several, of any format, as an ``xarray.Dataset`` on ``time``
-``write``            a Dataset as a file, in the format of its suffix
-``from_frame``       a Dataset from a pandas data frame
-``to_frame``         a data frame from a Dataset, indexed by moments in UTC
-``read_grid``        an anomaly grid, of any format
-``reference_field``  what the total field should be at the places of a log
-``observations``     what a fit needs of a log, and which of its columns move masses
-``fit``              a calibration of these observations, with its covariance, warnings and residual
-``Calibration``      what a fit found: the model, its coefficients and how sure they are
-``save``, ``load``   a calibration to and from ``cal.json``
-``correct``          the field of one reading, or of arrays of them
-``Corrector``        the same for many readings, one by one
-``Correction``       readings and telemetry, aligned and corrected as the bridge does it
-``correct_rows``     a log, corrected: total field, vector, anomaly, sigmas and flags
-``plot``             pictures: ``corrected``, ``residuals``, ``grid``; each returns matplotlib's axes
-``MagbridgeError``   what every error is that magbridge raises; its text is one line
-===================  ==================================================================================
+- ``read``: a log, or several, of any format, as an ``xarray.Dataset`` on ``time``
+- ``write``: a Dataset as a file, in the format of its suffix
+- ``from_frame``: a Dataset from a pandas data frame
+- ``to_frame``: a data frame from a Dataset, indexed by moments in UTC
+- ``read_grid``: an anomaly grid, of any format
+- ``reference_field``: what the total field should be at the places of a log
+- ``observations``: what a fit needs of a log, and which of its columns move masses
+- ``fit``: a calibration of these observations, with its covariance, warnings and residual
+- ``Calibration``: what a fit found: the model, its coefficients and how sure they are
+- ``save``, ``load``: a calibration to and from ``cal.json``
+- ``correct``: the field of one reading, or of arrays of them
+- ``Corrector``: the same for many readings, one by one
+- ``Correction``: readings and telemetry, aligned and corrected as the bridge does it
+- ``correct_rows``: a log, corrected: total field, vector, anomaly, sigmas and flags
+- ``plot``: pictures: ``corrected``, ``residuals``, ``grid``; each returns matplotlib's axes
+- ``MagbridgeError``: what every error is that magbridge raises; its text is one line
 
 :func:`magbridge.diagnose.run.diagnose` and :func:`magbridge.navigate.batch.navigate` go on from there. Each
 name is imported when it is first asked for: the bridge itself needs few of them. And since the program begins

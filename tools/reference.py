@@ -40,8 +40,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """Show a docstring's ``:func:`~a.b.c``` as the name alone."""
-    return ROLE.sub(r"\1\2", html)
+    """Show a docstring's ``:func:`~a.b.c``` as the name alone, and ``::`` before a block as one colon."""
+    return ROLE.sub(r"\1\2", html).replace("::</p>", ":</p>")
 
 
 def commands() -> str:

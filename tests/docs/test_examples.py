@@ -15,6 +15,7 @@ from pages import PAGES, ROOT, Block, blocks, commands
 from magbridge.calibration.fitting.mounted_masses import read_vehicle
 from magbridge.cli.common import app
 from magbridge.config import load
+from magbridge.fleet.register import read_fleet
 from magbridge.logs.mapping import declared
 from magbridge.navigate.options import Options
 from magbridge.toml import convert
@@ -62,7 +63,13 @@ def test_a_command_in_a_sentence_has_the_options_that_it_shows(page: Path) -> No
         if not re.fullmatch("[a-z]+", name):
             continue
         assert name in app, span
-        taken = {one for argument in app[name].assemble_argument_collection() for one in argument.names}
+        found = app[name]
+        while words and words[0] in found and not words[0].startswith("-"):
+            found = found[words.pop(0)]
+        if not found.default_command:  # a group of commands, named as such
+            assert not words, span
+            continue
+        taken = {one for argument in found.assemble_argument_collection() for one in argument.names}
         assert not [w for w in words if w.startswith("--") and w not in taken | {"--help"}], span
 
 
@@ -83,6 +90,11 @@ def test_a_block_of_toml_is_read_by_what_reads_such_a_file(block: Block, here: P
         assert declared((), file).columns
     elif re.search(r"^\[mass\.", block.text, re.MULTILINE):
         assert read_vehicle(file)
+    elif "[vehicle." in block.text:
+        for pattern in re.findall(r'"([\w./-]+/\*\.\w+)"', block.text):
+            (here / pattern.replace("*", "log")).parent.mkdir(parents=True, exist_ok=True)
+            (here / pattern.replace("*", "log")).touch()
+        assert read_fleet(file)
     elif "[project]" in block.text:
         assert not list(here.glob("*.py"))  # a package's own: tests/test_template_packages.py installs it
     else:
