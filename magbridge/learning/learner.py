@@ -33,6 +33,8 @@ FASTER: Final = 10.0
 """Times faster while the data are not explained, and for some time after."""
 CREEPING: Final = frozenset({"offset_drift", "temperature_offset"})
 """Causes that go on after their first part was learned."""
+LEARNABLE: Final = CREEPING | {"offset_step", "unmodelled_actuator"}
+"""Causes that the calibration's coefficients can take up, if only in part."""
 MORE: Final = 2.0
 """By which an alarm's log-likelihood ratio has to grow to be news."""
 QUIET: Final = 300
@@ -343,7 +345,7 @@ class Learner:
         if judge.roll_back and self.calibration is not self.first:
             self._publish(FIXED, "rolled back: the first calibration predicts better")
             self._restart(self.first)
-        elif judge.adopt and not self.frozen:
+        elif judge.adopt and not self.frozen and not self._beyond_learning():
             self._publish(CANDIDATE, "learned")
             self._settle("learned")
         elif judge.stale and not self.frozen:
@@ -353,6 +355,10 @@ class Learner:
             self.variance = 0.0 if self._alarm is None else self.variance
         if self._alarm is not None and self._quiet > QUIET and judge.better < 1.0:
             self._settle("gone")
+
+    def _beyond_learning(self) -> bool:
+        """Whether what is doubted is nothing that coefficients can learn: they would follow it badly."""
+        return self._alarm is not None and not set(self._alarm.causes) & LEARNABLE
 
     def _challenge(self) -> None:
         """Let what is learned so far be the candidate."""
