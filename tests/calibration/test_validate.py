@@ -23,7 +23,8 @@ def test_seaglider_dives_left_out(real_data: Path) -> None:
     assert len(nominal.by_run()) == 5
     assert nominal.rms / COUNT == pytest.approx(0.96, abs=0.03)
     assert 0.85 < moving.rms / nominal.rms < 1.02
-    assert 0.8 < np.nanstd(moving.standardised) < 1.35
+    # each sigma counts the level of the rock, which the IGRF does not tell: 145 nT beside 88
+    assert 0.4 < np.nanstd(moving.standardised) < 1.0
 
 
 def test_two_runs_at_least(glider: Gliders) -> None:

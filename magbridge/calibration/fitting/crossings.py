@@ -10,7 +10,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.observations import Observations
 
-__all__ = ["crossed", "far_off", "jumped", "left_open"]
+__all__ = ["crossed", "crosses_itself", "far_off", "jumped", "left_open"]
 
 TURNED = 30.0
 """deg between two courses that cross."""
@@ -22,8 +22,22 @@ SHARE = 0.25
 """Of the rock's length: places as near as that are one."""
 FARTHEST, NEAR = 5.0, 1000.0
 """Of the distance from the middle within which 99 % of the samples stay, and the least such distance, m."""
+PLACE = 125.0
+"""m: places as near as that are one, before the rock's length is known (:data:`SHARE` of 500 m)."""
+OFTEN = 0.05
+"""Share of the places that are met again on another course where a survey tells its own rock."""
 STILL = 5.0
 """m between samples, below which a course is not one."""
+
+
+def crosses_itself(data: Observations) -> bool:
+    """Return whether the track came back to places on other courses, so that it can tell what is rock."""
+    if data.place is None:
+        return False
+    whole = np.isfinite(data.place[:, :2]).all(axis=1)
+    place, course = _courses(data.place[whole & ~far_off(data.place[:, :2]), :2])
+    places = len(np.unique(np.floor(place / PLACE), axis=0))
+    return places > 0 and sum(crossed(place, course, PLACE)) >= OFTEN * places
 
 
 def left_open(data: Observations, length: float) -> Iterator[str]:

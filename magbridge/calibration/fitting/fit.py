@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import find_boresight
+from magbridge.calibration.fitting.crossings import crosses_itself, far_off, jumped, left_open
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.left_out import LeftOut
@@ -44,6 +45,8 @@ UNSUPPORTED = 5.0
 """Expected error over noise, above which the data do not support the fit."""
 LIKELIER = 3.0
 """Nats by which one more order is likelier (20:1) where the one that was asked for is too low."""
+UNKNOWN_LENGTH = 500.0
+"""m, taken for the rock's where no field in place was fitted."""
 WORSE = 1.25
 """Errors of parts left out over what a fit claims for them, from which on a pilot should know."""
 GAIN = 0.1
@@ -127,7 +130,9 @@ def fit(
     data : Observations
         The calibration runs; :func:`~.observe.observations` takes them from a deployment.
     method : str
-        One of :data:`METHODS`. Where the reference lacks the rock, ``auto`` is ``survey``.
+        One of :data:`METHODS`. Where the reference lacks the rock and the track crosses itself, so that it
+        tells rock from heading, ``auto`` is ``survey``. (Five dives of a Seaglider along one line, each left
+        out: 88 nT without a field in place, 152 with it.)
     order : int
         Highest total degree of the polynomials.
     site_bias : float
@@ -146,7 +151,7 @@ def fit(
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
     bias = _default_bias(data) if site_bias is None else site_bias
-    if method == "auto" and data.lacks_rock:
+    if method == "auto" and data.lacks_rock and crosses_itself(data):
         method = "survey"
     if method == "survey":
         options["level"] = bias
@@ -157,7 +162,13 @@ def fit(
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
+        far = np.zeros(len(data), bool)
+        if method == "auto" and data.place is not None:
+            far = far_off(data.place[:, :2]) & np.isfinite(data.place).all(axis=1)
+            data = data.part(~far)
         found = chosen(data, order, **options)
+        if method == "auto":
+            found = replace(found, open=(*jumped(int(far.sum())), *left_open(data, UNKNOWN_LENGTH)))
         if (kept := found.details.pop("flown", None)) is not None:
             data = data.part(kept)
             found.details["ends"] = int((~kept).sum())
