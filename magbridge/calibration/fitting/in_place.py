@@ -69,6 +69,8 @@ OUTLIER = 5.0
 """Sigmas beyond which a sample is left out."""
 DRIFTING = 2700.0
 """s, half the period of the fastest drift of a position."""
+OVERSHOT = 10.0
+"""Growth of the objective by which a step goes too far; less may be the track that is bent only after it."""
 SHORTEST = 1e-3
 """Part of a step, below which it is not shortened further."""
 SEARCHED = 12_000
@@ -301,7 +303,7 @@ class _Rounds:
         return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
 
     def _damped(self, step: FloatArray, reduced: Reduced, B: csr_array) -> FloatArray:
-        """Return z after the step (q,), shortened until the fit is no worse: far off it overshoots."""
+        """Return z after the step (q,), shortened while it overshoots, as it may far off."""
         precision = self.family.at(self.eta).precision
 
         def objective(z: FloatArray) -> float:
@@ -309,7 +311,7 @@ class _Rounds:
             return float(e @ e) / self.sigma**2 + float(z @ precision @ z)
 
         before, part = objective(self.z), 1.0
-        while part > SHORTEST and not objective(self.z + part * step) < before * (1.0 + 1e-3):
+        while part > SHORTEST and not objective(self.z + part * step) < OVERSHOT * before:
             part *= 0.5
         return self.z + part * step
 
