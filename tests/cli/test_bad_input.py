@@ -119,7 +119,11 @@ def test_a_position_in_another_unit_is_refused(
             "is heading, clockwise from north: it moves no mass",
         ),
         ("run --config none.toml", 2, "none.toml: No such file"),
-        ("simulate none -o x.csv", 2, "none: expected a scenario file (.toml), or one of bonne_bay, "),
+        (
+            "simulate none -o x.csv",
+            2,
+            "none: expected a scenario file (.toml), or one of battery, bolt, bonne_bay, ",
+        ),
         ("simulate none.toml -o x.csv", 2, "none.toml: No such file"),
         ("correct {d} --calibration none.json -o x.csv", 1, "none.json: cannot be read"),
         ("correct {d} --calibration {d} -o x.csv", 1, "not a calibration as magbridge "),

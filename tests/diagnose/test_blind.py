@@ -141,7 +141,8 @@ def test_what_no_cause_explains_is_called_unexplained() -> None:
     """A ship: in two hours a relay that nobody logs is a correlated noise, in theory, too."""
     row = blind("foreign", ("ship",), 15.0, number=27)
     assert row["unexplained"].keys() == {
-        "kind", "signal_to_noise", "period_s", "best_channel", "alternatives",
+        "kind", "signal_to_noise", "period_s", "best_channel", "alternatives", "correlation_time_s",
+        "follows",
     }  # fmt: skip
     assert not row["found"]
 
@@ -168,7 +169,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     assert found["verdict"] == "explained"
     keys = {"verdict", "rms_before_nT", "rms_after_nT", "gain", "findings", "unexplained", "remarks"}
-    assert set(found) == keys
+    assert set(found) == {*keys, "format", "assessment"}
     assert found["findings"][0]["cause"] == "current_field"
     assert found["gain"]["interval"][0] <= found["gain"]["rms_ratio"] <= found["gain"]["interval"][1] < 1.0
     assert set(found["findings"][0]["parameters"]["x"]) == {"value", "sigma", "unit"}
@@ -179,7 +180,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     assert page.count("data:image/png;base64,") >= 6
     assert page.index('<a href="#cause0"><b>current field</b>') < page.index("<h2")
     assert '<h3 id="cause0"><b>current field</b>' in page
-    assert "<code>calibration.json</code> beside this page, corrects" in page
+    assert "The extended calibration, calibration.json beside this page," in page
     assert "http" not in page.replace("http-equiv", "")
 
 

@@ -39,6 +39,8 @@ PARTS, BLOCKS = 10, 4
 """Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three."""
 TESTED = 20_000
 """Samples that are predicted: enough for any ratio."""
+ISOLATED = 0.02
+"""Share of the samples up to which outliers are single wrong samples, of which a model need know nothing."""
 CHANCE = 2.0
 """Standard errors by which R^2 must exceed 1 before it counts."""
 
@@ -82,10 +84,13 @@ def leave_out(
     normals = [prior.reduce(_normal(samples, c, noise, rows)) for rows in parts]
     hessian = np.sum([normal.hessian for normal in normals], axis=0)
     every = max(len(samples.field) // TESTED, 1)
+    counted = np.ones(len(samples.field), bool)
+    if noise.weight is not None and noise.rejected <= ISOLATED * len(counted):
+        counted = noise.weight > 0.0
     e, s2 = [], []
     for rows, normal in zip(parts, normals, strict=True):
         P = covariance_of((hessian - normal.hessian) / noise.sigma**2 + prior.precision)
-        tested = samples.part(rows[::every])
+        tested = samples.part(rows[counted[rows]][::every])
         off, g = residuals(tested, c)
         J = jacobian(tested.phi, g) @ prior.E
         e.append(off + J @ (P @ normal.gradient / noise.sigma**2))
