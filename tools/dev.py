@@ -13,6 +13,7 @@ it. The last two install the package as a user would, compiled where there is a 
 
 from __future__ import annotations
 
+import json
 import os
 import ssl
 import subprocess
@@ -29,6 +30,8 @@ LIVE = (
     "tests/calibration/test_correct.py", "tests/link", "tests/mavlink", "tests/sensors",
     "tests/sitl/test_replay.py",
 )  # fmt: skip
+REAL_TIME, FEW = ("tests/bridge/", "tests/sitl/", "tests/interop/", "tests/monitor/"), 5
+"""Rooms whose tests run in real time, and how many of them a stalled computer may make fail."""
 CHECKS = (
     ("ruff", "check", "."),
     ("ruff", "format", "--check", "."),
@@ -50,8 +53,21 @@ def run(*command: str | Path, **variables: str) -> None:
 
 
 def run_tests(python: Path, *arguments: str, **variables: str) -> None:
-    """Run the tests, two at a time. What fails is not tried again: a failure stays red."""
-    run(python, "-m", "pytest", "-n", "2", "--dist", "loadfile", *arguments, **variables)
+    """Run the tests, two at a time; a failure stays red.
+
+    Where nothing failed but tests that run in real time, against ptys and sockets, these are run once more,
+    one at a time, and told: a computer that stalls for half a second makes telemetry stale, as it should.
+    """
+    failures = ROOT / ".pytest_cache/v/cache/lastfailed"
+    failures.unlink(missing_ok=True)  # it gathers those of earlier runs
+    code = call(python, "-m", "pytest", "-n", "2", "--dist", "loadfile", *arguments, **variables)
+    if code != 1:
+        sys.exit(code)
+    failed = list(json.loads(failures.read_text()))
+    if len(failed) > FEW or not all(test.startswith(REAL_TIME) for test in failed):
+        sys.exit(code)
+    print("\nOnce more, one at a time, what runs in real time:", *failed, sep="\n  ", flush=True)
+    run(python, "-m", "pytest", *failed, **variables)
 
 
 def install(extra: str, place: Path = BIN, *options: str) -> None:
