@@ -30,7 +30,7 @@ from magbridge.calibration.arithmetic import (
 )
 from magbridge.calibration.kernel import FARTHEST, Kernel
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.terms import Step
+from magbridge.calibration.terms import Series, Step
 from magbridge.errors import CalibrationError
 from magbridge.records import BEYOND, Corrected, Quality
 
@@ -312,11 +312,18 @@ def _regressors(
 def regressors(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """(m, n) regressors of every sample, from a fresh state; arguments as for :func:`correct`."""
-    kernel, steps = calibration.kernel, _begun(calibration)
-    channels = channels.reshape(len(field), -1)
-    parts = [slice(start, start + CHUNK) for start in range(0, max(len(field), 1), CHUNK)]
-    return np.hstack([_regressors(kernel, steps, field[p], channels[p], time[p]) for p in parts])
+    """(m, n) regressors of every sample, from a fresh state, in the effects' array form.
+
+    Arguments as for :func:`correct`, which steps through the effects, since live and replayed samples must
+    have the same bits.
+    """
+    kernel, channels = calibration.kernel, channels.reshape(len(field), -1)
+    series = Series(time, field, dict(zip(calibration.channels, channels.T, strict=True)), kernel)
+    positions = list(channels.T)[: len(kernel.centre)]
+    phi = [*kernel.monomials(positions, np.ones(len(field)))]
+    for effect in calibration.effects:
+        phi += list(effect.batch(series))
+    return np.stack(phi)
 
 
 def _prepare_many(kernel: Kernel, phi: FloatArray) -> Any:

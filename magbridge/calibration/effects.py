@@ -1,8 +1,7 @@
 """Effects: terms that depend on something other than the positions, some with a state.
 
 An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
-regressors sample by sample (`begin` returns a stepper with a fresh state). Live and batch run the same
-stepper, so both give the same bits.
+regressors sample by sample (`begin` returns a stepper with a fresh state) or of a whole log (`batch`).
 
 Here are what they share and the effect of one telemetry channel; the others are in :mod:`.mass_effects` and
 :mod:`.instrument_effects`.
@@ -14,16 +13,16 @@ from collections.abc import Sequence
 from itertools import accumulate, repeat
 from math import exp, isnan
 from operator import mul
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import Effect, Power, Step
+from magbridge.calibration.terms import Effect, Power, Series, Step
 
-__all__ = ["MAX_INTERVAL", "ChannelEffect", "SingleChannelEffect", "offsets", "powers"]
+__all__ = ["MAX_INTERVAL", "ChannelEffect", "SingleChannelEffect", "held", "lagged", "offsets", "powers"]
 
 MAX_INTERVAL = 60_000_000
 """µs; over a longer gap no rate of change is computed."""
@@ -37,9 +36,58 @@ def offsets(regressors: int) -> FloatArray:
     return columns
 
 
-def powers(x: float, order: int) -> tuple[float, ...]:
-    """Return ``x, x^2, ... x^order``."""
+def powers(x: Any, order: int) -> tuple[Any, ...]:
+    """Return ``x, x^2, ... x^order`` of a number or an array: ``pow()`` is a hundred times as slow."""
     return tuple(accumulate(repeat(x, order), mul))
+
+
+def held(values: FloatArray, before: float) -> FloatArray:
+    """(n,) values with each NaN replaced by the last that is known, or by `before` where none is."""
+    known = ~np.isnan(values)
+    if known.all():
+        return values
+    last = np.maximum.accumulate(np.where(known, np.arange(1, len(values) + 1), 0))
+    return np.append(before, values)[last]
+
+
+def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
+    """(n,) y that follows x through equal lags in series (:class:`ChannelEffect`), from equilibrium.
+
+    Parameters
+    ----------
+    time, values : (n,) array
+        s, and x.
+    lag : float
+        s, the sum of all stages; at 0, y is x.
+    stages : int
+        Number of lags in series.
+    """
+    if lag <= 0.0 or len(time) < 2:
+        return values
+    share = -np.expm1(-np.diff(time) / (lag / stages))
+    usual = float(np.median(share))
+    even = np.abs(share - usual).max() <= 1e-6 * usual  # no gaps, and a clock that does not jitter
+    for _ in range(stages):
+        values = _filtered(values, usual) if even else _stepped(values, share)
+    return values
+
+
+def _filtered(values: FloatArray, share: float) -> FloatArray:
+    """(n,) ``y_t = y_(t-1) + s (x_t - y_(t-1))``."""
+    from scipy.signal import lfilter  # noqa: PLC0415  (the live path starts without scipy)
+
+    return np.asarray(lfilter([share], [1.0, share - 1.0], values, zi=[(1.0 - share) * values[0]])[0])
+
+
+def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
+    """(n,) the same with a share for each step, by doubling: the steps of 2, 4, 8 ... rows are one."""
+    y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
+    step = 1
+    while step < len(y):
+        y[step:] = y[step:] + kept[step:] * y[:-step]
+        kept[step:] = kept[step:] * kept[:-step]
+        step *= 2
+    return y
 
 
 class SingleChannelEffect(Effect, frozen=True, kw_only=True):
@@ -47,13 +95,10 @@ class SingleChannelEffect(Effect, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    cause : str
-        Name of the cause that it describes, as in ``findings.json``.
     channel : str
-        Name of the telemetry channel.
+        Name of the telemetry series.
     """
 
-    cause: str
     channel: str
 
     @property
@@ -116,3 +161,11 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
             return (levels[-1] - origin,)
 
         return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(1, n) regressors; 0 before the first value."""
+        values = series.values[self.channel]
+        known = np.flatnonzero(~np.isnan(values))
+        out = np.full(len(values), np.nan)
+        out[known] = lagged(series.time[known], values[known], self.lag, self.stages) - self.origin
+        return held(out, 0.0)[None]

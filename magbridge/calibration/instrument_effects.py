@@ -12,7 +12,7 @@ from msgspec import Meta
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, offsets, powers
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import HIGHEST, Effect, Power, Step, Width
+from magbridge.calibration.terms import HIGHEST, Effect, Power, Series, Step, Width
 
 __all__ = ["RateEffect", "ResponseEffect", "TimeEffect"]
 
@@ -22,7 +22,6 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    cause : str
     shape : {"step", "drift", "tone"}
         Step: ``H(t - t_0)``. Drift: ``x = (t - t_0) / period`` and its powers, with x held at -1 and 1 beyond
         them, because nothing is known of a drift outside the time it was fitted to. Tone: ``cos`` and ``sin``
@@ -36,7 +35,7 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
     """
 
     kind: ClassVar[str] = "time"
-    cause: str
+    remembers: ClassVar[bool] = False
     shape: Literal["step", "drift", "tone"]
     start: Annotated[float, Meta(ge=-1e12, le=1e12)]
     period: Width = 86_400.0
@@ -70,13 +69,22 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
 
         return step
 
+    def batch(self, series: Series) -> FloatArray:
+        """(r, n) regressors."""
+        after = series.time_us - round(self.start * 1e6)
+        if self.shape == "step":
+            return (after >= 0.0)[None].astype(float)
+        x = after / (self.period * 1e6)
+        if self.shape == "tone":
+            return np.stack([np.cos(2.0 * pi * x), np.sin(2.0 * pi * x)])
+        return np.stack(powers(np.clip(x, -1.0, 1.0), self.order))
+
 
 class RateEffect(Effect, frozen=True, kw_only=True):
     """Offsets proportional to the rate of change of the reading, ``dH_r/dt``; coefficients in s.
 
     Attributes
     ----------
-    cause : str
     on : {"skew", "eddy"}
         ``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three
         coefficients. ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six
@@ -88,7 +96,6 @@ class RateEffect(Effect, frozen=True, kw_only=True):
     """
 
     kind: ClassVar[str] = "rate"
-    cause: str
     on: Literal["skew", "eddy"]
 
     @property
@@ -130,13 +137,25 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
         return step
 
+    def batch(self, series: Series) -> FloatArray:
+        """(3, n) the same backward difference: a centred one correlates less with its own sample's noise."""
+        known = np.flatnonzero(np.isfinite(series.reading).all(axis=1))
+        apart = 1e-6 * np.diff(series.time_us[known])
+        joined = (apart > 0.0) & (apart < 1e-6 * MAX_INTERVAL)
+        apart = np.where(joined, apart, 1.0)
+        now = np.diff(series.reading[known], axis=0) * (joined / apart)[:, None]
+        joined[:1], joined[1:] = False, joined[1:] & joined[:-1]
+        share = joined * apart / (apart + np.roll(apart, 1))
+        out = np.zeros((3, len(series.time)))
+        out[:, known[1:]] = (now + (now - np.roll(now, 1, axis=0)) * share[:, None]).T
+        return out
+
 
 class ResponseEffect(Effect, frozen=True, kw_only=True):
     """A nonlinear response: a power of each channel's reading, or one channel with a knee.
 
     Attributes
     ----------
-    cause : str
     power : int
         ``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead.
     unit : float
@@ -149,7 +168,7 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
     """
 
     kind: ClassVar[str] = "response"
-    cause: str
+    remembers: ClassVar[bool] = False
     unit: Annotated[float, Meta(ge=1.0, le=1e9)]
     power: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
@@ -179,3 +198,11 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
             return (sign, sign * over / unit) if over >= 0.0 else (0.0, 0.0)
 
         return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(r, n) regressors."""
+        if self.power:
+            return np.asarray(powers(series.reading.T / self.unit, self.power)[-1])
+        sign = 1.0 if self.knee >= 0.0 else -1.0
+        over = sign * (series.reading[:, self.axis] - self.knee)
+        return np.where(over >= 0.0, [np.full_like(over, sign), sign * over / self.unit], 0.0)

@@ -6,16 +6,16 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from math import isnan, tanh
 from operator import sub
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from msgspec import Meta
 from numpy.polynomial.legendre import leg2poly
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.effects import MAX_INTERVAL, SingleChannelEffect, offsets, powers
+from magbridge.calibration.effects import MAX_INTERVAL, SingleChannelEffect, held, offsets, powers
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Step, Width
+from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Series, Step, Width
 from magbridge.errors import CalibrationError
 
 __all__ = [
@@ -24,7 +24,12 @@ __all__ = [
     "PlayEffect",
     "PowersEffect",
     "SourcesEffect",
+    "play",
 ]
+
+
+Factors = list[tuple[int, float, float, list[float]]]
+"""Of each: place of the position, its centre and scale, coefficients of its polynomial, the highest first."""
 
 
 class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
@@ -47,9 +52,11 @@ class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
 class PathEffect(MassEffect, frozen=True, kw_only=True):
     """Offsets that depend on nothing but where the mass is, ``x = (p - centre) / scale``."""
 
+    remembers: ClassVar[bool] = False
+
     @abstractmethod
-    def regressors(self, x: float) -> tuple[float, ...]:
-        """Return the regressors at x."""
+    def regressors(self, x: Any) -> tuple[Any, ...]:
+        """Return the regressors at x, a number or an array."""
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; while the value is missing, the last one holds."""
@@ -62,6 +69,10 @@ class PathEffect(MassEffect, frozen=True, kw_only=True):
             return self.regressors(x)
 
         return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(r, n) regressors."""
+        return np.stack(self.regressors(held((series.values[self.channel] - self.centre) / self.scale, 0.0)))
 
 
 class PowersEffect(PathEffect, frozen=True, kw_only=True):
@@ -83,7 +94,7 @@ class PowersEffect(PathEffect, frozen=True, kw_only=True):
         """Three coefficients (nT) for each power."""
         return 3 * self.order
 
-    def regressors(self, x: float) -> tuple[float, ...]:
+    def regressors(self, x: Any) -> tuple[Any, ...]:
         """Return x to x^order."""
         return powers(x, self.order)
 
@@ -114,9 +125,10 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
         """Three coefficients (nT) for each source."""
         return 3 * self.count
 
-    def regressors(self, x: float) -> tuple[float, ...]:
+    def regressors(self, x: Any) -> tuple[Any, ...]:
         """Return what each source does."""
-        return tuple((1.0 + (x - self.apart * k) ** 2) ** -1.5 for k in range(self.count))
+        near = [1.0 / (1.0 + (x - self.apart * k) ** 2) for k in range(self.count)]
+        return tuple(one * one**0.5 for one in near)
 
 
 class LegendreEffect(Effect, frozen=True, kw_only=True):
@@ -127,13 +139,12 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    cause : str
     exponents : tuple of int
         Degrees, one for each parameter, of positions scaled as the calibration scales them.
     """
 
     kind: ClassVar[str] = "legendre"
-    cause: str
+    remembers: ClassVar[bool] = False
     exponents: Exponents
 
     @property
@@ -154,7 +165,20 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
 
     def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
         """Return a stepper; it has no state."""
-        factors = [
+        factors = self._factors(kernel)
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
+            return (_product(factors, values),)
+
+        return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(1, n) regressors."""
+        values = list(series.values.values())
+        return np.reshape(_product(self._factors(series.kernel), values), (1, -1))
+
+    def _factors(self, kernel: Kernel) -> Factors:
+        return [
             (k, centre, scale, leg2poly([0.0] * e + [1.0])[::-1].tolist())
             for k, (centre, scale, e) in enumerate(
                 zip(kernel.centre, kernel.scale, self.exponents, strict=True)
@@ -162,16 +186,16 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
             if e
         ]
 
-        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
-            product = 1.0
-            for k, centre, scale, polynomial in factors:
-                x, value = (values[k] - centre) / scale, 0.0
-                for c in polynomial:  # the highest power first
-                    value = value * x + c
-                product *= value
-            return (product,)
 
-        return step
+def _product(factors: Factors, values: Sequence[Any]) -> Any:
+    """Return the product of the factors' polynomials, by Horner's scheme, of numbers or arrays."""
+    product: Any = 1.0
+    for k, centre, scale, polynomial in factors:
+        x, value = (values[k] - centre) / scale, 0.0
+        for c in polynomial:
+            value = value * x + c
+        product = product * value
+    return product
 
 
 class PlayEffect(MassEffect, frozen=True, kw_only=True):
@@ -224,6 +248,35 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
         return step
 
+    def batch(self, series: Series) -> FloatArray:
+        """(r, n) regressors; 0 before the first value."""
+        values = series.values[self.channel]
+        known = ~np.isnan(values)
+        out = np.full((max(self.order, 1), len(values)), np.nan)
+        p = values[known]
+        dragged, here = ((at - self.centre) / self.scale for at in (play(p, self.width), p))
+        if self.order:
+            out[:, known] = np.stack(powers(dragged, self.order)) - np.stack(powers(here, self.order))
+        else:
+            out[0, known] = self.scale / self.width * (np.tanh(dragged) - np.tanh(here))
+        return np.stack([held(row, 0.0) for row in out])
+
+
+def play(values: FloatArray, width: float) -> FloatArray:
+    """(n,) play operator of values, from the middle of the play (:class:`PlayEffect`).
+
+    Each row clips the output of the row before. Two such clips in series are one clip, so they are combined
+    by doubling: over 2, 4, 8 ... rows.
+    """
+    low, high = values - 0.5 * width, values + 0.5 * width
+    low[:1] = high[:1] = values[:1]
+    step = 1
+    while step < len(values):
+        bounds = low[step:].copy(), high[step:].copy()
+        low[step:], high[step:] = (np.clip(x[:-step], *bounds) for x in (low, high))
+        step *= 2
+    return low
+
 
 class ClockEffect(Effect, frozen=True, kw_only=True):
     """Telemetry that is late: ``theta += delay * dtheta/dp * dp/dt``, for all nine coefficients theta.
@@ -232,13 +285,11 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    cause : str
     sign : float
         1; or -1 if the delay is that of the field's samples behind the telemetry, as after a filter.
     """
 
     kind: ClassVar[str] = "clock"
-    cause: str = "clock_offset"
     sign: float = 1.0
 
     @property
@@ -267,3 +318,12 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
             )
 
         return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(9, n) regressors."""
+        monomials = np.stack(series.kernel.monomials([*series.values.values()], np.ones(len(series.time))))
+        apart = 1e-6 * np.diff(series.time_us)
+        joined = (apart > 0.0) & (apart < 1e-6 * MAX_INTERVAL)
+        rates = np.zeros_like(monomials)
+        rates[:, 1:] = np.where(joined, np.diff(monomials) / np.where(joined, apart, 1.0), 0.0)
+        return np.asarray(series.kernel.rate_weights.T @ rates)

@@ -9,10 +9,10 @@ else that moves the reading, with a state of its own where it needs one: see
 from __future__ import annotations
 
 from abc import ABCMeta, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from itertools import combinations_with_replacement
-from typing import Annotated, Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
 
 import msgspec
 import numpy as np
@@ -34,6 +34,7 @@ __all__ = [
     "Polynomial",
     "PositionTerm",
     "Power",
+    "Series",
     "Step",
     "Term",
     "Width",
@@ -169,13 +170,55 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
         return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))
 
 
+class Series(NamedTuple):
+    """A log of n samples, as the array form of an effect takes it.
+
+    Attributes
+    ----------
+    time : (n,) array
+        s since 1970 UTC, ascending.
+    reading : (n, 3) array
+        nT, the raw axes.
+    values : mapping of str to (n,) array
+        Telemetry by name, the parameters first; NaN where it is not known.
+    kernel : Kernel
+        That of the calibration.
+    """
+
+    time: FloatArray
+    reading: FloatArray
+    values: Mapping[str, FloatArray]
+    kernel: Kernel
+
+    @property
+    def time_us(self) -> FloatArray:
+        """(n,) µs, rounded as those of single samples are."""
+        return np.rint(self.time * 1e6)
+
+    def part(self, rows: slice, names: Sequence[str]) -> Series:
+        """Return these rows, with the telemetry of these names."""
+        values = {name: self.values[name][rows] for name in names}
+        return Series(self.time[rows], self.reading[rows], values, self.kernel)
+
+
 class Effect(Term, frozen=True, kw_only=True):
     """A term that depends on something other than the positions: a temperature, a current, time.
 
     It turns every sample into a few *regressors* (in a unit of its own); `columns` says what each
-    coefficient does with them. One function computes them sample by sample, live and in batch, so both give
-    the same bits. A NaN in its channel must not spoil its state: hold the last value.
+    coefficient does with them. Their physics has two forms side by side: :meth:`begin` computes them sample
+    by sample, and whatever is corrected passes through it, so live and from a log it has the same bits;
+    :meth:`batch` computes those of a whole log at once, for what is simulated, compared or fitted. A NaN in
+    its channel must not spoil its state: hold the last value.
+
+    Attributes
+    ----------
+    cause : str
+        What a diagnosis has added it for, as in ``findings.json``; empty where a fit or a person has.
     """
+
+    remembers: ClassVar[bool] = True
+    """Whether regressors depend on earlier samples, too: then those of some rows take the whole log."""
+    cause: str = ""
 
     def channels(self) -> tuple[str, ...]:
         """Names of the telemetry channels that it needs: parameters or other columns of a deployment."""
@@ -196,6 +239,14 @@ class Effect(Term, frozen=True, kw_only=True):
         kernel : Kernel
             That of the calibration.
         """
+
+    def batch(self, series: Series) -> FloatArray:
+        """(r, n) regressors of a whole log, from a fresh state: by default those of :meth:`begin`."""
+        step = self.begin(tuple(series.values), series.kernel)
+        values = np.reshape([*series.values.values()], (-1, len(series.time))).T.tolist()
+        times = series.time_us.astype(np.int64).tolist()
+        samples = zip(times, *series.reading.T.tolist(), values, strict=True)
+        return np.array([step(*sample) for sample in samples]).T
 
 
 def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.effects import lagged
 from magbridge.calibration.residual import rms
-from magbridge.diagnose.causes.regressors import lagged
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["Memory", "Seen", "memory", "seen"]

@@ -7,7 +7,7 @@ from math import exp, nan
 import numpy as np
 import pytest
 
-from magbridge.calibration.correct import correct, regressors
+from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.mass_effects import (
@@ -18,7 +18,7 @@ from magbridge.calibration.mass_effects import (
     SourcesEffect,
 )
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import HIGHEST, Effect, Polynomial, symmetric
+from magbridge.calibration.terms import HIGHEST, TERMS, Effect, Polynomial, Series, symmetric, term_class
 from magbridge.errors import CalibrationError
 
 START = 1.7e9
@@ -43,13 +43,52 @@ def stepped(
     effect: Effect, time: np.ndarray, values: np.ndarray | None = None, field: np.ndarray | None = None
 ) -> np.ndarray:
     """(n, r) regressors of the effect; its channel, or else the position, has these values."""
-    n = len(time)
-    cal = with_effect(effect)
-    channels = np.zeros((n, len(cal.channels)))
+    n, cal = len(time), with_effect(effect, of_p=np.arange(1.0, 10.0))
+    channels = {name: np.zeros(n) for name in cal.channels}
     if values is not None:
-        channels[:, -1] = values
+        channels[cal.channels[-1]] = values
     field = np.full((n, 3), 3e4) if field is None else field
-    return regressors(cal, field, channels, START + time)[len(cal.kernel.position_weights) :].T
+    series = Series(START + time, field, channels, cal.kernel)
+    one_by_one = Effect.batch(effect, series)
+    np.testing.assert_allclose(effect.batch(series), one_by_one, rtol=1e-6, atol=1e-9)
+    return one_by_one.T
+
+
+EFFECTS = (
+    ChannelEffect(channel="warm", origin=3.0),
+    ChannelEffect(channel="warm", origin=3.0, lag=40.0, stages=2, on="scale"),
+    PowersEffect(channel="warm", centre=0.1, scale=0.7, order=3),
+    SourcesEffect(channel="p", centre=-0.8, scale=0.2, apart=1.25, count=5),
+    LegendreEffect(exponents=(4,)),
+    PlayEffect(channel="p", width=0.4, centre=0.2, scale=0.5),
+    PlayEffect(channel="warm", width=0.4, centre=0.2, scale=0.5, order=2),
+    ClockEffect(sign=-1.0),
+    TimeEffect(shape="step", start=START + 501.0),
+    TimeEffect(shape="drift", start=START + 700.0, period=300.0, order=2),
+    TimeEffect(shape="tone", start=START, period=17.3),
+    RateEffect(on="eddy"),
+    ResponseEffect(unit=4e4, power=3),
+    ResponseEffect(unit=4e4, axis=1, knee=-2e4),
+)
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda one: one.kind)
+def test_an_effect_has_one_physics_in_two_forms(effect: Effect) -> None:
+    """Sample by sample and over a log: with jitter, gaps, unknown values, and readings that are missing."""
+    rng, n = np.random.default_rng(3), 300
+    time = np.cumsum(rng.choice([4.0, 4.1, 37.0, 400.0], n, p=[0.6, 0.3, 0.09, 0.01]))
+    values = np.clip(0.15 * rng.normal(size=n).cumsum(), -1.0, 1.0)
+    values[rng.random(n) < 0.1] = values[:3] = nan
+    field = rng.uniform(-6e4, 6e4, (n, 3))
+    field[rng.random(n) < 0.05, 1] = nan
+    found = stepped(effect, time, values, field)
+    assert found.shape == (n, effect.columns(5e4).shape[1])
+    assert np.ptp(found[np.isfinite(found).all(axis=1)], axis=0).all()
+
+
+def test_every_effect_is_held_to_it() -> None:
+    every = {kind for kind in TERMS if issubclass(term_class(kind), Effect)}
+    assert {effect.kind for effect in EFFECTS} == every
 
 
 def test_a_lag_approaches_a_new_temperature_as_heat_stores_do() -> None:

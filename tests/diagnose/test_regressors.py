@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from posed import calibrated, missed, regressors_of, right, surveyed, thinned, walk
 
-from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order
-from magbridge.diagnose.causes.regressors import lagged
 from magbridge.diagnose.causes.response import BENT
 from magbridge.diagnose.causes.time_dependent import offset_step
 from magbridge.diagnose.causes.timing import field_rates, mass_rates

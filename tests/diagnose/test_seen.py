@@ -9,10 +9,10 @@ import pytest
 from msgspec import structs
 from posed import calibrated, surveyed, walk
 
+from magbridge.calibration.effects import lagged
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
-from magbridge.diagnose.causes.regressors import lagged
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.run import diagnose

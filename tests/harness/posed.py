@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Effect, Polynomial
+from magbridge.calibration.terms import Effect, Polynomial, Series
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
@@ -70,11 +70,9 @@ def calibrated(coefficients: FloatArray, variance: float = 4.0, **parameter: flo
 
 def regressors_of(survey: Survey, calibration: Calibration, effect: Effect) -> FloatArray:
     """(r, n) regressors of one effect along the survey, computed sample by sample as the bridge does."""
-    channels = tuple(dict.fromkeys((*calibration.units, *effect.channels())))
-    step = effect.begin(channels, calibration.kernel)
-    times = np.rint(survey.time * 1e6).astype(np.int64).tolist()
-    rows = zip(times, *survey.field.T.tolist(), survey.values(channels).tolist(), strict=True)
-    return np.array([step(*row) for row in rows]).T
+    channels = dict.fromkeys((*calibration.units, *effect.channels()))
+    values = {name: survey.channels[name].values for name in channels}
+    return Effect.batch(effect, Series(survey.time, survey.field, values, calibration.kernel))
 
 
 def right(rows: int) -> Problem:

@@ -161,7 +161,7 @@ def of_effect(
     width: float | FloatArray,
     unit: str | Sequence[str],
     *,
-    phi: FloatArray | Callable[[slice], FloatArray],
+    phi: FloatArray | Callable[[slice], FloatArray] | None = None,
     channel: str | None = None,
     names: tuple[str, ...] = (),
     origin: float = 0.0,
@@ -169,12 +169,11 @@ def of_effect(
 ) -> Candidate:
     """Make a candidate of an effect.
 
-    Its regressors are `phi` (r, n), or a function from rows to those, less `origin`. `unit` is that of all
-    its coefficients, or has one for each of as many equal parts of them.
+    Its regressors are those of its array form; or else `phi` (r, n), or a function from rows to those, less
+    `origin`. `unit` is that of all its coefficients, or has one for each of as many equal parts of them.
     """
     widths = np.broadcast_to(np.asarray(width, float), effect.size)
     columns = effect_columns(problem, effect, phi, origin).times(widths)
-    cause: str = effect.cause  # type: ignore[attr-defined]
     if not names:
         powers = effect.size // 3
         names = tuple(
@@ -182,7 +181,7 @@ def of_effect(
         )
     parts = (unit,) if isinstance(unit, str) else unit
     units = tuple(part for part in parts for _ in range(effect.size // len(parts)))
-    return Candidate(cause, channel, columns, widths, names, units, (effect,), **more)
+    return Candidate(effect.cause, channel, columns, widths, names, units, (effect,), **more)
 
 
 def of_reference(

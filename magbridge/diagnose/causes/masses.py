@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import reduce
 from itertools import product
 
 import numpy as np
-from scipy.special import eval_legendre
 
-from magbridge.arrays import FloatArray
 from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
-from magbridge.diagnose.causes.regressors import play, powers
 from magbridge.diagnose.compare.prior import FALL
 from magbridge.diagnose.compare.problem import Problem
 
@@ -47,16 +43,14 @@ def unmodelled_actuator(problem: Problem) -> list[Candidate]:
 
 def _series(problem: Problem, effect: PowersEffect, channel: str | None = None) -> Candidate:
     """Return the powers of a mass' position."""
-    order, centre, scale = effect.order, effect.centre, effect.scale
-    moved = problem.survey.channels[effect.channel]
-    step = f"{scale:.3g} {moved.unit}".rstrip()
+    order = effect.order
+    step = f"{effect.scale:.3g} {problem.survey.channels[effect.channel].unit}".rstrip()
     return of_effect(
         problem,
         effect,
         np.repeat(100.0 * FALL ** np.arange(order), 3),
         [per(step, power) for power in range(1, order + 1)],
         channel=channel,
-        phi=lambda rows: powers((moved.values[rows] - centre) / scale, order),
     )
 
 
@@ -89,7 +83,7 @@ def actuator_order(problem: Problem) -> list[Candidate]:
 def _sources(problem: Problem, name: str, near: float) -> Candidate:
     """Return sources all along one mass' path, and a little beyond its ends."""
     low, high = problem.survey.channels[name].extent
-    channel, scale = problem.survey.channels[name], 0.5 * near * (high - low)
+    scale = 0.5 * near * (high - low)
     gaps = int(np.ceil(2.0 / (APART * near)))
     centre = 0.5 * (low + high - gaps * APART * scale)
     effect = SourcesEffect(
@@ -97,25 +91,14 @@ def _sources(problem: Problem, name: str, near: float) -> Candidate:
     )
     at = centre + APART * scale * np.arange(gaps + 1)
     names = tuple(f"{axis} {name} {x:.3g}" for x in at for axis in AXES)
-
-    def phi(rows: slice) -> FloatArray:
-        squared = 1.0 / (1.0 + ((channel.values[rows] - at[:, None]) / scale) ** 2)
-        return np.asarray(squared * np.sqrt(squared))
-
-    return of_effect(problem, effect, 50.0, "nT", names=names, phi=phi, spectra=np.ones((1, effect.size)))
+    return of_effect(problem, effect, 50.0, "nT", names=names, spectra=np.ones((1, effect.size)))
 
 
 def _term(problem: Problem, exponents: tuple[int, ...]) -> Candidate:
     own = [(p, e) for p, e in zip(problem.calibration.parameters, exponents, strict=True) if e]
     label = " ".join(f"P{e}({p.name})" for p, e in own)
     effect = LegendreEffect(cause="actuator_order", exponents=exponents)
-    factors = [(problem.survey.channels[p.name].values, p.centre, p.scale, e) for p, e in own]
-
-    def phi(rows: slice) -> FloatArray:
-        product = [eval_legendre(e, (values[rows] - centre) / scale) for values, centre, scale, e in factors]
-        return np.asarray(reduce(np.multiply, product)[None])
-
-    return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES), phi=phi)
+    return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES))
 
 
 def hysteresis(problem: Problem) -> list[Candidate]:
@@ -144,19 +127,11 @@ def _plays(problem: Problem, name: str, shapes: Sequence[tuple[float, float, flo
     """
     low, high = problem.survey.channels[name].extent
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    channel = problem.survey.channels[name]
-    p, unit = channel.values, channel.unit
-    grid = {width: play(p, width) for width in {2.0 * half * w for w, _, _ in shapes}}
+    unit = problem.survey.channels[name].unit
 
     def again(width: float, centre: float, scale: float) -> Candidate:
         effect = PlayEffect(cause="hysteresis", channel=name, width=width, centre=centre, scale=scale)
-        y = grid[width] if width in grid else play(p, width)
-
-        def phi(rows: slice) -> FloatArray:
-            curved = np.tanh((y[rows] - centre) / scale) - np.tanh((p[rows] - centre) / scale)
-            return scale / width * curved[None]
-
         shape = {"width": (width, unit), "centre": (centre, unit), "scale": (scale, unit)}
-        return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, phi=phi, again=again)
+        return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, again=again)
 
     return [again(2.0 * half * w, middle + half * c, half * s) for w, c, s in shapes]

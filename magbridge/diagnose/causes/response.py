@@ -9,10 +9,8 @@ from itertools import product
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import ResponseEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
-from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["BENT", "nonlinearity", "saturation"]
@@ -38,11 +36,10 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
 
 
 def _power(problem: Problem, power: int, width: float) -> Candidate:
-    unit, H = problem.calibration.reference.field, problem.reading
+    unit = problem.calibration.reference.field
     effect = ResponseEffect(cause="nonlinearity", unit=unit, power=power)
-    phi = lambda rows: powers(H[rows].T / unit, power)[-1]  # noqa: E731  (a regressor is one line)
     names = tuple(f"{axis}{power}" for axis in AXES)
-    return of_effect(problem, effect, width, per(f"{unit:.0f} nT", power), names=names, phi=phi)
+    return of_effect(problem, effect, width, per(f"{unit:.0f} nT", power), names=names)
 
 
 def saturation(problem: Problem) -> list[Candidate]:
@@ -58,20 +55,14 @@ def saturation(problem: Problem) -> list[Candidate]:
 
 def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candidate]:
     """Return the candidates for one axis, at one end of its range."""
-    unit, H = problem.calibration.reference.field, problem.reading
+    unit = problem.calibration.reference.field
     names = (f"{AXES[axis]} jump", f"{AXES[axis]} slope")
 
     def again(knee: float) -> Candidate:
         effect = ResponseEffect(cause="saturation", unit=unit, axis=axis, knee=knee)
-        way = 1.0 if knee >= 0.0 else -1.0
-
-        def phi(rows: slice) -> FloatArray:
-            over = way * (H[rows, axis] - knee)
-            return np.stack([way * (over >= 0), way * np.maximum(over, 0.0) / unit])
-
         return of_effect(
             problem, effect, np.array([100.0, 0.1 * unit]), ("nT", per(f"{unit:.0f} nT")), names=names,
-            phi=phi, shape={"knee": (knee, "nT")}, again=again,
+            shape={"knee": (knee, "nT")}, again=again,
         )  # fmt: skip
 
     return [again(knee) for knee in knees]

@@ -10,10 +10,9 @@ from typing import Literal
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
-from magbridge.diagnose.causes.regressors import lagged, once
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.problem import Problem, once
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
 
@@ -91,11 +90,6 @@ def temperature_scale(problem: Problem) -> list[Candidate]:
     return _thermal(problem, "scale")
 
 
-def _level(problem: Problem, name: str) -> Callable[[slice], FloatArray]:
-    values = problem.survey.channels[name].values
-    return lambda rows: values[None, rows]
-
-
 def current_field(problem: Problem) -> list[Candidate]:
     """A current loop is a fixed source: ``T += sum_k b_k I_k(t)`` (Biot and Savart), zero when they are.
 
@@ -124,5 +118,5 @@ def _proportional(problem: Problem, cause: str, kind: str, largest: float) -> li
         of = problem.survey.channels[name].unit
         unit = f"nT/{of}" if of else "nT per 1"
         width = largest / max(abs(low), abs(high))
-        made.append(of_effect(problem, effect, width, unit, channel=name, phi=_level(problem, name)))
+        made.append(of_effect(problem, effect, width, unit, channel=name))
     return made

@@ -7,7 +7,6 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
-from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["interference_tone", "offset_drift", "offset_step"]
@@ -32,10 +31,9 @@ def offset_step(problem: Problem) -> list[Candidate]:
 
     def again(onset: float) -> Candidate:
         effect = TimeEffect(cause="offset_step", shape="step", start=onset)
-        phi = lambda rows: (t[rows] >= onset)[None].astype(float)  # noqa: E731  (a regressor is one line)
         alike = len(cycles) if max(onset, first) in cycles else len(grid) - len(cycles)
         return of_effect(
-            problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, again=again, phi=phi,
+            problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, again=again,
             likelier=float(np.log(0.5 * len(grid) / alike)) if cycles else 0.0,
         )  # fmt: skip
 
@@ -51,13 +49,9 @@ def offset_drift(problem: Problem) -> list[Candidate]:
         effect = TimeEffect(
             cause="offset_drift", shape="drift", start=float(start), period=period, order=order
         )
-
-        def phi(rows: slice, order: int = order, effect: TimeEffect = effect) -> FloatArray:
-            return powers((t[rows] - effect.start) / effect.period, order)
-
         step = f"{period / 3600:.3g} h" if period > 600 else f"{period:.3g} s"
         units = [per(step, power) for power in range(1, order + 1)]
-        made.append(of_effect(problem, effect, 50.0, units, phi=phi))
+        made.append(of_effect(problem, effect, 50.0, units))
     return made
 
 
@@ -89,14 +83,9 @@ def interference_tone(problem: Problem) -> list[Candidate]:
 
     def again(period: float) -> Candidate:
         effect = TimeEffect(cause="interference_tone", shape="tone", start=float(t[0]), period=period)
-
-        def phi(rows: slice) -> FloatArray:
-            angle = 2.0 * np.pi * (t[rows] - t[0]) / period
-            return np.stack([np.cos(angle), np.sin(angle)])
-
         names = tuple(f"{f} {axis}" for f in ("cos", "sin") for axis in AXES)
         return of_effect(
-            problem, effect, 10.0, "nT", names=names, phi=phi, shape={"period": (period, "s")}, again=again,
+            problem, effect, 10.0, "nT", names=names, shape={"period": (period, "s")}, again=again,
             trials=0.5 * len(t),
         )  # fmt: skip
 

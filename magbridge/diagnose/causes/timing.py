@@ -8,9 +8,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
-from magbridge.diagnose.causes.regressors import once
 from magbridge.diagnose.compare.interpolation import LOST, rates
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.problem import Problem, once
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
 

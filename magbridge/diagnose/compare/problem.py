@@ -27,7 +27,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -35,14 +37,16 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, residuals
-from magbridge.calibration.terms import Effect
+from magbridge.calibration.terms import Effect, Series
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.design_columns import Mixture
 from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import noise_sigma, prior
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["DELAY", "DELAYS", "Problem", "effect_columns", "pose", "samples_of"]
+__all__ = ["DELAY", "DELAYS", "Problem", "effect_columns", "once", "pose", "samples_of"]
+
+T = TypeVar("T")
 
 DELAY = 0.3
 """s, a plausible size of a channel's delay after its row."""
@@ -97,6 +101,12 @@ class Problem:
         own = {parameter.name for parameter in self.calibration.parameters}
         return [name for name, c in self.survey.channels.items() if kind in c.kinds and name not in own]
 
+    def series(self, effect: Effect, rows: slice = slice(None)) -> Series:
+        """Return rows of the log as the array form of an effect takes them."""
+        names = dict.fromkeys([*(p.name for p in self.calibration.parameters), *effect.channels()])
+        values = {name: self.survey.channels[name].values[rows] for name in names}
+        return Series(self.survey.time[rows], self.reading[rows], values, self.calibration.kernel)
+
     @cached_property
     def free(self) -> FloatArray:
         """(n, q) ``-de/dz``; the delays' are :attr:`late`."""
@@ -118,6 +128,19 @@ class Problem:
     def straight(self, z: FloatArray) -> FloatArray:
         """(n,) residual without what the channels' delays in z (q,) add to it."""
         return np.asarray(self.residual - self.late @ z[DELAYS])
+
+
+def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
+    """Cache a function's result for each problem: causes share regressors, of 50 MB for a month."""
+    known: WeakKeyDictionary[Problem, T] = WeakKeyDictionary()
+
+    @wraps(made)
+    def of(problem: Problem) -> T:
+        if problem not in known:
+            known[problem] = made(problem)
+        return known[problem]
+
+    return of
 
 
 @dataclass(frozen=True)
@@ -154,12 +177,19 @@ def _run(places: Sequence[int]) -> slice | list[int]:
 
 
 def effect_columns(
-    problem: Problem, effect: Effect, phi: FloatArray | Callable[[slice], FloatArray], origin: float = 0.0
+    problem: Problem,
+    effect: Effect,
+    phi: FloatArray | Callable[[slice], FloatArray] | None = None,
+    origin: float = 0.0,
 ) -> Mixture:
     """Return the columns of an effect's coefficients.
 
-    Its regressors are `phi` less `origin`; `phi` is (r, n), or a function from m rows to (r, m).
+    Its regressors are `phi` less `origin`; `phi` is (r, n), or a function from m rows to (r, m); by default
+    they are those of the effect's own array form.
     """
+    if phi is None:
+        whole = effect.batch(problem.series(effect)) if effect.remembers else None
+        phi = whole if whole is not None else lambda rows: effect.batch(problem.series(effect, rows))
     tensor = -effect.columns(problem.calibration.reference.field)
     pairs = [(int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0))]
     M = np.stack([tensor[:, r, s] for r, s in pairs])

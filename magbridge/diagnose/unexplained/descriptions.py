@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.effects import powers
 from magbridge.calibration.mass_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.causes.regressors import powers
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.design_columns import Columns, size_of
 from magbridge.diagnose.compare.interpolation import rates
@@ -112,7 +112,9 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
     fresh = ~problem.survey.learned
 
     def waves(count: int) -> Columns:
-        return lambda rows: powers(np.exp(1j * np.pi * (time[rows] - time[0]) / whole), count).real.T
+        return lambda rows: (
+            np.stack(powers(np.exp(1j * np.pi * (time[rows] - time[0]) / whole), count)).real.T
+        )
 
     passing, times = passage(problem, fit)
     return [

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.causes.regressors import lagged, play, powers
+from magbridge.calibration.effects import lagged, powers
+from magbridge.calibration.mass_effects import play
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
@@ -67,7 +68,7 @@ def direction(body: Columns) -> Columns:
     def columns(rows: slice) -> FloatArray:
         part = body(rows)
         part = (part / np.linalg.norm(part, axis=1)[:, None]).T
-        table = np.concatenate([np.ones((1, *part.shape)), powers(part, 4)])
+        table = np.stack([np.ones(part.shape), *powers(part, 4)])
         return np.stack([table[i, 0] * table[j, 1] * table[k, 2] for i, j, k in exponents]).T
 
     return columns
@@ -83,8 +84,8 @@ def response(reading: FloatArray, slopes: Columns) -> Columns:
     def columns(rows: slice) -> FloatArray:
         x = np.clip([channel(rows) for channel in channels], -1.0, 1.0)
         turning = x + 1j * np.sqrt(1.0 - x**2)  # cos k theta = T_k(x), with x = cos theta
-        waves = powers(turning, BEND).real.swapaxes(0, 1)
-        return (slopes(rows).T[:, None] * waves).reshape(3 * BEND, -1).T
+        waves = np.stack(powers(turning, BEND), 1).real
+        return np.asarray((slopes(rows).T[:, None] * waves).reshape(3 * BEND, -1).T)
 
     return columns
 
@@ -114,7 +115,7 @@ def crossing(reading: FloatArray, slopes: Columns) -> Columns:
 def curve(values: FloatArray) -> Columns:
     """Powers of a channel (n,)."""
     y = _scaled(values)
-    return _centred(lambda rows: powers(y(rows), 4).T, len(values))
+    return _centred(lambda rows: np.stack(powers(y(rows), 4)).T, len(values))
 
 
 def hysteresis(values: FloatArray) -> Columns:
@@ -127,7 +128,7 @@ def hysteresis(values: FloatArray) -> Columns:
 
     def columns(rows: slice) -> FloatArray:
         v, w = scaled(rows), way[rows]
-        branches = [powers(x[rows], 3) - powers(v, 3) for x in plays]
+        branches = [np.stack(powers(x[rows], 3)) - np.stack(powers(v, 3)) for x in plays]
         return np.concatenate([*branches, [w, w * v]]).T
 
     return _centred(columns, len(values))
@@ -143,7 +144,7 @@ def swings(time: FloatArray, rate: FloatArray) -> Columns:
     low, high = np.quantile(rate, (0.001, 0.999))  # telemetry that jumps is no turn
     y = np.clip(rate, low, high) / max(high, -low, 1e-12)
     swung = _followed(time, y[None], SWAYS)
-    return _centred(lambda rows: powers(swung(rows).T, 2).reshape(2 * len(SWAYS), -1).T, len(rate))
+    return _centred(lambda rows: np.reshape(powers(swung(rows).T, 2), (2 * len(SWAYS), -1)).T, len(rate))
 
 
 def near_surface(time: FloatArray, depth: FloatArray) -> Columns:
@@ -160,7 +161,7 @@ def repeated(problem: Problem) -> Columns:
     # the median: a long last dive must not stretch the others
     usual = max(float(np.median([since[end - 1] for end in [*start[1:], len(dive)]])), 1.0)
     u = np.minimum(since / usual, 1.0)
-    return _centred(lambda rows: powers(np.exp(1j * np.pi * u[rows]), REPEATED).real.T, len(u))
+    return _centred(lambda rows: np.stack(powers(np.exp(1j * np.pi * u[rows]), REPEATED)).real.T, len(u))
 
 
 def lower_end(down: FloatArray) -> Columns:
