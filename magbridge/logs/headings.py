@@ -41,7 +41,7 @@ ALIASES = {
     ),
     "roll": ("rollangle", "rolldeg"),
     "pitch": ("pitchangle", "pitchdeg"),
-    "heading": ("yaw", "hdg", "compassheading", "trueheading"),
+    "heading": ("yaw", "hdg", "compassheading", "trueheading", "magneticheading"),
     "latitude": ("lat", "gpslat", "gpslatitude"),
     "longitude": ("lon", "long", "lng", "gpslon", "gpslongitude"),
     "depth": ("depthm",),

@@ -255,6 +255,9 @@ def _name(
             unit = told
         elif name in declared.columns and not unit and declared.columns[name].heading:
             unit = split(declared.columns[name].heading or "")[1]
+        if name == "heading" and "magnetic" in f"{headings[k]} {unit}".lower():
+            found.attrs.setdefault("heading_reference", "magnetic")
+            unit = unit.replace("magnetic", "").strip(" ,")
         if name and unit:
             found.units[name] = unit
     found.names = final

@@ -8,7 +8,8 @@ A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)``
 :class:`~magbridge.logs.options.Options` make a difference to it. It yields deployments of at most `rows`
 rows in the order of the file, or pairs of a deployment and the numbers of its rows in the file. What is wrong
 with their times and values is :mod:`magbridge.logs.checks`' business. A format that can be written also has
-``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``.
+``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``; where its file has no room for
+attributes, also ``metadata``, bytes that are written beside it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from typing import Any, NamedTuple
 from magbridge.errors import FormatError, PluginError
 from magbridge.plugins import blamed, load, plugins
 
-__all__ = ["FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "suffixes"]
+__all__ = ["FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "metadata_path", "suffixes"]
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
@@ -172,3 +173,8 @@ def _recognised(path: Path) -> Format | None:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     signed = (one for one in FORMATS.values() if one.signature is not None)
     return next((one for one in signed if re.match(one.signature or b"", head, re.DOTALL)), None)
+
+
+def metadata_path(path: Path) -> Path:
+    """Return where the metadata of a table stand: W3C, *Model for Tabular Data and Metadata*, section 5.3."""
+    return path.with_name(f"{path.name}-metadata.json")

@@ -3,9 +3,12 @@
 A heading is ``name``, ``name [unit]`` or ``name (unit)``: ``battpos [in]``. Columns of
 :data:`magbridge.columns.COLUMNS` need no unit; those in another known unit (``mag_x [uT]``, ``roll [rad]``)
 are converted. Before the header there may be lines such as ``# heading_reference = magnetic``, and
-``# fill_value = -9999`` where that number stands for a missing value; from a bridge's log, also the settings
-by which it corrected. ``quality`` holds the names of the flags, separated by spaces. Numbers are written with
-as many digits as it takes to read back the same float64.
+``# fill_value = -9999`` where that number stands for a missing value. ``quality`` holds the names of the
+flags, separated by spaces. Numbers are written with as many digits as it takes to read back the same float64.
+
+What is written begins with the header, as other programs expect; attributes stand beside it, in the file that
+W3C's *Metadata Vocabulary for Tabular Data* gives to ``NAME.csv``: ``NAME.csv-metadata.json``. What would
+change a value's meaning stands in the file itself: ``heading [deg magnetic]``.
 
 Files of others are read by :mod:`.layout` (separator, decimal commas, headings, units) and :mod:`.clocks`
 (times); what other programs capture without headings by :mod:`.captures`. What was guessed is told by the
@@ -22,6 +25,7 @@ from math import isnan
 from pathlib import Path
 from typing import TextIO
 
+import msgspec
 import numpy as np
 import xarray as xr
 
@@ -31,6 +35,7 @@ from magbridge.logs import captures
 from magbridge.logs.deployment import GUESSED, HISTORY, deployment, lasting, with_losses
 from magbridge.logs.layout import HEAD, layout_of
 from magbridge.logs.options import Options
+from magbridge.logs.registry import metadata_path
 from magbridge.logs.table import Table
 from magbridge.records import Quality
 
@@ -43,6 +48,12 @@ KEPT = 1000
 """Characters that are kept of a longer one: a row that is dropped, and counted."""
 LOOKED_AT = 1 << 16
 """Bytes by which the encoding is found."""
+
+
+class Metadata(msgspec.Struct):
+    """Of a table, by W3C's vocabulary, what is read again: its notes."""
+
+    notes: list[dict[str, str | float]]
 
 
 def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
@@ -87,7 +98,7 @@ def _chunks(
         return
     layout = layout_of(path, head, options.declared)
     table = Table(path, layout, head, strict=options.strict)
-    attrs = {**layout.attrs, **table.attrs}
+    attrs = {**_attributes(path), **layout.attrs, **table.attrs}
     if guesses := [*guess, *layout.guesses, *table.guesses]:
         told = "; ".join(guesses)
         before = [str(attrs[HISTORY])] if HISTORY in attrs else []
@@ -115,20 +126,25 @@ def _lines(file: TextIO) -> Iterator[str]:
 
 
 class FileWriter:
-    """Writes deployments one after the other; the columns are those of the first."""
+    """Writes deployments one after the other; the columns are those of the first.
+
+    Attributes
+    ----------
+    metadata : bytes
+        What belongs beside the file.
+    """
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._csv = csv.writer(self._file, lineterminator="\n")
+        self.metadata = b""
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows, and before the first ones the header."""
         if first:
-            for key, value in lasting(dataset.attrs).items():
-                self._file.write(f"# {key} = {value}\n")
-            for line in str(dataset.attrs.get(HISTORY, "")).splitlines():
-                self._file.write(f"# {HISTORY} = {line}\n")
-            self._csv.writerow(["time", *(_heading(dataset[name]) for name in dataset.data_vars)])
+            headings = ["time", *(_heading(dataset, str(name)) for name in dataset.data_vars)]
+            self.metadata = _metadata(dataset, headings)
+            self._csv.writerow(headings)
         columns = [_texts("time", dataset["time"].values)]
         columns += [_texts(str(name), dataset[name].values) for name in dataset.data_vars]
         self._csv.writerows(zip(*columns, strict=True))
@@ -138,9 +154,34 @@ class FileWriter:
         self._file.close()
 
 
-def _heading(column: xr.DataArray) -> str:
-    unit = column.attrs.get("units", "1")
-    return str(column.name) if column.name in COLUMNS or unit == "1" else f"{column.name} [{unit}]"
+def _heading(dataset: xr.Dataset, name: str) -> str:
+    unit = dataset[name].attrs.get("units", "1")
+    if name == "heading" and dataset.attrs.get("heading_reference") == "magnetic":
+        return f"heading [{unit} magnetic]"
+    return name if name in COLUMNS or unit == "1" else f"{name} [{unit}]"
+
+
+def _metadata(dataset: xr.Dataset, headings: Sequence[str]) -> bytes:
+    attrs: dict[str, str | float] = lasting(dataset.attrs)
+    if history := dataset.attrs.get(HISTORY):
+        attrs[HISTORY] = str(history)
+    document = {
+        "@context": "http://www.w3.org/ns/csvw",
+        "notes": [attrs],
+        "tableSchema": {"columns": [{"titles": heading} for heading in headings]},
+    }
+    return msgspec.json.format(msgspec.json.encode(document), indent=2) + b"\n"
+
+
+def _attributes(path: Path) -> dict[str, str | float]:
+    """Return what stands beside the file."""
+    beside = metadata_path(path)
+    if not beside.is_file():
+        return {}
+    try:
+        return msgspec.json.decode(beside.read_bytes(), type=Metadata).notes[0]
+    except (msgspec.MsgspecError, IndexError):
+        raise FormatError(beside, "expected the metadata of a CSV file, with one note") from None
 
 
 def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[str]:

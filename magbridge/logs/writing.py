@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
-from magbridge.logs.registry import format_of
+from magbridge.logs.registry import format_of, metadata_path
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -66,6 +66,9 @@ class Writer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.__exit__(kind, error, trace)
+        if kind is None and (metadata := getattr(self._file, "metadata", b"")):
+            with atomic_path(metadata_path(self._path)) as beside:
+                beside.write_bytes(metadata)
 
     def append(self, dataset: xr.Dataset) -> None:
         """Write the rows of `dataset`, which begin after the last ones.

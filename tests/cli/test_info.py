@@ -63,7 +63,7 @@ def test_columns_are_declared_on_the_command_line(command: Command) -> None:
     said = command("convert", "theirs.csv", "-o", "ours.csv", *columns)
     assert "guessed: decimal commas; fields separated by ';'; time is 'Zeit'" in said.err
     assert float(read("ours.csv")["mag_z"][0]) == 45_000.0
-    assert "# history = theirs.csv was read with: decimal commas" in Path("ours.csv").read_text()
+    assert "theirs.csv was read with: decimal commas" in read("ours.csv").attrs["history"]
     assert "guessed" not in command("convert", "ours.csv", "-o", "again.nc").err
     Path("columns.toml").write_text('[columns.mag_x]\nfrom = "Fx"\nunit = "mT"\n')
     command("convert", "theirs.csv", "-o", "ours.csv", "--columns", "columns.toml")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import netCDF4
 import numpy as np
+import pandas as pd
 import pytest
 
 from magbridge import logs
@@ -23,6 +24,27 @@ def test_csv_is_as_plain_as_can_be(tmp_path: Path) -> None:
         "1.5,1.0,0.1,",
         "2.0,,2.0,stale_telemetry extrapolated",
     ]
+
+
+def test_csv_opens_elsewhere_and_keeps_its_attributes(tmp_path: Path) -> None:
+    attrs = {"heading_reference": "magnetic", "align.lag": 0.5, "history": "made\nand corrected"}
+    columns = {"heading": [10.0, 20.0], "pump": [1.0, 2.0]}
+    logs.write(deployment("made", [1.5, 2], columns, {"pump": "A"}, attrs), tmp_path / "a.csv")
+    theirs = pd.read_csv(tmp_path / "a.csv")
+    assert list(theirs.columns) == ["time", "heading [deg magnetic]", "pump [A]"]
+    assert {name: logs.read(tmp_path / "a.csv").attrs[name] for name in attrs} == attrs
+    (tmp_path / "a.csv").rename(tmp_path / "moved.csv")
+    assert logs.read(tmp_path / "moved.csv").attrs["heading_reference"] == "magnetic"
+    (tmp_path / "moved.csv-metadata.json").write_text("{")
+    with pytest.raises(FormatError, match=r"moved\.csv-metadata\.json: expected the metadata of a CSV file"):
+        logs.read(tmp_path / "moved.csv")
+
+
+@pytest.mark.parametrize("heading", ["Magnetic heading", "heading [deg, magnetic]", "heading (magnetic)"])
+def test_csv_heading_says_what_it_refers_to(heading: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f'time,"{heading}"\n1,2\n')
+    log = logs.read(tmp_path / "a.csv")
+    assert (log.attrs["heading_reference"], float(log["heading"][0])) == ("magnetic", 2.0)
 
 
 @pytest.mark.parametrize("rows", [1, 1000])
