@@ -57,7 +57,7 @@ def calibrate(
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
-    fleet: Path | None = None,
+    fleet: str = "",
     member: str = "",
     refit: str = "",
     heading_reference: Heading = None,
@@ -106,8 +106,9 @@ def calibrate(
         Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
         undone; 0: no filter.
     fleet
-        A fleet's catalogue: the fit starts from what the vehicle's earlier deployments and its fleet let
-        expect, and it is said what that is worth (method auto). Two runs are then often enough.
+        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from what the
+        vehicle's earlier deployments and its fleet let expect, and it is said what that is worth (method
+        auto). Two runs are then often enough.
     member
         Which of the fleet's vehicles this is; of logs that are catalogued, it is known.
     refit
@@ -269,7 +270,7 @@ def _drifting(position_sigma: float, data: Observations, method: str) -> dict[st
     return {"position_sigma": position_sigma} if position_sigma else {}
 
 
-def _began(fleet: Path, member: str, refit: str, files: tuple[Path, ...]) -> Start:
+def _began(fleet: str, member: str, refit: str, files: tuple[Path, ...]) -> Start:
     """Return what a fleet lets expect of these logs."""
     from magbridge.fleet.start import start
 

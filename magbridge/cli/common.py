@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AS_THEY_SAY",
     "Base",
+    "Day",
     "Folder",
     "Grid",
     "Heading",
@@ -121,6 +122,9 @@ def _day(_: Any, tokens: Sequence[Token]) -> dt.date:
         raise ValueError(f"expected YYYY-MM-DD, not {tokens[0].value}.") from None
 
 
+Day = Annotated[dt.date | None, Parameter(converter=_day)]
+
+
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Reading:
@@ -142,7 +146,7 @@ class Reading:
         to.
     """
 
-    date: Annotated[dt.date | None, Parameter(converter=_day)] = None
+    date: Day = None
     compass: str | None = None
     strict: bool = False
     column: tuple[str, ...] = ()

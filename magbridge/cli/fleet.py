@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import datetime as dt
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter, validators
 
-from magbridge.cli.common import Json, Output, Whole, app, complain, file_to_write, print_result
+from magbridge.cli.common import Day, Json, Output, Whole, app, complain, file_to_write, print_result
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
 
 if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
     from magbridge.fleet.drift import History
 
 fleet = App(
@@ -19,8 +22,8 @@ fleet = App(
     help="Many vehicles, many logs, one memory: catalogue, process, learn from them, watch them.",
 )
 app.command(fleet)
-Folder = Annotated[Path, Parameter(name="--catalogue")]
-HERE = Path("fleet")
+Where = Annotated[str, Parameter(name="--catalogue")]
+HERE = "fleet"
 
 
 @fleet.command(usage="Usage: magbridge fleet add FILE... [--vehicle NAME --deployment NAME] [OPTIONS]")
@@ -32,7 +35,8 @@ def add(
     parameter: tuple[str, ...] = (),
     serial: str = "",
     sensor: str = "",
-    catalogue: Folder = HERE,
+    date: Day = None,
+    catalogue: Where = HERE,
     json: Json = False,
 ) -> None:
     """Put vehicles and logs on record. What is there already is not added again.
@@ -40,7 +44,8 @@ def add(
     Parameters
     ----------
     files
-        A fleet.toml with vehicles, deployments and patterns of logs; or the logs of one deployment.
+        A fleet.toml with vehicles, deployments and patterns of logs; or the logs of one deployment; or a
+        calibration of it that was made elsewhere (cal.json).
     vehicle
         The logs' vehicle. It is new where --parameter is given.
     deployment
@@ -52,51 +57,77 @@ def add(
     serial
         The vehicle's serial number: tells two of one name apart.
     sensor
-        Its sensor: logs of another are refused.
+        Its sensor: logs of another are refused. Without --parameter, that of this deployment.
+    date
+        When the deployment of a calibration began (YYYY-MM-DD).
     catalogue
-        The catalogue's folder, made where it is not there.
+        The catalogue: a folder, or postgresql://USER@HOST/DATABASE; made where it is not there.
     json
         Print the result as JSON.
     """
-    from magbridge.fleet.catalogue import Catalogue
-    from magbridge.fleet.register import Vehicle, add_logs, add_vehicle, logs_of, read_fleet
+    from magbridge.fleet.catalogue import open_catalogue
+    from magbridge.fleet.given import add_calibration
+    from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle, logs_of, read_fleet
 
     if not files and not (vehicle and parameter):
         raise WrongUse("expected a fleet.toml or logs, or --vehicle with its --parameter")
-    described = [file for file in files if file.suffix.lower() == ".toml"]
-    logs = [file for file in files if file not in described]
-    if logs and not (vehicle and deployment):
+    described, made, logs = _sorted(files)
+    if (logs or made) and not (vehicle and deployment):
         raise WrongUse("logs: say --vehicle and --deployment, or put them into a fleet.toml")
     plans = {file: read_fleet(file) for file in described}
-    there = Catalogue(catalogue, create=True)
-    added, new, lines = 0, 0, list[str]()
-    if vehicle and (parameter or serial or sensor):
+    calibrations = _calibrations(made, date)
+    there = open_catalogue(catalogue, create=True)
+    added, new, given, lines = 0, 0, 0, list[str]()
+    if vehicle and (parameter or serial):
         added += add_vehicle(there, vehicle, Vehicle(parameters=parameter, serial=serial, sensor=sensor))
     with waiting("reading"):
         for file, named in plans.items():
             for name, one in named.items():
                 added += add_vehicle(there, name, one)
                 for part in one.deployment:
-                    count, said = add_logs(there, name, part.name, part.refit, logs_of(file, part))
+                    count, said = add_logs(there, name, part, logs_of(file, part))
                     new, lines = new + count, lines + said
+        this = Deployment(deployment, (), refit, "" if parameter else sensor)
         if logs:
-            count, said = add_logs(there, vehicle, deployment, refit, logs)
+            count, said = add_logs(there, vehicle, this, logs)
             new, lines = new + count, lines + said
+        for start, calibration in calibrations:
+            given += add_calibration(there, vehicle, this, start, calibration)
     for line in lines:
         complain(line)
     print_result(
-        {"catalogue": str(catalogue), "vehicles": added, "logs": new, "remarks": lines},
-        f"{catalogue}: {added} vehicles and {new} logs added",
+        {"catalogue": there.name, "vehicles": added, "logs": new, "calibrations": given, "remarks": lines},
+        f"{there.name}: {added} vehicles, {new} logs and {given} calibrations added",
         json,
     )
+
+
+def _sorted(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
+    """Return the fleet.toml, the calibrations and the logs among files."""
+    kinds: dict[str, list[Path]] = {".toml": [], ".json": [], "": []}
+    for file in files:
+        kinds.get(file.suffix.lower(), kinds[""]).append(file)
+    return kinds[".toml"], kinds[".json"], kinds[""]
+
+
+def _calibrations(files: Sequence[Path], date: dt.date | None) -> list[tuple[float, Calibration]]:
+    """Return when each calibration's deployment began, s since 1970, and the calibration."""
+    from magbridge.calibration.file import load
+
+    if files and date is None:
+        raise WrongUse(f"{files[0]}: a calibration says no date: when did its deployment begin (--date)?")
+    start = dt.datetime.combine(date, dt.time(), dt.UTC).timestamp() if date else 0.0
+    return [(start, load(file)) for file in files]
 
 
 @fleet.command
 def process(
     *,
-    catalogue: Folder = HERE,
+    catalogue: Where = HERE,
+    results: Path | None = None,
     diagnose: bool = False,
     maps: bool = False,
+    retry: bool = False,
     workers: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=1024))] = 2,
     memory: str = "4 GiB",
     scheduler: str = "",
@@ -110,11 +141,16 @@ def process(
     Parameters
     ----------
     catalogue
-        The catalogue's folder; corrected logs and maps go to its folder results.
+        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
+    results
+        Folder for corrected logs and maps; by default results in the catalogue's folder, and fleet-results
+        here for one on a server.
     diagnose
         Also diagnose each deployment.
     maps
         Also make each deployment's anomaly map.
+    retry
+        Also try deployments again in which something failed.
     workers
         Processes on this machine.
     memory
@@ -124,13 +160,14 @@ def process(
     json
         Print the result as JSON.
     """
-    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.catalogue import open_catalogue
+    from magbridge.fleet.memory import remember
     from magbridge.fleet.process import client_of, jobs, new_jobs
     from magbridge.fleet.process import process as run
 
-    there = Catalogue(catalogue)
+    there = open_catalogue(catalogue, results)
     every = jobs(there, diagnose=diagnose, maps=maps)
-    todo = new_jobs(there, every)
+    todo = new_jobs(there, every, retry=retry)
     failures: list[str] = []
     if todo:
         with client_of(scheduler, workers, memory) as client:
@@ -138,31 +175,34 @@ def process(
                 failures += outcome.failures
                 for line in outcome.failures:
                     complain(line)
+        with waiting("learning"):
+            remember(there)
     result = {"deployments": len(every), "processed": len(todo), "failures": failures}
     print_result(
         result,
-        f"{catalogue}: {len(todo)} of {len(every)} deployments were new, {len(failures)} failures",
+        f"{there.name}: {len(todo)} of {len(every)} deployments were new, {len(failures)} failures",
         json,
     )
     if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
-        raise DataError(f"{catalogue}: not one deployment could be calibrated")
+        raise DataError(f"{there.name}: not one deployment could be calibrated")
 
 
 @fleet.command
-def status(*, catalogue: Folder = HERE, json: Json = False) -> None:
+def status(*, catalogue: Where = HERE, json: Json = False) -> None:
     """Say what is catalogued, what is done, and what failed.
 
     Parameters
     ----------
     catalogue
-        The catalogue's folder.
+        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
     json
         Print the result as JSON.
     """
-    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.status import status as of
 
-    found = of(Catalogue(catalogue))
+    there = open_catalogue(catalogue)
+    found = of(there)
     for line in found["failures"]:
         complain(line)
     rows = "\n".join(
@@ -170,7 +210,7 @@ def status(*, catalogue: Folder = HERE, json: Json = False) -> None:
         f"calibrated, {one['failed']} failed, {one['new']} new"
         for one in found["vehicles"]
     )
-    print_result(found, f"{catalogue}: {len(found['vehicles'])} vehicles\n{rows}".rstrip(), json)
+    print_result(found, f"{there.name}: {len(found['vehicles'])} vehicles\n{rows}".rstrip(), json)
 
 
 @fleet.command
@@ -178,7 +218,7 @@ def show(
     vehicle: str = "",
     /,
     *,
-    catalogue: Folder = HERE,
+    catalogue: Where = HERE,
     html: Annotated[Path | None, Parameter(validator=file_to_write(".html"))] = None,
     json: Json = False,
 ) -> None:
@@ -189,29 +229,28 @@ def show(
     vehicle
         Its name; all vehicles, if none is given.
     catalogue
-        The catalogue's folder.
+        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
     html
         A page to write, with a picture of each vehicle.
     json
         Print the result as JSON.
     """
-    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.drift import facts, history
-    from magbridge.fleet.memory import fleet_of
+    from magbridge.fleet.memory import fleets
     from magbridge.fleet.register import vehicles
 
-    there = Catalogue(catalogue)
+    there = open_catalogue(catalogue)
     names = [vehicle] if vehicle else list(vehicles(there))
     found: dict[str, History] = {}
-    with waiting("learning") as step:
-        for name in names:
-            step(name)
-            try:
-                found[name] = history(fleet_of(there, name), name)
-            except DataError as error:
-                complain(f"{name}: {error}")
+    with waiting("learning"):
+        for name, learnt in fleets(there, names).items():
+            if isinstance(learnt, DataError):
+                complain(f"{name}: {learnt}")
+            else:
+                found[name] = history(learnt, name)
     if not found:
-        raise DataError(f"{catalogue}: nothing to show: no deployment has been calibrated")
+        raise DataError(f"{there.name}: nothing to show: no deployment has been calibrated")
     if html:
         from magbridge.fleet.page import write_page
 
@@ -227,7 +266,7 @@ def export(
     *,
     output: Output,
     refit: str = "",
-    catalogue: Folder = HERE,
+    catalogue: Where = HERE,
     json: Json = False,
 ) -> None:
     """Write what is expected of a vehicle's next deployment as a calibration, before any run is flown.
@@ -241,17 +280,17 @@ def export(
     refit
         The refit it will fly with; by default a new one.
     catalogue
-        The catalogue's folder.
+        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
     json
         Print the result as JSON.
     """
     from magbridge.calibration.file import save
-    from magbridge.fleet.catalogue import Catalogue
+    from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.memory import fleet_of
     from magbridge.fleet.unflown import unflown
 
     with waiting("learning"):
-        learnt = fleet_of(Catalogue(catalogue), vehicle)
+        learnt = fleet_of(open_catalogue(catalogue), vehicle)
         calibration = unflown(learnt, vehicle, refit)
     save(calibration, output)
     count = sum(one.vehicle == vehicle for one in learnt.lessons)

@@ -1,7 +1,8 @@
 """Fleets: many vehicles, many logs, one memory.
 
-:mod:`.catalogue` keeps what is known in a folder of Parquet files; :mod:`.register` puts vehicles and logs
-there. :mod:`.process` finds what is new and runs :mod:`.work` on each deployment, in parallel.
+:mod:`.catalogue` is what is known, in a folder of Parquet files (:mod:`.folder`) or in a database
+(:mod:`.postgres`); :mod:`.register` and :mod:`.given` put vehicles, logs and calibrations there.
+:mod:`.process` finds what is new and runs :mod:`.work` on each deployment, in parallel.
 :mod:`.hierarchy` is the statistics of coefficients over vehicles, refits and power-ups, :mod:`.learn` teaches
 it, :mod:`.memory` is a catalogue's, :mod:`.drift` tells what changed and when, and :mod:`.page` shows it.
 """

@@ -125,7 +125,9 @@ class _Passed:
     score: float
 
 
-def learn(observed: Sequence[Observed], groups: IndexArray) -> Population:
+def learn(
+    observed: Sequence[Observed], groups: IndexArray, variances: FloatArray | None = None
+) -> Population:
     """Learn the variances of a fleet.
 
     Parameters
@@ -134,7 +136,11 @@ def learn(observed: Sequence[Observed], groups: IndexArray) -> Population:
         One for each deployment, all with the same K coefficients.
     groups : (K,) array
         Number of the group that each coefficient shares its variances with.
+    variances : (3, K) array, optional
+        Those found from the same deployments before.
     """
+    if variances is not None:
+        return _round(variances, observed, groups)[0]
     start = np.square(EXPECTED)[:, None] * np.ones((1, len(groups)))
     found = Population(start, Information(np.eye(len(groups)), np.zeros(len(groups))), {}, -np.inf)
     for turn in range(1, ROUNDS + 1):

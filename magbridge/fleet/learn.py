@@ -20,7 +20,7 @@ from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import DataError
-from magbridge.fleet.hierarchy import Observed, Population, learn
+from magbridge.fleet.hierarchy import LEVELS, Observed, Population, learn
 
 __all__ = ["Fleet", "Lesson", "learn_fleet"]
 
@@ -105,8 +105,10 @@ class Fleet:
         return Known(self.parameters, self.exponents, FIELD, E @ mean, E @ P @ E.T)
 
 
-def learn_fleet(lessons: Sequence[Lesson]) -> Fleet:
+def learn_fleet(lessons: Sequence[Lesson], variances: Sequence[float] | None = None) -> Fleet:
     """Learn from deployments of vehicles whose masses have the same names, fitted to the same order.
+
+    `variances` are those that the same lessons have given before.
 
     Raises
     ------
@@ -122,7 +124,8 @@ def learn_fleet(lessons: Sequence[Lesson]) -> Fleet:
     basis = np.asarray(family.E * family.widths(family.centre))
     with threadpool_limits(1, "blas"):
         observed = tuple(Observed(one.vehicle, one.refit, one.brought(parameters, basis)) for one in lessons)
-        population = learn(observed, _groups(exponents))
+        known = None if variances is None else np.reshape(variances, (len(LEVELS), -1))
+        population = learn(observed, _groups(exponents), known)
     return Fleet(parameters, exponents, basis, population, tuple(lessons), observed)
 
 

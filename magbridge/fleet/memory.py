@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable
+from hashlib import sha256
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 
 from magbridge.calibration.file import decode_calibration
@@ -11,42 +14,69 @@ from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import DataError, WrongUse
 from magbridge.fleet.catalogue import Catalogue, Row
+from magbridge.fleet.given import GIVEN
 from magbridge.fleet.learn import Fleet, Lesson, learn_fleet
-from magbridge.fleet.process import jobs
-from magbridge.fleet.register import current_files, vehicles
+from magbridge.fleet.process import jobs, last_attempts
+from magbridge.fleet.register import current_files, vehicle_named, vehicles
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
-
-__all__ = ["current", "fleet_of", "lessons", "owner"]
+__all__ = ["current", "fleet_of", "fleets", "lessons", "owner", "remember"]
 
 
-def current(catalogue: Catalogue, table: str) -> list[Row]:
-    """Return the rows of a table of results that are made of what the catalogue's logs are now."""
+class _Taught(NamedTuple):
+    """A lesson, what its logs' SHA-256 are, the sensor it flew, and whether it was made elsewhere."""
+
+    lesson: Lesson
+    inputs: frozenset[str]
+    sensor: str
+    given: bool
+
+
+def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> list[Row]:
+    """Return the rows of a table of results that are made of what the catalogue's logs are now.
+
+    Of a deployment that was tried again, those of the last attempt; and all that was made elsewhere.
+    """
     names = {job.name for job in jobs(catalogue)}
-    return [row for row in catalogue.rows(table) if row["job"] in names]
+    last = last_attempts(catalogue.rows("done"))
+    wanted = [*columns, "job", "attempt"] if columns else ()
+    return [
+        row
+        for row in catalogue.rows(table, wanted)
+        if row["job"] == GIVEN or (row["job"] in names and row["attempt"] == last.get(row["job"], 1))
+    ]
 
 
 def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> list[Lesson]:
     """Return what deployments of vehicles with the masses of one, `like`, have taught.
 
-    What has been learnt from logs of these SHA-256, `without`, is left out.
+    What has been learnt from logs of these SHA-256, `without`, is left out. So is a calibration made
+    elsewhere from logs that were calibrated here, too.
 
     Raises
     ------
     WrongUse
         There is no such vehicle.
     """
-    known = vehicles(catalogue)
-    if like not in known:
-        raise WrongUse(f"{like}: not a vehicle of {catalogue.folder} ({', '.join(known) or 'none yet'})")
-
-    def kind(name: str) -> tuple[list[str], int]:
-        return known[name]["parameters"], known[name]["order"]
-
-    rows = (row for row in current(catalogue, "calibrations") if row["precision"])
-    found = [_lesson(row) for row in rows if kind(row["vehicle"]) == kind(like)]
-    return [one for one, inputs in found if not inputs & set(without)]
+    vehicle_named(catalogue, like)
+    kinds = {name: _kind(row) for name, row in vehicles(catalogue).items()}
+    rows = [
+        row
+        for row in current(catalogue, "calibrations")
+        if row["precision"] and kinds.get(row["vehicle"]) == kinds[like]
+    ]
+    taught = sorted(map(_taught, rows), key=lambda one: (one.lesson.time, one.lesson.deployment))
+    here = frozenset[str]().union(*(one.inputs for one in taught if not one.given))
+    newest = {(one.lesson.vehicle, one.lesson.refit): one.sensor for one in taught if one.sensor}
+    found = []
+    for one in taught:
+        if one.inputs & set(without) or (one.given and one.inputs & here):
+            continue
+        of = one.lesson.vehicle, one.lesson.refit
+        if one.sensor != newest.get(of, one.sensor) and one.sensor:  # another sensor is as good as a refit
+            found.append(one.lesson._replace(refit=f"{one.lesson.refit}, {one.sensor}"))
+        else:
+            found.append(one.lesson)
+    return found
 
 
 def fleet_of(catalogue: Catalogue, vehicle: str, without: Collection[str] = ()) -> Fleet:
@@ -63,10 +93,33 @@ def fleet_of(catalogue: Catalogue, vehicle: str, without: Collection[str] = ()) 
     units = {tuple(one.unit for one in lesson.parameters) for lesson in found}
     if len(units) > 1:
         both = " and ".join(", ".join(one) for one in sorted(units))
-        raise DataError(
-            f"{catalogue.folder}: {vehicle}'s fleet gives its positions in different units: {both}"
-        )
-    return learn_fleet(found)
+        raise DataError(f"{catalogue.name}: {vehicle}'s fleet gives its positions in different units: {both}")
+    of = _name(found)
+    stored = {row["of"]: row for row in catalogue.rows("populations")} if found else {}
+    return learn_fleet(found, stored[of]["variances"] if of in stored else None)
+
+
+def fleets(catalogue: Catalogue, names: Iterable[str]) -> dict[str, Fleet | DataError]:
+    """Return each vehicle's fleet, or why there is none; vehicles with the same masses share theirs."""
+    found: dict[Any, Fleet | DataError] = {}
+    out: dict[str, Fleet | DataError] = {}
+    for name in names:
+        kind = _kind(vehicle_named(catalogue, name))
+        if kind not in found:
+            try:
+                found[kind] = fleet_of(catalogue, name)
+            except DataError as error:
+                found[kind] = error
+        out[name] = found[kind]
+    return out
+
+
+def remember(catalogue: Catalogue) -> None:
+    """Put on record how the coefficients of the catalogue's fleets vary, so that it is learnt once."""
+    for fleet in fleets(catalogue, vehicles(catalogue)).values():
+        if isinstance(fleet, Fleet):
+            variances = fleet.population.variances.ravel().tolist()
+            catalogue.add("populations", [{"of": _name(fleet.lessons), "variances": variances}])
 
 
 def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
@@ -82,12 +135,25 @@ def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
     found = {(row["vehicle"], row["refit"]) for row in rows}
     if len({vehicle for vehicle, _ in found}) != 1:
         said = "of several of its vehicles" if found else "in its catalogue of none"
-        raise WrongUse(f"--fleet {catalogue.folder}: the logs are {said}: name the vehicle (--member)")
+        raise WrongUse(f"--fleet {catalogue.name}: the logs are {said}: name the vehicle (--member)")
     return sorted(found)[-1]
 
 
-def _lesson(row: Row) -> tuple[Lesson, set[str]]:
-    """Return what a calibration has taught, and the SHA-256 of what it was made from."""
+def _kind(vehicle: Row) -> tuple[tuple[str, ...], int]:
+    """Return what vehicles must have in common to learn from each other: their masses, and the order."""
+    return tuple(vehicle["parameters"]), vehicle["order"]
+
+
+def _name(lessons: Iterable[Lesson]) -> str:
+    """Return the name of what has been learnt from lessons: other lessons, another name."""
+    each = sorted(
+        (one.vehicle, one.refit, one.deployment, one.time, one.information.vector.tolist()) for one in lessons
+    )
+    return sha256(msgspec.json.encode(each)).hexdigest()[:32]
+
+
+def _taught(row: Row) -> _Taught:
+    """Return what a calibration has taught."""
     calibration = decode_calibration(row["calibration"].encode(), f"calibration of {row['deployment']}")
     term = calibration.terms[0]
     assert isinstance(term, Polynomial)
@@ -97,4 +163,4 @@ def _lesson(row: Row) -> tuple[Lesson, set[str]]:
         row["vehicle"], row["refit"], row["deployment"], row["start"], calibration.parameters,
         term.exponents, calibration.reference.field, told,
     )  # fmt: skip
-    return lesson, set(calibration.inputs.values())
+    return _Taught(lesson, frozenset(calibration.inputs.values()), row["sensor"], row["job"] == GIVEN)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import groupby
 from typing import NamedTuple
@@ -100,8 +100,8 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
 
     A task whose worker is lost is given to another; one that is killed leaves nothing but what is done.
     """
-    folder = catalogue.folder.resolve() / "results"
-    futures = {client.submit(work, job, folder, key=f"deployment-{job.name}"): job for job in todo}
+    folder = catalogue.results.resolve()
+    futures = {client.submit(work, job, folder, pure=False): job for job in todo}
     for future in as_completed(futures):
         job = futures[future]
         try:
@@ -114,25 +114,38 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
     catalogue.compact()
 
 
-def new_jobs(catalogue: Catalogue, every: list[Job]) -> list[Job]:
-    """Return the jobs of which the catalogue has no result."""
-    done = [(row["job"], row["diagnosed"], row["mapped"]) for row in catalogue.rows("done")]
-    finished = {name for name, _, _ in done}
-    diagnosed = {name for name, has, _ in done if has}
-    mapped = {name for name, _, has in done if has}
-    return [
-        job
-        for job in every
-        if job.name not in finished
-        or (job.diagnose and job.name not in diagnosed)
-        or (job.map and job.name not in mapped)
-    ]
+def new_jobs(catalogue: Catalogue, every: list[Job], *, retry: bool = False) -> list[Job]:
+    """Return the jobs of which the catalogue has no result; with `retry`, also those with failures."""
+    done = catalogue.rows("done")
+    last = last_attempts(done)
+    has = {(row["job"], what) for row in done for what in ("diagnosed", "mapped") if row[what]}
+    failed = set[str]()
+    if retry:
+        rows = catalogue.rows("failures", ["job", "attempt"])
+        failed = {row["job"] for row in rows if row["attempt"] == last.get(row["job"])}
+    todo = []
+    for job in every:
+        more = job.name in failed
+        wanted = (job.diagnose and (job.name, "diagnosed") not in has) or (
+            job.map and (job.name, "mapped") not in has
+        )
+        if more or wanted or job.name not in last:
+            todo.append(job._replace(attempt=last.get(job.name, 1) + more))
+    return todo
+
+
+def last_attempts(done: Iterable[Row]) -> dict[str, int]:
+    """Return the last attempt at each job, from the rows of what is done."""
+    last: dict[str, int] = {}
+    for row in done:
+        last[row["job"]] = max(row["attempt"], last.get(row["job"], 0))
+    return last
 
 
 def _kept(catalogue: Catalogue, job: Job, done: Done) -> Outcome:
     """Add a deployment's rows to the catalogue; that it is done comes last."""
     added = sum(catalogue.add(table, rows) for table, rows in done.tables.items())
     if not done.hindrance:
-        catalogue.add("done", [{"job": job.name, "diagnosed": job.diagnose, "mapped": job.map}])
+        catalogue.add("done", [{**job.mark, "diagnosed": job.diagnose, "mapped": job.map}])
     lines = [row["line"] for row in done.tables.get("failures", ())]
     return Outcome(job, added, (*lines, *([done.hindrance] if done.hindrance else [])))

@@ -10,6 +10,7 @@
     [[vehicle.comet.deployment]]
     name = "2026-05"
     refit = "2026-04"                       # of which refit; if not given, each deployment is its own
+    sensor = "HMR2300 0160"                 # if it was not the vehicle's
     logs = ["comet/2026-05/*.nc"]
 """
 
@@ -34,16 +35,18 @@ __all__ = [
     "current_files",
     "logs_of",
     "read_fleet",
+    "vehicle_named",
     "vehicles",
 ]
 
 
 class Deployment(Table, frozen=True):
-    """``[[vehicle.NAME.deployment]]``: a deployment, the refit it flew with, patterns of its logs."""
+    """``[[vehicle.NAME.deployment]]``: a deployment, what it flew with, patterns of its logs."""
 
     name: str
     logs: tuple[str, ...]
     refit: str = ""
+    sensor: str = ""
 
 
 class Vehicle(Table, frozen=True):
@@ -86,11 +89,25 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
         if row["vehicle"] in found:
             both = " and ".join(_told(one) for one in (found[row["vehicle"]], row))
             raise FormatError(
-                catalogue.folder / "vehicles",
-                f"two vehicles are named {row['vehicle']!r}: {both}; remove the file of one of them",
+                catalogue.name,
+                f"two vehicles are named {row['vehicle']!r}: {both}; the row of one of them has to go",
             )
         found[row["vehicle"]] = row
     return found
+
+
+def vehicle_named(catalogue: Catalogue, name: str) -> Row:
+    """Return a vehicle.
+
+    Raises
+    ------
+    WrongUse
+        There is none of that name.
+    """
+    known = vehicles(catalogue)
+    if name not in known:
+        raise WrongUse(f"{name}: not a vehicle of {catalogue.name} ({', '.join(known) or 'none yet'})")
+    return known[name]
 
 
 def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
@@ -106,24 +123,24 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     known = vehicles(catalogue).get(name)
     if known is not None and known != row:
         raise WrongUse(
-            f"{name}: {catalogue.folder} has another vehicle of that name: {_told(known)}, not {_told(row)}"
+            f"{name}: {catalogue.name} has another vehicle of that name: {_told(known)}, not {_told(row)}"
         )
     return catalogue.add("vehicles", [row])
 
 
 def add_logs(
-    catalogue: Catalogue, vehicle: str, deployment: str, refit: str, logs: Sequence[Path]
+    catalogue: Catalogue, vehicle: str, deployment: Deployment, logs: Sequence[Path]
 ) -> tuple[int, list[str]]:
     """Put a deployment's logs on record; return how many are new, and a line for each that cannot be.
+
+    `logs` are the files that its patterns stand for.
 
     Raises
     ------
     WrongUse
         There is no such vehicle.
     """
-    if vehicle not in (known := vehicles(catalogue)):
-        there = ", ".join(known) or "none yet"
-        raise WrongUse(f"{vehicle}: not a vehicle of {catalogue.folder} ({there})")
+    vehicle_named(catalogue, vehicle)
     before = catalogue.rows("files")
     newest = {row["path"]: row for row in current_files(before)}
     rows, lines = [], []
@@ -135,8 +152,10 @@ def add_logs(
             continue
         path = str(log.resolve())
         last = newest.get(path)
-        where = {"vehicle": vehicle, "deployment": deployment, "refit": refit or deployment}
-        content = {**where, "path": path, "sha256": sha, "size": size}
+        content = {
+            "vehicle": vehicle, "deployment": deployment.name, "refit": deployment.refit or deployment.name,
+            "sensor": deployment.sensor, "path": path, "sha256": sha, "size": size,
+        }  # fmt: skip
         if last is not None and content == {key: last[key] for key in content}:
             continue
         if last is not None and last["sha256"] != sha:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from magbridge.calibration.fitting.fit import Fit
 from magbridge.calibration.fitting.known import DEPARTURE, Known
-from magbridge.fleet.catalogue import Catalogue
+from magbridge.fleet.catalogue import open_catalogue
 from magbridge.fleet.memory import fleet_of, owner
 
 __all__ = ["UNLIKE", "Start", "gained", "start"]
@@ -32,13 +32,13 @@ class Start(NamedTuple):
         return tuple(one.name for one in self.known.parameters)
 
 
-def start(folder: Path, member: str, refit: str, digests: Collection[str]) -> Start:
+def start(where: str | Path, member: str, refit: str, digests: Collection[str]) -> Start:
     """Return what a catalogue lets expect of logs.
 
     Parameters
     ----------
-    folder : path
-        The catalogue.
+    where : str or path
+        The catalogue: a folder, or a server's URL.
     member, refit : str
         The logs' vehicle, and which refit it flew with; empty: as the catalogue has them.
     digests : collection of str
@@ -51,7 +51,7 @@ def start(folder: Path, member: str, refit: str, digests: Collection[str]) -> St
     DataError
         Nothing has been calibrated yet.
     """
-    catalogue = Catalogue(folder)
+    catalogue = open_catalogue(where)
     if not member:
         member, on_record = owner(catalogue, digests)
         refit = refit or on_record

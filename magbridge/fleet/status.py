@@ -6,38 +6,50 @@ from collections import Counter
 from typing import Any
 
 from magbridge.fleet.catalogue import Catalogue
-from magbridge.fleet.process import jobs, new_jobs
+from magbridge.fleet.given import GIVEN
+from magbridge.fleet.process import jobs, last_attempts, new_jobs
 
 __all__ = ["status"]
+
+COUNTED = (
+    "deployments", "logs", "calibrated", "unsupported", "failed", "new", "given", "diagnosed", "mapped"
+)  # fmt: skip
+"""Of each vehicle; `given` are calibrations made elsewhere."""
 
 
 def status(catalogue: Catalogue) -> dict[str, Any]:
     """Return, as a dictionary that JSON can hold, each vehicle's counts and the failures on record."""
-    every = jobs(catalogue)
-    new = {job.name for job in new_jobs(catalogue, every)}
-    calibrated = {row["job"] for row in catalogue.rows("calibrations", ["job"])}
-    unsupported = {
-        row["job"] for row in catalogue.rows("calibrations", ["job", "supported"]) if not row["supported"]
-    }
-    names = {job.name for job in every}
-    failures = [row for row in catalogue.rows("failures") if row["job"] in names]
-    counts: dict[str, Counter[str]] = {}
-    for job in every:
-        done = job.name in calibrated
-        counts.setdefault(job.vehicle["vehicle"], Counter()).update(
-            deployments=1,
-            logs=len(job.files),
-            new=job.name in new,
-            calibrated=done,
-            unsupported=job.name in unsupported,
-            failed=not done and job.name not in new,
-        )
-    for row in catalogue.rows("vehicles", ["vehicle"]):
-        counts.setdefault(row["vehicle"], Counter())
-    keys = ("deployments", "logs", "calibrated", "unsupported", "failed", "new")
+    every = {job.name: job for job in jobs(catalogue)}
+    done = catalogue.rows("done")
+    last = last_attempts(done)
+    new = {job.name for job in new_jobs(catalogue, list(every.values()))}
+    counts = {row["vehicle"]: Counter[str]() for row in catalogue.rows("vehicles", ["vehicle"])}
+    for job in every.values():
+        counts[job.vehicle["vehicle"]].update(deployments=1, logs=len(job.files), new=job.name in new)
+    calibrated = set[str]()
+    for row in catalogue.rows("calibrations", ["job", "attempt", "vehicle", "supported"]):
+        if row["job"] == GIVEN:
+            counts[row["vehicle"]].update(given=1)
+        elif row["job"] in every and row["attempt"] == last.get(row["job"], 1):
+            calibrated.add(row["job"])
+            counts[row["vehicle"]].update(calibrated=1, unsupported=not row["supported"])
+    for name in every.keys() - calibrated - new:
+        counts[every[name].vehicle["vehicle"]].update(failed=1)
+    for what in ("diagnosed", "mapped"):
+        for name in {row["job"] for row in done if row[what]} & every.keys():
+            counts[every[name].vehicle["vehicle"]].update({what: 1})
+    failures = [
+        row["line"]
+        for row in catalogue.rows("failures")
+        if row["job"] in every and row["attempt"] == last.get(row["job"], 1)
+    ]
+    sensors: dict[str, set[str]] = {}
+    for row in catalogue.rows("sensors"):
+        sensors.setdefault(row["sensor"], set()).add(row["vehicle"])
     return {
         "vehicles": [
-            {"vehicle": name, **{key: one[key] for key in keys}} for name, one in sorted(counts.items())
+            {"vehicle": name, **{key: one[key] for key in COUNTED}} for name, one in sorted(counts.items())
         ],
-        "failures": [row["line"] for row in failures],
+        "sensors": [{"sensor": name, "vehicles": sorted(on)} for name, on in sorted(sensors.items())],
+        "failures": failures,
     }

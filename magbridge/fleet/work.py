@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -52,12 +52,23 @@ class Job(NamedTuple):
     files: tuple[Row, ...]
     diagnose: bool = False
     map: bool = False
+    attempt: int = 1
+
+    @property
+    def sensor(self) -> str:
+        """The sensor it flew with; empty: whichever."""
+        return str(next((row["sensor"] for row in self.files if row["sensor"]), self.vehicle["sensor"]))
+
+    @property
+    def mark(self) -> Row:
+        """What each of its results begins with."""
+        return {"job": self.name, "attempt": self.attempt}
 
     @property
     def name(self) -> str:
         """What its results are made of, as 32 hexadecimal digits: other logs or parameters, another name."""
         made_of = (
-            self.vehicle["vehicle"], self.deployment, self.refit, self.vehicle["sensor"],
+            self.vehicle["vehicle"], self.deployment, self.refit, self.sensor,
             self.vehicle["parameters"], self.vehicle["order"], sorted({row["sha256"] for row in self.files}),
         )  # fmt: skip
         return sha256(msgspec.json.encode(made_of)).hexdigest()[:32]
@@ -104,6 +115,9 @@ def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
             tables.setdefault("failures", []).append(_failure(job, str(error)))
             continue
         tables.setdefault("logs", []).append(_log(log, row["sha256"]))
+        if sensor := str(log.attrs.get("sensor", "")) or job.sensor:
+            one = {"sensor": sensor, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment}
+            tables.setdefault("sensors", []).append(one)
     if not logs:
         raise DataError("none of its logs can be used")
     together = join(list(logs.values()))
@@ -117,13 +131,16 @@ def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
     stems = {row["sha256"]: Path(row["path"]).stem for row in job.files}
     for sha, log in logs.items():
         path = folder / f"{stems[sha]}-{sha[:8]}.nc"
-        tables.setdefault("corrected", []).append(_correct(job, found.calibration, log, sha, path))
+        row = _correct(job, found.calibration, log, path)
+        tables.setdefault("corrected", []).append(
+            {**row, "sha256": sha, "path": path.relative_to(results).as_posix()}
+        )
     if job.diagnose:
         tables["findings"] = list(_findings(job, together, found.calibration))
     if job.map:
-        tables["maps"] = [
-            _map(job, list(logs.values()), found.calibration, folder / f"map-{job.name[:8]}.nc")
-        ]
+        path = folder / f"map-{job.name[:8]}.nc"
+        row = _map(job, list(logs.values()), found.calibration, path)
+        tables["maps"] = [{**row, "path": path.relative_to(results).as_posix()}]
 
 
 def _checked(path: Path, job: Job) -> xr.Dataset:
@@ -132,9 +149,9 @@ def _checked(path: Path, job: Job) -> xr.Dataset:
     if counts_from_boot(log):
         first = str(np.datetime64(int(log["time"][0]), "s"))
         raise FormatError(path, f"its clock says {first}: give it a date (magbridge convert --date)")
-    sensor, expected = str(log.attrs.get("sensor", "")), job.vehicle["sensor"]
+    sensor, expected = str(log.attrs.get("sensor", "")), job.sensor
     if "" not in (sensor, expected) and sensor != expected:
-        raise FormatError(path, f"sensor {sensor!r}, but {job.vehicle['vehicle']} carries {expected!r}")
+        raise FormatError(path, f"sensor {sensor!r}, but {_named(job)} carries {expected!r}")
     return log
 
 
@@ -156,8 +173,9 @@ def _log(log: xr.Dataset, sha: str) -> Row:
 def _calibration(job: Job, found: Fit, start: float) -> Row:
     calibration, told = found.calibration, found.information
     return {
-        "job": job.name, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment, "refit": job.refit,
-        "start": start, "method": calibration.method, "rms": found.rms, "noise": calibration.noise.sensor,
+        **job.mark, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment, "refit": job.refit,
+        "start": start, "sensor": calibration.sensor.name or job.sensor, "method": calibration.method,
+        "rms": found.rms, "noise": calibration.noise.sensor,
         "expected": found.details["expected_over_noise"] * calibration.noise.sensor,
         "supported": found.supported, "warnings": list(found.warnings),
         "calibration": encode_calibration(calibration).decode(),
@@ -166,7 +184,7 @@ def _calibration(job: Job, found: Fit, start: float) -> Row:
     }  # fmt: skip
 
 
-def _correct(job: Job, calibration: Calibration, log: xr.Dataset, sha: str, path: Path) -> Row:
+def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) -> Row:
     """Write a log's corrected field; return its row."""
     path.parent.mkdir(parents=True, exist_ok=True)
     correction = Correction(calibration)
@@ -181,15 +199,15 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, sha: str, path
             samples, flagged = samples + len(sigma), flagged + int(doubtful.sum())
             variances += float((sigma[good] ** 2).sum())
     return {
-        "job": job.name, "sha256": sha, "path": _relative(path), "samples": samples,
-        "flagged": flagged, "sigma": float(np.sqrt(variances / max(samples - flagged, 1))),
+        **job.mark, "samples": samples, "flagged": flagged,
+        "sigma": float(np.sqrt(variances / max(samples - flagged, 1))),
     }  # fmt: skip
 
 
 def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> Iterator[Row]:
     """Yield a row for each cause found, or one that says that there is none."""
     found = diagnose([log], calibration, learned_from=[log])
-    nothing: dict[str, Any] = {"job": job.name, "verdict": found.verdict}
+    nothing: Row = {**job.mark, "verdict": found.verdict}
     if not found.findings:
         yield {**nothing, "cause": "", "channel": "", "signal_to_noise": None}
     for one in found.findings:
@@ -205,20 +223,15 @@ def _map(job: Job, logs: list[xr.Dataset], calibration: Calibration, path: Path)
     grid = anomaly_map(made.gridded, made.samples.origin, name=path.name)
     grid.save(path)
     return {
-        "job": job.name, "path": _relative(path), "rms": float(np.sqrt(np.mean(made.residual**2))),
+        **job.mark, "rms": float(np.sqrt(np.mean(made.residual**2))),
         "sigma": float(np.nanmedian(grid.sigma)),
     }  # fmt: skip
-
-
-def _relative(path: Path) -> str:
-    """Return a result's path below the catalogue: results/VEHICLE/DEPLOYMENT/NAME."""
-    return "/".join(path.parts[-4:])
 
 
 def _failure(job: Job, line: str) -> Row:
     whole = line if line.startswith("/") else f"{_named(job)}: {line}"
     return {
-        "job": job.name, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment,
+        **job.mark, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment,
         "line": " ".join(whole.split()),
     }  # fmt: skip
 

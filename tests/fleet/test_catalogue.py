@@ -9,10 +9,20 @@ import pytest
 from fleets import fly
 
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
-from magbridge.fleet import catalogue as room
-from magbridge.fleet.catalogue import Catalogue
+from magbridge.fleet import folder as room
+from magbridge.fleet.folder import FolderCatalogue as Catalogue
 from magbridge.fleet.process import jobs
-from magbridge.fleet.register import Vehicle, add_logs, add_vehicle, current_files, read_fleet, vehicles
+from magbridge.fleet.register import (
+    Deployment,
+    Vehicle,
+    add_logs,
+    add_vehicle,
+    current_files,
+    read_fleet,
+    vehicles,
+)
+
+MAY = Deployment("may", ())
 
 
 @pytest.fixture
@@ -20,8 +30,8 @@ def empty(tmp_path: Path) -> Catalogue:
     return Catalogue(tmp_path / "fleet", create=True)
 
 
-def line(n: int) -> dict[str, str]:
-    return {"job": str(n), "vehicle": "v", "deployment": "d", "line": f"failure {n}"}
+def line(n: int) -> dict[str, str | int]:
+    return {"job": str(n), "attempt": 1, "vehicle": "v", "deployment": "d", "line": f"failure {n}"}
 
 
 def test_a_row_is_there_once(empty: Catalogue) -> None:
@@ -35,7 +45,8 @@ def test_two_writers_of_the_same_rows_write_one_file(
     empty: Catalogue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = Catalogue(empty.folder)
-    monkeypatch.setattr(other, "_keys", lambda _: set())  # it looked before the first had written
+    before = empty._read("failures", ())
+    monkeypatch.setattr(other, "_read", lambda *_: before)  # it looked before the first had written
     empty.add("failures", [line(1), line(2)])
     other.add("failures", [line(2), line(1)])
     other.add("failures", [line(2), line(3)])
@@ -95,26 +106,26 @@ def test_two_vehicles_of_one_name(empty: Catalogue) -> None:
 def test_a_log_that_changed_is_another_version(empty: Catalogue, tmp_path: Path) -> None:
     log = fly(tmp_path / "log.nc", 1, 0)
     add_vehicle(empty, "comet", Vehicle(parameters=("battpos",)))
-    assert add_logs(empty, "comet", "may", "", [log]) == (1, [])
-    assert add_logs(empty, "comet", "may", "", [log]) == (0, [])
+    assert add_logs(empty, "comet", MAY, [log]) == (1, [])
+    assert add_logs(empty, "comet", MAY, [log]) == (0, [])
     first, kept = jobs(empty)[0].name, log.read_bytes()
     fly(log, 1, 1)
-    count, (said,) = add_logs(empty, "comet", "may", "", [log])
+    count, (said,) = add_logs(empty, "comet", MAY, [log])
     assert count == 1
     assert said.endswith("log.nc: has changed since it was catalogued; what it holds now counts")
     (now,) = current_files(empty.rows("files"))
     assert now["version"] == 2
     assert jobs(empty)[0].name != first
     log.write_bytes(kept)  # and back
-    add_logs(empty, "comet", "may", "", [log])
+    add_logs(empty, "comet", MAY, [log])
     assert jobs(empty)[0].name == first
 
 
 def test_an_unknown_vehicle_and_a_missing_log(empty: Catalogue, tmp_path: Path) -> None:
     with pytest.raises(WrongUse, match=r"nemo: not a vehicle of .* \(none yet\)"):
-        add_logs(empty, "nemo", "may", "", [])
+        add_logs(empty, "nemo", MAY, [])
     add_vehicle(empty, "comet", Vehicle())
-    count, (said,) = add_logs(empty, "comet", "may", "", [tmp_path / "gone.nc"])
+    count, (said,) = add_logs(empty, "comet", MAY, [tmp_path / "gone.nc"])
     assert count == 0
     assert "gone.nc: expected a file, there is none" in said
 

@@ -13,11 +13,16 @@ from fleets import fly
 
 from magbridge.calibration.file import decode_calibration, load
 from magbridge.cli import main
-from magbridge.fleet.catalogue import TABLES, Catalogue, Row
+from magbridge.fleet.catalogue import TABLES, Row
+from magbridge.fleet.folder import FolderCatalogue as Catalogue
+from magbridge.fleet.memory import current, lessons
 from magbridge.fleet.process import client_of, jobs, new_jobs, process
-from magbridge.fleet.register import Vehicle, add_logs, add_vehicle
+from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
+from magbridge.fleet.status import status
 from magbridge.fleet.work import work
 from magbridge.logs import read, write
+
+MAY = Deployment("may", ())
 
 
 def catalogue_of(folder: Path, flown: Path) -> Catalogue:
@@ -48,7 +53,7 @@ def test_every_deployment_is_done_once(done: Catalogue) -> None:
         ("one", "first"), ("one", "second"), ("two", "first"),
     }  # fmt: skip
     assert len(found["calibrations"]) == len(found["logs"]) == len(found["corrected"]) == 3
-    assert all((done.folder / row["path"]).is_file() for row in found["corrected"])
+    assert all((done.results / row["path"]).is_file() for row in found["corrected"])
     assert all(row["rms"] < 2.0 and row["flagged"] == 0 for row in found["calibrations"] if "flagged" in row)
     assert not new_jobs(done, jobs(done))
 
@@ -57,15 +62,15 @@ def test_killed_and_begun_again_is_the_same(done: Catalogue, flown: Path, tmp_pa
     again = catalogue_of(tmp_path, flown)
     for turn in range(3):  # each time killed after one deployment, the last just before it was marked as done
         job = new_jobs(again, jobs(again))[0]
-        tables = work(job, again.folder / "results").tables
+        tables = work(job, again.results).tables
         for table, rows in tables.items():
             again.add(table, rows)
         if turn < 2:
-            again.add("done", [{"job": job.name, "diagnosed": False, "mapped": False}])
+            again.add("done", [{**job.mark, "diagnosed": False, "mapped": False}])
     (left,) = new_jobs(again, jobs(again))
-    for table, rows in work(left, again.folder / "results").tables.items():
+    for table, rows in work(left, again.results).tables.items():
         assert again.add(table, rows) == 0
-    again.add("done", [{"job": left.name, "diagnosed": False, "mapped": False}])
+    again.add("done", [{**left.mark, "diagnosed": False, "mapped": False}])
     assert content(again) == content(done)
 
 
@@ -78,22 +83,62 @@ def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(tmp_path: Pat
         fly(tmp_path / "boot.nc", 1, 0, start=100.0, sensor="HMR 1"),
     ]
     (tmp_path / "text.nc").write_text("no log")
-    add_logs(catalogue, "comet", "may", "", [*logs, tmp_path / "text.nc"])
+    add_logs(catalogue, "comet", MAY, [*logs, tmp_path / "text.nc"])
     (job,) = jobs(catalogue)
     tables = work(job, tmp_path / "results").tables
     assert len(tables["calibrations"]) == len(tables["corrected"]) == 1
     lines = " | ".join(sorted(row["line"] for row in tables["failures"]))
     assert "boot.nc: its clock says 1970-01-01T00:01:40: give it a date" in lines
-    assert "other.nc: sensor 'HMR 2', but comet carries 'HMR 1'" in lines
+    assert "other.nc: sensor 'HMR 2', but comet may carries 'HMR 1'" in lines
     assert "text.nc" in lines
     assert len(tables["failures"]) == 3
+
+
+def test_a_failure_is_tried_again_when_asked(flown: Path, tmp_path: Path) -> None:
+    catalogue = catalogue_of(tmp_path, flown)
+    every = jobs(catalogue)
+    job, *others = every
+    # as an older version left it, which could not read a log
+    catalogue.add(
+        "failures", [{**job.mark, "vehicle": "one", "deployment": "first", "line": "no such format"}]
+    )
+    catalogue.add("done", [{**each.mark, "diagnosed": False, "mapped": False} for each in every])
+    assert status(catalogue)["failures"] == ["no such format"]
+    assert not new_jobs(catalogue, every)
+    (again,) = new_jobs(catalogue, every, retry=True)
+    assert (again.name, again.attempt) == (job.name, 2)
+    for table, rows in work(again, catalogue.results).tables.items():
+        catalogue.add(table, rows)
+    assert not current(catalogue, "calibrations")  # killed before it was done
+    catalogue.add("done", [{**again.mark, "diagnosed": False, "mapped": False}])
+    assert [row["attempt"] for row in current(catalogue, "calibrations")] == [2]
+    assert status(catalogue)["failures"] == []
+    assert not new_jobs(catalogue, every, retry=True)
+
+
+def test_which_sensor_flew_where_is_on_record(flown: Path, tmp_path: Path) -> None:
+    catalogue = Catalogue(tmp_path / "fleet", create=True)
+    add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",), sensor="HMR 1"))
+    for number, sensor in enumerate(("HMR 1", "HMR 2", "HMR 2")):
+        log = fly(tmp_path / f"{number}.nc", 1, number, sensor=sensor)
+        add_logs(catalogue, "comet", Deployment(f"d{number}", (), "spring", "HMR 2" * (number == 1)), [log])
+    lines = []
+    for job in jobs(catalogue):
+        tables = work(job, catalogue.results).tables
+        lines += [row["line"] for row in tables.pop("failures", [])]
+        for table, rows in tables.items():
+            catalogue.add(table, rows)
+    assert lines[0].endswith("2.nc: sensor 'HMR 2', but comet d2 carries 'HMR 1'")
+    assert {row["sensor"] for row in catalogue.rows("sensors")} == {"HMR 1", "HMR 2"}
+    # another sensor is as good as a refit
+    assert [one.refit for one in lessons(catalogue, "comet")] == ["spring, HMR 1", "spring"]
 
 
 def test_what_is_wrong_with_the_moment_is_not_on_record(tmp_path: Path) -> None:
     catalogue = Catalogue(tmp_path / "fleet", create=True)
     add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
     log = fly(tmp_path / "log.nc", 1, 0)
-    add_logs(catalogue, "comet", "may", "", [log])
+    add_logs(catalogue, "comet", MAY, [log])
     (job,) = jobs(catalogue)
     kept = log.read_bytes()
     log.write_bytes(kept + b" ")
@@ -119,7 +164,7 @@ def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.
             changed = read(log)
             changed["mag_y"] = changed["mag_y"] + 400.0
             write(changed, log)
-        add_logs(catalogue, "comet", f"d{number}", "spring", [log])
+        add_logs(catalogue, "comet", Deployment(f"d{number}", (), "spring"), [log])
     for job in jobs(catalogue):
         for table, rows in work(job, tmp_path / "results").tables.items():
             catalogue.add(table, rows)

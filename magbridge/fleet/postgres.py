@@ -1,0 +1,106 @@
+"""A catalogue in a PostgreSQL database, for those who share one.
+
+The tables are those of :data:`.TABLES`, in a schema of their own, each with the rows' keys as its primary
+key: rows that two people add at once are there once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import polars as pl
+import psycopg
+from psycopg import sql
+from psycopg.rows import dict_row
+
+from magbridge.errors import FormatError, PortError
+from magbridge.fleet.catalogue import FORMAT, TABLES, Catalogue, Row
+
+__all__ = ["PostgresCatalogue"]
+
+SCHEMA = sql.Identifier("magbridge_fleet")
+PATIENCE = 10
+"""s until a server that does not answer is given up."""
+MAKING = 0x6D616762
+"""Number of the lock that one holds who makes the tables."""
+TYPES: dict[pl.DataType, str] = {
+    pl.String(): "text",
+    pl.Float64(): "double precision",
+    pl.Int64(): "bigint",
+    pl.Boolean(): "boolean",
+    pl.List(pl.String()): "text[]",
+    pl.List(pl.Float64()): "double precision[]",
+}
+
+
+class PostgresCatalogue(Catalogue):
+    """The tables of a database, ``postgresql://USER@HOST/DATABASE``; as libpq, it reads ``~/.pgpass``."""
+
+    def __init__(self, url: str, results: Path, *, create: bool = False) -> None:
+        self._url, self.results = url, results
+        parts = urlsplit(url)
+        # without what may hold a password
+        self.name = f"postgresql://{parts.netloc.rpartition('@')[2]}{parts.path}"
+        with self._connected() as connection:
+            if create:
+                self._make(connection)
+            known = connection.execute("select to_regclass('magbridge_fleet.catalogue')").fetchone()
+            if known is None or known[0] is None:
+                raise FormatError(self.name, "expected a fleet's catalogue (magbridge fleet add makes one)")
+            found = connection.execute("select max(format) from magbridge_fleet.catalogue").fetchone()
+        self._check_format(found[0] if found else 0)
+
+    def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:  # noqa: D102  as the catalogue's
+        query = sql.SQL('select {} from {}.{} order by key collate "C"').format(
+            sql.SQL(", ").join(map(sql.Identifier, columns or TABLES[table])), SCHEMA, sql.Identifier(table)
+        )
+        with self._connected() as connection, connection.cursor(row_factory=dict_row, binary=True) as cursor:
+            return cursor.execute(query).fetchall()
+
+    def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
+        names = ("key", *TABLES[table])
+        query = sql.SQL("insert into {}.{} ({}) values ({}) on conflict (key) do nothing").format(
+            SCHEMA,
+            sql.Identifier(table),
+            sql.SQL(", ").join(map(sql.Identifier, names)),
+            sql.SQL(", ").join(map(sql.Placeholder, names)),
+        )
+        with self._connected() as connection, connection.cursor() as cursor:
+            cursor.executemany(query, [{"key": key, **row} for key, row in keyed.items()])
+            return cursor.rowcount
+
+    @contextmanager
+    def _connected(self) -> Iterator[psycopg.Connection]:
+        """Connect for one transaction."""
+        try:
+            with psycopg.connect(self._url, connect_timeout=PATIENCE) as connection:
+                yield connection
+        except psycopg.Error as error:
+            raise PortError(self.name, " ".join(str(error).split())) from error
+
+    def _make(self, connection: psycopg.Connection) -> None:
+        """Make the tables that are not there; one at a time does so."""
+        connection.execute("select pg_advisory_xact_lock(%s)", (MAKING,))
+        connection.execute(sql.SQL("create schema if not exists {}").format(SCHEMA))
+        connection.execute(
+            sql.SQL("create table if not exists {}.catalogue (format bigint primary key)").format(SCHEMA)
+        )
+        connection.execute(
+            sql.SQL(
+                "insert into {0}.catalogue select %s where not exists (select from {0}.catalogue)"
+            ).format(SCHEMA),
+            (FORMAT,),
+        )
+        for table, columns in TABLES.items():
+            typed = [
+                sql.SQL("{} {}").format(sql.Identifier(name), sql.SQL(TYPES[kind]))
+                for name, kind in columns.items()
+            ]
+            connection.execute(
+                sql.SQL("create table if not exists {}.{} (key text primary key, {})").format(
+                    SCHEMA, sql.Identifier(table), sql.SQL(", ").join(typed)
+                )
+            )

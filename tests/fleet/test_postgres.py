@@ -1,0 +1,111 @@
+"""A catalogue on a server says the same as one in a folder, whoever writes to it at once."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Barrier, Thread
+
+import pytest
+
+pytest.importorskip("psycopg", reason="PostgreSQL's client is not installed")
+
+import psycopg
+from databases import program, server
+
+from magbridge.cli import main
+from magbridge.errors import FormatError, PortError
+from magbridge.fleet.catalogue import TABLES, Catalogue, open_catalogue
+from magbridge.fleet.process import jobs
+from magbridge.fleet.work import work
+
+pytestmark = pytest.mark.skipif(
+    not (program("initdb") and program("pg_ctl")), reason="no PostgreSQL server is installed"
+)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[str]:
+    with server() as url:
+        yield url
+
+
+@pytest.fixture
+def url(running: str) -> str:
+    """A database of nothing."""
+    with psycopg.connect(running) as connection:
+        connection.execute("drop schema if exists magbridge_fleet cascade")
+    return running
+
+
+def test_it_says_what_a_folder_says(url: str, flown: Path, tmp_path: Path) -> None:
+    both: list[Catalogue] = []
+    for where in (url, str(tmp_path / "fleet")):
+        assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", where]) == 0
+        catalogue = open_catalogue(where, tmp_path / "results")
+        job = jobs(catalogue)[0]
+        for _ in range(2):  # the second time, nothing is new
+            added = [
+                catalogue.add(table, rows) for table, rows in work(job, catalogue.results).tables.items()
+            ]
+        assert not any(added)
+        catalogue.add("done", [{**job.mark, "diagnosed": False, "mapped": True}])
+        both.append(catalogue)
+    for table in TABLES:
+        assert both[0].rows(table) == both[1].rows(table)
+    few = [catalogue.rows("calibrations", ["rms", "warnings"]) for catalogue in both]
+    assert few[0] == few[1]
+    assert set(few[0][0]) == {"rms", "warnings"}
+
+
+def test_the_commands_know_it(
+    url: str, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["fleet", "status", "--catalogue", url]) == 1
+    assert "expected a fleet's catalogue (magbridge fleet add makes one)" in capsys.readouterr().err
+    assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", url]) == 0
+    catalogue = open_catalogue(url, tmp_path)
+    for job in jobs(catalogue):
+        for table, rows in work(job, catalogue.results).tables.items():
+            catalogue.add(table, rows)
+    capsys.readouterr()
+    assert main(["fleet", "status", "--catalogue", url, "--json"]) == 0
+    assert [one["calibrated"] for one in json.loads(capsys.readouterr().out)["vehicles"]] == [2, 1]
+    cal = str(tmp_path / "cal.json")
+    assert main(["calibrate", str(flown / "one/second.nc"), "--fleet", url, "-o", cal, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["fleet"]["deployments"] == 1
+
+
+def test_many_make_it_and_write_to_it_at_once(url: str) -> None:
+    together, wrong = Barrier(4), list[Exception]()
+
+    def writer(number: int) -> None:
+        together.wait()
+        try:
+            catalogue = open_catalogue(url, create=True)
+            for n in (1, 2, number + 10):
+                row = {"job": str(n), "attempt": 1, "vehicle": "v", "deployment": "d", "line": f"failure {n}"}
+                catalogue.add("failures", [row])
+        except (PortError, FormatError) as error:
+            wrong.append(error)
+
+    threads = [Thread(target=writer, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+    assert len(open_catalogue(url).rows("failures")) == 6
+
+
+def test_a_newer_one_and_a_server_that_is_gone_are_a_line_each(url: str) -> None:
+    open_catalogue(url, create=True)
+    with psycopg.connect(url) as connection:
+        connection.execute("insert into magbridge_fleet.catalogue values (9)")
+    with pytest.raises(FormatError, match="a catalogue of format 9; this magbridge reads up to 1"):
+        open_catalogue(url)
+    with pytest.raises(PortError, match=r"^postgresql:///nothing: ") as refused:
+        open_catalogue("postgresql://someone:secret@/nothing?host=/no/such/folder")
+    assert "secret" not in str(refused.value)
+    assert "\n" not in str(refused.value)
