@@ -97,11 +97,10 @@ def test_what_is_wrong_with_one_log_is_a_line_and_the_rest_goes_on(tmp_path: Pat
 def test_a_failure_is_tried_again_when_asked(flown: Path, tmp_path: Path) -> None:
     catalogue = catalogue_of(tmp_path, flown)
     every = jobs(catalogue)
-    job, *others = every
+    job = every[0]
     # as an older version left it, which could not read a log
-    catalogue.add(
-        "failures", [{**job.mark, "vehicle": "one", "deployment": "first", "line": "no such format"}]
-    )
+    failed = {**job.mark, "vehicle": "one", "deployment": "first", "line": "no such format"}
+    catalogue.add("failures", [failed])
     catalogue.add("done", [{**each.mark, "diagnosed": False, "mapped": False} for each in every])
     assert status(catalogue)["failures"] == ["no such format"]
     assert not new_jobs(catalogue, every)
