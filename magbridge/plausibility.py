@@ -51,6 +51,10 @@ QUIETEST: Final = 0.1
 """nT: no fluxgate's noise is lower."""
 STEP: Final = 1.02
 """Factor by which a sample moves the median of the second differences."""
+PATIENCE: Final = 6
+FASTEST: Final = 12
+"""Samples in a row that lie on one side of the median before its steps grow, and by how many times at most: twenty
+times the noise is learned in half the samples, and white noise passes for 2.3 times itself no oftener."""
 ENOUGH: Final = 100
 """Second differences from which on their median says something of the noise."""
 INNOVATION: Final = 4.0 / 3.0 / (6.0 * 0.6745**2)
@@ -68,7 +72,10 @@ REPEATS: Final = 256
 RARELY: Final = 1e-9
 """Probability of a run of repeated numbers that a healthy axis does not show."""
 UNREST: Final = 0.3
-"""Share of an outlier's square that is added to the variance of the next sample, and so on."""
+BURST: Final = 8
+BURST_UNREST: Final = 0.8
+"""Share of an outlier's square that is added to the variance of the next sample, and so on: a spike passes. One
+that comes within so many samples of another is rather noise, whose next sample is as bad."""
 WRONG_US: Final = 8_000_000
 """µs for which a wrong level is no burst of garbage."""
 LASTING_US: Final = 120_000_000
@@ -124,15 +131,18 @@ class Plausibility:
         self._variance = 0.0  # of innovations, nT^2
         self._level = nan
         self._level_variance = 0.0
+        self._before = nan  # the level before a sample that only the time or a mass's move made acceptable
         self._level_us = 0
         self._slope = SLOPE * SLOPE
         self._mark, self._mark_us = nan, 0
         self._unrest = self._median = 0.0
+        self._decay, self._quiet = UNREST, BURST
         self._last = self._last_but_one = nan
         self._moved_us = 0
         self._values: tuple[float, ...] = ()
         self._candidate, self._agreed = nan, 0
         self._bends = self._accepted = 0
+        self._run, self._rising = 0, False  # of second differences on one side of their median
         self._moved = self._largest = 0.0
         self._jumps = self._wrong = 0
         self._until_us = self._wrong_until_us = self._wrong_us = 0
@@ -262,18 +272,24 @@ class Plausibility:
         e = total - self._level
         self._learn_noise(total)
         if e * e > GATE * GATE * spread and self._accepted < AGREE:
+            if moved and learn:
+                self._move(time_us, e, moved)
             self._begin(time_us, values, total, sigma)  # which of the first is the outlier is not known
             self._accepted = 0
             return 0.0
         if e * e <= GATE * GATE * spread:
             self._accepted += 1
             self._agreed = 0
+            self._before = self._level if e * e > GATE * GATE * variance else nan
             self._begin(time_us, values, self._level + 0.5 * e, sigma)
             if time_us - self._mark_us >= SLOPE_US:
                 self._learn_slope(time_us)
-            self._unrest = self._unrest * UNREST if self._unrest > variance else 0.0
+            self._unrest = self._unrest * self._decay if self._unrest > variance else 0.0
+            self._quiet += 1
             return self._unrest
         self._unrest = min(e * e, CLIP * GATE * GATE * spread)
+        self._decay = BURST_UNREST if self._quiet < BURST else UNREST
+        self._quiet = 0
         self.flags = IMPLAUSIBLE
         if not learn:
             return e * e
@@ -284,7 +300,9 @@ class Plausibility:
         else:
             self._candidate, self._agreed = total, 1
         if self._agreed == AGREE:
-            self._move(time_us, self._candidate - self._level, moved)
+            back = self._candidate - self._before
+            if not back * back <= GATE * GATE * spread:  # else the last that was accepted was the outlier
+                self._move(time_us, self._candidate - self._level, moved)
             self._begin(time_us, values, self._candidate, sigma)
             self._agreed = 0
         return e * e
@@ -298,7 +316,11 @@ class Plausibility:
         bend = abs(total - 2.0 * self._last + self._last_but_one)
         self._last_but_one, self._last = self._last, total
         if bend == bend:  # noqa: PLR0124 - compiled, quicker than a call
-            self._median *= STEP if bend > self._median else 1.0 / STEP
+            rising = bend > self._median
+            self._run = self._run + 1 if rising == self._rising else 0
+            self._rising = rising
+            step = STEP ** min(max(self._run - PATIENCE, 1), FASTEST)
+            self._median *= step if rising else 1.0 / step
             self._variance = INNOVATION * self._median * self._median
             self._bends += 1
 
