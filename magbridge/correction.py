@@ -19,6 +19,7 @@ from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, identity
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
+from magbridge.direction import Direction
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
 from magbridge.learning import Learner
@@ -67,6 +68,7 @@ class Correction:
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
         # what has no calibration is not expected to be the Earth's field
         self.plausibility = None if calibration.method == "none" else Plausibility(calibration.noise.sensor)
+        self.direction = None if calibration.boresight is None else Direction()
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
@@ -132,12 +134,17 @@ class Correction:
                 self.aligner.settings.reference_sigma,
             )
             quality |= self.plausibility.flags
+        turned = 0.0
+        if self.direction is not None:
+            turned = self.direction.check(sample.time_us, x, y, z)
+            quality |= self.direction.flags
         if self.learner is not None:
             quality |= self._learn(reading, sample, quality, main_field, where, restarted=restarted)
             judged += self.learner.variance
-        if sample.sigma or sample.spans or judged:
+        if sample.sigma or sample.spans or judged or turned:
             more = judged + (self._more(sample) if sample.sigma or sample.spans else 0.0)
             sigma = sqrt(sigma * sigma + more)
+            more += turned
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
         return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
 
@@ -227,9 +234,13 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
     level = np.full(len(results), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
-    main_fields = magnitude(main_field(deployment))
-    known, places = main_fields.tolist(), _places(deployment)
+    vectors = main_field(deployment)
+    main_fields = magnitude(vectors)
+    known, places, attitudes = main_fields.tolist(), _places(deployment), _attitudes(deployment)
     for row, reading, stamp in _readings(correction, deployment):
+        if correction.direction is not None and attitudes is not None:
+            correction.direction.expect(*vectors[row].tolist())
+            correction.direction.attitude(stamp, *attitudes[row])
         sample, one = correction.reading(reading, stamp, main_field=known[row], where=places[row])
         level[row] = correction.level(sample, one)
         results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
@@ -251,6 +262,16 @@ def _places(deployment: xr.Dataset) -> list[tuple[float, float] | None]:
         return [None] * deployment.sizes["time"]
     both = (deployment[name].to_numpy().astype(float).tolist() for name in ("latitude", "longitude"))
     return [(lat, lon) if isfinite(lat + lon) else None for lat, lon in zip(*both, strict=True)]
+
+
+def _attitudes(deployment: xr.Dataset) -> list[list[float]] | None:
+    """Return roll, pitch and heading of every row, rad; None where a log has none."""
+    names = ["roll", "pitch", "heading"]
+    if not set(names) <= set(deployment):
+        return None
+    degrees = np.stack([deployment[name].to_numpy().astype(float) for name in names], axis=1)
+    attitudes: list[list[float]] = np.radians(degrees).tolist()
+    return attitudes
 
 
 def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:

@@ -53,8 +53,8 @@ STEP: Final = 1.02
 """Factor by which a sample moves the median of the second differences."""
 PATIENCE: Final = 6
 FASTEST: Final = 12
-"""Samples in a row that lie on one side of the median before its steps grow, and by how many times at most: twenty
-times the noise is learned in half the samples, and white noise passes for 2.3 times itself no oftener."""
+"""Samples in a row that lie on one side of the median before its steps grow, and by how many times at most:
+twenty times the noise is learned in half the samples, and white noise passes for more no oftener."""
 ENOUGH: Final = 100
 """Second differences from which on their median says something of the noise."""
 INNOVATION: Final = 4.0 / 3.0 / (6.0 * 0.6745**2)
@@ -74,8 +74,8 @@ RARELY: Final = 1e-9
 UNREST: Final = 0.3
 BURST: Final = 8
 BURST_UNREST: Final = 0.8
-"""Share of an outlier's square that is added to the variance of the next sample, and so on: a spike passes. One
-that comes within so many samples of another is rather noise, whose next sample is as bad."""
+"""Share of an outlier's square that is added to the variance of the next sample, and so on: a spike passes.
+One that comes within so many samples of another is rather noise, whose next sample is as bad."""
 WRONG_US: Final = 8_000_000
 """µs for which a wrong level is no burst of garbage."""
 LASTING_US: Final = 120_000_000

@@ -144,7 +144,7 @@ def test_a_wrong_mass_is_seen_if_it_moves_with_the_very_second_sample() -> None:
 
 
 def test_a_spike_that_a_mass_s_move_makes_acceptable_is_no_new_level() -> None:
-    """After 40 s of motion the rock below may be another by 80 nT; when the next samples are as before, it is not."""
+    """After 40 s of motion the rock may be another by 80 nT; if the next samples are as before, it is not."""
     flight = Flight()
     flight.values[700:] = 1.0
     flight.quality[690:700] = MOVING
@@ -177,7 +177,7 @@ def test_more_noise_than_the_calibration_s_widens_sigma_within_a_hundred_samples
     wrong = (flags == 0) & (error > 3.0 * sigma)
     assert np.median(sigma[1000:]) == pytest.approx(20.0 * (4 / 3) ** 0.5, rel=0.2)
     assert np.mean(wrong[800:]) < 0.004
-    assert np.mean(wrong[700:800]) < 0.06
+    assert np.mean(wrong[700:800]) < 0.08
     assert [line for line in told if "noise" in line]
     assert len(told) == len(set(told))
 

@@ -28,7 +28,7 @@ from magbridge.link.parameters import alignment, file_rate, learning, telemetry_
 from magbridge.link.publish import Sample
 from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
-from magbridge.mavlink import Signing, Spec
+from magbridge.mavlink import Message, Signing, Spec, spec
 from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Quality, Reading
 from magbridge.sensors import open_driver
@@ -42,6 +42,7 @@ __all__ = ["Pipeline", "unmet"]
 
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
+ATTITUDE: Final = spec("ATTITUDE").id
 LATELY = 64
 """Samples over which the sample rate is computed."""
 DOUBTS = int(
@@ -104,7 +105,7 @@ class Pipeline:
         used = None if foreign else calibration
         learner = open_learner(config, used)
         self._correction = Correction(used, config.align, learner)
-        self._plausibility = self._correction.plausibility
+        self._plausibility, self._direction = self._correction.plausibility, self._correction.direction
         self._calibration_id = calibration_id(used) if used else 0
         autopilot = config.link.system, config.link.autopilot
         stamps = start.signing_timestamp, start.signing_streams
@@ -221,7 +222,9 @@ class Pipeline:
             where=self._position.where,
         )
         if self._plausibility is not None and self._plausibility.notices:
-            self._tell_implausible()
+            self._tell_implausible(self._plausibility.notices)
+        if self._direction is not None and self._direction.notices:
+            self._tell_implausible(self._direction.notices)
         doubts = corrected.quality & DOUBTS
         if doubts != self._quality:
             self._tell_doubts(doubts)
@@ -245,10 +248,19 @@ class Pipeline:
                     self._correction.telemetry(name, value, when_us, guessed=guessed)
             if message.id == Position.MESSAGE:
                 self._position.update(message, time_us)
+            elif message.id == ATTITUDE and message.component == self._config.link.autopilot:
+                self._turn(message, time_us)
             if self.navigation is not None:
                 self.navigation.hear(message, time_us)
         self.journal.link(time_us, component.heard)
         component.heard.clear()
+
+    def _turn(self, message: Message, time_us: int) -> None:
+        """Take the vehicle's attitude, beside which the vector's direction is judged."""
+        if self._direction is not None:
+            utc_us = time_us + self.component.codec.utc_offset_us
+            self._direction.expect(*self._position.direction(time_us, utc_us))
+            self._direction.attitude(time_us, message["roll"], message["pitch"], message["yaw"])
 
     def _tune(self, _: str = "") -> None:
         """Apply the present values of the parameters to the alignment."""
@@ -263,11 +275,10 @@ class Pipeline:
         self.component.announcer.state("quality", f"field: {names or 'good'}", severity)
         self._quality = doubts
 
-    def _tell_implausible(self) -> None:
-        assert self._plausibility is not None
-        for text in self._plausibility.notices:
+    def _tell_implausible(self, notices: list[str]) -> None:
+        for text in notices:
             self.component.announcer.say(text, MAV_SEVERITY.ERROR)
-        self._plausibility.notices.clear()
+        notices.clear()
 
     def _tell_no_anomaly(self, reason: str) -> None:
         self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)

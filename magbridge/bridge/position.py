@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import nan
+from math import isnan, nan
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from magbridge.errors import MagbridgeError
@@ -39,6 +39,8 @@ class Position:
         self._where: tuple[float, float, float] | None = None
         self._when_us = self._evaluated_us = 0
         self._field = nan
+        self._vector = nan, nan, nan
+        self._vector_us = 0
         self._model: NearbyField | None = None
 
     def update(self, message: Message, time_us: int) -> None:
@@ -67,6 +69,19 @@ class Position:
             self._evaluated_us = utc_us
             self._field = self._evaluate(utc_us)
         return self._field
+
+    def direction(self, time_us: int, utc_us: int) -> tuple[float, float, float]:
+        """Return the IGRF's vector in nT, north-east-down, of the last minute; NaN as :meth:`main_field`."""
+        if isnan(self.main_field(time_us, utc_us)):
+            return nan, nan, nan
+        if abs(utc_us - self._vector_us) > MAX_AGE_US:
+            from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
+
+            assert self._where is not None
+            latitude, longitude, depth = self._where
+            north, east, down = igrf(longitude, latitude, depth, utc_us * 1e-6)[0].tolist()
+            self._vector, self._vector_us = (north, east, down), utc_us
+        return self._vector
 
     def _evaluate(self, utc_us: int) -> float:
         assert self._where is not None

@@ -1,0 +1,120 @@
+"""Whether the corrected vector points where the main field does, given the vehicle's attitude.
+
+The total field does not tell a wrong mounting, two axes that are exchanged or one whose sign is wrong. The
+direction does: with the unit vector *d* that is down in body axes, ``sin I = b·d / |b|`` is the field's
+inclination, which needs no heading; and the levelled vector's heading from magnetic north, ``m = atan2(-b·s,
+b·f)``, f and s forward and starboard in the horizontal plane, gives the declination ``D = yaw - m``.
+
+Roll and pitch come from gravity, and are off by a degree or two: an inclination more than :data:`INCLINED`
+off is flagged. The heading of an autopilot may come from a compass beside the same iron, or be none before a
+flight: if it and the vector differ by more than :data:`TURNED`, one of both is wrong, which is not known from
+aboard. It is reported, and the vector's sigma spans the difference.
+"""
+
+from __future__ import annotations
+
+from math import asin, atan2, cos, degrees, inf, isfinite, nan, pi, radians, remainder, sin, sqrt
+from typing import Final
+
+from magbridge.records import Quality
+
+__all__ = ["Direction"]
+
+INCLINED: Final = radians(10.0)
+"""Five sigmas of 2 deg: attitude 1.5, boresight 1, main field 0.2 (Chulliat et al. 2020, table 14), rock."""
+TURNED: Final = radians(60.0)
+"""Five sigmas of a compass that is off by 12 deg."""
+STEEP: Final = 0.2
+"""Share of the field that is horizontal, below which no heading is read from it."""
+EVERY_US: Final = 1_000_000
+"""µs from one look to the next: a mounting does not change from sample to sample."""
+FRESH_US: Final = 5_000_000
+"""µs for which an attitude is the present one."""
+LASTING: Final = 8
+"""Looks in a row that differ: what a manoeuvre does to an attitude is over by then."""
+LONG_US: Final = 3_600_000_000
+"""µs for which what was seen is remembered: at some headings a reversed axis looks right."""
+IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
+
+
+class Direction:
+    """Judges the vector now and then.
+
+    Attributes
+    ----------
+    flags : int
+        Of the last sample: :class:`~magbridge.records.Quality` bits.
+    notices : list of str
+        What was found since the caller has last emptied it, each once.
+    """
+
+    def __init__(self) -> None:
+        self.flags = 0
+        self.notices: list[str] = []
+        self._told = 0
+        self._roll = self._pitch = self._yaw = nan
+        self._attitude_us = -FRESH_US
+        self._inclination = self._declination = nan
+        self._next_us = 0
+        self._tilted = self._turned = 0
+        self._variance = 0.0
+        self._until_us = self._tilted_until_us = 0
+
+    def attitude(self, time_us: int, roll: float, pitch: float, yaw: float) -> None:
+        """Take the vehicle's attitude, rad, of forward-starboard-down axes, yaw from true north."""
+        if isfinite(roll + pitch + yaw):
+            self._roll, self._pitch, self._yaw, self._attitude_us = roll, pitch, yaw, time_us
+
+    def expect(self, north: float, east: float, down: float) -> None:
+        """Take the main field at the vehicle, any unit; NaN where it is not known."""
+        self._inclination = atan2(down, sqrt(north * north + east * east))
+        self._declination = atan2(east, north)
+
+    def check(self, time_us: int, x: float, y: float, z: float) -> float:
+        """Judge a corrected vector: set :attr:`flags`, return the variance (nT²) to add to each component's.
+
+        Parameters
+        ----------
+        time_us : int
+            µs.
+        x, y, z : float
+            nT, body axes.
+        """
+        if time_us < self._next_us and self._next_us - time_us <= EVERY_US:
+            return self._variance
+        self._next_us = time_us + EVERY_US
+        field = sqrt(x * x + y * y + z * z)
+        known = abs(time_us - self._attitude_us) < FRESH_US
+        if not known or not 0.0 < field < inf or self._inclination != self._inclination:
+            return self._variance
+        cr, sr, cp, sp = cos(self._roll), sin(self._roll), cos(self._pitch), sin(self._pitch)
+        down = min(max((-sp * x + sr * cp * y + cr * cp * z) / field, -1.0), 1.0)
+        forward, starboard = cp * x + sr * sp * y + cr * sp * z, cr * y - sr * z
+        inclination = asin(down)
+        tilt = inclination - self._inclination
+        turn = remainder(self._yaw + atan2(starboard, forward) - self._declination, 2.0 * pi)
+        level = min(cos(inclination), cos(self._inclination))
+        self._judge(time_us, tilt, turn if level > STEEP else 0.0)
+        if self._tilted >= LASTING or self._turned >= LASTING:  # the chord between both directions
+            horizontal = 2.0 * level * sin(0.5 * turn)
+            chord = field * field * (4.0 * sin(0.5 * tilt) ** 2 + horizontal * horizontal)
+            self._variance, self._until_us = max(self._variance, chord), time_us + LONG_US
+        elif time_us >= self._until_us:
+            self._variance = 0.0
+        return self._variance
+
+    def _judge(self, time_us: int, tilt: float, turn: float) -> None:
+        """Count looks that differ, by `tilt` in inclination and by `turn` in heading, rad."""
+        self._tilted = self._tilted + 1 if abs(tilt) > INCLINED else 0
+        self._turned = self._turned + 1 if abs(turn) > TURNED else 0
+        if self._tilted >= LASTING:
+            self._tilted_until_us = time_us + LONG_US
+            self._notify(1, f"inclination off by {degrees(tilt):+.0f} deg: axes or mounting wrong")
+        if self._turned >= LASTING:
+            self._notify(2, f"vector {degrees(turn):+.0f} deg off the heading: axes or compass wrong")
+        self.flags = IMPLAUSIBLE if time_us < self._tilted_until_us else 0
+
+    def _notify(self, which: int, text: str) -> None:
+        if not self._told & which:
+            self._told |= which
+            self.notices.append(text)

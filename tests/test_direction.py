@@ -1,0 +1,91 @@
+"""A wrong mounting, which the total field does not tell; and attitudes that tell nothing of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import nan
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magbridge.arrays import FloatArray
+from magbridge.direction import Direction
+from magbridge.records import Quality
+
+NED = np.array([17_000.0, -5_500.0, 48_500.0])
+"""nT, as off Newfoundland: inclination 70 deg, declination -18 deg."""
+
+
+def flight(n: int = 400, seed: int = 1) -> Iterator[tuple[int, FloatArray, FloatArray]]:
+    """Yield µs, attitude (roll, pitch, yaw) as it is, and the field in body axes: turns and dives."""
+    rng = np.random.default_rng(seed)
+    for k in range(n):
+        attitude = np.array([rng.normal(0.0, 5.0), 25.0 * np.sign(np.sin(k / 50)), (0.7 * k) % 360.0])
+        to_ned = Rotation.from_euler("ZYX", attitude[::-1], degrees=True)
+        yield k * 4_000_000, np.radians(attitude), to_ned.inv().apply(NED)
+
+
+def judge(
+    wrong: FloatArray, attitude_error: FloatArray | None = None, field: FloatArray = NED
+) -> tuple[FloatArray, FloatArray, list[str]]:
+    """Return flags and sigma of each sample, and what was told, of a vector that is `wrong` (3, 3) times."""
+    one, flags, sigma = Direction(), [], []
+    one.expect(*field.tolist())
+    rng = np.random.default_rng(2)
+    for time_us, attitude, body in flight():
+        told = attitude + rng.normal(0.0, np.radians(1.5), 3)
+        one.attitude(time_us, *(told + (0.0 if attitude_error is None else attitude_error)).tolist())
+        sigma.append(one.check(time_us, *(wrong @ body).tolist()) ** 0.5)
+        flags.append(one.flags)
+    return np.array(flags), np.array(sigma), one.notices
+
+
+def test_a_right_vector_is_left_alone_and_so_is_one_without_position_or_attitude() -> None:
+    compass = np.radians([0.0, 0.0, 15.0])
+    for field, off in ((NED, None), (NED, compass), (NED * nan, None), (NED, compass * nan)):
+        flags, sigma, told = judge(np.eye(3), off, field)
+        assert not flags.any()
+        assert not sigma.any()
+        assert told == []
+
+
+@pytest.mark.parametrize("axes", [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
+def test_reversed_axes_are_seen_though_the_total_field_is_right(axes: tuple[int, ...]) -> None:
+    signs = np.ones(3)
+    signs[list(axes)] = -1.0
+    flags, sigma, told = judge(np.diag(signs))
+    assert np.mean((flags == Quality.IMPLAUSIBLE) | (sigma > 10_000.0)) > 0.5
+    assert told
+
+
+def test_exchanged_axes_and_a_mounting_that_is_pitched_are_flagged() -> None:
+    pitched = Rotation.from_euler("y", 20.0, degrees=True).as_matrix()
+    for wrong in (np.eye(3)[[1, 0, 2]], np.eye(3)[[0, 2, 1]], pitched):
+        flags, sigma, told = judge(wrong)
+        assert np.mean((flags != 0) | (sigma > 5_000.0)) > 0.5
+        assert len(told) <= 2
+
+
+def test_a_mounting_that_is_turned_is_reported_and_its_vector_s_sigma_spans_the_difference() -> None:
+    turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
+    level = np.hypot(NED[0], NED[1])
+    one = Direction()
+    one.expect(*NED.tolist())
+    for k in range(20):
+        one.attitude(k * 1_000_000, 0.0, 0.0, 0.0)
+        variance = one.check(k * 1_000_000, *(turned @ NED).tolist())
+        assert (variance > 0.0) == (k >= 7)
+    assert one.flags == 0, "the total field is right, and which of compass and vector is wrong is not known"
+    assert variance**0.5 == pytest.approx(2.0**0.5 * level, rel=1e-6)
+    assert one.notices == ["vector +90 deg off the heading: axes or compass wrong"]
+
+
+def test_what_the_heading_of_a_vehicle_at_the_pole_is_does_not_matter() -> None:
+    polar = np.array([3_000.0, 0.0, 57_000.0])
+    one = Direction()
+    one.expect(*polar.tolist())
+    for k in range(20):
+        one.attitude(k * 1_000_000, 0.0, 0.0, 3.0)
+        assert one.check(k * 1_000_000, *polar.tolist()) == 0.0
+    assert one.notices == []
