@@ -21,6 +21,7 @@ __all__ = [
     "CORRECTED",
     "NT_PER_UNIT",
     "Column",
+    "absent",
     "counts_from_boot",
     "factor",
     "may_be",
@@ -183,6 +184,12 @@ def may_be(unit: str, other: str) -> bool:
     return {unit, other} & {"", "1"} != set() or usual(unit) == usual(other)
 
 
+def absent(name: str, there: Iterable[str]) -> str:
+    """Say that a column is not there, what is, and how to tell which of those it is."""
+    headings = " ".join(repr(one) if " " in one else one for one in there)
+    return f'expected this column; there are: {headings}; if one is it: --column {name}="THEIRS [unit]"'
+
+
 def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
     """Check that a deployment has these columns.
 
@@ -193,10 +200,10 @@ def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
     """
     for name in names:
         if name not in deployment:
-            there = " ".join(str(column) for column in deployment.data_vars)
             source = deployment.attrs.get("source", "the deployment")
             guessed = f"; guessed: {deployment.attrs['guessed']}" if "guessed" in deployment.attrs else ""
-            raise FormatError(source, f"expected this column; there are: {there}{guessed}", column=name)
+            there = [str(column) for column in deployment.data_vars]
+            raise FormatError(source, absent(name, there) + guessed, column=name)
 
 
 def require_units(deployment: xr.Dataset, units: Mapping[str, str]) -> None:

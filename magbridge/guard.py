@@ -8,18 +8,19 @@ through a pipe, piece by piece; for a whole file that costs the fork and one cop
 from __future__ import annotations
 
 import faulthandler
-import multiprocessing
 import os
 import signal
 import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from magbridge.errors import FormatError, MagbridgeError
+
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
 
 if sys.platform != "win32":
     import resource
@@ -71,6 +72,8 @@ def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     Where there is no fork (Windows), or a process may have no children (a worker of a pool), it is read
     here: then a crash ends the process, and nothing limits the time.
     """
+    import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
+
     if sys.platform == "win32" or multiprocessing.current_process().daemon:
         yield from _foreseen(path, read)
         return

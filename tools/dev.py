@@ -71,17 +71,22 @@ def run_tests(python: Path, *arguments: str, **variables: str) -> None:
 
 
 def install(extra: str, place: Path = BIN, *options: str) -> None:
-    """Install the lock file's versions into an environment, with one extra; other packages in it stay."""
+    """Install the lock file's versions into an environment, with one extra; other packages in it stay.
+
+    Everything is compiled to bytecode at once, which uv does not do by itself: where Python may not write any
+    (PYTHONDONTWRITEBYTECODE), each start of the program would compile a thousand modules.
+    """
     if not (BIN / "python").exists():
         venv.create(BIN.parent, with_pip=True)
     if not (BIN / "uv").exists():
         run(BIN / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", UV)
     known = ssl.get_default_verify_paths()  # a network's own proxy is known to the system only, not to uv
     run(
-        BIN / "uv", "sync", "--quiet", "--locked", "--inexact", "--extra", extra, *options,
+        BIN / "uv", "sync", "--quiet", "--locked", "--inexact", "--compile-bytecode", "--extra", extra, *options,
         UV_PROJECT_ENVIRONMENT=str(place.parent), VIRTUAL_ENV="", UV_PYTHON_DOWNLOADS="never",
         UV_SYSTEM_CERTS=str(bool(known.cafile or known.capath)).lower(),
     )  # fmt: skip
+    run(place / "python", "-m", "compileall", "-q", "magbridge", "sitl")
 
 
 def install_compiled() -> dict[str, str]:

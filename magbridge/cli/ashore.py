@@ -17,8 +17,8 @@ from magbridge.cli.common import (
     Picture,
     Reading,
     Whole,
-    app,
     check_inputs,
+    command,
     file_to_write,
     logs_to_read,
     note_losses,
@@ -27,7 +27,7 @@ from magbridge.cli.common import (
 from magbridge.progress import track, waiting
 
 
-@app.command(usage="Usage: magbridge convert FILE... -o FILE [OPTIONS]")
+@command("convert FILE... -o FILE [OPTIONS]")
 def convert(
     *files: Path,
     output: Log,
@@ -67,7 +67,7 @@ def convert(
     print_result({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
 
 
-@app.command(usage="Usage: magbridge simulate SCENARIO -o FILE [OPTIONS]")
+@command("simulate SCENARIO -o FILE [OPTIONS]")
 def simulate(
     scenario: Path,
     /,
@@ -125,7 +125,7 @@ def simulate(
     print_result({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
 
 
-@app.command(usage="Usage: magbridge map GRID... -o grid.nc [OPTIONS]")
+@command("map GRID... -o grid.nc [OPTIONS]")
 def map(  # noqa: A001 - the command's name
     *grids: Path,
     output: Grid,

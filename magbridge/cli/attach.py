@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Json, Whole, app, complain, file_to_write, print_result
+from magbridge.cli.common import Json, Whole, command, complain, file_to_write, print_result
 from magbridge.errors import WrongUse
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 
-@app.command(usage="Usage: magbridge init [-o bridge.toml] [OPTIONS]")
+@command("init [-o bridge.toml] [OPTIONS]")
 def init(
     *,
     output: Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".toml"))] = Path(
@@ -146,7 +146,7 @@ def _option(text: str) -> tuple[str, Any]:
         return name.strip(), value.strip()  # a word without quotes
 
 
-@app.command(usage="Usage: magbridge ports [PORT...] [OPTIONS]")
+@command("ports [PORT...] [OPTIONS]")
 def ports(
     *names: str,
     baudrate: tuple[int, ...] = (),
@@ -196,7 +196,7 @@ def ports(
         print_result({"ports": found}, "", as_json=True)
 
 
-@app.command(usage="Usage: magbridge drivers [NAME] [OPTIONS]")
+@command("drivers [NAME] [OPTIONS]")
 def drivers(name: str | None = None, /, *, json: Json = False) -> None:
     """List the drivers of sensors, or the options of one, as they stand in [sensor.options] of a bridge.toml.
 

@@ -16,8 +16,8 @@ from magbridge.cli.common import (
     Json,
     Reading,
     Whole,
-    app,
     check_inputs,
+    command,
     complain,
     folder_to_write,
     print_result,
@@ -29,7 +29,7 @@ SLOWEST = 1e-3
 """Lowest replay speed, relative to real time: a log of an hour then takes six weeks."""
 
 
-@app.command
+@command("demo [OPTIONS]")
 def demo(
     *,
     out: Folder = Path("demo"),
@@ -85,7 +85,7 @@ def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
             serve(link, 0, "127.0.0.1", port, show=show)
 
 
-@app.command(usage="Usage: magbridge run --config bridge.toml [--check]")
+@command("run --config bridge.toml [--check]")
 def run(*, config: Path, check: bool = False) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
 
@@ -123,7 +123,7 @@ def _check(config: Path) -> None:
     print(f"{config}: the bridge would start" + (", with what is said above" if found else ""))
 
 
-@app.command(usage="Usage: magbridge replay FILE... [--config bridge.toml] [OPTIONS]")
+@command("replay FILE... [--config bridge.toml] [OPTIONS]")
 def replay(
     *files: Path,
     config: Path | None = None,
@@ -165,7 +165,7 @@ def replay(
         raise DataError("the replay did not publish what the log holds")
 
 
-@app.command(usage="Usage: magbridge dialect -o DIR")
+@command("dialect -o DIR")
 def dialect(*, output: Annotated[Folder, Parameter(name=["--output", "-o"])], json: Json = False) -> None:
     """Write the MAVLink dialect for other programs: the XML with all that it includes, modules for pymavlink.
 
@@ -185,7 +185,7 @@ def dialect(*, output: Annotated[Folder, Parameter(name=["--output", "-o"])], js
     print_result({"files": files}, "\n".join(files), json)
 
 
-@app.command(usage="Usage: magbridge monitor [LINK] [OPTIONS]")
+@command("monitor [LINK] [OPTIONS]")
 def monitor(
     link: str = "udpin:0.0.0.0:14550",
     /,

@@ -20,9 +20,9 @@ from magbridge.cli.common import (
     Picture,
     Reading,
     Whole,
-    app,
     by_base_station,
     check_inputs,
+    command,
     complain,
     logs_to_read,
     note_losses,
@@ -44,7 +44,7 @@ ALL = "all"
 """``--compass all``: a calibration for each compass."""
 
 
-@app.command(usage="Usage: magbridge calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
+@command("calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
 def calibrate(
     *files: Path,
     output: Output,
@@ -327,7 +327,7 @@ def _digests(files: tuple[Path, ...]) -> dict[str, str]:
     return {str(file) if names.count(file.name) > 1 else file.name: key for key, file in seen.items()}
 
 
-@app.command(usage="Usage: magbridge plan --calibration cal.json --mission FILE [OPTIONS]")
+@command("plan --calibration cal.json --mission FILE [OPTIONS]")
 def plan(
     *,
     calibration: Path,

@@ -15,8 +15,8 @@ from magbridge.cli.common import (
     Log,
     Picture,
     Reading,
-    app,
     check_inputs,
+    command,
     complain,
     doubts_of,
     file_to_write,
@@ -46,7 +46,7 @@ KEPT = (
 """Columns of a log that stay beside the corrected field, with the calibration's parameters."""
 
 
-@app.command(usage="Usage: magbridge correct FILE... --calibration cal.json -o FILE [OPTIONS]")
+@command("correct FILE... --calibration cal.json -o FILE [OPTIONS]")
 def correct(
     *files: Path,
     calibration: Path,

@@ -13,7 +13,7 @@ from magbridge.cli.common import (
     Folder,
     Json,
     Reading,
-    app,
+    command,
     complain,
     doubts_of,
     logs_to_read,
@@ -36,7 +36,7 @@ ITSELF = (
 )
 
 
-@app.command(usage="Usage: magbridge diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
+@command("diagnose FILE... --calibration cal.json -o DIR [OPTIONS]")
 def diagnose(
     *files: Path,
     calibration: Path,

@@ -7,11 +7,11 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Whole, app, complain, doubts_of, file_to_write
+from magbridge.cli.common import Folder, Whole, command, complain, doubts_of, file_to_write
 from magbridge.errors import DataError, WrongUse
 
 
-@app.command(usage="Usage: magbridge export cal.json --c DIR | --ardupilot F.param | --px4 F.params")
+@command("export cal.json --c DIR | --ardupilot F.param | --px4 F.params")
 def export(
     calibration: Path,
     /,

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 fleet = App(
     name="fleet",
     help="Many vehicles, many logs, one memory: catalogue, process, learn from them, watch them.",
+    help_format="markdown",
 )
 app.command(fleet)
 Where = Annotated[str, Parameter(name="--catalogue")]

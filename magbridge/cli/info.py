@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import AS_THEY_SAY, Json, Reading, app, complain, logs_to_read, print_result
+from magbridge.cli.common import AS_THEY_SAY, Json, Reading, command, complain, logs_to_read, print_result
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 
-@app.command(usage="Usage: magbridge info FILE... [OPTIONS]")
+@command("info FILE... [OPTIONS]")
 def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> None:
     """Say what logs hold: columns, units, rates, gaps, ranges, and what could be done with them.
 
@@ -96,8 +96,8 @@ def _uses(facts: dict[str, Any]) -> Table:
     from rich.table import Table
 
     table = Table("command", "could use it?")
-    for command, lacks in facts["uses"].items():
-        table.add_row(command, f"lacks {'; and '.join(lacks)}" if lacks else "yes")
+    for name, lacks in facts["uses"].items():
+        table.add_row(name, f"lacks {'; and '.join(lacks)}" if lacks else "yes")
     return table
 
 

@@ -15,7 +15,7 @@ from magbridge.cli.common import (
     Log,
     Picture,
     Reading,
-    app,
+    command,
     complain,
     doubts_of,
     logs_to_read,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["navigate"]
 
 
-@app.command(usage="Usage: magbridge navigate FILE... --calibration cal.json --map grid.nc -o FILE [OPTIONS]")
+@command("navigate FILE... --calibration cal.json --map grid.nc -o FILE [OPTIONS]")
 def navigate(
     *files: Path,
     map: Path,  # noqa: A002 - the flag's name

@@ -16,9 +16,9 @@ from magbridge.cli.common import (
     Picture,
     Reading,
     Whole,
-    app,
     by_base_station,
     check_inputs,
+    command,
     complain,
     doubts_of,
     file_to_write,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Written = Annotated[Path | None, Parameter(validator=file_to_write())]
 
 
-@app.command(usage="Usage: magbridge survey LOG... -o map.nc [OPTIONS]")
+@command("survey LOG... -o map.nc [OPTIONS]")
 def survey(
     *logs: Path,
     output: Output,

@@ -18,12 +18,14 @@ import re
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from magbridge.errors import FormatError, PluginError
 from magbridge.plugins import blamed, load, plugins
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 __all__ = ["FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "metadata_path", "suffixes"]
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import BoolArray, FloatArray
+from magbridge.columns import absent
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import clock_of, seconds
 from magbridge.logs.layout import BLANKS, Layout, cells
@@ -93,8 +94,7 @@ class Table:
         self._path, self._layout, self._declared = path, layout, layout.declared
         self.faults = Faults(path, strict=strict)
         if "time" not in layout.names:
-            expected = f"expected this column; there are: {' '.join(layout.headings)}"
-            raise FormatError(path, expected, row=layout.row, column="time")
+            raise FormatError(path, absent("time", layout.headings), row=layout.row, column="time")
         self._time = layout.names.index("time")
         heading, unit = layout.headings[self._time].strip(), layout.units.pop("time", "")
         first = [cells(line, layout.separator) for line in head[layout.first :] if line.strip()]
