@@ -82,7 +82,8 @@ def install(extra: str, place: Path = BIN, *options: str) -> None:
         run(BIN / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check", UV)
     known = ssl.get_default_verify_paths()  # a network's own proxy is known to the system only, not to uv
     run(
-        BIN / "uv", "sync", "--quiet", "--locked", "--inexact", "--compile-bytecode", "--extra", extra, *options,
+        BIN / "uv", "sync", "--quiet", "--locked", "--inexact", "--compile-bytecode",
+        "--extra", extra, *options,
         UV_PROJECT_ENVIRONMENT=str(place.parent), VIRTUAL_ENV="", UV_PYTHON_DOWNLOADS="never",
         UV_SYSTEM_CERTS=str(bool(known.cafile or known.capath)).lower(),
     )  # fmt: skip

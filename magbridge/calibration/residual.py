@@ -236,16 +236,21 @@ class Whitening:
         rows = slice(self._at, self._at + len(values))
         y = values.reshape(len(values), -1)
         r, K, S = self.decay[rows, None], self.gain[rows, None], self.variance[rows, None]
-        updated = K * y  # of m_t + K_t v_t = (1 - K_t) m_t + K_t y_t
         before = np.zeros(y.shape[1]) if self._last is None else self._last
-        updated[0] += (1.0 - K[0]) * r[0] * before
-        if (self.gain[rows] != 1.0).any():  # x_t - (1 - K_t) r_t x_t-1 = K_t y_t: two diagonals
+        updated = y  # m_t + K_t v_t = (1 - K_t) m_t + K_t y_t
+        if (K != 1.0).any():  # x_t - (1 - K_t) r_t x_t-1 = K_t y_t: two diagonals
+            updated = K * y
+            updated[0] += (1.0 - K[0]) * r[0] * before
             band = np.ones((2, len(y)))
             band[1, :-1] = -((1.0 - K) * r)[1:, 0]
             updated, _ = dtbtrs(band, updated, uplo="L", diag="U")
-        m = r * np.vstack([before[None], updated[:-1]])
-        self._at, self._last = rows.stop, updated[-1]
-        return np.asarray(((y - m) / np.sqrt(S)).reshape(values.shape))
+        v = np.empty_like(y)  # in place from here on: new memory costs more than the arithmetic
+        v[0] = r[0] * before
+        np.multiply(r[1:], updated[:-1], out=v[1:])
+        np.subtract(y, v, out=v)
+        v /= np.sqrt(S)
+        self._at, self._last = rows.stop, updated[-1].copy()
+        return v.reshape(values.shape)
 
 
 def _gains(decay: FloatArray, white: float) -> tuple[FloatArray, FloatArray]:
