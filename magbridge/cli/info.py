@@ -11,6 +11,9 @@ from magbridge.cli.common import AS_THEY_SAY, Json, Reading, command, complain, 
 if TYPE_CHECKING:
     from rich.table import Table
 
+WIDE = 110
+"""Characters of a terminal from which on the meanings have room."""
+
 
 @command("info FILE... [OPTIONS]")
 def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> None:
@@ -48,11 +51,11 @@ def _show(file: str, facts: dict[str, Any]) -> None:
     from magbridge.logs.compasses import Compass
 
     console = Console(highlight=False, soft_wrap=False)
-    console.print(f"[bold]{_plain(file)}[/bold]: {_plain(summary(facts))}")
+    console.print(f"[bold]{_plain(file)}[/bold]: {_plain(summary(facts))}", soft_wrap=True)
     for compass in facts["compasses"]:
         one = convert(compass, Compass)
         console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
-    console.print(_columns(facts))
+    console.print(_columns(facts, meanings=console.width >= WIDE))
     console.print(_uses(facts))
     for hint in [*(f"guessed: {guess}" for guess in facts["guessed"]), *facts["hints"]]:
         complain(f"{file}: {hint}")
@@ -73,29 +76,38 @@ def _utc(time: float) -> str:
     return f"{datetime.fromtimestamp(time, UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
-def _columns(facts: dict[str, Any]) -> Table:
+def _columns(facts: dict[str, Any], *, meanings: bool) -> Table:
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table("column", "unit", "known", "lowest", "highest", "changes every", "meaning")
+    from magbridge.columns import CHANNEL_TIMES
+
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for name in ("column", "unit"):
+        table.add_column(name, overflow="fold")
     for name in ("known", "lowest", "highest", "changes every"):
-        table.columns[[str(column.header) for column in table.columns].index(name)].justify = "right"
+        table.add_column(name, justify="right", no_wrap=True)
+    if meanings:
+        table.add_column("meaning")
     for one in facts["columns"]:
         every = one["changes_every_s"]
+        ends = ("", "") if one["name"] in CHANNEL_TIMES else (one["lowest"], one["highest"])
         table.add_row(
             _plain(one["name"]),
-            _plain(one["unit"]),
+            "" if one["unit"] == "1" else _plain(one["unit"]),
             f"{one['known']:.0%}",
-            *("" if one[end] is None else f"{one[end]:.6g}" for end in ("lowest", "highest")),
+            *(f"{end:.6g}" if isinstance(end, float) else "" for end in ends),
             "" if every is None else f"{every:.3g} s",
-            _plain(one["meaning"]),
+            *([_plain(one["meaning"])] if meanings and one["meaning"] != one["name"] else []),
         )
     return table
 
 
 def _uses(facts: dict[str, Any]) -> Table:
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table("command", "could use it?")
+    table = Table("command", "could use it?", box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for name, lacks in facts["uses"].items():
         table.add_row(name, f"lacks {'; and '.join(lacks)}" if lacks else "yes")
     return table

@@ -52,7 +52,8 @@ larger ones."""
 FRACTIONS = (("ns", 1e17, 1e19), ("us", 1e14, 1e17), ("ms", 1e11, 1e14))
 YEAR_1980 = 315_532_800.0
 DATES = (
-    *(rf"%{day}{sign}%{month}{sign}%Y" for sign in "./-" for day, month in ("dm", "md")),
+    "%d.%m.%Y",  # nobody writes the month first with dots
+    *(rf"%{day}{sign}%{month}{sign}%Y" for sign in "/-" for day, month in ("dm", "md")),
     *(rf"%Y{sign}%m{sign}%d" for sign in "./"),
 )
 HOURS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p")
@@ -103,7 +104,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     numbers = pd.to_numeric(pd.Series(present, dtype=object), errors="coerce").to_numpy(float)
     if not present or np.isfinite(numbers).any():
         return _counted(heading, unit, numbers[np.isfinite(numbers)])
-    return _written(present, zone)
+    return _written(heading, present, zone)
 
 
 def _counted(heading: str, unit: str, numbers: FloatArray) -> Clock:
@@ -139,7 +140,7 @@ def _kind(heading: str, numbers: FloatArray, *, certain: bool) -> tuple[str, str
     return "s", "" if certain else "seconds"
 
 
-def _written(texts: Sequence[str], zone: str | None) -> Clock:
+def _written(heading: str, texts: Sequence[str], zone: str | None) -> Clock:
     times = pd.Series(list(texts), dtype=object)
     zoned = all(re.search(r"(Z|UTC|GMT|[+-]\d\d:?\d\d)$", text) for text in texts)
     said = "" if zoned else f"times in {zone}" if zone else "times in UTC"
@@ -149,8 +150,8 @@ def _written(texts: Sequence[str], zone: str | None) -> Clock:
     if not fit:
         return Clock("iso")  # each cell will be refused with its row
     if len(fit) > 1 and len({_order(pattern) for pattern in fit}) > 1:
-        which = " or ".join(f"[{pattern}]" for pattern in fit[:2])
-        raise ValueError(f'day or month first? {texts[0]!r} can be both: declare --column time="... {which}"')
+        which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit[:2])
+        raise ValueError(f"day or month first? {texts[0]!r} can be both: {which}")
     return Clock(fit[0], f"{fit[0]}, {said}" if said else fit[0])
 
 

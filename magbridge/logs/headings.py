@@ -37,14 +37,15 @@ ALIASES = {
     "time": (
         *("timestamp", "datetime", "timeutc", "utctime", "datetimeutc", "dateandtime", "isotime", "unixtime"),
         *("unixtimestamp", "posixtime", "epoch", "epochtime", "utc", "gpstime", "gpsseconds", "jd", "mjd"),
-        *("juliandate", "julianday", "julian", "exceltime", "exceldate", "zeit", "seconds", "t"),
+        *("juliandate", "julianday", "julian", "exceltime", "exceldate", "datenum", "timeiso", "isoformat"),
+        *("zeit", "zeitstempel", "uhrzeit", "heure", "hora", "timeofday", "seconds", "t"),
     ),
     "roll": ("rollangle", "rolldeg"),
     "pitch": ("pitchangle", "pitchdeg"),
     "heading": ("yaw", "hdg", "compassheading", "trueheading", "magneticheading"),
-    "latitude": ("lat", "gpslat", "gpslatitude"),
-    "longitude": ("lon", "long", "lng", "gpslon", "gpslongitude"),
-    "depth": ("depthm",),
+    "latitude": ("lat", "gpslat", "gpslatitude", "breite", "geobreite"),
+    "longitude": ("lon", "long", "lng", "gpslon", "gpslongitude", "laenge", "lnge", "geolaenge"),
+    "depth": ("depthm", "tiefe", "profondeur", "profundidad"),
 }
 """Our name -> what others call it, the surest first."""
 
@@ -72,10 +73,11 @@ def is_unit(text: str) -> bool:
     return usual(text.strip().strip("[]()")) in UNITS
 
 
-def aliases(names: Sequence[str]) -> Mapping[int, str]:
+def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str]:
     """Return, for columns under another name than ours that are known to mean the same: position -> our name.
 
-    The three axes are recognised together or not at all: one `b_x` alone may be anything.
+    The three axes are recognised together or not at all: one `b_x` alone may be anything. Three columns in
+    units of a magnetic field, alike but for their x, y and z, are the axes whatever they are called.
     """
     bare = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     found: dict[int, str] = {}
@@ -93,6 +95,8 @@ def aliases(names: Sequence[str]) -> Mapping[int, str]:
                     if place is not None
                 }
                 break
+        else:
+            found |= _axes(bare, units)
     for name in COLUMNS:
         if name in names or name == "quality":  # a foreign one is not our set of flags
             continue
@@ -102,3 +106,11 @@ def aliases(names: Sequence[str]) -> Mapping[int, str]:
                 found[place] = name
                 break
     return found
+
+
+def _axes(bare: Sequence[str], units: Sequence[str]) -> dict[int, str]:
+    """Return the positions of the three axes among bare names, if their units say that they are."""
+    fields = [k for k, unit in enumerate(units) if usual(unit) in NT_PER_UNIT and bare[k]]
+    letters = {bare[k][-1]: k for k in fields} if len(fields) == len(AXES) else {}
+    alike = len({bare[k][:-1] for k in fields}) == 1
+    return {letters[axis]: f"mag_{axis}" for axis in AXES} if alike and set(letters) == set(AXES) else {}

@@ -87,10 +87,10 @@ def info(log: xr.Dataset) -> dict[str, Any]:
 
 
 def lacking(log: xr.Dataset, needs: Needs) -> list[str]:
-    """Return what of `needs` a log lacks, as ``a b or c``; a column without any value is not there."""
+    """Return what of `needs` a log lacks, as ``a b, or c``; a column without any value is not there."""
     there = {str(name) for name in log.data_vars if bool(log[name].notnull().any())}
     return [
-        " or ".join(" ".join(name for name in one if name not in there) for one in alternatives)
+        ", or ".join(" ".join(name for name in one if name not in there) for one in alternatives)
         for alternatives in needs
         if not any(set(one) <= there for one in alternatives)
     ]
@@ -143,6 +143,8 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
     if moving := telemetry(log):
         hints.append(f"may move the field, for --parameter: {' '.join(moving)}")
+    if any(lacking(log, needs) for needs in USES.values()):
+        hints.append('what is lacking may stand under another name: --column NAME="THEIRS [unit]"')
     empty = [one["name"] for one in columns if not one["known"]]
     if empty:
         hints.append(f"never known: {' '.join(empty)}")

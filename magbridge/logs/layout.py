@@ -33,6 +33,8 @@ BLANKS = " "
 """Stands for any number of blanks between fields."""
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AP]M)?", re.IGNORECASE)
+DATED = re.compile("date|datum|fecha|jour", re.IGNORECASE)
+"""What in a heading says that the column holds dates."""
 NMEA = "GgaSentence"
 """Heading of the first field that may hold separators of its own."""
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
@@ -237,7 +239,8 @@ def _name(
     ]
     taken = _declared(path, found, names, declared, row)
     bare = ["" if k in taken else name for k, name in enumerate(names)]
-    known = {k: name for k, name in aliases(bare).items() if name not in taken.values()}
+    declares = [parts[k][1] or (units[k] if k < len(units) else "") for k in range(len(names))]
+    known = {k: name for k, name in aliases(bare, declares).items() if name not in taken.values()}
     for k, name in known.items():
         found.guesses.append(f"{name} is {headings[k]!r}")
     chosen = taken | known
@@ -250,7 +253,7 @@ def _name(
     for k, name in enumerate(final):
         if (not headings[k] and not name) or (name and name in final[:k]):
             raise FormatError(path, f"expected a name of its own for column {k + 1}, not {name!r}", row=row)
-        unit = parts[k][1] or (units[k] if k < len(units) else "")
+        unit = declares[k]
         if name in declared.columns and (told := declared.columns[name].unit) is not None:
             unit = told
         elif name in declared.columns and not unit and declared.columns[name].heading:
@@ -285,7 +288,7 @@ def _declared(
 
 def _find_date(found: Layout, rows: Sequence[Sequence[str]]) -> None:
     """Find the column with the date, where ``time`` holds times of day."""
-    dates = [k for k, heading in enumerate(found.headings) if "date" in split(heading)[0].lower()]
+    dates = [k for k, heading in enumerate(found.headings) if DATED.search(split(heading)[0])]
     if "time" not in found.names or len(dates) != 1 or found.names[dates[0]] == "time":
         return
     place = found.names.index("time")

@@ -155,6 +155,8 @@ def _table(path: Path) -> tuple[pd.DataFrame, int]:
     names = [name.strip() for name in head.rstrip(";\r").split(";")]
     fields = [line.rstrip(";\r").split(";", len(names)) for line in lines if line.strip()]
     whole = [one + [""] * (len(names) - len(one)) for one in fields if len(one) <= len(names)]
+    if not whole:
+        raise FormatError(path, "expected rows after the header", row=2)
     return pd.DataFrame(whole, columns=names, dtype=str), len(fields) - len(whole)
 
 

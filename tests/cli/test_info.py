@@ -33,7 +33,7 @@ def test_info_says_what_is_missing() -> None:
     log = made("log", START + np.arange(9.0), {"mag_x": np.ones(9), "depth": np.full(9, np.nan)})
     facts = info(log)
     assert facts["uses"].keys() == USES.keys()
-    assert facts["uses"]["calibrate"] == ["mag_y mag_z", "reference_field or latitude longitude"]
+    assert facts["uses"]["calibrate"] == ["mag_y mag_z", "reference_field, or latitude longitude"]
     assert facts["uses"]["correct"] == ["mag_y mag_z"]
     assert "never known: depth" in facts["hints"]
 

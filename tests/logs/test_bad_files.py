@@ -25,7 +25,9 @@ BAD_CSV = {
     "": "expected a log, the file is empty",
     "\n1,2\n": "row 1: expected a header row, the file is empty",
     "time,mag_x\n": "row 2: expected rows after the header",
-    "s,mag_x\n1,2\n": "row 1, column 'time': expected this column; there are: s mag_x",
+    "s,mag_x\n1,2\n": "row 1, column 'time': expected this column; there are: s mag_x; "
+    'if one is it: --column time="THEIRS [unit]"',
+    "Timestamp;NavState;": "row 2: expected rows after the header",
     "1,2\n3,4\n": "row 1: expected a header row with the columns' names, not '1,2'",
     "time,water_speed [kn]\n1,2\n": "column 'water_speed': expected m/s, not kn",
     "time,,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 2, not ''",
@@ -41,8 +43,8 @@ BAD_CSV = {
         "row 3, column 'time': expected seconds since 1970, not '2016-06-23'"
     ),
     "time,mag_x\n3/4/2022 12:00,2\n3/4/2022 12:01,2\n": (
-        "column 'time': day or month first? '3/4/2022 12:00' can be both: declare "
-        '--column time="... [%d/%m/%Y %H:%M] or [%m/%d/%Y %H:%M]"'
+        "column 'time': day or month first? '3/4/2022 12:00' can be both: "
+        '--column time="time [%d/%m/%Y %H:%M]" or --column time="time [%m/%d/%Y %H:%M]"'
     ),
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
     "time,heading\n1,-9999\n": "row 2, column 'heading': expected deg, at most 540, not -9999.0",
@@ -156,7 +158,7 @@ def test_a_disk_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_missing_channels_are_named(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text("time,mag_x,battpos\n1,2,3\n")
-    lacking = "log.csv: column 'mag_y': expected this column; there are: mag_x battpos"
+    lacking = "log.csv: column 'mag_y': expected this column; there are: mag_x battpos; if one"
     for read in (logs.read, lambda path, required: list(logs.read_chunks(path, required=required))):
         with pytest.raises(FormatError, match=lacking):
             read(path, required=CHANNELS)

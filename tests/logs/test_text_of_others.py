@@ -112,6 +112,23 @@ def test_leap_seconds_are_those_of_the_day(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log["time"], [1_435_708_799.5, 1_435_708_800.5])
 
 
+def test_three_columns_in_units_of_a_field_are_its_axes(tmp_path: Path) -> None:
+    text = (
+        "Messfahrt;12\nDatum;Uhrzeit;X;Y;Z;Kolben;Breite\n;;µT;µT;µT;mm;°\n"
+        "04.05.2022;12:00:00;30,5;1,0;45,0;6,9;49,5\n04.05.2022;12:00:01;30,5;1,0;45,0;6,8;49,5\n"
+    )
+    log = read(tmp_path, text.encode("cp1252"))
+    np.testing.assert_array_equal(log["time"], [NOON, NOON + 1])
+    np.testing.assert_allclose([log[f"mag_{axis}"][0] for axis in "xyz"], [30_500.0, 1_000.0, 45_000.0])
+    assert log["Kolben"].attrs["units"] == "mm"
+    assert float(log["latitude"][0]) == 49.5
+    assert "mag_x is 'X'" in log.attrs["guessed"]
+    # places are in metres, and a fourth field leaves it open which three are meant
+    for units in ("m;m;m", "µT;µT;m"):
+        assert "mag_x" not in read(tmp_path, text.replace("µT;µT;µT", units).encode("cp1252"))
+    assert "mag_x" not in read(tmp_path, "time,x [nT],y [nT],z [nT],F [nT]\n1.6e9,1,2,3,4\n")
+
+
 def test_seconds_since_a_start_are_not_dated(tmp_path: Path) -> None:
     log = read(tmp_path, '"Time (s)","Magnetic field x (µT)"\n0.0,3.0E+01\n1.0E-02,3.1E+01\n')
     assert log.attrs["time_reference"] == "boot"
