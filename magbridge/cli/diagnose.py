@@ -111,7 +111,7 @@ def diagnose(
 
 
 def summary(facts: dict[str, Any], parts: str) -> str:
-    """Return the findings in lines: the verdict with its RMS, then each cause with its alternatives.
+    """Return the findings in lines: the verdict with its RMS, fit for use or not, then each cause.
 
     Parameters
     ----------
@@ -130,7 +130,9 @@ def summary(facts: dict[str, Any], parts: str) -> str:
         rms += f" ({low:.2f} to {high:.2f} times, 95 %)" + ": no gain is shown" * (high >= 1.0)
     else:
         rms = f"{before} nT RMS" + ", not held out" * (not parts) + "; nothing is added to the calibration"
-    return "\n  ".join([f"{facts['verdict']}: {rms}", *causes_of(facts)])
+    use = facts["assessment"]
+    fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
+    return "\n  ".join([f"{facts['verdict']}: {rms}", fit, *causes_of(facts)])
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
@@ -138,12 +140,21 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
     causes = []
     for one in facts["findings"]:
         others = " or ".join(map(_plain, one["alternatives"]))
-        causes.append(f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}" + f"; or {others}" * bool(others))
+        said = f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}{_followed(one['follows'])}"
+        causes.append(said + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:
         said = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"
         within = ", ".join(map(_plain, rest["alternatives"]))
-        causes.append(said + f"; not ruled out: {within}" * bool(within))
+        causes.append(f"{said}{_followed(rest['follows'])}" + f"; resembles {within}" * bool(within))
     return causes or ["no cause"]
+
+
+def _followed(what: dict[str, Any] | None) -> str:
+    """Return what is seen, apart from what it may be: the series that an effect follows, lag and axis."""
+    if not what or not what["channel"]:
+        return ""
+    late = f" {what['lag_s']:g} s late" * bool(what["lag_s"])
+    return f", follows {what['channel']}{late}" + f" along {what['axis']}" * bool(what["axis"])
 
 
 def _plain(one: dict[str, Any]) -> str:

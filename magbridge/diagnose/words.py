@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import floor, isfinite, log10
 
+from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.rivals import Rival
 
-__all__ = ["label", "measured", "names_of", "number"]
+__all__ = ["label", "measured", "names_of", "number", "series_of"]
 
 
 def label(cause: str, channel: str | None) -> str:
@@ -17,7 +18,13 @@ def label(cause: str, channel: str | None) -> str:
 
 def names_of(rivals: Sequence[Rival], joint: str = ", ") -> str:
     """Return causes as a list in words, the likeliest first."""
-    return joint.join(label(*rival.candidate.group) for rival in rivals)
+    return joint.join(label(rival.candidate.cause, series_of(rival.candidate)) for rival in rivals)
+
+
+def series_of(candidate: Candidate) -> str | None:
+    """Return the telemetry that a candidate follows, as people read it; None where it follows none."""
+    several = len({channel for effect in candidate.effects for channel in effect.channels()}) > 1
+    return "several together" if candidate.channel is None and several else candidate.channel
 
 
 def number(value: float, digits: int = 3) -> str:

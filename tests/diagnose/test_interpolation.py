@@ -17,7 +17,7 @@ from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.extend import relinearised
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.report.decision import late
+from magbridge.diagnose.report.page import late
 
 TAKEN = np.array([0.0, 0.16, 0.32])
 """s, of a converter that takes the channels in turn."""

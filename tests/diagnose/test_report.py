@@ -24,9 +24,8 @@ from magbridge.diagnose.gain import Gain
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.decision import gained
-from magbridge.diagnose.report.found import _folded, _outliers
-from magbridge.diagnose.report.remaining import nameless
+from magbridge.diagnose.report.details import _folded, _outliers, nameless
+from magbridge.diagnose.report.page import improved
 from magbridge.diagnose.report.words import chance, measured, number, physics, row, sizes
 from magbridge.diagnose.run import _verdict
 from magbridge.diagnose.unexplained.leftover import Leftover
@@ -89,24 +88,35 @@ def test_a_chance_is_written_to_one_digit(p_value: float, text: str) -> None:
 
 
 def test_the_command_names_every_cause_that_may_be_it_on_a_line_of_its_own() -> None:
-    clock = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04}
+    seen = {"channel": "battpos", "lag_s": 2.0, "axis": "z"}
+    clock = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04, "follows": seen}
     current = {"cause": "current_field", "channel": "pitch_current"}
-    rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [clock, current]}
+    rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [clock, current], "follows": None}
     found = {"verdict": "explained", "findings": [clock | {"alternatives": [current]}], "unexplained": None}
-    assert causes_of(found) == ["clock_offset, S/N 9.0; or current_field (pitch_current)"]
+    assert causes_of(found) == [
+        "clock_offset, S/N 9.0, follows battpos 2 s late along z; or current_field (pitch_current)"
+    ]
     nameless = {"verdict": "unexplained", "findings": [], "unexplained": rest}
-    words = "not ruled out: clock_offset, current_field (pitch_current)"
+    words = "resembles clock_offset, current_field (pitch_current)"
     assert causes_of(nameless) == [f"left without a name: drift, S/N 7.0; {words}"]
     assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == ["no cause"]
 
 
 def test_the_command_says_what_the_gain_was_measured_on() -> None:
     """And tells no gain where nothing was added: 1.14 -> 1.14 nT would read as one that failed."""
-    one = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04, "alternatives": []}
+    one = {
+        "cause": "clock_offset",
+        "channel": None,
+        "signal_to_noise": 9.04,
+        "alternatives": [],
+        "follows": None,
+    }
     facts = {"verdict": "explained", "findings": [one], "unexplained": None, "rms_before_nT": 117.42}
     facts |= {"rms_after_nT": 74.42, "gain": {"interval": [0.486, 0.84]}}
-    first, second = summary(facts, "dives").splitlines()
+    facts |= {"assessment": {"fit_for_use": "once_settled", "answer": "Only once these doubts are settled."}}
+    first, use, second = summary(facts, "dives").splitlines()
     assert first == "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %)"
+    assert use == "  fit for use: once settled. Only once these doubts are settled."
     assert second == "  clock_offset, S/N 9.0"
     assert "nT RMS, not held out (0.49" in summary(facts, "")
     assert "95 %): no gain is shown" in summary(facts | {"gain": {"interval": [0.9, 1.02]}}, "dives")
@@ -148,11 +158,11 @@ def test_a_constant_of_the_reference_is_one_at_any_attitude() -> None:
 def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
     """As on a log of a compass in steps of 100 nT: a name, and 588 nT that became 587."""
     none, much = Gain(588.1, 587.3, 0.999, (0.863, 1.021)), Gain(117.0, 75.8, 0.65, (0.48, 0.83))
-    assert gained(none, "eighths of the log") == (
+    assert improved(none, "eighths of the log") == (
         "On eighths of the log left out of the fit, 588 nT RMS became 587 nT (ratio 1.00, 95 % interval "
         "0.86 to 1.02: no gain is shown)."
     )
-    assert gained(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
+    assert improved(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
     assert (none.shown, much.shown) == (False, True)
 
 
@@ -175,7 +185,7 @@ def test_the_times_of_wrong_samples_are_all_or_the_first() -> None:
     few, many = (_outliers(np.linspace(1780300800.0, 1780300799.0 + n, n)) for n in (2, 13))
     assert "2 isolated samples are wrong, at 08:00:00, 08:00:01 UTC." in few
     assert "13 isolated samples are wrong, the first 12 at 08:00:00, " in many
-    assert "1 isolated sample is wrong, at 08:00:00 UTC. No RMS before or after counts it." in _outliers(
+    assert "1 isolated sample is wrong, at 08:00:00 UTC. No RMS before or after counts them." in _outliers(
         np.array([1780300800.0])
     )
 

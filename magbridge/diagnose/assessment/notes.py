@@ -11,7 +11,7 @@ from magbridge.diagnose.assessment.numbers import motion, times_usual
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.words import names_of, number
+from magbridge.diagnose.words import names_of, number, series_of
 
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
@@ -126,7 +126,7 @@ def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance
     if not rivals:
         yield Note("alone", f"Alternatives: none. {alone} {theory}.", {"chance_alone": chance})
     elif all(rival.candidate.cause == candidate.cause for rival in rivals):
-        series = ", ".join(str(rival.candidate.channel) for rival in rivals)
+        series = ", ".join(str(series_of(rival.candidate)) for rival in rivals)
         yield Note(
             "series_uncertain",
             f"Alternatives: only in the series. {alone} Which series it follows is less sure: {series} would "

@@ -1,4 +1,4 @@
-"""Figures of the report: measured against simulated, before and after."""
+"""Figures of the report: measured less reference before and after, and what each cause adds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.signal import periodogram
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.canvas import (
-    BEFORE,
+    AFTER,
     DOTS,
     FAINT,
     INK,
@@ -26,8 +26,9 @@ from magbridge.diagnose.report.canvas import (
     sides,
     thin,
 )
+from magbridge.diagnose.report.words import label
 
-__all__ = ["channels", "measured", "spectrum", "track"]
+__all__ = ["channels", "measured", "spectrum", "terms", "track"]
 
 CHANNELS, BINS = 12, 20
 """Channels drawn, and bins of each."""
@@ -38,25 +39,15 @@ PERIODS = {10.0: "10 s", 60.0: "1 min", 600.0: "10 min", 3600.0: "1 h", 43200.0:
 
 
 def measured(diagnosis: Diagnosis) -> str:
-    """Draw the total field measured and simulated, and below each other their difference before and after."""
+    """Draw the difference of measured and reference field, before and after, one below the other."""
     survey, part = diagnosis.problem.survey, thin(len(diagnosis.problem))
-    figure, axes = canvas(10, 7.2, 3, 1, sharex=True, height_ratios=[1, 1.2, 1.2])
-    top, lower = axes[0, 0], axes[1:, 0]
+    figure, axes = canvas(10, 4.0, 2, 1, sharex=True)
     unit, hours = clock(diagnosis)
-    since, total, reference, stated = curves(
-        diagnosis,
-        survey.reference + diagnosis.before,
-        survey.reference,
-        2.0 * np.sqrt(diagnosis.problem.stated),
-    )
-    top.plot(since, total, color=BEFORE, linewidth=0.8, label="measured, corrected as calibrated")
-    top.plot(since, reference, color=INK, linewidth=1.1, label="simulated (reference)")
-    top.set_ylabel("total field (nT)")
-    top.set_ylim(ends(total, reference, low=0.1, high=0.1))
+    since, stated = curves(diagnosis, 2.0 * np.sqrt(diagnosis.problem.stated))
     both = sides(diagnosis)
     limits = ends(*(left for left, _ in both.values()), low=0.15, high=0.15)
     starts = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
-    for axis, (name, (left, colour)) in zip(lower, both.items(), strict=True):
+    for axis, (name, (left, colour)) in zip(axes[:, 0], both.items(), strict=True):
         axis.fill_between(
             since, -stated, stated, color=FAINT, alpha=0.25, linewidth=0, label="±2 sigma as calibrated"
         )
@@ -66,16 +57,37 @@ def measured(diagnosis: Diagnosis) -> str:
         for start in starts if starts.size < MANY else ():
             axis.axvline((start - survey.time[0]) / unit, color=FAINT, linewidth=0.4)
         axis.set_ylim(limits)
-        axis.set_ylabel("difference (nT)")
-    lower[-1].set_xlabel(
-        f"{hours} since the start"
-        + (f"; grey lines separate the {survey.parts}" if starts.size < MANY else "")
-    )
-    for axis in axes[:, 0]:  # above the axes, where it covers nothing
-        axis.legend(
+        axis.set_ylabel("nT")
+        axis.legend(  # above the axes, where it covers nothing
             fontsize=SMALL, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), markerscale=5,
             ncols=3, borderaxespad=0.0,
         )  # fmt: skip
+    lines = f"; grey lines separate the {survey.parts}" if starts.size < MANY else ""
+    axes[-1, 0].set_xlabel(f"{hours} since the start{lines}")
+    return png(figure)
+
+
+def terms(diagnosis: Diagnosis) -> str | None:
+    """Draw what each found cause adds to the total field, through what all others leave."""
+    if not diagnosis.findings:
+        return None
+    count, part = len(diagnosis.findings), thin(len(diagnosis.problem))
+    figure, axes = canvas(10, 0.4 + 2.1 * count, count, 1, sharex=True)
+    for axis, finding in zip(axes[:, 0], diagnosis.findings, strict=True):
+        added = finding.field(diagnosis.problem)
+        alone = added + diagnosis.fit.left / diagnosis.problem.gain
+        since, line = curves(diagnosis, added)
+        axis.plot(since, alone[part], color=FAINT, label="all else removed", **DOTS)
+        axis.plot(*rolling(diagnosis, alone), color=INK, linewidth=0.9, label="its running mean")
+        axis.plot(since, line, color=AFTER, linewidth=1.4, label="what the cause adds")
+        axis.axhline(0.0, color=INK, linewidth=0.5)
+        low, high = ends(alone, low=0.1, high=0.1)
+        axis.set_ylim(min(low, 0.0), max(high, 0.0))
+        axis.set_ylabel("nT")
+        axis.set_title(label(*finding.candidate.group), fontsize=SMALL + 1.0, loc="left")
+    axes[-1, 0].set_xlabel(f"{clock(diagnosis)[1]} since the start")
+    handles = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, fontsize=SMALL, frameon=False, loc="outside upper left", ncols=3, markerscale=5)
     return png(figure)
 
 
@@ -217,6 +229,6 @@ def track(diagnosis: Diagnosis) -> str | None:
         axis.set_ylabel(f"north ({unit})")
     assert dots is not None
     bar = figure.colorbar(dots, ax=axes, shrink=0.8, extend="both")
-    bar.set_label("measured − simulated (nT)", size=SMALL)
+    bar.set_label("measured − reference (nT)", size=SMALL)
     bar.ax.tick_params(labelsize=SMALL)
     return png(figure)

@@ -13,13 +13,15 @@ from operator import itemgetter
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.rivals import Rival
-from magbridge.diagnose.words import label, measured, names_of, number
+from magbridge.diagnose.seen import Seen
+from magbridge.diagnose.words import label, measured, names_of, number, series_of
 
 __all__ = [
     "MANY",
     "bold",
     "chance",
     "figure",
+    "goes_with",
     "label",
     "listed",
     "measured",
@@ -37,13 +39,23 @@ MANY = 12
 
 def bold(candidate: Candidate) -> str:
     """Return a candidate's cause in bold, and its channel."""
-    channel = candidate.channel
+    channel = series_of(candidate)
     return f"<b>{label(candidate.cause, None)}</b>" + (f" ({escape(channel)})" if channel else "")
 
 
 def listed(rivals: Sequence[Rival], joint: str = ", ") -> str:
     """Return causes as a list in words, the likeliest first."""
     return escape(names_of(rivals, joint))
+
+
+def goes_with(seen: Seen, *, share: bool = False) -> str:
+    """Return what a signal is seen to follow, how late and along which axis; empty if none."""
+    if not seen.channel:
+        return ""
+    axis = "along the field" if seen.axis == "field" else f"mostly along {seen.axis}" if seen.axis else ""
+    late = f"{seen.lag:g} s late" if seen.lag else ""
+    much = f"in {100 * seen.share:.0f} % of its power" * share
+    return ", ".join(part for part in (f"<code>{escape(seen.channel)}</code>", late, axis, much) if part)
 
 
 def physics(cause: Cause) -> str:
@@ -93,11 +105,11 @@ def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
     return ", ".join(texts) or "no plausible size reaches it"
 
 
-def figure(png: str | None, title: str, caption: str = "") -> str:
-    """Return a picture (base64 of a PNG) below its title and caption, as HTML; nothing if there is none."""
+def figure(png: str | None, caption: str) -> str:
+    """Return a picture (base64 of a PNG) below its caption, as HTML; nothing if there is none."""
     if png is None:
         return ""
     return (
-        f"<figure><figcaption><b>{title}</b> {caption}</figcaption>"
-        f'<div><img alt="{escape(title)}" src="data:image/png;base64,{png}"></div></figure>'
+        f"<figure><figcaption>{caption}</figcaption>"
+        f'<div><img alt="{escape(caption)}" src="data:image/png;base64,{png}"></div></figure>'
     )

@@ -1,0 +1,196 @@
+"""The page's folded parts: each cause, what is left, and what such a log can show at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from html import escape
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.inference.isolability import CONFOUNDED, Visible
+from magbridge.diagnose.report import figures
+from magbridge.diagnose.report.findings import parameters
+from magbridge.diagnose.report.words import (
+    MANY,
+    bold,
+    chance,
+    figure,
+    goes_with,
+    label,
+    listed,
+    number,
+    physics,
+    row,
+    sizes,
+    table,
+)
+from magbridge.diagnose.unexplained.leftover import Leftover
+
+__all__ = ["described", "found", "nameless", "remaining", "visible"]
+
+KINDS = {
+    "switching": "Something that switches or comes and goes",
+    "drift": "A slow drift",
+    "tone": "A tone",
+    "transient": "A transient",
+    "broadband": "Something broadband",
+}
+"""What is left, as the subject of a sentence."""
+WORSE = 1.3
+"""Multiple of the fitted residual from which the one held out is remarked on."""
+ALIKE = 4
+"""Causes listed that look like one."""
+
+
+def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
+    """Return what is known of each cause, and of isolated wrong samples."""
+    if not diagnosis.findings and diagnosis.wrong is None:
+        return [f"<p>None of {len(causes)} causes is named.</p>"]
+    parts = [figure(figures.terms(diagnosis), "What each cause adds, through what all others leave.")]
+    for finding, notes in zip(diagnosis.findings, diagnosis.assessment.notes, strict=False):
+        numbers = parameters(finding, len(diagnosis.problem))
+        gain, of = finding.gain, finding.candidate
+        rows = (row(name, **one) for name, one in numbers.items())
+        evidence = (
+            f"<p>Signal-to-noise ratio {finding.signal_to_noise:.1f}; by noise alone with a chance of "
+            f"{chance(finding.hypothesis.p_value)}; without it the held-out RMS is "
+            f"{1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: {1 / max(gain.interval[1], 1e-9):.2f} to "
+            f"{1 / max(gain.interval[0], 1e-9):.2f}).</p>"
+        )
+        parts += [
+            f"<h3>{bold(of)}</h3>",
+            f'<p class="faint">{physics(causes[of.cause])}</p>',
+            evidence,
+            _folded(table(("term", "value", "1 sigma", "unit"), rows), numbers),
+            *(f"<p>{escape(note.text)}</p>" for note in notes),
+        ]
+    if diagnosis.wrong is not None:
+        parts.append(_outliers(diagnosis.problem.survey.time[diagnosis.wrong.rows]))
+    return parts
+
+
+def _outliers(time: FloatArray) -> str:
+    """Say how many samples are wrong, and when: `time` (k,) in s since 1970."""
+    when = ", ".join(datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S") for t in time[:MANY])
+    wrong = "1 isolated sample is wrong" if time.size == 1 else f"{time.size} isolated samples are wrong"
+    first = f"the first {MANY} " if time.size > MANY else ""
+    return (
+        f"<h3><b>outliers</b></h3><p>{wrong}, {first}at {when} UTC. No RMS before or after counts them.</p>"
+    )
+
+
+def _folded(terms: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
+    """Fold a table that is too long to be read line by line: its terms count together, few by themselves."""
+    if len(numbers) <= MANY:
+        return terms
+    clear = sum(abs(one["value"]) > 2.0 * one["sigma"] for one in numbers.values() if one["sigma"])
+    return (
+        f"<details><summary>{len(numbers)} terms, {clear} of them beyond 2 sigma</summary>{terms}</details>"
+    )
+
+
+def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
+    """Return what is left: how large, how slow, what it goes with, and beside what was predicted."""
+    rest, left = diagnosis.unexplained, diagnosis.assessment.residual
+    budget, parts = diagnosis.assessment.budget, diagnosis.problem.survey.parts
+    rows = {
+        "predicted by the calibration as given: noise and its own uncertainty": budget.predicted,
+        "found with the calibration as given": budget.before,
+        f"found with the extended calibration, on {parts} left out of its fit": budget.after,
+        "left in the fit to the whole log": budget.fitted,
+    }
+    lines = (
+        f'<tr><td>{name}</td><td class="n">{number(size)} nT</td></tr>'
+        for name, size in rows.items()
+        if size is not None
+    )
+    worse = (
+        f"<p>What was left out is predicted {number((budget.after or 0.0) / budget.fitted, 2)} times worse "
+        "than what was fitted: this log determines some of the new terms badly, or they act differently from "
+        "part to part.</p>"
+    )
+    how = (
+        f"<p>It is {number(left.rms)} nT RMS, {number(left.white)} nT from one sample to the next, remembers "
+        f"{number(left.correlation_time, 2)} s, and follows "
+        f"{goes_with(diagnosis.assessment.follows, share=True) or 'nothing logged'}. {_noise(diagnosis)}</p>"
+    )
+    return [
+        f"<p>{described(rest)}. {nameless(rest, causes)}</p>" if rest else "",
+        how,
+        table(("difference between measured and reference", "RMS"), lines),
+        worse * ((budget.after or 0.0) > WORSE * budget.fitted),
+    ]
+
+
+def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
+    """Say why the rest has no name, and what would tell the possible causes apart."""
+    if not rest.within:
+        return "It fits no known cause, so it has no name."
+    return (
+        "No name is asserted: a description without a cause does as well. It resembles: "
+        f"{listed(rest.within)}. To tell: {escape(causes[rest.within[0].candidate.cause].separated_by)}."
+    )
+
+
+def described(rest: Leftover) -> str:
+    """Return what is left as a sentence without its full stop, as HTML."""
+    goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
+    period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
+    size = f"signal-to-noise ratio {rest.signal_to_noise:.1f}"
+    return f"<b>{KINDS[rest.kind]}</b>{period} is left ({size}{goes})"
+
+
+def _noise(diagnosis: Diagnosis) -> str:
+    noise = diagnosis.fit.noise
+    tails = (
+        "Gaussian" if noise.nu > 1e5 else f"with heavy tails (Student's t, {noise.nu:g} degrees of freedom)"
+    )
+    samples = len(noise.scale)
+    correlation = (
+        f"{samples} samples tell as much of a constant as {noise.independent:.0f} independent ones"
+        if noise.independent < 0.95 * samples
+        else "practically uncorrelated in time"
+    )
+    return (
+        f"The noise model: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {correlation}. "
+        f"The calibration states {number(diagnosis.problem.calibration.noise.sensor)} nT."
+    )
+
+
+def visible(diagnosis: Diagnosis) -> list[str]:
+    """Say how large each cause must be to be found in such a log, and which look like it."""
+    report = diagnosis.isolability
+    hidden = [one for one in report.visible if not any(isfinite(size) for size, _ in one.sizes.values())]
+    rows = (
+        f'<tr><td>{escape(label(one.cause, one.channel))}</td><td class="n">{one.sure:.1f}</td>'
+        f"<td>{sizes(one.sizes)}</td><td>{_alike(diagnosis, one)}</td></tr>"
+        for one in report.visible
+        if one not in hidden
+    )
+    heads = ("cause", "S/N found in 95 %", "smallest size found in 95 %", "looks like")
+    unseen = "; ".join(escape(label(one.cause, one.channel)) for one in hidden)
+    missing = "; ".join(f"{label(name, None)}: {escape(needs)}" for name, needs in report.untestable.items())
+    basis = (
+        "<p>From telemetry, attitude and noise alone. The true cause may be none of them, and beyond the "
+        f"ranges that were flown nothing was measured. Likeness above {100 * CONFOUNDED:.0f} %: such causes "
+        "are easily taken for each other.</p>"
+    )
+    return [
+        basis,
+        table(heads, rows),
+        f"<p>Not to be found at any plausible size: {unseen}.</p>" if unseen else "",
+        f"<p>Not testable here, with what it would take: {missing}.</p>" if missing else "",
+    ]
+
+
+def _alike(diagnosis: Diagnosis, one: Visible) -> str:
+    """List the causes that look most like `one`, the likest first."""
+    alike = [(b if a is one else a, rho) for a, b, rho in diagnosis.isolability.pairs if one is a or one is b]
+    few = [f"{escape(label(other.cause, other.channel))} {100 * rho:.0f} %" for other, rho in alike[:ALIKE]]
+    return ", ".join(few) + (f", and {len(alike) - ALIKE} more" if len(alike) > ALIKE else "")
