@@ -26,6 +26,7 @@ from terminal import command_line, table
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.known import Known
+from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Noise, Reference
 from magbridge.calibration.residual import rms
@@ -36,7 +37,7 @@ from magbridge.fleet.learn import Lesson, learn_fleet
 from sitl import Twin, load, segments, simulate
 from sitl.bound import oracle
 from sitl.dataset import at_rest, corrected
-from sitl.platform import Matrix, Vehicle, draw_vehicle
+from sitl.platform import MOUNTINGS, Matrix, Vehicle, draw_vehicle
 
 MASSES = ("battpos", "ballast")
 REFITTED = {"fixed iron": 50.0, "soft iron": 1e-3, "place": 0.005, "moment": 0.1}
@@ -158,6 +159,9 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=2, help="deployments of each refit")
     parser.add_argument("--refit", choices=["usual", "battery"], default="usual")
     parser.add_argument("--runs", type=int, nargs="+", default=[0, 2, 10])
+    parser.add_argument(
+        "--mounted", action="store_true", help="the fleet knows where masses usually sit (drawn: 6 cm off)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     options = parser.parse_args()
@@ -170,7 +174,9 @@ def main() -> None:
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
         told = list(pool.map(lesson, [one for one in flights if one.number < last]))
-        fleet = learn_fleet([one for one in told if isinstance(one, Lesson)])
+        where = {name: Mounting(MOUNTINGS[name].at, MOUNTINGS[name].travel) for name in MASSES}
+        mounted = {f"vehicle {k}": where for k in range(options.vehicles)} if options.mounted else {}
+        fleet = learn_fleet([one for one in told if isinstance(one, Lesson)], mounted)
         scored = [one for one in flights if one.number == last]
         refit = f"refit {last // options.every}"
         priors = [fleet.known(f"vehicle {one.vehicle}", refit) for one in scored]
@@ -178,7 +184,7 @@ def main() -> None:
     console = Console(width=110)
     for error in (one for one in told if isinstance(one, str)):
         console.print(f"not learnt from: {error}")
-    widths = np.sqrt(np.median(fleet.population.variances, axis=1))
+    widths = np.sqrt(np.median(fleet.population.variances.own, axis=1))
     console.print(
         f"learnt in {fleet.population.rounds} rounds; median of the physical widths: "
         + ", ".join(f"{name} {width:.2g}" for name, width in zip(LEVELS, widths, strict=True))

@@ -19,7 +19,7 @@ import polars as pl
 from magbridge.arrays import plain
 from magbridge.errors import FormatError, MissingExtra
 
-__all__ = ["FORMAT", "TABLES", "Catalogue", "Row", "open_catalogue"]
+__all__ = ["FORMAT", "TABLES", "TEXT", "Catalogue", "Row", "open_catalogue"]
 
 Row = dict[str, Any]
 FORMAT = 1
@@ -33,7 +33,10 @@ TEXT, NUMBER, COUNT, TEXTS, NUMBERS = (
     pl.List(pl.Float64()),
 )
 TABLES: dict[str, dict[str, pl.DataType]] = {
-    "vehicles": {"vehicle": TEXT, "serial": TEXT, "sensor": TEXT, "parameters": TEXTS, "order": COUNT},
+    "vehicles": {
+        "vehicle": TEXT, "serial": TEXT, "sensor": TEXT, "parameters": TEXTS, "order": COUNT, "mass": TEXT,
+        "version": COUNT,
+    },
     "files": {
         "vehicle": TEXT, "deployment": TEXT, "refit": TEXT, "path": TEXT, "sha256": TEXT, "size": COUNT,
         "version": COUNT, "sensor": TEXT,
@@ -59,7 +62,7 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
     },
     "maps": {"job": TEXT, "attempt": COUNT, "path": TEXT, "rms": NUMBER, "sigma": NUMBER},
     "done": {"job": TEXT, "attempt": COUNT, "diagnosed": pl.Boolean(), "mapped": pl.Boolean()},
-    "populations": {"of": TEXT, "variances": NUMBERS},
+    "populations": {"of": TEXT, "own": NUMBERS, "shaped": NUMBERS},
     "failures": {"job": TEXT, "attempt": COUNT, "vehicle": TEXT, "deployment": TEXT, "line": TEXT},
 }  # fmt: skip
 """Table -> columns and their types, in nT, deg and s since 1970. `calibration` is a whole cal.json,

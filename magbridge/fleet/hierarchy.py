@@ -9,21 +9,25 @@ A tree of Gaussian random effects over the coefficients z (K of them, in units o
     r_{ij} \sim N(v_i, V_2),\quad
     z_{ijk} \sim N(r_{ij}, V_3)
 
-with diagonal V_l, one variance for each group of alike coefficients. A deployment says of its z what its own
+with diagonal V_l, one variance for each group of alike coefficients. Where it is known how a refit moves a
+vehicle's coefficients together, :math:`r_{ij} \sim N(v_i, V_2 + D_i U D_i^T)`: the columns of D_i are such
+shapes, and U holds a variance for each group of them. A deployment says of its z what its own
 data say, a Gaussian likelihood of precision J and vector h, which may be singular: two runs determine few
 combinations, and a whole set most.
 
 Notes
 -----
 Sums run up the tree and means down (Gaussian belief propagation, exact on a tree; Pearl 1988). Integrating a
-child x of its parent p out, with :math:`L = J + V^{-1}`:
+child x of its parent p out, with S the covariance of its difference and :math:`L = J + S^{-1}`:
 
 .. math::
 
-    J_p \leftarrow J_p + J L^{-1} V^{-1},\quad h_p \leftarrow h_p + V^{-1} L^{-1} h,\quad
-    \log Z \leftarrow \log Z + (h^T L^{-1} h - \log|L| - \log|V|) / 2
+    J_p \leftarrow J_p + J L^{-1} S^{-1},\quad h_p \leftarrow h_p + S^{-1} L^{-1} h,\quad
+    \log Z \leftarrow \log Z + (h^T L^{-1} h - \log|L| - \log|S|) / 2
 
-and back, :math:`x | p \sim N(L^{-1}(h + V^{-1} p), L^{-1})`. The variances maximise the likelihood by
+and back, :math:`x | p \sim N(L^{-1}(h + S^{-1} p), L^{-1})`. A difference d splits into what each of its
+parts, with the covariance Q and the shape B (V and I, or U and D), contributes:
+:math:`b | d \sim N(Q B^T S^{-1} d,\ Q - Q B^T S^{-1} B Q)`. The variances maximise the likelihood by
 expectation-maximisation (Laird & Ware 1982, Biometrics 38:963), each with a scaled inverse chi-squared prior
 worth :data:`WORTH` differences, so that a level with few members keeps a plausible size.
 """
@@ -31,8 +35,9 @@ worth :data:`WORTH` differences, so that a level with few members keeps a plausi
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -40,7 +45,7 @@ from scipy.linalg import cho_factor, cho_solve
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.known import Information
 
-__all__ = ["LEVELS", "Observed", "Population", "learn"]
+__all__ = ["LEVELS", "NONE", "Observed", "Population", "Shapes", "Variances", "learn"]
 
 LEVELS = ("vehicle", "refit", "power-up")
 """What coefficients vary with, from the root down."""
@@ -62,13 +67,51 @@ class Observed:
 
 
 @dataclass(frozen=True, eq=False)
+class Shapes:
+    """How refits move coefficients together.
+
+    Attributes
+    ----------
+    of : dict
+        Vehicle -> D (K, s); one that is not there has none.
+    groups : (s,) array
+        Number of the group that each column shares its variance with.
+    """
+
+    of: Mapping[str, FloatArray]
+    groups: IndexArray
+
+
+class Variances(NamedTuple):
+    """How far members differ from their parents.
+
+    Attributes
+    ----------
+    own : (3, K) array
+        Of each coefficient, at each of :data:`LEVELS`.
+    shaped : (s,) array
+        Of the size of each shape, from refit to refit.
+    """
+
+    own: FloatArray
+    shaped: FloatArray
+
+    @classmethod
+    def expected(cls, K: int, s: int) -> Variances:
+        """Return what is expected before any fleet is seen."""
+        return cls(np.square(EXPECTED)[:, None] * np.ones((1, K)), np.full(s, EXPECTED[1] ** 2))
+
+
+@dataclass(frozen=True, eq=False)
 class Population:
     """A fleet's variances, and what all but each vehicle say of the fleet's mean.
 
     Attributes
     ----------
-    variances : (3, K) array
+    variances : Variances
         Of the differences at each of :data:`LEVELS`.
+    shapes : Shapes
+        How refits move the coefficients of each vehicle.
     total : Information
         Of the fleet's mean, its prior included.
     each : dict
@@ -79,7 +122,8 @@ class Population:
         Of expectation-maximisation.
     """
 
-    variances: FloatArray
+    variances: Variances
+    shapes: Shapes
     total: Information
     each: dict[str, Information]
     log_likelihood: float
@@ -97,21 +141,28 @@ class Population:
         refit : str
             Its refit: one of the past, or another.
         """
-        V = self.variances
+        by_vehicle, by_refit, by_power_up = _spreads(self.variances, self.shapes, vehicle)
         known = self.each.get(vehicle)
         others = self.total if known is None else _minus(self.total, known)
         mean, P = _moments(others)
-        P = P + np.diag(V[0])
+        P = P + by_vehicle.S
         branches: dict[str, list[Information]] = defaultdict(list)
         for one in past:
-            branches[one.refit].append(one.information)
+            branches[one.refit].append(_up(one.information, by_power_up).told)
         own = branches.pop(refit, [])
-        elsewhere = [
-            _up(_summed([_up(i, V[2]).told for i in leaves]), V[1]).told for leaves in branches.values()
-        ]
+        elsewhere = [_up(_summed(leaves), by_refit).told for leaves in branches.values()]
         mean, P = _updated(mean, P, elsewhere)
-        mean, P = _updated(mean, P + np.diag(V[1]), [_up(i, V[2]).told for i in own])
-        return mean, P + np.diag(V[2])
+        mean, P = _updated(mean, P + by_refit.S, own)
+        return mean, P + by_power_up.S
+
+
+class _Spread(NamedTuple):
+    """Covariance S of a difference, its inverse W, log determinant, and the parts it is made of: Q, B."""
+
+    S: FloatArray
+    W: FloatArray
+    log_det: float
+    parts: tuple[tuple[FloatArray, FloatArray], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +176,36 @@ class _Passed:
     score: float
 
 
+class _Sums:
+    """Expected squares of all differences at each level, and of all shapes' sizes; how many there are."""
+
+    def __init__(self, K: int, s: int) -> None:
+        self.own, self.shaped = np.zeros((len(LEVELS), K)), np.zeros(s)
+        self.counts = [0] * len(LEVELS)
+        self.refits = 0
+
+    def add(self, level: int, dd: FloatArray, spread: _Spread) -> None:
+        """Count a difference whose expected d d^T is `dd` (K, K)."""
+        self.counts[level] += 1
+        (own, *shaped) = (
+            q + ((Y := (q[:, None] * B.T) @ spread.W) @ (dd - spread.S) * Y).sum(axis=1)
+            for q, B in spread.parts
+        )
+        self.own[level] += own
+        for squares in shaped:
+            self.shaped += squares
+            self.refits += 1
+
+
+NONE = Shapes({}, np.zeros(0, np.intp))
+"""Nothing is known of how refits move coefficients."""
+
+
 def learn(
-    observed: Sequence[Observed], groups: IndexArray, variances: FloatArray | None = None
+    observed: Sequence[Observed],
+    groups: IndexArray,
+    shapes: Shapes = NONE,
+    variances: Variances | None = None,
 ) -> Population:
     """Learn the variances of a fleet.
 
@@ -136,95 +215,125 @@ def learn(
         One for each deployment, all with the same K coefficients.
     groups : (K,) array
         Number of the group that each coefficient shares its variances with.
-    variances : (3, K) array, optional
-        Those found from the same deployments before.
+    shapes : Shapes
+        How refits move coefficients together.
+    variances : Variances, optional
+        Those to take, instead of learning them.
     """
-    if variances is not None:
-        return _round(variances, observed, groups)[0]
-    start = np.square(EXPECTED)[:, None] * np.ones((1, len(groups)))
-    found = Population(start, Information(np.eye(len(groups)), np.zeros(len(groups))), {}, -np.inf)
-    for turn in range(1, ROUNDS + 1):
-        scored, squares, counts = _round(found.variances, observed, groups)
-        renewed = np.empty_like(start)
-        for level, (square, count) in enumerate(zip(squares, counts, strict=True)):
-            inner = np.bincount(groups, square) + WORTH * EXPECTED[level] ** 2
-            # the mode of its posterior: of count differences of each member, and of the prior
-            renewed[level] = (inner / (count * np.bincount(groups) + WORTH + 2.0))[groups]
-        moved = np.abs(np.log(renewed / found.variances)).max()
-        found = replace(scored, variances=renewed, rounds=turn)
-        if moved < STILL:
+    start = variances or Variances.expected(len(groups), len(shapes.groups))
+    found, sums = _round(start, observed, groups, shapes)
+    for turn in range(1, (0 if variances else ROUNDS) + 1):
+        old = found.variances
+        new = _renewed(sums, groups, shapes)
+        found, sums = _round(new, observed, groups, shapes)
+        found = replace(found, rounds=turn)
+        moved = np.log(np.append(new.own, new.shaped) / np.append(old.own, old.shaped))
+        if np.abs(moved).max() < STILL:
             break
-    scored, _, _ = _round(found.variances, observed, groups)
-    return replace(scored, rounds=found.rounds)
+    return found
+
+
+def _renewed(sums: _Sums, groups: IndexArray, shapes: Shapes) -> Variances:
+    """Return the mode of the variances' posterior: of count differences of each member, and of the prior."""
+
+    def mode(squares: FloatArray, count: int, of: IndexArray, expected: float) -> FloatArray:
+        inner = np.bincount(of, squares) + WORTH * expected**2
+        return np.asarray((inner / (count * np.bincount(of) + WORTH + 2.0))[of])
+
+    own = [
+        mode(squares, count, groups, size)
+        for squares, count, size in zip(sums.own, sums.counts, EXPECTED, strict=True)
+    ]
+    return Variances(np.array(own), mode(sums.shaped, sums.refits, shapes.groups, EXPECTED[1]))
 
 
 def _round(
-    V: FloatArray, observed: Sequence[Observed], groups: IndexArray
-) -> tuple[Population, FloatArray, tuple[int, int, int]]:
-    """Go up and down the tree once; return expected squares of all differences (3, K), and how many."""
+    variances: Variances, observed: Sequence[Observed], groups: IndexArray, shapes: Shapes = NONE
+) -> tuple[Population, _Sums]:
+    """Go up and down the tree once."""
+    K = len(groups)
+    spreads = {one.vehicle: _spreads(variances, shapes, one.vehicle) for one in observed}
     tree: dict[str, dict[str, list[_Passed]]] = defaultdict(lambda: defaultdict(list))
     for one in observed:
-        tree[one.vehicle][one.refit].append(_up(one.information, V[2]))
-    size = V.shape[1]
+        tree[one.vehicle][one.refit].append(_up(one.information, spreads[one.vehicle][2]))
     middle = {
         vehicle: {
-            refit: _up(_summed([leaf.told for leaf in leaves]), V[1]) for refit, leaves in refits.items()
+            refit: _up(_summed([leaf.told for leaf in leaves]), spreads[vehicle][1])
+            for refit, leaves in refits.items()
         }
         for vehicle, refits in tree.items()
     }
     top = {
-        vehicle: _up(_summed([one.told for one in refits.values()]), V[0])
+        vehicle: _up(_summed([one.told for one in refits.values()]), spreads[vehicle][0])
         for vehicle, refits in middle.items()
     }
-    total = _summed([Information(np.eye(size), np.zeros(size)), *(one.told for one in top.values())])
+    total = _summed([Information(np.eye(K), np.zeros(K)), *(one.told for one in top.values())])
     mean, P = _moments(total)
-    nodes = [
-        *top.values(),
-        *(one for refits in middle.values() for one in refits.values()),
-        *(leaf for refits in tree.values() for leaves in refits.values() for leaf in leaves),
-    ]
-    score = sum(one.score for one in nodes) + 0.5 * (
-        total.vector @ mean - np.linalg.slogdet(total.precision)[1]
-    )
-    squares = np.zeros_like(V)
+    score = 0.5 * (total.vector @ mean - np.linalg.slogdet(total.precision)[1])
+    sums = _Sums(K, len(shapes.groups))
     for vehicle, at in top.items():
-        there = _down(at, mean, P, squares[0])
+        by = spreads[vehicle]
+        score += at.score
+        there = _down(at, mean, P, sums, 0, by[0])
         for refit, inner in middle[vehicle].items():
-            here = _down(inner, *there, squares[1])
+            score += inner.score
+            here = _down(inner, *there, sums, 1, by[1])
             for leaf in tree[vehicle][refit]:
-                _down(leaf, *here, squares[2])
-    counts = len(top), sum(map(len, middle.values())), len(observed)
-    score += _log_prior(V, groups)
-    return Population(V, total, {name: one.told for name, one in top.items()}, float(score)), squares, counts
+                score += leaf.score
+                _down(leaf, *here, sums, 2, by[2])
+    score += _log_prior(variances, groups, shapes)
+    each = {name: one.told for name, one in top.items()}
+    return Population(variances, shapes, total, each, float(score)), sums
 
 
-def _log_prior(V: FloatArray, groups: IndexArray) -> float:
+def _spreads(variances: Variances, shapes: Shapes, vehicle: str) -> tuple[_Spread, _Spread, _Spread]:
+    """Return how a vehicle differs from the fleet, its refits from it, and power-ups from their refit."""
+    D = shapes.of.get(vehicle)
+    return (
+        _spread(variances.own[0]),
+        _spread(variances.own[1], *(() if D is None else ((variances.shaped, D),))),
+        _spread(variances.own[2]),
+    )
+
+
+def _spread(own: FloatArray, *shaped: tuple[FloatArray, FloatArray]) -> _Spread:
+    """Return ``S = diag(own) + D diag(u) D^T`` for each u, D of `shaped`."""
+    S, W, log_det = np.diag(own), np.diag(1.0 / own), float(np.log(own).sum())
+    for u, D in shaped:
+        S = S + (D * u) @ D.T
+        factor = cho_factor(S)
+        W, log_det = cho_solve(factor, np.eye(len(S))), 2.0 * float(np.log(np.diag(factor[0])).sum())
+    return _Spread(S, np.asarray(W), log_det, ((own, np.eye(len(own))), *shaped))
+
+
+def _log_prior(variances: Variances, groups: IndexArray, shapes: Shapes) -> float:
     """Scaled inverse chi-squared, for one member of each group."""
     _, first = np.unique(groups, return_index=True)
-    v, expected = V[:, first], np.square(EXPECTED)[:, None]
+    _, one = np.unique(shapes.groups, return_index=True)
+    v = np.append(variances.own[:, first], variances.shaped[one])
+    expected = np.append(np.repeat(np.square(EXPECTED), len(first)), np.full(len(one), EXPECTED[1] ** 2))
     return float(-np.sum((0.5 * WORTH + 1.0) * np.log(v) + 0.5 * WORTH * expected / v))
 
 
-def _up(own: Information, variance: FloatArray) -> _Passed:
-    """Integrate a node out whose differences from its parent have that variance (K,)."""
-    L = own.precision + np.diag(1.0 / variance)
+def _up(own: Information, spread: _Spread) -> _Passed:
+    """Integrate a node out whose difference from its parent has that covariance."""
+    L = own.precision + spread.W
     factor = cho_factor(L)
     R = np.asarray(cho_solve(factor, np.eye(len(L))))
-    G = R / variance
-    g = R @ own.vector
+    G, g = R @ spread.W, R @ own.vector
     J = own.precision @ G
     log_L = 2.0 * np.log(np.diag(factor[0])).sum()
-    score = 0.5 * (own.vector @ g - log_L - np.log(variance).sum())
-    return _Passed(Information(0.5 * (J + J.T), g / variance), G, g, R, float(score))
+    score = 0.5 * (own.vector @ g - log_L - spread.log_det)
+    return _Passed(Information(0.5 * (J + J.T), spread.W @ g), G, g, R, float(score))
 
 
 def _down(
-    node: _Passed, mean: FloatArray, P: FloatArray, squares: FloatArray
+    node: _Passed, mean: FloatArray, P: FloatArray, sums: _Sums, level: int, spread: _Spread
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a node's mean and covariance from its parent's; add the expected squares of the difference."""
+    """Return a node's mean and covariance from its parent's; count the difference."""
     own = node.G @ mean + node.g
     off = node.G - np.eye(len(mean))
-    squares += (own - mean) ** 2 + np.diag(node.R) + ((off @ P) * off).sum(axis=1)
+    sums.add(level, np.outer(own - mean, own - mean) + node.R + off @ P @ off.T, spread)
     return own, node.R + node.G @ P @ node.G.T
 
 

@@ -7,7 +7,7 @@ monomial and are of one kind (A or T; for the constant: gain, soft iron, hard ir
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,14 +16,17 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.known import Information, Known, rescaling
+from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import DataError
-from magbridge.fleet.hierarchy import LEVELS, Observed, Population, learn
+from magbridge.fleet.hierarchy import NONE, Observed, Population, Shapes, Variances, learn
+from magbridge.fleet.shapes import shape_groups, shapes_of
 
 __all__ = ["Fleet", "Lesson", "learn_fleet"]
 
+NOWHERE: Mapping[str, Mapping[str, Mounting]] = {}
 FIELD = 50_000.0
 """nT, the F_0 that a fleet's coefficients refer to."""
 
@@ -70,6 +73,8 @@ class Fleet:
     basis : (9 m, 9 m) array
         nT; coefficients of z, which is in units of the physical widths.
     population : Population
+    mounted : mapping
+        Vehicle -> where its masses sit.
     lessons : tuple of Lesson
         In the order of time.
     observed : tuple of Observed
@@ -80,6 +85,7 @@ class Fleet:
     exponents: tuple[Exponents, ...]
     basis: FloatArray
     population: Population
+    mounted: Mapping[str, Mapping[str, Mounting]]
     lessons: tuple[Lesson, ...]
     observed: tuple[Observed, ...]
 
@@ -105,10 +111,21 @@ class Fleet:
         return Known(self.parameters, self.exponents, FIELD, E @ mean, E @ P @ E.T)
 
 
-def learn_fleet(lessons: Sequence[Lesson], variances: Sequence[float] | None = None) -> Fleet:
+def learn_fleet(
+    lessons: Sequence[Lesson],
+    mounted: Mapping[str, Mapping[str, Mounting]] = NOWHERE,
+    variances: Variances | None = None,
+) -> Fleet:
     """Learn from deployments of vehicles whose masses have the same names, fitted to the same order.
 
-    `variances` are those that the same lessons have given before.
+    Parameters
+    ----------
+    lessons : sequence of Lesson
+        One for each deployment.
+    mounted : mapping
+        Vehicle -> where its masses sit, of those of which all are known.
+    variances : Variances, optional
+        Those that the same lessons have given before.
 
     Raises
     ------
@@ -124,9 +141,35 @@ def learn_fleet(lessons: Sequence[Lesson], variances: Sequence[float] | None = N
     basis = np.asarray(family.E * family.widths(family.centre))
     with threadpool_limits(1, "blas"):
         observed = tuple(Observed(one.vehicle, one.refit, one.brought(parameters, basis)) for one in lessons)
-        known = None if variances is None else np.reshape(variances, (len(LEVELS), -1))
-        population = learn(observed, _groups(exponents), known)
-    return Fleet(parameters, exponents, basis, population, tuple(lessons), observed)
+        groups = _groups(exponents)
+        shapes = _shapes(observed, groups, mounted, exponents, parameters, basis)
+        population = learn(observed, groups, shapes, variances)
+    return Fleet(parameters, exponents, basis, population, mounted, tuple(lessons), observed)
+
+
+def _shapes(
+    observed: Sequence[Observed],
+    groups: IndexArray,
+    mounted: Mapping[str, Mapping[str, Mounting]],
+    exponents: tuple[Exponents, ...],
+    parameters: tuple[Parameter, ...],
+    basis: FloatArray,
+) -> Shapes:
+    """Return how refits move z, about where each vehicle is before anything is learnt of the variances."""
+    names = {one.name for one in parameters}
+    whole = {vehicle: where for vehicle, where in mounted.items() if where.keys() == names}
+    if not whole:
+        return NONE
+    first = learn(observed, groups, variances=Variances.expected(len(groups), 0))
+    found = {}
+    for vehicle, where in whole.items():
+        past = [one for one in observed if one.vehicle == vehicle]
+        if not past:
+            continue
+        mean, P = first.expected(vehicle, past, "")
+        D = shapes_of(where, exponents, parameters, FIELD, basis @ mean, basis @ P @ basis.T)
+        found[vehicle] = np.asarray(np.linalg.solve(basis, D))
+    return Shapes(found, shape_groups(len(parameters)))
 
 
 def _whole_range(lessons: Sequence[Lesson]) -> tuple[Parameter, ...]:

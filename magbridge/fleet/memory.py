@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from hashlib import sha256
 from typing import Any, NamedTuple
 
@@ -11,13 +11,15 @@ import numpy as np
 
 from magbridge.calibration.file import decode_calibration
 from magbridge.calibration.fitting.known import Information
+from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import DataError, WrongUse
 from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.fleet.given import GIVEN
+from magbridge.fleet.hierarchy import LEVELS, Variances
 from magbridge.fleet.learn import Fleet, Lesson, learn_fleet
 from magbridge.fleet.process import jobs, last_attempts
-from magbridge.fleet.register import current_files, vehicle_named, vehicles
+from magbridge.fleet.register import current_files, masses, vehicle_named, vehicles
 
 __all__ = ["current", "fleet_of", "fleets", "lessons", "owner", "remember"]
 
@@ -94,9 +96,13 @@ def fleet_of(catalogue: Catalogue, vehicle: str, without: Collection[str] = ()) 
     if len(units) > 1:
         both = " and ".join(", ".join(one) for one in sorted(units))
         raise DataError(f"{catalogue.name}: {vehicle}'s fleet gives its positions in different units: {both}")
-    of = _name(found)
-    stored = {row["of"]: row for row in catalogue.rows("populations")} if found else {}
-    return learn_fleet(found, stored[of]["variances"] if of in stored else None)
+    mounted = {name: masses(row) for name, row in vehicles(catalogue).items()}
+    of = _name(found, mounted)
+    stored = {
+        row["of"]: Variances(np.reshape(row["own"], (len(LEVELS), -1)), np.array(row["shaped"]))
+        for row in catalogue.rows("populations")
+    }
+    return learn_fleet(found, mounted, stored.get(of))
 
 
 def fleets(catalogue: Catalogue, names: Iterable[str]) -> dict[str, Fleet | DataError]:
@@ -118,8 +124,9 @@ def remember(catalogue: Catalogue) -> None:
     """Put on record how the coefficients of the catalogue's fleets vary, so that it is learnt once."""
     for fleet in fleets(catalogue, vehicles(catalogue)).values():
         if isinstance(fleet, Fleet):
-            variances = fleet.population.variances.ravel().tolist()
-            catalogue.add("populations", [{"of": _name(fleet.lessons), "variances": variances}])
+            own, shaped = (one.ravel().tolist() for one in fleet.population.variances)
+            of = _name(fleet.lessons, fleet.mounted)
+            catalogue.add("populations", [{"of": of, "own": own, "shaped": shaped}])
 
 
 def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
@@ -144,12 +151,13 @@ def _kind(vehicle: Row) -> tuple[tuple[str, ...], int]:
     return tuple(vehicle["parameters"]), vehicle["order"]
 
 
-def _name(lessons: Iterable[Lesson]) -> str:
-    """Return the name of what has been learnt from lessons: other lessons, another name."""
+def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting]]) -> str:
+    """Return the name of what has been learnt: from other lessons, another name."""
     each = sorted(
         (one.vehicle, one.refit, one.deployment, one.time, one.information.vector.tolist()) for one in lessons
     )
-    return sha256(msgspec.json.encode(each)).hexdigest()[:32]
+    where = [(name, mounted.get(name, {})) for name in sorted({one.vehicle for one in lessons})]
+    return sha256(msgspec.json.encode((each, where), order="sorted")).hexdigest()[:32]
 
 
 def _taught(row: Row) -> _Taught:

@@ -16,7 +16,7 @@ from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.fleet.register import current_files, vehicles
 from magbridge.fleet.work import Done, Job, work
 
-__all__ = ["Outcome", "client_of", "jobs", "new_jobs", "process"]
+__all__ = ["Outcome", "client_of", "jobs", "last_attempts", "new_jobs", "process"]
 
 START = "120s"
 """Until processes of this machine are up: they import much, and it may be busy."""

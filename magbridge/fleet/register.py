@@ -7,6 +7,10 @@
     sensor = "HMR2300 0153"                 # refuses another sensor's logs
     parameters = ["battpos", "ballast"]
 
+    [vehicle.comet.mass.battpos]            # where its masses sit, as in vehicle.toml; if all are known
+    at = [-0.45, 0.0, 0.05]
+    travel = [0.0254, 0.0, 0.0]
+
     [[vehicle.comet.deployment]]
     name = "2026-05"
     refit = "2026-04"                       # of which refit; if not given, each deployment is its own
@@ -20,8 +24,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta
 
+from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.files import digest, existing
 from magbridge.fleet.catalogue import Catalogue, Row
@@ -34,10 +40,15 @@ __all__ = [
     "add_vehicle",
     "current_files",
     "logs_of",
+    "masses",
     "read_fleet",
     "vehicle_named",
     "vehicles",
 ]
+
+
+SAME = "serial", "parameters"
+"""What a vehicle keeps; all else about it may be corrected, and the newest counts."""
 
 
 class Deployment(Table, frozen=True):
@@ -50,12 +61,13 @@ class Deployment(Table, frozen=True):
 
 
 class Vehicle(Table, frozen=True):
-    """``[vehicle.NAME]``: a vehicle, its sensor, and the columns that move its masses."""
+    """``[vehicle.NAME]``: a vehicle, its sensor, the columns that move its masses, and where those sit."""
 
     parameters: tuple[str, ...] = ()
     serial: str = ""
     sensor: str = ""
     order: Annotated[int, Meta(ge=1, le=6)] = 3
+    mass: dict[str, Mounting] = msgspec.field(default_factory=dict)
     deployment: tuple[Deployment, ...] = ()
 
 
@@ -85,15 +97,21 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
         Two have one name.
     """
     found: dict[str, Row] = {}
-    for row in catalogue.rows("vehicles"):
-        if row["vehicle"] in found:
-            both = " and ".join(_told(one) for one in (found[row["vehicle"]], row))
+    for row in sorted(catalogue.rows("vehicles"), key=lambda row: row["version"]):
+        last = found.get(row["vehicle"], row)
+        if any(last[key] != row[key] for key in SAME):
+            both = " and ".join(_told(one) for one in (last, row))
             raise FormatError(
                 catalogue.name,
                 f"two vehicles are named {row['vehicle']!r}: {both}; the row of one of them has to go",
             )
         found[row["vehicle"]] = row
     return found
+
+
+def masses(row: Row) -> dict[str, Mounting]:
+    """Return where a vehicle's masses sit, by the columns that move them."""
+    return msgspec.json.decode(row["mass"], type=dict[str, Mounting])
 
 
 def vehicle_named(catalogue: Catalogue, name: str) -> Row:
@@ -111,7 +129,7 @@ def vehicle_named(catalogue: Catalogue, name: str) -> Row:
 
 
 def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
-    """Put a vehicle on record, unless it is; return how many were added.
+    """Put a vehicle, or what is new about it, on record; return how many were added or changed.
 
     Raises
     ------
@@ -120,12 +138,15 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     """
     row = {"vehicle": name, **{key: getattr(vehicle, key) for key in ("serial", "sensor", "order")}}
     row["parameters"] = list(vehicle.parameters)
-    known = vehicles(catalogue).get(name)
-    if known is not None and known != row:
+    row["mass"] = msgspec.json.encode(vehicle.mass, order="sorted").decode()
+    known = vehicles(catalogue).get(name, {**row, "version": 0})
+    if any(known[key] != row[key] for key in SAME):
         raise WrongUse(
             f"{name}: {catalogue.name} has another vehicle of that name: {_told(known)}, not {_told(row)}"
         )
-    return catalogue.add("vehicles", [row])
+    if known == {**row, "version": known["version"]} and known["version"]:
+        return 0
+    return catalogue.add("vehicles", [{**row, "version": known["version"] + 1}])
 
 
 def add_logs(

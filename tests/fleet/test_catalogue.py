@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from fleets import fly
 
+from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
 from magbridge.fleet import folder as room
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
@@ -18,6 +19,7 @@ from magbridge.fleet.register import (
     add_logs,
     add_vehicle,
     current_files,
+    masses,
     read_fleet,
     vehicles,
 )
@@ -96,9 +98,14 @@ def test_two_vehicles_of_one_name(empty: Catalogue) -> None:
     assert add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1")) == 0
     with pytest.raises(WrongUse, match=r"another vehicle of that name: serial 1, .* not serial 2"):
         add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="2"))
+    where = {"battpos": Mounting((-0.5, 0.0, 0.0), (0.0254, 0.0, 0.0))}
+    for mass in (where, {}, where, where):  # measured, taken back, and given again
+        add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1", mass=mass))
+        assert masses(vehicles(empty)["comet"]) == mass
+    assert len(empty.rows("vehicles")) == 4
     # two people at once, who could not see each other
-    row = {"vehicle": "comet", "serial": "2", "sensor": "", "parameters": ["battpos"], "order": 3}
-    empty.add("vehicles", [row])
+    first = empty.rows("vehicles")[0]
+    empty.add("vehicles", [{**first, "serial": "2"}])
     with pytest.raises(FormatError, match="two vehicles are named 'comet'"):
         vehicles(empty)
 

@@ -8,7 +8,7 @@ import pytest
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.known import Information
 from magbridge.fleet import hierarchy
-from magbridge.fleet.hierarchy import Observed, Population, learn
+from magbridge.fleet.hierarchy import Observed, Population, Shapes, Variances, learn
 
 
 def observed(
@@ -30,16 +30,24 @@ def observed(
     return out, truth
 
 
-def test_what_is_expected_is_the_dense_gaussians_answer() -> None:
+@pytest.mark.parametrize("shaped", [False, True])
+def test_what_is_expected_is_the_dense_gaussians_answer(*, shaped: bool) -> None:
     rng = np.random.default_rng(0)
     seen, _ = observed(rng, (1.0, 0.3, 0.1), (2, 2, 2), K=3)
     V = np.array([[1.0, 0.5, 2.0], [0.1, 0.2, 0.3], [0.01, 0.02, 0.03]])
-    population, _, _ = hierarchy._round(V, seen, np.arange(3))
+    D, u = {"0": rng.normal(size=(3, 2)), "1": rng.normal(size=(3, 2))}, np.array([0.5, 2.0])
+    shapes = Shapes(D, np.arange(2)) if shaped else hierarchy.NONE
+    variances = Variances(V, u if shaped else np.zeros(0))
+    population, _ = hierarchy._round(variances, seen, np.arange(3), shapes)
     mean, P = population.expected("1", [one for one in seen if one.vehicle == "1"], "0")
     # the dense joint of all deployments and the next one, by its covariances
     labels = [(one.vehicle, one.refit) for one in seen] + [("1", "0")]
-    shared = [[1.0 + V[0] * (a[0] == b[0]) + V[1] * (a == b) for b in labels] for a in labels]
-    S = np.block([[np.diag(block) for block in row] for row in shared])
+
+    def shared(a: tuple[str, str], b: tuple[str, str]) -> FloatArray:
+        refit = np.diag(V[1]) + (D[a[0]] * u) @ D[a[0]].T * shaped
+        return np.asarray(np.eye(3) + np.diag(V[0]) * (a[0] == b[0]) + refit * (a == b))
+
+    S = np.block([[shared(a, b) for b in labels] for a in labels])
     S += np.kron(np.eye(len(labels)), np.diag(V[2]))
     J, h = np.zeros_like(S), np.zeros(len(S))
     for k, one in enumerate(seen):
@@ -63,8 +71,34 @@ def test_every_round_is_likelier(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_variances_are_those_that_it_was_drawn_from() -> None:
     sigmas = (0.8, 0.2, 0.05)
     seen, _ = observed(np.random.default_rng(2), sigmas, (15, 3, 3))
-    found = np.sqrt(learn(seen, np.zeros(4, int)).variances[:, 0])
+    found = np.sqrt(learn(seen, np.zeros(4, int)).variances.own[:, 0])
     assert (np.abs(np.log(found / sigmas)) < 0.35).all()
+
+
+def test_refits_that_move_coefficients_together_are_told_from_those_that_do_not() -> None:
+    rng = np.random.default_rng(5)
+    K, u, size = 4, 0.5, 0.03
+    D = {str(v): rng.normal(size=(K, 2)) for v in range(10)}
+    seen = []
+    for v, shape in D.items():
+        vehicle = rng.normal(size=K)
+        for r in range(3):
+            z = vehicle + shape @ rng.normal(0, u, 2) + rng.normal(0, size, K)
+            H = rng.normal(size=(3, K)) / 0.02
+            y = H @ z + rng.normal(size=3)
+            seen.append(Observed(v, str(r), Information(H.T @ H, H.T @ y)))
+    groups, shapes = np.zeros(K, int), Shapes(D, np.zeros(2, int))
+    shaped, plain = learn(seen, groups, shapes), learn(seen, groups)
+    assert np.sqrt(shaped.variances.shaped[0]) == pytest.approx(u, rel=0.3)
+    assert shaped.variances.own[1, 0] < 0.1 * plain.variances.own[1, 0]
+    assert shaped.log_likelihood > plain.log_likelihood
+    # one number of a new refit, and so much more of all is known
+    past = [one for one in seen if one.vehicle == "9"]
+    left = []
+    for population in (shaped, plain):
+        _, P = population.expected("9", past, "new")
+        left.append(np.trace(np.linalg.inv(np.linalg.inv(P) + np.diag([0.0, 0.0, 1e4, 1e4]))))
+    assert left[0] < 0.3 * left[1]
 
 
 def test_the_next_deployment_is_where_it_is_expected_as_often_as_said() -> None:
@@ -75,7 +109,7 @@ def test_the_next_deployment_is_where_it_is_expected_as_often_as_said() -> None:
         seen, truth = observed(rng, sigmas, (3, 2, 3))
         V = np.square(sigmas)[:, None] * np.ones((1, 4))
         last = len(seen) - 1
-        population, _, _ = hierarchy._round(V, seen[:last], np.zeros(4, int))
+        population, _ = hierarchy._round(Variances(V, np.zeros(0)), seen[:last], np.zeros(4, int))
         past = [one for one in seen[:last] if one.vehicle == "2"]
         for refit in ("1", "new"):
             mean, P = population.expected("2", past, refit)
@@ -93,5 +127,5 @@ def test_a_vehicle_of_no_past_is_as_wide_as_the_fleet() -> None:
     population: Population = learn(seen, np.zeros(4, int))
     _, new = population.expected("unknown", [], "first")
     _, old = population.expected("0", [one for one in seen if one.vehicle == "0"], "0")
-    assert (np.diag(new) > population.variances.sum(axis=0)).all()
+    assert (np.diag(new) > population.variances.own.sum(axis=0)).all()
     assert (np.diag(old) < np.diag(new)).all()
