@@ -13,7 +13,9 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -21,11 +23,12 @@ from magbridge.errors import FormatError, MagbridgeError
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
+    from multiprocessing.process import BaseProcess
 
 if sys.platform != "win32":
     import resource
 
-__all__ = ["guarded"]
+__all__ = ["Guarded", "Job", "guarded"]
 
 T = TypeVar("T")
 
@@ -47,6 +50,27 @@ class Raised(NamedTuple):
 
     rebuild: Callable[..., BaseException]
     arguments: tuple[Any, ...]
+
+    @classmethod
+    def by(cls, error: BaseException) -> Raised:
+        """Return an error without its causes, which other packages would pickle with it."""
+        how = error.__reduce__()
+        assert isinstance(how, tuple)
+        return cls(*how[:2])
+
+
+class Job(NamedTuple):
+    """A file, and what returns an iterable of objects read from it, which can be pickled."""
+
+    path: Path
+    read: Callable[[], Iterable[Any]]
+
+    @property
+    def limits(self) -> tuple[int, int]:
+        """The s of processor time and the bytes of memory that reading it may take, by its size."""
+        files = self.path.iterdir() if self.path.is_dir() else [self.path]  # a folder is one log, too
+        size = sum(file.stat().st_size for file in files if file.is_file())
+        return round(SECONDS + PER_MEGABYTE * size / 1e6), MEMORY + PER_BYTE * size
 
 
 def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
@@ -72,51 +96,103 @@ def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     Where there is no fork (Windows), or a process may have no children (a worker of a pool), it is read
     here: then a crash ends the process, and nothing limits the time.
     """
-    import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
-
-    if sys.platform == "win32" or multiprocessing.current_process().daemon:
-        yield from _foreseen(path, read)
-        return
-    files = path.iterdir() if path.is_dir() else [path]  # a folder is one log, too
-    size = sum(file.stat().st_size for file in files if file.is_file())
-    seconds = round(SECONDS + PER_MEGABYTE * size / 1e6)
-    memory = MEMORY + PER_BYTE * size
-    used = _memory()[1]
-    context = multiprocessing.get_context("fork")
-    pieces, end = context.Pipe(duplex=False)
-    child = context.Process(target=_send, args=(end, path, read, seconds, memory), daemon=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of a fork beside threads: the child uses none
-        child.start()
-    end.close()
+    one = Guarded([Job(path, read)])
     try:
+        yield from one.pieces(0)
+    finally:
+        one.close()
+
+
+class Guarded:
+    """Small files that are read one after the other as :func:`guarded` reads one, all in one child.
+
+    The child of a file that ends it is followed by another, for the files after that.
+    """
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        self._jobs = jobs
+        self._received: list[deque[tuple[bool, Any]]] = [deque() for _ in jobs]
+        self._at = 0
+        self._child: _Child | None = None
+
+    def pieces(self, k: int) -> Iterator[Any]:
+        """Yield what is read of a file, once; of files before it, what was read is kept."""
+        import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
+
+        if sys.platform == "win32" or multiprocessing.current_process().daemon:
+            yield from _foreseen(*self._jobs[k])
+            return
         while True:
-            _await(pieces, path, child.pid, WAIT * seconds, used + memory)
-            try:
-                done, piece = pieces.recv()
-            except EOFError:
-                child.join()
-                raise FormatError(path, _ended_by(child.exitcode or 0, seconds)) from None
+            while not self._received[k]:
+                self._receive()
+            done, piece = self._received[k].popleft()
             if isinstance(piece, Raised):
                 raise piece.rebuild(*piece.arguments)
             if done:
                 return
             yield piece
-    finally:
-        child.kill()
-        child.join()
-        pieces.close()
+
+    def close(self) -> None:
+        """End the child."""
+        if self._child is not None:
+            self._child.end()
+            self._child = None
+
+    def _receive(self) -> None:
+        """Wait for the next piece of the file that is being read."""
+        job = self._jobs[self._at]
+        if self._child is None:
+            self._child = _Child(self._jobs[self._at :])
+        try:
+            done, piece = self._child.receive(job)
+        except FormatError as error:
+            self.close()
+            done, piece = True, Raised.by(error)
+        self._received[self._at].append((done, piece))
+        self._at += done
+        if self._at == len(self._jobs):
+            self.close()
 
 
-def _await(pieces: Connection, path: Path, process: int | None, seconds: float, memory: int) -> None:
-    """Wait for a piece from `process`, at most `seconds` and while it uses no more than `memory` bytes."""
-    waited = 0.0
-    while not pieces.poll(POLL):
-        waited += POLL
-        if waited > seconds:
-            raise FormatError(path, f"takes longer than {seconds:.0f} s to read: damaged")
-        if _memory(process)[1] > memory:
-            raise FormatError(path, TOO_LARGE)
+class _Child:
+    """A process that reads files, and the pipe through which the pieces come."""
+
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
+
+        context = multiprocessing.get_context("fork")
+        self._used = _memory()[1]
+        self._pieces, end = context.Pipe(duplex=False)
+        self._process = context.Process(target=_send, args=(end, jobs), daemon=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore", DeprecationWarning
+            )  # of a fork beside threads: the child uses none
+            self._process.start()
+        end.close()
+        self.end = weakref.finalize(self, _end, self._process, self._pieces)
+
+    def receive(self, job: Job) -> tuple[bool, Any]:
+        """Return whether `job` is done, and its piece; FormatError: it takes too much, or ends the child."""
+        (seconds, memory), waited = job.limits, 0.0
+        while not self._pieces.poll(POLL):
+            waited += POLL
+            if waited > WAIT * seconds:
+                raise FormatError(job.path, f"takes longer than {WAIT * seconds:.0f} s to read: damaged")
+            if _memory(self._process.pid)[1] > self._used + memory:
+                raise FormatError(job.path, TOO_LARGE)
+        try:
+            done, piece = self._pieces.recv()
+        except EOFError:
+            self._process.join()
+            raise FormatError(job.path, _ended_by(self._process.exitcode or 0, seconds)) from None
+        return bool(done), piece
+
+
+def _end(process: BaseProcess, pieces: Connection) -> None:
+    process.kill()
+    process.join()
+    pieces.close()
 
 
 def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
@@ -139,8 +215,8 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
         raise damaged from error
 
 
-def _send(end: Connection, path: Path, read: Callable[[], Iterable[Any]], seconds: int, memory: int) -> None:
-    """Read in the child, and send (False, piece) for each, then (True, None), or (True, Raised)."""
+def _send(end: Connection, jobs: Sequence[Job]) -> None:
+    """Read in the child, and send (False, piece) for each of a file, then (True, None) or (True, Raised)."""
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):  # HDF5 and dbdreader print what they find
@@ -148,25 +224,28 @@ def _send(end: Connection, path: Path, read: Callable[[], Iterable[Any]], second
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the child
     for number in (signal.SIGTERM, signal.SIGXCPU):
         signal.signal(number, signal.SIG_DFL)
-    _limit(seconds, memory)
     try:
-        for piece in _foreseen(path, read):
-            end.send((False, piece))
-        end.send((True, None))
+        for job in jobs:
+            _limit(*job.limits)
+            try:
+                for piece in _foreseen(*job):
+                    end.send((False, piece))
+                end.send((True, None))
+            except BrokenPipeError:
+                raise
+            except (MagbridgeError, OSError) as error:
+                end.send((True, Raised.by(error)))
     except BrokenPipeError:  # the parent wants no more
         pass
-    except (MagbridgeError, OSError) as error:
-        how = error.__reduce__()
-        assert isinstance(how, tuple)
-        end.send((True, Raised(*how[:2])))  # not the error itself: other packages pickle its causes with it
 
 
 def _limit(seconds: int, memory: int) -> None:
-    """Limit this process to `seconds` of processor time and `memory` bytes beyond what it has."""
+    """Limit this process to `seconds` of processor time and `memory` bytes beyond what it has taken."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    _lower(resource.RLIMIT_CPU, seconds)
+    _set(resource.RLIMIT_CPU, round(used.ru_utime + used.ru_stime) + seconds)
     if size := _memory()[0]:
-        _lower(resource.RLIMIT_AS, size + memory + RESERVED)
+        _set(resource.RLIMIT_AS, size + memory + RESERVED)
 
 
 def _memory(process: int | str | None = "self") -> tuple[int, int]:
@@ -178,7 +257,7 @@ def _memory(process: int | str | None = "self") -> tuple[int, int]:
     return int(size) * resource.getpagesize(), int(resident) * resource.getpagesize()
 
 
-def _lower(kind: int, limit: int) -> None:
+def _set(kind: int, limit: int) -> None:
     _, most = resource.getrlimit(kind)
     resource.setrlimit(kind, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
 

@@ -13,7 +13,7 @@ import pytest
 
 from magbridge import guard
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.guard import guarded
+from magbridge.guard import Guarded, Job, guarded
 
 
 @pytest.fixture
@@ -119,3 +119,45 @@ def test_a_child_that_waits_for_ever_is_ended(file: Path, monkeypatch: pytest.Mo
 
     with pytest.raises(FormatError, match="takes longer than"):
         list(guarded(file, sleeps))
+
+
+def where() -> Iterator[int]:
+    yield os.getpid()
+    yield os.getpid()
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (4, 0, 1, 2, 3)])
+def test_one_child_reads_several_files_and_another_what_follows_a_crash(
+    file: Path, order: tuple[int, ...]
+) -> None:
+    child = Guarded([Job(file, read) for read in (where, where, crashes, where, stumbles)])
+    found: dict[int, list[int]] = {}
+    failed: dict[int, str] = {}
+    for k in order:
+        found[k] = []
+        try:
+            for piece in child.pieces(k):
+                found[k].append(piece)
+        except FormatError as error:
+            failed[k] = str(error)
+    assert failed.keys() == {2, 4}
+    assert "SIGSEGV" in failed[2]
+    assert "ValueError" in failed[4]
+    assert len({*found[0], *found[1]}) == 1
+    assert os.getpid() not in found[0]
+    assert len(set(found[3])) == 1
+    assert found[3][0] != found[0][0]
+    assert found[2] == found[4] == [1]
+
+
+def test_each_of_several_files_has_its_own_time(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "SECONDS", 2.0)
+
+    def busy() -> Iterator[int]:
+        until = time.process_time() + 0.7
+        while time.process_time() < until:
+            pass
+        yield 1
+
+    child = Guarded([Job(file, busy)] * 4)
+    assert [list(child.pieces(k)) for k in range(4)] == [[1]] * 4

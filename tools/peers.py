@@ -8,8 +8,9 @@ magyc (PyPI) needs numpy < 2 and gtsam, MAVProxy a desktop; neither belongs into
 
 In: an ``.npz`` with raw ``field`` (n, 3) nT, ``reference`` (n,) nT, ``attitude`` (n, 3) deg roll, pitch,
 heading, ``rates`` (n, 3) rad/s (both exact, better than any vehicle knows them), ``reference_ned`` (3,) nT,
-``time`` (n,) s. Out, on stdout: JSON, for each method ``{"A": 3x3, "T": 3}`` such that the corrected field is
-``A (field - T)``, or ``{"failed": reason}``.
+``time`` (n,) s and, where there is one, a ``current`` (n,) A. Out, on stdout: JSON, for each method (or those
+whose name has the second argument in it) ``{"A": 3x3, "T": 3, "K": 3}`` such that the corrected field is
+``A (field - T) + K current``, or ``{"failed": reason}``.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import sys
 import types
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,8 +31,11 @@ MAGFIT_SAMPLES = 250
 """magfit sums in Python; it is given every n-th sample, as its own 'Reduce' does."""
 
 
-def magfit(data: dict[str, np.ndarray]) -> np.ndarray:
-    """MAVProxy's magfit: offsets, scale, diagonals, off-diagonals by attitude and the Earth's field."""
+def magfit(data: dict[str, np.ndarray], *, motors: bool = False) -> np.ndarray:
+    """MAVProxy's magfit: offsets, scale, diagonals, off-diagonals by attitude and the Earth's field.
+
+    `motors`: also its compensation of the battery's current.
+    """
     # it imports a desktop toolkit for its window; the fit itself does not use it
     desktop = types.SimpleNamespace(Dialog=object, Panel=object, Frame=object)
     for name in ("wx_loader", "wx_processguard", "grapher", "multiproc_util"):
@@ -46,23 +51,20 @@ def magfit(data: dict[str, np.ndarray]) -> np.ndarray:
     peer.declination = float(np.degrees(np.arctan2(east, north)))
     peer.margs = {
         "OffsetMax": 1500.0, "ScaleMin": 0.8, "ScaleMax": 1.2, "Elliptical": True, "DiagonalMin": 0.8,
-        "DiagonalMax": 1.2, "OffDiagMin": -0.2, "OffDiagMax": 0.2, "CMOT": False, "CMOT NoChange": False,
+        "DiagonalMax": 1.2, "OffDiagMin": -0.2, "OffDiagMax": 0.2, "CMOT": motors,
+        "CMOT NoChange": False, "CMOT Max": 10.0,
     }  # fmt: skip
-    peer.data = [
-        (
-            types.SimpleNamespace(MagX=x, MagY=y, MagZ=z),
-            types.SimpleNamespace(Roll=roll, Pitch=pitch, Yaw=yaw),
-            None,
-        )
-        for (x, y, z), (roll, pitch, yaw) in zip(
-            (data["field"][rows] / NT_PER_MILLIGAUSS).tolist(), data["attitude"][rows].tolist(), strict=True
-        )
-    ]
-    found = peer.fit_WWW()
-    bare = [
-        peer.correct(types.SimpleNamespace(MagX=x, MagY=y, MagZ=z), None, found)
+    fields = [
+        types.SimpleNamespace(MagX=x, MagY=y, MagZ=z)
         for x, y, z in (data["field"] / NT_PER_MILLIGAUSS).tolist()
     ]
+    attitudes = [types.SimpleNamespace(Roll=r, Pitch=p, Yaw=y) for r, p, y in data["attitude"].tolist()]
+    batteries: list[Any] = [None] * len(fields)
+    if motors:
+        batteries = [types.SimpleNamespace(Curr=ampere) for ampere in data["current"].tolist()]
+    peer.data = list(zip(fields[rows], attitudes[rows], batteries[rows], strict=True))
+    found = peer.fit_WWW()
+    bare = [peer.correct(mag, battery, found) for mag, battery in zip(fields, batteries, strict=True)]
     return np.array([[v.x, v.y, v.z] for v in bare]) * NT_PER_MILLIGAUSS
 
 
@@ -92,6 +94,7 @@ def _magyc(name: str) -> Callable[[dict[str, np.ndarray]], np.ndarray]:
 
 METHODS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
     "MAVProxy magfit": magfit,
+    "MAVProxy magfit, motors": partial(magfit, motors=True),
     "magyc magfactor3": _magyc("magfactor3"),
     "magyc twostep_hi": _magyc("twostep_hi"),
     "magyc twostep_hsi": _magyc("twostep_hsi"),
@@ -104,12 +107,15 @@ METHODS: dict[str, Callable[[dict[str, np.ndarray]], np.ndarray]] = {
 
 
 def main() -> None:
-    data = dict(np.load(sys.argv[1]))
+    data, wanted = dict(np.load(sys.argv[1])), "".join(sys.argv[2:])
     results: dict[str, Any] = {}
     raw, reference = data["field"], data["reference"]
-    design = np.column_stack([raw, np.ones(len(raw))])
+    current = data.get("current", np.zeros(len(raw)))
+    design = np.column_stack([raw, np.ones(len(raw)), np.nan_to_num(current)])
     warnings.simplefilter("ignore")
     for name, method in METHODS.items():
+        if wanted not in name or (name.endswith("motors") and not np.any(np.nan_to_num(current))):
+            continue
         try:
             with contextlib.redirect_stdout(sys.stderr):
                 corrected = method(data)
@@ -120,11 +126,10 @@ def main() -> None:
             results[name] = {"failed": f"{type(error).__name__}: {error}".splitlines()[0][:120]}
             continue
         affine = np.linalg.lstsq(design, corrected, rcond=None)[0]
-        A, b = affine[:3].T, affine[3]
-        size = np.linalg.norm(raw @ A.T + b, axis=1)
-        # most know no scale: give them the best
-        A, b = (part * (size @ reference) / (size @ size) for part in (A, b))
-        results[name] = {"A": A.tolist(), "T": (-np.linalg.pinv(A) @ b).tolist()}
+        size = np.linalg.norm(design @ affine, axis=1)
+        affine *= (size @ reference) / (size @ size)  # most know no scale: give them the best
+        A, b, K = affine[:3].T, affine[3], affine[4]
+        results[name] = {"A": A.tolist(), "T": (-np.linalg.pinv(A) @ b).tolist(), "K": K.tolist()}
     json.dump(results, sys.stdout)
 
 

@@ -22,6 +22,7 @@ from magbridge.cli.common import (
     Whole,
     by_base_station,
     check_inputs,
+    chosen_parameters,
     command,
     complain,
     logs_to_read,
@@ -78,7 +79,9 @@ def calibrate(
     output
         The calibration to write (cal.json).
     parameter
-        A column that gives the position of a moving mass; may be repeated.
+        A column that gives the position of a moving mass, or a current; may be repeated. auto: of the log's
+        currents, throttles, motors and masses those that predict parts left out better, and it is said by how
+        much (method auto).
     order
         Highest total degree of the polynomials in the parameters.
     method
@@ -150,22 +153,21 @@ def calibrate(
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 
-    if vehicle and method != "auto":
-        raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
-    if fleet and (vehicle or method != "auto"):
-        raise WrongUse("--fleet: goes with method auto, and without --vehicle")
+    _refuse_together(parameter, method, vehicle, fleet)
     began = _began(fleet, member, refit, files) if fleet else None
     parameter = parameter or (began.names if began else ())
     anomalies = read_grid(grid) if grid else None
     with waiting("reading"):
         logs = by_base_station(read_each(files, options=reading.options), base)
         deployment = join(logs)
-    require(deployment, (*CHANNELS, *parameter))
+    require(deployment, CHANNELS)
     deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
     note_unused_grid(grid, deployment)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     with _naming(deployment), waiting("fitting"):
+        parameter = chosen_parameters(parameter, deployment, grid=anomalies, order=order, site_bias=site_bias)
+        require(deployment, parameter)
         data = replace(
             observations(deployment, parameter, grid=anomalies),
             inputs=_digests((*files, *([base] if base else []))),
@@ -195,6 +197,16 @@ def calibrate(
     )
     if reading.strict and not found.supported:
         raise DataError("the data do not support this fit (see the warnings), and --strict was given")
+
+
+def _refuse_together(parameter: tuple[str, ...], method: str, vehicle: Path | None, fleet: str) -> None:
+    """WrongUse: options that do not go together."""
+    if vehicle and method != "auto":
+        raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
+    if "auto" in parameter and (method != "auto" or fleet or vehicle):
+        raise WrongUse("--parameter auto: goes with method auto, and without --vehicle and --fleet")
+    if fleet and (vehicle or method != "auto"):
+        raise WrongUse("--fleet: goes with method auto, and without --vehicle")
 
 
 def _of(path: Path, compass: int) -> Path:

@@ -41,6 +41,7 @@ __all__ = [
     "app",
     "by_base_station",
     "check_inputs",
+    "chosen_parameters",
     "command",
     "complain",
     "doubts_of",
@@ -258,6 +259,33 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
     station = join(stations)
     note_losses(station.attrs)
     return with_daily_variation(own, station)
+
+
+def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: Any) -> tuple[str, ...]:
+    """Return the parameters of a fit: those that are named, or for ``auto`` the columns that are worth it.
+
+    What each that was tried buys on parts left out is told on stderr. `options` are of
+    :func:`~magbridge.calibration.fitting.offered.best_parameters`.
+
+    Raises
+    ------
+    WrongUse
+        ``auto`` among names.
+    """
+    from magbridge.calibration.fitting.offered import AUTO, best_parameters, lines
+    from magbridge.logs.info import movers
+
+    if AUTO not in named:
+        return tuple(named)
+    if len(named) > 1:
+        raise WrongUse(f"--parameter {AUTO}: chooses them all, and goes with no other")
+    offered = movers(deployment)
+    taken, offers = best_parameters(deployment, offered, **options)
+    for line in lines(offers) or [
+        f"--parameter {AUTO}: none of {' '.join(offered) or 'its columns'} moves the field"
+    ]:
+        complain(line)
+    return taken
 
 
 def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:

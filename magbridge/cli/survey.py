@@ -18,6 +18,7 @@ from magbridge.cli.common import (
     Whole,
     by_base_station,
     check_inputs,
+    chosen_parameters,
     command,
     complain,
     doubts_of,
@@ -73,7 +74,8 @@ def survey(
     output
         The map, netCDF (.nc): what navigate --map takes. With --predict: the predictions (.csv).
     parameter
-        A column that gives the position of a moving mass; may be repeated.
+        A column that gives the position of a moving mass, or a current; may be repeated. auto: those of the
+        log that predict parts left out better.
     order
         Highest total degree of the polynomials in the parameters.
     calibration
@@ -183,6 +185,7 @@ def _calibrated(
     from magbridge.logs.deployment import join
 
     together = join(logs)
+    parameters = chosen_parameters(parameters, together, order=order, **options)
     require(together, parameters)
     found = fit(observations(together, parameters), order=order, **options)
     for warning in found.warnings:

@@ -61,9 +61,11 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
         text = b"FMT," in file.read(4096)
     flash = (read_text if text else read_binary)(path, WANTED)
     fields = in_declared_units(flash)
-    runs = [run for part in _boots(flash.records) if (run := _run(fields, part)).magnetometers]
+    records = {name: _in_microseconds(name, one) for name, one in flash.records.items()}
+    runs = [run for part in _boots(records) if (run := _run(fields, part)).magnetometers]
     if not runs:
-        raise FormatError(path, "expected an ArduPilot log with MAG records")
+        timeless = ", whose records have times" * any(name.startswith("MAG") for name in records)
+        raise FormatError(path, f"expected an ArduPilot log with MAG records{timeless}")
     lost = {"lines_skipped" if text else "bytes_skipped": flash.skipped}
     yield from pieces(path, rows, runs, lost, options.compass if options else None)
 
@@ -77,6 +79,20 @@ def _run(fields: Fields, records: dict[str, Records]) -> Run:
         if {"MagX", "MagY", "MagZ"} <= records_of.fields.keys()
     ]
     return Run(mags, _telemetry(fields, records), _utc_offset(records))
+
+
+def _in_microseconds(name: str, records: Records) -> Records:
+    """Return records with the times of today: up to ArduPilot 3.2 they are in ms, a GPS' of its week."""
+    fields = records.fields
+    if "TimeMS" not in fields or "TimeUS" in fields:
+        return records
+    if name.startswith("GPS"):
+        if not {"T", "Week"} <= fields.keys():
+            return records
+        fields = fields | {"TimeUS": 1e3 * fields["T"], "GWk": fields["Week"], "GMS": fields["TimeMS"]}
+    else:
+        fields = fields | {"TimeUS": 1e3 * fields["TimeMS"]}
+    return records._replace(fields=fields)
 
 
 def _boots(records: dict[str, Records]) -> Iterator[dict[str, Records]]:

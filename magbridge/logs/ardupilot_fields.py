@@ -47,11 +47,13 @@ FIELDS: Fields = {
 """Of records with one column, the first that the log has is taken. Sub's and Copter's CTUN have height and
 throttle, Rover's throttle is in THR, that of all motors together in MOTB."""
 INSTANCE = ("I", "Instance", "Inst")
+TIMES = ("TimeUS", "TimeMS")
+"""s since the boot in µs, or in ms up to ArduPilot 3.2."""
 NUMBERED = 8
 MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health", *INSTANCE}
 WANTED: dict[str, set[str]] = {
     **{
-        f"{name}{k}": {"TimeUS", *INSTANCE, *(field for _, field, _, _ in fields)}
+        f"{name}{k}": {*TIMES, *INSTANCE, *(field for _, field, _, _ in fields)}
         for name, fields in {**FIELDS, "MAG": tuple(("", field, "", 1.0) for field in sorted(MAG))}.items()
         for k in ("", *range(2, NUMBERED + 1))
     },
@@ -64,7 +66,7 @@ WANTED: dict[str, set[str]] = {
 }
 """Kinds of records, and of each the fields that are read."""
 for _gps in ("GPS", "GPS2"):
-    WANTED[_gps] |= {"GWk", "GMS", "Status"}
+    WANTED[_gps] |= {"GWk", "GMS", "Status", "Week", "T"}
 
 OURS = {
     **{label: (label, 1.0) for label in ("deg", "m", "A", "V", "rpm", "%")},

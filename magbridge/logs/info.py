@@ -14,7 +14,7 @@ from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_of
 from magbridge.logs.deployment import MEANING, noted, passed_over
 
-__all__ = ["GAP", "USES", "info", "lacking", "telemetry"]
+__all__ = ["GAP", "USES", "info", "lacking", "movers", "telemetry"]
 
 POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")
@@ -40,6 +40,24 @@ USES: dict[str, Needs] = {
 """Command -> what it needs: of each group, one of the alternatives, each a set of columns."""
 GAP = 2.5
 """A pause longer than this many sampling intervals is a gap."""
+STATES = {
+    "degC",
+    "K",
+    "Pa",
+    "hPa",
+    "kPa",
+    "mbar",
+    "bar",
+    "dbar",
+    "inHg",
+    "V",
+    "s",
+    "m",
+    "m/s",
+    "nT",
+    "arcmin",
+}
+"""Units of what a vehicle is in, or drifts by: temperatures, pressures, voltages, speeds."""
 EARTHS = 15_000.0, 90_000.0
 """nT, within which the Earth's field lies, with a vehicle's own."""
 
@@ -109,6 +127,16 @@ def telemetry(log: xr.Dataset) -> list[str]:
     ]
 
 
+def movers(log: xr.Dataset) -> list[str]:
+    """Return the telemetry that may be what moves the field: currents, throttles, positions; no states."""
+    reckoned = {name for names in RECKONING for name in names}
+    return [
+        name
+        for name in telemetry(log)
+        if name not in reckoned and log[name].attrs.get("units", "1") not in STATES
+    ]
+
+
 def _column(name: str, column: xr.DataArray, time: FloatArray) -> dict[str, Any]:
     values = column.to_numpy()
     known = np.isfinite(values)
@@ -133,16 +161,17 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
             fitting = [
                 unit for unit, factor in NT_PER_UNIT.items() if EARTHS[0] < length * factor < EARTHS[1]
             ]
-            said = (
-                f'; in {fitting[0]} it would be the Earth\'s: --column mag_x="mag_x [{fitting[0]}]" and so on'
-            )
-            hints.append(f"the vector's length is {length:.4g} nT (median)" + said * bool(fitting))
+            told = [
+                f'; in {unit} it would be the Earth\'s: --column mag_x="mag_x [{unit}]" and so on'
+                for unit in fitting[:1]
+            ]
+            hints.append(f"the vector's length is {length:.4g} nT (median){''.join(told)}")
     if log.attrs.get("time_reference") == "boot":
         hints.append("times count from a start that the log does not tell: --date says when it was")
     if "heading" in log and "heading_reference" not in log.attrs:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
-    if moving := telemetry(log):
-        hints.append(f"may move the field, for --parameter: {' '.join(moving)}")
+    if moving := movers(log):
+        hints.append(f"may move the field, for --parameter: {' '.join(moving)} (auto: those that do)")
     if any(lacking(log, needs) for needs in USES.values()):
         hints.append('what is lacking may stand under another name: --column NAME="THEIRS [unit]"')
     empty = [one["name"] for one in columns if not one["known"]]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from magbridge.columns import CHANNEL_TIMES, counts_from_boot, require
 from magbridge.errors import FormatError
 from magbridge.files import existing
-from magbridge.guard import guarded
+from magbridge.guard import Guarded, Job, guarded
 from magbridge.logs.options import Options
 from magbridge.logs.registry import LEADS, Format, format_of, is_bag
 
@@ -29,6 +29,8 @@ __all__ = ["read", "read_chunks", "read_each"]
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 WHOLE = 1 << 40
 """Rows: more than any file has."""
+SMALL = 4_000_000
+"""Bytes of a file below which one child process reads several."""
 DEFAULTS = Options()
 
 
@@ -115,12 +117,15 @@ class _Files:
         self.paths, self._options = paths, options
         self._bad: dict[Path, FormatError] = {}
         self._told = 0
+        self._together: dict[int, Iterator[Any]] | None = None
 
     def pieces(self, k: int, rows: int) -> Iterator[xr.Dataset]:
         """Yield the pieces of one file, as far as it can be read; FormatError: none of the files can be."""
         path = self.paths[k]
+        if self._together is None:
+            self._together = _read_together(self.paths, rows, self._options)
         try:
-            yield from _chunks(path, rows, self._options)
+            yield from _chunks(path, rows, self._options, self._together.pop(k, None))
         except FormatError as error:
             self._bad[path] = error
             if self._options.strict or len(self._bad) == len(self.paths):
@@ -152,20 +157,41 @@ def _with_another(path: Path, given: Collection[Path]) -> bool:
     return leads is not None and any(path.with_suffix(name) in given for name in (leads, leads.upper()))
 
 
-def _chunks(path: Path, rows: int, options: Options) -> Iterator[xr.Dataset]:
-    """Yield one file in pieces, checked and dated."""
+def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Any]]:
+    """Return what is read of the small files that need a child process, by their places: one for all."""
+    small = [k for k, path in enumerate(paths) if path.is_file() and 0 < path.stat().st_size < SMALL]
+    formats = {k: form for k in small if (form := format_of(paths[k])).guarded}
+    if len(formats) < 2:
+        return {}
+    for form in {form.module: form for form in formats.values()}.values():
+        form.load()  # once here, and not in every child
+    jobs = [Job(paths[k], partial(_raw, paths[k], form, rows, options)) for k, form in formats.items()]
+    child = Guarded(jobs)
+    return {k: child.pieces(number) for number, k in enumerate(formats)}
+
+
+def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]:
+    """Yield the pieces of a file as its format's module does."""
+    chunks = form.load().chunks
+    more = (options,) if "options" in signature(chunks).parameters else ()
+    return _blamed(form, partial(chunks, path, rows, *more))
+
+
+def _chunks(
+    path: Path, rows: int, options: Options, together: Iterator[Any] | None = None
+) -> Iterator[xr.Dataset]:
+    """Yield one file in pieces, checked and dated; `together` is what is read of it with others."""
     from magbridge.logs.checks import checked  # noqa: PLC0415 - xarray is for ashore
     from magbridge.logs.deployment import passed_over  # noqa: PLC0415
 
     if not path.stat().st_size:
         raise FormatError(path, "expected a log, the file is empty")
     form = format_of(path)
-    chunks = form.load().chunks
-    more = (options,) if "options" in signature(chunks).parameters else ()
-    pieces = partial(_blamed, form, partial(chunks, path, rows, *more))
+    form.load()
+    pieces = partial(_raw, path, form, rows, options)
     part = None
     try:
-        numbered = _numbered(guarded(path, pieces) if form.guarded else pieces())
+        numbered = _numbered(together or (guarded(path, pieces) if form.guarded else pieces()))
         if options.compass is not None and not form.compasses:
             from magbridge.logs.compasses import by_columns  # noqa: PLC0415 - xarray is for ashore
 

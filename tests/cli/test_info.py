@@ -11,7 +11,7 @@ from commands import Command
 
 from magbridge.logs import read, write
 from magbridge.logs.deployment import deployment as made
-from magbridge.logs.info import USES, info
+from magbridge.logs.info import USES, info, movers
 
 START = 1.6e9
 
@@ -50,6 +50,18 @@ def test_info_knows_a_field_in_another_unit() -> None:
     axes = {"mag_x": [30.0, 30.0], "mag_y": [5.0, 5.0], "mag_z": [45.0, 45.0]}
     (hint,) = [line for line in info(made("log", [START, START + 1], axes))["hints"] if "length" in line]
     assert "54.31 nT (median); in uT it would be the Earth's" in hint
+
+
+def test_a_field_that_is_the_earths_in_no_unit() -> None:
+    axes = {key: [68000.0, 68000.0] for key in ("mag_x", "mag_y", "mag_z")}
+    (hint,) = [line for line in info(made("log", [START, START + 1], axes))["hints"] if "length" in line]
+    assert hint == "the vector's length is 1.178e+05 nT (median)"
+
+
+def test_what_moves_the_field_is_no_state_of_the_vehicle() -> None:
+    names = {"pump": "A", "water": "degC", "supply": "V", "mast": "1", "speed": "m/s", "still": "A"}
+    columns = {name: np.arange(9.0) * (name != "still") for name in names}
+    assert movers(made("log", START + np.arange(9.0), columns, names)) == ["pump", "mast"]
 
 
 def test_info_of_nothing_is_one_line(command: Command) -> None:

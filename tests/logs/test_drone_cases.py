@@ -59,6 +59,44 @@ def test_the_motors_share_is_taken_off_by_either_name(compensation: str, tmp_pat
     np.testing.assert_array_equal(back["mag_z"], -32_500.0)
 
 
+def test_a_log_of_the_times_when_times_were_in_milliseconds(tmp_path: Path) -> None:
+    """Up to ArduPilot 3.2: TimeMS since the boot, but of a GPS since the week began, its T since the boot."""
+    path = tmp_path / "old.log"
+    columns = "MagX,MagY,MagZ,OfsX,OfsY,OfsZ,MOfsX,MOfsY,MOfsZ"
+    week, ms = divmod(UTC - 315_964_800 + 18, 604_800)
+    described = [
+        f"FMT, 15, 25, MAG, Ihhhhhhhhh, TimeMS,{columns}",
+        "FMT, 1, 19, ATT, IccccCC, TimeMS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw",
+        "FMT, 130, 45, GPS, BIHBcLLeeEefI, Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T",
+    ]
+    records = [
+        line
+        for k in range(20)
+        for line in (
+            f"GPS, 3, {1000 * ms + 200 * k}, {week}, 9, 1, 47.5, 8.5, 1, 400, 0, 0, 0, {5000 + 200 * k}",
+            f"ATT, {5000 + 200 * k}, 0, 1.5, 0, -2, 0, {k}",
+            f"MAG, {5010 + 200 * k}, {100 + k}, 200, -300, 10, 0, 0, 0, 5, 0",
+        )
+    ]
+    path.write_text("\n".join([*described, *records]))
+    back = logs.read(path)
+    assert not passed_over(back.attrs)
+    np.testing.assert_allclose(back["time"], UTC + 0.01 + 0.2 * np.arange(20), rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(back["mag_x"], 9_000.0 + 100 * np.arange(20))
+    np.testing.assert_array_equal(back["mag_y"], 19_500.0)
+    np.testing.assert_array_equal(back["heading"], np.arange(20))
+    assert (back["latitude"] == 47.5).all()
+
+
+def test_records_without_any_time_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "older.log"
+    path.write_text("FMT, 15, 21, MAG, hhh, MagX,MagY,MagZ\n" + "MAG, 100, 200, -300\n" * 9)
+    with pytest.raises(
+        FormatError, match="expected an ArduPilot log with MAG records, whose records have times"
+    ):
+        logs.read(path)
+
+
 def test_the_soft_iron_matrix_is_undone(tmp_path: Path) -> None:
     """MAG = D (raw + Ofs) + MO, with D of COMPASS_DIA and COMPASS_ODI."""
     log = Log()

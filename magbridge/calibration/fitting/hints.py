@@ -11,7 +11,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
 
-__all__ = ["undeclared"]
+__all__ = ["undeclared", "worths"]
 
 PARTS = 8
 """Parts of a log, of which each is left out in turn."""
@@ -39,8 +39,24 @@ def undeclared(calibration: Calibration, data: Observations, columns: Mapping[st
     residual is regressed on ``u, c u, c^2 u`` beside the same of each declared parameter, which without c
     may have taken some of its part; what c adds is measured on parts left out.
     """
+    found = worths(calibration, data, columns)
+    strongest = sorted(found, key=lambda name: -found[name])[:3]
+    return [
+        f"column {name!r} is not declared and moves the field, by about {found[name]:.0f} nT here: "
+        f"--parameter {name}"
+        for name in strongest
+    ]
+
+
+def worths(
+    calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray], better: float = BETTER
+) -> dict[str, float]:
+    """Return what each column explains of a fit's residual on parts left out, nT; see :func:`undeclared`.
+
+    Columns that leave more than the share `better` of it are left out.
+    """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
-        return []
+        return {}
     corrected = correct(calibration, data.field, data.parameters, data.time)
     residual = corrected.total - data.reference
     direction = corrected.vector / corrected.total[:, None]
@@ -55,14 +71,9 @@ def undeclared(calibration: Calibration, data: Observations, columns: Mapping[st
         without = _left_out(plain, residual[known])
         left = _left_out(np.column_stack([plain, _moved(c, direction[known], 2)]), residual[known])
         worth = float(np.sqrt(max(without**2 - left**2, 0.0)))
-        if left < BETTER * without and worth > LEAST:
+        if left < better * without and worth > LEAST:
             found[name] = worth
-    strongest = sorted(found, key=lambda name: -found[name])[:3]
-    return [
-        f"column {name!r} is not declared and moves the field, by about {found[name]:.0f} nT here: "
-        f"--parameter {name}"
-        for name in strongest
-    ]
+    return found
 
 
 def _moved(c: FloatArray, direction: FloatArray, order: int) -> FloatArray:
