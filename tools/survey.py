@@ -158,7 +158,10 @@ def errors(calibration: Calibration, part: xr.Dataset) -> tuple[FloatArray, Floa
 def score_map(
     twin: Twin, log: xr.Dataset, data: Observations, calibration: Calibration, length: float, size: float
 ) -> tuple[float, float]:
-    """Return the map's RMS over the oracle's, and its standardised error, up to one length off the track."""
+    """Return the map's RMS over the oracle's, and its standardised error, up to one length off the track.
+
+    The level, which no survey knows, is the map's mean error along the track.
+    """
     done = survey(from_vector(log, calibration, 0))
     assert data.place is not None
     rng = np.random.default_rng(0)
@@ -168,8 +171,8 @@ def score_map(
     true = twin.world.rock.anomaly(at + origin_shift)  # type: ignore[attr-defined]
     shift = np.subtract(_world(twin, done.samples.origin), origin_shift)
     anomaly, sigma = done.gridded.at(at - shift)
-    error = anomaly - true
-    error -= error.mean()
+    along = done.gridded.at(picked - shift)[0] - twin.world.rock.anomaly(picked + origin_shift)  # type: ignore[attr-defined]
+    error = anomaly - true - along.mean()
     best = best_map(twin, data, at, true, length, size, origin_shift)
     return rms(error) / max(rms(best), 1e-9), rms(error / sigma)
 
@@ -198,8 +201,7 @@ def best_map(
     B = field.basis(place)
     read = rock + np.random.default_rng(1).normal(0, noise, len(rock))
     w = Factor(B.T @ B / noise**2 + field.precision / size**2).solve(B.T @ read / noise**2)
-    error = field.basis(at) @ w - true
-    return np.asarray(error - error.mean())
+    return np.asarray(field.basis(at) @ w - true)
 
 
 def show(rows: list[Row], console: Console) -> None:

@@ -11,14 +11,15 @@ uncertainty: Schmidt 1966).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.evidence import Widths, maximise
+from magbridge.calibration.fitting.field_doubt import plausible
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
@@ -32,16 +33,17 @@ from magbridge.calibration.fitting.latent import Group, slow_functions, with_gro
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
-from magbridge.field.place.blocks import NearInverse, near_inverse
+from magbridge.field.place.blocks import near_inverse
 from magbridge.field.place.matern import Matern
+from magbridge.survey.gridded import Gridded, Posterior
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.samples import Samples
 
-__all__ = ["Gridded", "gridded"]
+__all__ = ["gridded"]
 
 LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
 """nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
-SLOW, SLOW_SPREAD = 2.0, np.log(4.0)
+SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """As in a survey that calibrates itself."""
 SEARCHED = 4_000
 """Samples about the middle with which the field is searched."""
@@ -57,68 +59,6 @@ NOTHING = PriorFamily(
     np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
 )
 """A prior of no coefficients."""
-
-
-@dataclass(frozen=True, eq=False)
-class Gridded:
-    """A gridded survey: ask it for the field at any place.
-
-    Attributes
-    ----------
-    field : Matern
-    roughness : Roughness
-        How the field's size varies from place to place.
-    size, sigma, rho : float
-        nT, the field's standard deviation where the roughness is 1, and the noise's; its autocorrelation.
-    w : (nodes,) array
-        The field's coefficients.
-    follow : (nodes, r) array
-        How they move with 1-sigma of what is uncertain elsewhere: levels, slow changes, the calibration.
-    inverse : NearInverse
-        Of the precision, in units of the noise's.
-    levels : (n,) array
-        nT, what was taken off each sample: its line's level and the slow part.
-    middle : float
-        m, depth at which the map holds.
-    mean : float
-        nT, of all samples.
-    kept : (n,) array
-        Which samples are no outliers.
-    widths : Widths
-        As the evidence chose them.
-    """
-
-    field: Matern
-    roughness: Roughness
-    size: float
-    sigma: float
-    rho: float
-    w: FloatArray
-    follow: FloatArray
-    inverse: NearInverse
-    levels: FloatArray
-    middle: float
-    mean: float
-    kept: BoolArray
-    widths: Widths
-
-    def at(self, place: FloatArray, depth: FloatArray | float | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return the anomaly and its 1-sigma (n,) each, nT, at places (n, 2), m, and depths (n,), m.
-
-        The depth is the map's own if not given.
-        """
-        deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
-        scale = self.roughness.at(place)
-        B = csr_array(diags_array(scale) @ self.field.basis(place, deeper))
-        variance = self.sigma**2 * self.inverse.variances(B)
-        variance += ((B @ self.follow) ** 2).sum(axis=1)
-        variance[~self.field.nodes.inside(place)] = (self.size * scale[~self.field.nodes.inside(place)]) ** 2
-        return self.mean + B @ self.w, np.sqrt(np.maximum(variance, 0.0))
-
-    def at_samples(self, samples: Samples) -> FloatArray:
-        """Return the anomaly (n,), nT, at the samples' own places and depths."""
-        B = self.field.basis(samples.place, np.nan_to_num(samples.depth - self.middle))
-        return np.asarray(self.mean + self.roughness.at(samples.place) * (B @ self.w))
 
 
 class _Problem:
@@ -183,7 +123,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         sums = problem.sums(choice.field, every)
         reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
         widths = maximise(reduced.quadratic, family, weighed.eta, sigma)
-        z, covariance = _solved(reduced, widths, family)
+        z, _ = _solved(reduced, widths, family)
         w = reduced.field(z)
         e = samples.value - problem.mean - problem.D @ z - problem.basis(choice.field, every) @ w
         e = e / problem.scale  # where the rock is rough, so is what no node resolves
@@ -191,24 +131,52 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
             break
         problem.kept = ~far
         weighed = replace(weighed, eta=widths.eta, sigma=widths.sigma)
-    follow = reduced.follow @ np.linalg.cholesky(covariance)
+    shaken = np.empty((nodes.size, 0))
     if samples.modes.shape[1]:
-        follow = np.hstack([follow, _considered(problem, choice, reduced, widths, family, every)])
+        shaken = _considered(problem, choice, reduced, widths, family, every)
+
+    def sums_of(field: Matern) -> Sums:
+        return problem.sums(field, every) if field.harmonic else sums
+
+    posteriors = [
+        _posterior(weight, one, sums_of(one.field), problem, family, widths, shaken)
+        for weight, one in _left_open(choice, sums_of, replace(weighed, eta=widths.eta))
+    ]
     return Gridded(
-        field=choice.field,
-        roughness=roughness,
-        size=choice.ratio * widths.sigma,
-        sigma=widths.sigma,
-        rho=choice.rho,
-        w=w,
-        follow=_apart(follow, problem, choice.field, every),
-        inverse=near_inverse(reduced.precision, choice.field.edges),
-        levels=problem.D @ z,
-        middle=problem.middle,
-        mean=problem.mean,
-        kept=problem.kept,
-        widths=widths,
+        tuple(posteriors), roughness, choice.rho, problem.middle, problem.mean, problem.kept, widths
     )
+
+
+def _left_open(
+    choice: Choice, sums_of: Callable[[Matern], Sums], weighed: Weighed
+) -> list[tuple[float, Choice]]:
+    """Return the plausible sizes and lengths of the field, with their weights."""
+
+    def score(one: Choice) -> float:
+        reduced = eliminate(sums_of(one.field), one.field, one.ratio, one.rho)
+        return weighed.score(reduced, one.field, one.ratio)
+
+    return plausible(score, choice)
+
+
+def _posterior(
+    weight: float,
+    choice: Choice,
+    sums: Sums,
+    problem: _Problem,
+    family: PriorFamily,
+    widths: Widths,
+    shaken: FloatArray,
+) -> Posterior:
+    """Return the field given its size and length; `shaken` (nodes, r): what the calibration does to it."""
+    reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
+    z, covariance = _solved(reduced, widths, family)
+    follow = np.hstack([reduced.follow @ np.linalg.cholesky(covariance), shaken])
+    return Posterior(
+        weight, choice.field, choice.ratio * widths.sigma, widths.sigma, reduced.field(z),
+        _apart(follow, problem, choice.field), near_inverse(reduced.precision, choice.field.edges),
+        problem.D @ z,
+    )  # fmt: skip
 
 
 def _groups(samples: Samples) -> tuple[Group, ...]:
@@ -279,9 +247,10 @@ def _considered(
     return np.asarray(all_in.follow[:, q:] - reduced.follow @ own)
 
 
-def _apart(follow: FloatArray, problem: _Problem, field: Matern, rows: IndexArray) -> FloatArray:
+def _apart(follow: FloatArray, problem: _Problem, field: Matern) -> FloatArray:
     """Take from the uncertain shifts of the field (nodes, r) their mean over the samples: that is level."""
-    mean = np.asarray(problem.basis(field, rows).sum(axis=0)).ravel() / len(rows)
+    every = np.arange(len(problem.samples.value))
+    mean = np.asarray(problem.basis(field, every).sum(axis=0)).ravel() / len(every)
     shift = mean @ follow
     even = mean.sum()
     return np.asarray(follow - shift[None, :] / max(even, 1e-9))

@@ -7,7 +7,7 @@ import numpy as np
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
-from magbridge.survey.gridding import Gridded
+from magbridge.survey.gridded import Gridded
 
 __all__ = ["anomaly_map"]
 

@@ -16,7 +16,8 @@ from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
 from magbridge.survey.crossovers import Crossovers, crossovers
-from magbridge.survey.gridding import Gridded, gridded
+from magbridge.survey.gridded import Gridded
+from magbridge.survey.gridding import gridded
 from magbridge.survey.read import corrected_by_others, from_vector, joined
 from magbridge.survey.samples import Samples
 

@@ -126,15 +126,14 @@ def choose(
             best = found
     assert best is not None
     nodes = nodes_for(place, best.field.length)
-    tried = []
+    best = replace(best, score=-np.inf)
     for alpha in SMOOTHNESS:
         field = Matern(nodes, best.field.length, alpha, harmonic)
-        tried.append(
-            climb(
-                sums_of(field), replace(best, field=field), weighed, move_rho=move_rho, steps=int(36 * effort)
-            )
-        )
-    best = max(tried, key=lambda one: one.score)
+        begin = replace(best, field=field)
+        found = climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
+        if found.score < best.score:
+            break
+        best = found
     if harmonic:
         flat = replace(best.field, harmonic=False)
         other = climb(

@@ -28,6 +28,7 @@ from scipy.sparse import csr_array
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.crossings import far_off, jumped, left_open
 from magbridge.calibration.fitting.evidence import Widths, maximise
+from magbridge.calibration.fitting.field_doubt import plausible
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
@@ -55,7 +56,7 @@ from magbridge.field.place.matern import Matern
 
 __all__ = ["InPlace", "fit_in_place", "fit_survey"]
 
-SLOW, SLOW_SPREAD = 2.0, np.log(4.0)
+SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """nT over a stretch, and the 1-sigma of its logarithm: a quiet day's currents aloft, a sensor's drift."""
 GUESSED = 2
 """Rounds before the field is searched: while the coefficients are far off, they look like rock and noise."""
@@ -164,12 +165,13 @@ def fit_survey(
     samples, own = posed.samples, posed.family
     q = own.E.shape[1]
     survey = SurveySamples(data, samples, _groups(data, level), _drift(data, position_sigma))
-    found = _Rounds(survey, with_groups(own, survey.groups), q).settle()
+    rounds = _Rounds(survey, with_groups(own, survey.groups), q)
+    found = rounds.settle()
     prior = found.family.at(found.widths.eta)
     coefficients = prior.coefficients(found.z)
     check_scales(samples, coefficients)
     sigma, choice = found.widths.sigma, found.choice
-    covariance = covariance_of(found.reduced.quadratic.H / sigma**2 + prior.precision)
+    covariance = rounds.covariance(found)
     P = prior.E @ covariance @ prior.E.T
     lifted = replace(samples, reference=samples.reference + found.lacking)
     fit = assemble(
@@ -297,10 +299,31 @@ class _Rounds:
         B = self.survey.basis(choice.field)
         self.z = self._damped(np.asarray(step, float), reduced, B)
         self.w, self.nodes = reduced.field(self.z), choice.field.nodes
-        lacking = self._lacking(self.z, reduced, B)
-        self.survey.bend(choice.field, self.w, self.z[self.q :])
+        if self.survey.drift is not None:
+            self.survey.bend(choice.field, self.w, self.z[self.q :])
+            B = self.survey.basis(choice.field)
+        lacking = self._slow() + B @ self.w
         score = widths.log_evidence + reduced.log_evidence
         return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
+
+    def covariance(self, answer: _Answer) -> FloatArray:
+        """Return that of z (q, q), with what the data leave open of the field's size and length."""
+        start, z = answer.choice, answer.z
+        sums, s2 = self._sums(start.field, 1), self.sigma**2
+        precision = self.family.at(self.eta).precision
+        weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
+
+        def reduced(one: Choice) -> Reduced:
+            mine = self._sums(one.field, 1) if one.field.harmonic else sums
+            return eliminate(mine, one.field, one.ratio, one.rho)
+
+        total = np.zeros_like(precision)
+        for weight, one in plausible(lambda one: weighed.score(reduced(one), one.field, one.ratio), start):
+            quadratic = reduced(one).quadratic
+            P = covariance_of(quadratic.H / s2 + precision)
+            moved = P @ quadratic.b / s2 - z
+            total += weight * (P + np.outer(moved, moved))
+        return total
 
     def _damped(self, step: FloatArray, reduced: Reduced, B: csr_array) -> FloatArray:
         """Return z after the step (q,), shortened while it overshoots, as it may far off."""
@@ -316,9 +339,14 @@ class _Rounds:
         return self.z + part * step
 
     def _lacking(self, z: FloatArray, reduced: Reduced, B: csr_array) -> FloatArray:
-        """Return what the reference lacks at every sample with z (q,) and the field that follows, nT."""
-        steady = self.survey.steady
-        return np.asarray(steady @ z[self.q : self.q + steady.shape[1]] + B @ reduced.field(z))
+        """Return what the reference lacks at every sample with z (q,) and the field that follows, nT.
+
+        A track that bends from the last answer's to that of z meets the field's slopes on its way.
+        """
+        functions, many = self.survey.functions, self.survey.steady.shape[1]
+        latent = z[self.q :].copy()
+        latent[many:] -= self.z[self.q + many :]
+        return np.asarray(functions @ latent + B @ reduced.field(z))
 
     def _few(self, field: Matern) -> Sums:
         return self._sums(field, self.step)

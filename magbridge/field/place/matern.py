@@ -26,10 +26,10 @@ from magbridge.field.place.nodes import Nodes
 
 __all__ = ["SMOOTHNESS", "Matern"]
 
-SMOOTHNESS = (2, 3, 4)
-"""Powers alpha that are tried: rough, smooth, and as good as a Gaussian."""
-FLAT, FALLING = 4, 6
-"""Strips of nodes that the prior's stencil reaches across, and splines that a slope with depth widens."""
+SMOOTHNESS = (2, 3, 4, 6, 10, 16)
+"""Powers alpha that are tried: from rough to as good as a Gaussian."""
+SPLINE, FALLING = 4, 6
+"""Strips of nodes that a spline reaches across, and those that a slope with depth widens."""
 WAVES = 96
 """Wave numbers an axis at which a spectrum is summed."""
 
@@ -97,7 +97,7 @@ class Matern:
     @property
     def edges(self) -> IndexArray:
         """(b + 1,) where blocks of nodes begin that couple to the next one only."""
-        return self.nodes.edges(FALLING if self.harmonic else FLAT)
+        return self.nodes.edges(max(self.alpha, FALLING if self.harmonic else SPLINE))
 
     @cached_property
     def log_determinant(self) -> float:

@@ -1,0 +1,82 @@
+r"""What the data leave open of a field's size and length.
+
+Of a few patches of rock nobody can tell its size and length well: an answer at the likeliest ones alone would
+be too sure where the track does not go. The evidence is summed over points about its maximum,
+
+.. math:: p(f) \approx \sum_k w_k\, p(f \mid \theta_k), \quad \theta_k = \hat\theta + V S g_k,
+
+of a Gauss-Hermite rule (3 x 3) along the axes V of its curvature with the spreads S, each weighed with its
+own evidence (Rue, Martino & Chopin 2009, section 6.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.field_search import Choice
+
+__all__ = ["MANY", "plausible"]
+
+MANY = 2_500
+"""Nodes from which on size and length are known well enough."""
+STEP = 0.3
+"""Of the logarithms of size and length, over which the evidence's curvature is taken."""
+WIDEST = 0.7
+"""Spread of these logarithms at most: beyond, the evidence is no parabola."""
+RULE = ((0.0, 2.0 / 3.0), (3.0**0.5, 1.0 / 6.0), (-(3.0**0.5), 1.0 / 6.0))
+"""Nodes and weights for a standard normal distribution."""
+LEAST = 0.01
+"""Weight below which a point is not worth its cost."""
+
+
+def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[float, Choice]]:
+    """Return choices about the best one with their weights, which add up to 1; the best one first.
+
+    Parameters
+    ----------
+    score : callable
+        The log evidence of a choice; may raise LinAlgError where there is none.
+    best : Choice
+        About where that is largest.
+    """
+    if best.field.nodes.size > MANY:
+        return [(1.0, best)]
+
+    def at(x: FloatArray) -> Choice:
+        field = replace(best.field, length=best.field.length * float(np.exp(x[1])))
+        return replace(best, field=field, ratio=best.ratio * float(np.exp(x[0])))
+
+    def value(x: FloatArray) -> float:
+        try:
+            return score(at(x))
+        except np.linalg.LinAlgError:
+            return -np.inf
+
+    top = value(np.zeros(2))
+    spreads, axes = _spread(value, top)
+    points: list[tuple[float, Choice]] = []
+    for (g, p), (h, q) in product(RULE, RULE):
+        x = axes @ (spreads * np.array([g, h]))
+        gained = (value(x) if x.any() else top) - top + 0.5 * (g * g + h * h)
+        points.append((p * q * float(np.exp(min(gained, 5.0))), at(x)))
+    total = sum(weight for weight, _ in points)
+    kept = [(weight, one) for weight, one in points if weight > LEAST * total]
+    total = sum(weight for weight, _ in kept)
+    return [(weight / total, one) for weight, one in kept]
+
+
+def _spread(value: Callable[[FloatArray], float], top: float) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviations (2,) along the axes, columns (2, 2), of the evidence's curvature."""
+    a, b = STEP * np.eye(2)
+    bend = np.diag([value(x) + value(-x) - 2.0 * top for x in (a, b)]) / STEP**2
+    both = value(a + b) + value(-a - b) - 2.0 * top
+    bend[0, 1] = bend[1, 0] = 0.5 * (both / STEP**2 - np.trace(bend))
+    if not np.isfinite(bend).all():
+        return np.full(2, 0.1), np.eye(2)
+    values, axes = np.linalg.eigh(-bend)
+    return np.maximum(values, WIDEST**-2.0) ** -0.5, axes

@@ -1,0 +1,125 @@
+"""The field of a gridded survey, at any place: its mean and sigma over all that the data leave open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.fitting.evidence import Widths
+from magbridge.field.place.blocks import NearInverse
+from magbridge.field.place.matern import Matern
+from magbridge.survey.roughness import Roughness
+from magbridge.survey.samples import Samples
+
+__all__ = ["Gridded", "Posterior"]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The field given its size and length.
+
+    Attributes
+    ----------
+    weight : float
+        How plausible these are.
+    field : Matern
+    size, sigma : float
+        nT, the field's standard deviation where the roughness is 1, and the noise's.
+    w : (nodes,) array
+        The field's coefficients.
+    follow : (nodes, r) array
+        How they move with 1-sigma of what is uncertain elsewhere: levels, slow changes, the calibration.
+    inverse : NearInverse
+        Of the precision, in units of the noise's.
+    levels : (n,) array
+        nT, what was taken off each sample: its line's level and the slow part.
+    """
+
+    weight: float
+    field: Matern
+    size: float
+    sigma: float
+    w: FloatArray
+    follow: FloatArray
+    inverse: NearInverse
+    levels: FloatArray
+
+    def at(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
+        """Return the field and its variance, (n,) each, of splines B (n, nodes)."""
+        return B @ self.w, self.sigma**2 * self.inverse.variances(B) + ((B @ self.follow) ** 2).sum(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Gridded:
+    """A gridded survey: ask it for the field at any place.
+
+    Attributes
+    ----------
+    posteriors : tuple of Posterior
+        Of the likeliest size and length first, then of others that the data leave open.
+    roughness : Roughness
+        How the field's size varies from place to place.
+    rho : float
+        The noise's autocorrelation.
+    middle : float
+        m, depth at which the map holds.
+    mean : float
+        nT, of all samples.
+    kept : (n,) array
+        Which samples are no outliers.
+    widths : Widths
+        As the evidence chose them.
+    """
+
+    posteriors: tuple[Posterior, ...]
+    roughness: Roughness
+    rho: float
+    middle: float
+    mean: float
+    kept: BoolArray
+    widths: Widths
+
+    @property
+    def field(self) -> Matern:
+        """The likeliest field."""
+        return self.posteriors[0].field
+
+    @property
+    def size(self) -> float:
+        """The field's standard deviation where the roughness is 1, nT."""
+        return float(np.sqrt(sum(one.weight * one.size**2 for one in self.posteriors)))
+
+    @property
+    def sigma(self) -> float:
+        """The noise's, nT."""
+        return self.posteriors[0].sigma
+
+    @property
+    def levels(self) -> FloatArray:
+        """nT, what was taken off each sample (n,): its line's level and the slow part."""
+        return np.asarray(sum(one.weight * one.levels for one in self.posteriors))
+
+    def at(self, place: FloatArray, depth: FloatArray | float | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return the anomaly and its 1-sigma (n,) each, nT, at places (n, 2), m, and depths (n,), m.
+
+        The depth is the map's own if not given.
+        """
+        deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
+        scale = self.roughness.at(place)
+        outside = ~self.field.nodes.inside(place)
+        mean, square = np.zeros(len(place)), np.zeros(len(place))
+        for one in self.posteriors:
+            here, variance = one.at(csr_array(diags_array(scale) @ one.field.basis(place, deeper)))
+            variance[outside] = (one.size * scale[outside]) ** 2
+            mean += one.weight * here
+            square += one.weight * (variance + here**2)
+        return self.mean + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+
+    def at_samples(self, samples: Samples) -> FloatArray:
+        """Return the anomaly (n,), nT, at the samples' own places and depths."""
+        deeper, rough = np.nan_to_num(samples.depth - self.middle), self.roughness.at(samples.place)
+        parts = [one.weight * (one.field.basis(samples.place, deeper) @ one.w) for one in self.posteriors]
+        return np.asarray(self.mean + rough * sum(parts))
