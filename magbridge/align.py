@@ -49,6 +49,10 @@ class Sample:
 
     Attributes
     ----------
+    reading : Reading
+        As the instrument sent it.
+    reading_us : int
+        µs, our time at the reading's ``device_time``.
     time_us : int
         µs, common to all channels.
     field : tuple of 3 float
@@ -70,10 +74,12 @@ class Sample:
     No msgspec record, because compiled code reads the attributes of a class of its own without a call.
     """
 
-    __slots__ = ("age", "field", "quality", "sigma", "spans", "time_us", "values")
+    __slots__ = ("age", "field", "quality", "reading", "reading_us", "sigma", "spans", "time_us", "values")
 
     def __init__(
         self,
+        reading: Reading,
+        reading_us: int,
         time_us: int,
         field: Vector,
         values: tuple[float, ...],
@@ -82,6 +88,8 @@ class Sample:
         sigma: float,
         spans: tuple[tuple[int, float, float], ...],
     ) -> None:
+        self.reading: Final = reading
+        self.reading_us: Final = reading_us
         self.time_us: Final = time_us
         self.field: Final = field
         self.values: Final = values
@@ -149,10 +157,6 @@ class Track:
     def stale(self, time_us: int) -> bool:
         """Say whether the value is unknown, or older than ``max_age``, at `time_us`."""
         return self.lacking or time_us - self.last_us > self.max_age * 1e6
-
-    def moving(self, time_us: int, settle_time: float) -> bool:
-        """Say whether the parameter is moving, or stopped less than `settle_time` s before `time_us`."""
-        return self.moved_us == self.last_us or time_us - self.moved_us <= settle_time * 1e6
 
     def between(self, begin_us: int) -> tuple[float, float]:
         """Return the least and the greatest value since `begin_us`, what was held then included."""
@@ -275,7 +279,8 @@ class Aligner:
         variance += growth
         sigma = variance**0.5 if variance else 0.0
         # the two low bits of a time belong to the log
-        return Sample(sample_us - sample_us % 4, field, values, age, quality | more, sigma, spans)
+        time_of_all_us = sample_us - sample_us % 4
+        return Sample(reading, time_us, time_of_all_us, field, values, age, quality | more, sigma, spans)
 
     def _parameters(
         self, sample_us: int, undated: bool
@@ -285,6 +290,7 @@ class Aligner:
         An `undated` sample waited, and it is not known since when.
         """
         late_us, settings = self.late_since_us, self.settings
+        settle_us = settings.settle_time * 1e6
         values: list[float] = []
         spans: list[tuple[int, float, float]] = []
         quality, variance, oldest = 0, 0.0, 0.0
@@ -302,8 +308,8 @@ class Aligner:
             if track.lacking or age > track.max_age:
                 quality |= STALE
                 variance += (settings.stale_growth * age) ** 2
-            if track.moving(sample_us, settings.settle_time):
-                quality |= MOVING
+            if track.moved_us == track.last_us or sample_us - track.moved_us <= settle_us:
+                quality |= MOVING  # or it stopped not long ago
                 spans.append((index, low, high))
             if sample_us < track.first_us or (late_us and (undated or sample_us > track.last_us)):
                 quality |= LATE_JOIN

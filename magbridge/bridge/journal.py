@@ -37,8 +37,9 @@ class Journal:
 
     def sent(self, frames: list[tuple[int, bytes]]) -> None:
         """Record the frames sent over the link, each with its event time (µs)."""
-        for time_us, frame in frames:
-            self._add(time_us, SENT, frame)
+        if self.active and frames:
+            self._records += [(time_us, SENT, frame) for time_us, frame in frames]
+            self.count += len(frames)
 
     def link(self, time_us: int, frames: list[bytes]) -> None:
         """Record the frames that came over the link."""

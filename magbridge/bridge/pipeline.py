@@ -25,7 +25,6 @@ from magbridge.errors import ConfigError
 from magbridge.link.authority import Sources
 from magbridge.link.component import Component, check_publish
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
-from magbridge.link.publish import Sample
 from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
 from magbridge.mavlink import Message, Signing, Spec, spec
@@ -167,27 +166,28 @@ class Pipeline:
 
     def feed(self, event: Event) -> list[tuple[int, bytes]]:
         """Process an event; return the frames to send over the link, each with its event time (µs)."""
-        component, time_us, channel, data = self.component, event.time_us, event.channel, event.data
+        component, journal = self.component, self.journal
+        outbox, time_us, channel, data = component.outbox, event.time_us, event.channel, event.data
         component.advance(time_us)
-        due = component.outbox.drain()
-        self.journal.sent(due)
+        due = outbox.drain()
+        journal.sent(due)
         if self._late and time_us > self._changes.until_us:
             self._late = False
             self._correction.aligner.late_since_us = 0
         if channel is SENSOR:
-            self.journal.sensor(time_us, data)
+            journal.sensor(time_us, data)
             self._hear_sensor(data, time_us)
         elif channel is LINK:
             self._hear_link(data, time_us)
         elif data:
-            self.journal.state(time_us, data)
+            journal.state(time_us, data)
             self._changes.hear(data, time_us)
             if self._changes.until_us >= time_us:
                 self._late = True
                 self._correction.aligner.late_since_us = self._changes.since_us
-        answers = component.outbox.drain()
-        self.journal.sent(answers)
-        return due + answers
+        answers = outbox.drain()
+        journal.sent(answers)
+        return due + answers if due else answers
 
     def beside(self, messages: Sequence[tuple[Spec, bytes]]) -> bytes:
         """Return the frames of messages that are sent beside those of :meth:`feed` and are not logged."""
@@ -207,19 +207,19 @@ class Pipeline:
 
     def _sample(self, reading: Reading, stamp: Stamp) -> None:
         time_us, missing, restarted = stamp.time_us, stamp.missing, stamp.restarted
+        component, position = self.component, self._position
         self._samples += 1
         self._lost += missing
         self._times.append(time_us)
         self.sensor.read(reading.field, time_us)
-        utc_offset_us = self.component.codec.utc_offset_us
-        main_field = self._position.main_field(time_us, time_us + utc_offset_us)
+        main_field = position.main_field(time_us, time_us + component.codec.utc_offset_us)
         sample, corrected = self._correction.reading(
             reading,
             time_us,
             restarted=restarted,
             missing=missing,
             main_field=main_field,
-            where=self._position.where,
+            where=position.where,
         )
         if self._plausibility is not None and self._plausibility.notices:
             self._tell_implausible(self._plausibility.notices)
@@ -231,11 +231,10 @@ class Pipeline:
         anomaly = corrected.total_field - main_field
         if self.navigation is not None:
             self.navigation.sample(sample.time_us, corrected)
-        publisher = self.component.publisher
-        out = Sample(reading, time_us, corrected, sample.time_us, sample.age, anomaly)
-        publisher.publish(out)
+        publisher = component.publisher
+        publisher.publish(sample, corrected, anomaly)
         if self.journal.active and self._raw_rate.hertz != 0:
-            self.journal.raw(self.component.codec.now_us, publisher.raw_payload(out))
+            self.journal.raw(component.codec.now_us, publisher.raw_payload(sample))
         if self.learning is not None:
             self.learning.sample(sample.time_us)
 

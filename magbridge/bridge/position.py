@@ -30,13 +30,19 @@ class Position:
     ----------
     tell : callable
         Takes the reason why there is no main field at a known position.
+
+    Attributes
+    ----------
+    where : tuple of 2 float or None
+        Latitude and longitude, deg, of the last position; None before the first.
     """
 
     MESSAGE: ClassVar[int] = POSITION.id
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         self._tell = tell
-        self._where: tuple[float, float, float] | None = None
+        self.where: tuple[float, float] | None = None
+        self._depth = 0.0
         self._when_us = self._evaluated_us = 0
         self._field = nan
         self._vector = nan, nan, nan
@@ -47,13 +53,8 @@ class Position:
         """Take a GLOBAL_POSITION_INT."""
         latitude, longitude, altitude = message["lat"] * 1e-7, message["lon"] * 1e-7, message["alt"] * 1e-3
         if latitude or longitude:  # an autopilot that does not know its position sends 0, 0
-            self._where = latitude, longitude, -altitude
+            self.where, self._depth = (latitude, longitude), -altitude
             self._when_us, self._evaluated_us = time_us, 0
-
-    @property
-    def where(self) -> tuple[float, float] | None:
-        """Latitude and longitude, deg, of the last position; None before the first."""
-        return self._where[:2] if self._where is not None else None
 
     def main_field(self, time_us: int, utc_us: int) -> float:
         """Return the IGRF's total field in nT; NaN where position or date is not known, or no model holds.
@@ -63,7 +64,7 @@ class Position:
         time_us, utc_us : int
             µs of event time, and of UNIX time by the host's clock as it is set now.
         """
-        if self._where is None or utc_us < CLOCK_SET_US or abs(time_us - self._when_us) > MAX_AGE_US:
+        if self.where is None or utc_us < CLOCK_SET_US or abs(time_us - self._when_us) > MAX_AGE_US:
             return nan
         if abs(utc_us - self._evaluated_us) > AGAIN_US:
             self._evaluated_us = utc_us
@@ -84,13 +85,13 @@ class Position:
         return self._vector
 
     def _evaluate(self, utc_us: int) -> float:
-        assert self._where is not None
+        assert self.where is not None
         try:
             if self._model is None:
                 from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
 
                 self._model = NearbyField()
-            return self._model.at(*self._where, utc_us * 1e-6)[0]
+            return self._model.at(*self.where, self._depth, utc_us * 1e-6)[0]
         except (ImportError, MagbridgeError) as error:
             self._tell(str(error))
             return nan

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from magbridge.link.component import Component, check_publish
 from magbridge.link.parameters import Parameters, Tunable, alignment, telemetry_ages
-from magbridge.link.publish import Sample
 from magbridge.link.telemetry import TelemetryMap
 
 __all__ = [
     "Component",
     "Parameters",
-    "Sample",
     "TelemetryMap",
     "Tunable",
     "alignment",

@@ -198,8 +198,9 @@ class Component:
 
     def advance(self, t_us: int) -> None:
         """Let time pass until `t_us`; everything sent carries the time at which it was due."""
-        self.timers.advance(t_us, self._begin)
-        self._begin(t_us)
+        if self.timers.next_deadline <= t_us:
+            self.timers.advance(t_us, self._begin)
+        self.codec.now_us = t_us
 
     def receive(self, data: bytes, t_us: int) -> list[Message]:
         """Take bytes from the link; return the messages that are telemetry of our vehicle.

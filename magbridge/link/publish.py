@@ -7,14 +7,14 @@ from math import isfinite, nan
 from struct import Struct
 from typing import Final
 
-from magbridge.align import nearest
+from magbridge.align import Sample, nearest
 from magbridge.link.outbox import Outbox
 from magbridge.link.rates import Rate
 from magbridge.mavlink import spec
 from magbridge.mavlink.dialect import MAG_RAW_FLAGS
-from magbridge.records import Corrected, Reading
+from magbridge.records import Corrected
 
-__all__ = ["PUBLISHED", "Publisher", "Sample"]
+__all__ = ["PUBLISHED", "Publisher"]
 
 RAW: Final = spec("MAG_RAW")
 FIELD: Final = spec("MAG_FIELD")
@@ -33,46 +33,6 @@ COUNTS: Final = int(MAG_RAW_FLAGS.COUNTS)
 SEQUENCE: Final = int(MAG_RAW_FLAGS.SEQUENCE)
 POWER_CYCLE: Final = int(MAG_RAW_FLAGS.POWER_CYCLE)
 NO_COUNTS: Final = (0, 0, 0)
-
-
-class Sample:
-    """One sample, as the bridge hands it out.
-
-    Attributes
-    ----------
-    reading : Reading
-    reading_us : int
-        µs, our time at the reading's ``device_time``.
-    corrected : Corrected
-    time_us : int
-        µs, our time of the corrected sample.
-    telemetry_age : float
-        s, of the oldest parameter in the correction; infinite where one never came.
-    anomaly : float
-        nT above the main field; NaN where the position is not known.
-
-    Notes
-    -----
-    As :class:`magbridge.align.Sample`, a class of its own for speed.
-    """
-
-    __slots__ = ("anomaly", "corrected", "reading", "reading_us", "telemetry_age", "time_us")
-
-    def __init__(
-        self,
-        reading: Reading,
-        reading_us: int,
-        corrected: Corrected,
-        time_us: int,
-        telemetry_age: float = nan,
-        anomaly: float = nan,
-    ) -> None:
-        self.reading: Final = reading
-        self.reading_us: Final = reading_us
-        self.corrected: Final = corrected
-        self.time_us: Final = time_us
-        self.telemetry_age: Final = telemetry_age
-        self.anomaly: Final = anomaly
 
 
 class Publisher:
@@ -95,26 +55,37 @@ class Publisher:
         self._outbox, self._codec = outbox, outbox.codec
         self.calibration_id, self._start_us = calibration_id, start_us
         self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
-        self.latest: Sample | None = None
+        self.latest: tuple[Sample, Corrected, float] | None = None
         self.samples = 0
 
-    def publish(self, sample: Sample) -> None:
-        """Send what is due of a sample; ``outbox.codec.now_us`` is the time of sending."""
-        self.latest = sample
+    def publish(self, sample: Sample, corrected: Corrected, anomaly: float = nan) -> None:
+        """Send what is due of a sample; ``outbox.codec.now_us`` is the time of sending.
+
+        Parameters
+        ----------
+        sample : Sample
+            As aligned.
+        corrected : Corrected
+            What the calibration made of it.
+        anomaly : float
+            nT above the main field; NaN where the position is not known.
+        """
+        self.latest = sample, corrected, anomaly
         self.samples += 1
+        time_us = sample.time_us
         for rate, send in self._messages:
-            if rate.due(sample.time_us):
-                send(sample)
+            if rate.hertz == 0.0 or rate.due(time_us):
+                send(sample, corrected, anomaly)
 
     def repeat(self, name: str) -> bool:
         """Send message `name` of the latest sample again; False where there is none yet."""
         if self.latest is None:
             return False
-        send: Callable[[Sample], None] = getattr(self, PUBLISHED[name])
-        send(self.latest)
+        send: Callable[[Sample, Corrected, float], None] = getattr(self, PUBLISHED[name])
+        send(*self.latest)
         return True
 
-    def _raw(self, sample: Sample) -> None:
+    def _raw(self, sample: Sample, _: Corrected, __: float) -> None:
         self._outbox.put(RAW, self.raw_payload(sample))
 
     def raw_payload(self, sample: Sample) -> bytes:
@@ -132,49 +103,44 @@ class Publisher:
         x_count, y_count, z_count = counts or NO_COUNTS
         x_late, y_late, z_late = reading.channel_delay
         return RAW.struct.pack(
-            since_1970(sample.reading_us + self._codec.utc_offset_us), (sequence or 0) & MASK,
+            max(sample.reading_us + self._codec.utc_offset_us, 0), (sequence or 0) & MASK,
             x, y, z, x_count, y_count, z_count,
             nearest(x_late * 1e6), nearest(y_late * 1e6), nearest(z_late * 1e6),
             reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, 0, flags,
         )  # fmt: skip
 
-    def _field(self, sample: Sample) -> None:
-        corrected = sample.corrected
+    def _field(self, sample: Sample, corrected: Corrected, anomaly: float) -> None:
         x, y, z = corrected.field
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
         payload = FIELD.struct.pack(
-            since_1970(sample.time_us + self._codec.utc_offset_us), corrected.total_field,
+            max(sample.time_us + self._codec.utc_offset_us, 0), corrected.total_field,
             self.samples & MASK, self.calibration_id, corrected.total_field_sigma,
-            x, y, z, x_sigma, y_sigma, z_sigma, sample.anomaly, sample.telemetry_age,
+            x, y, z, x_sigma, y_sigma, z_sigma, anomaly, sample.age,
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
         )  # fmt: skip
         self._outbox.put(FIELD, payload)
 
-    def _imu(self, sample: Sample) -> None:
-        x, y, z = sample.corrected.field
-        time_us = since_1970(sample.time_us + self._codec.utc_offset_us)
+    def _imu(self, sample: Sample, corrected: Corrected, _: float) -> None:
+        x, y, z = corrected.field
+        time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
         payload = IMU_FIELD.pack(time_us, x * GAUSS, y * GAUSS, z * GAUSS, MAGNETOMETER, 0)
         self._outbox.put(IMU, payload)
 
-    def _named(self, sample: Sample) -> None:
-        corrected = sample.corrected
+    def _named(self, sample: Sample, corrected: Corrected, anomaly: float) -> None:
         boot_ms = (sample.time_us - self._start_us) // 1000 & MASK
         values = [(b"mag_total", corrected.total_field), (b"mag_sigma", corrected.total_field_sigma)]
-        if isfinite(sample.anomaly):
-            values.append((b"mag_anom", sample.anomaly))
+        if isfinite(anomaly):
+            values.append((b"mag_anom", anomaly))
         for name, value in values:
             self._outbox.put(NAMED, NAMED.struct.pack(boot_ms, value, name))
 
-    def _vector(self, sample: Sample) -> None:
-        payload = VECTOR.struct.pack(
-            since_1970(sample.time_us + self._codec.utc_offset_us), *sample.corrected.field, b"mag_field"
+    def _vector(self, sample: Sample, corrected: Corrected, _: float) -> None:
+        self._outbox.put(
+            VECTOR,
+            VECTOR.struct.pack(
+                max(sample.time_us + self._codec.utc_offset_us, 0), *corrected.field, b"mag_field"
+            ),
         )
-        self._outbox.put(VECTOR, payload)
-
-
-def since_1970(time_us: int) -> int:
-    """Return a time (µs) that a message can hold: a host whose clock was never set begins at 0."""
-    return time_us if time_us > 0 else 0
 
 
 PUBLISHED: dict[str, str] = {

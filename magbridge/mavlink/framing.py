@@ -12,21 +12,23 @@ from typing import Final
 from fastcrc.crc16 import mcrf4xx
 
 from magbridge.mavlink.dialect import MESSAGES
-from magbridge.mavlink.messages import Message, Spec, spec
+from magbridge.mavlink.messages import Message, spec
 
 __all__ = [
     "AFTER",
+    "BEFORE_V2",
     "EXTRA",
+    "HEADER",
     "LAST",
     "MAGIC",
     "MORE",
     "NOT_A_FRAME",
     "SIGNATURE",
+    "SIGNED",
     "V1",
     "V2",
     "find_magic",
     "frame_end",
-    "join",
     "message",
 ]
 
@@ -41,6 +43,7 @@ MORE: Final = -1
 LAST: Final = 0xFFFF
 """The last message id that a message outside the dialect may have."""
 HEADER: Final = Struct("<BBBBBBB3s")
+"""Of version 2: magic byte, length of the payload, flags of two sorts, sequence, sender, message."""
 EXTRA: Final = {number: extra for number, (_, extra, _) in MESSAGES.items()}
 AFTER: Final = [mcrf4xx(bytes((value,)), 0) for value in range(256)]
 """The checksum of each byte alone, from which that of any bytes follows, one by one."""
@@ -122,16 +125,6 @@ def message(frame: bytes) -> Message:
 def _number(data: bytes, start: int) -> int:
     """Return the id of the message whose version 2 frame begins at ``data[start]``."""
     return data[start + 7] | data[start + 8] << 8 | data[start + 9] << 16
-
-
-def join(
-    layout: Spec, payload: bytes, sequence: int, system: int, component: int, *, signed: bool = False
-) -> bytes:
-    """Make a version 2 frame, without the signature that `signed` announces."""
-    if not payload or not payload[-1]:  # a call that most payloads need not
-        payload = payload.rstrip(b"\0") or b"\0"
-    body = HEADER.pack(V2, len(payload), signed, 0, sequence, system, component, layout.number) + payload
-    return body + closed(mcrf4xx(body, BEFORE_V2), layout.extra).to_bytes(2, "little")
 
 
 def closed(checksum: int, extra: int) -> int:

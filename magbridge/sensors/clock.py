@@ -148,7 +148,8 @@ class DeviceClock:
             self._begin(device_time, arrival_us)
             time_us = float(arrival_us)
         elif timed:
-            missing = missing or self._unnumbered(sequence, device_time)
+            if sequence is None and self._period:  # a nominal rate but no number
+                missing = max(round((device_time - self._device_time) / self._period) - 1, 0)
             time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, tells)
         elif self._period:
             time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, tells)
@@ -188,12 +189,6 @@ class DeviceClock:
                 hole = 0
         self._since_us, self._readings = arrival_us, 0
         return max(hole, 0)
-
-    def _unnumbered(self, sequence: int | None, device_time: float) -> int:
-        """Return how many readings are missing before one with a time and a nominal rate but no number."""
-        if sequence is not None or not self._period:
-            return 0
-        return max(round((device_time - self._device_time) / self._period) - 1, 0)
 
     def _begin(self, device_time: float, arrival_us: int) -> None:
         """Learn the relation between the clocks anew, from this reading on."""

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from line import Line, MakeLine
 
-from magbridge.link import Sample
+from magbridge.align import Sample
 from magbridge.records import Corrected, Quality, Reading
 
 START = 1_700_000_000_000_000
@@ -27,12 +27,12 @@ CORRECTED = Corrected(
 )
 
 
-def sample(t_us: int = START, **fields: float) -> Sample:
-    return Sample(READING, t_us + 4000, CORRECTED, t_us, **fields)
+def sample(t_us: int = START, reading: Reading = READING, age: float = nan) -> Sample:
+    return Sample(reading, t_us + 4000, t_us, reading.field, (), age, 0, 0.0, ())
 
 
-def publish(link: Line, one: Sample) -> list[Any]:
-    link.component.publisher.publish(one)
+def publish(link: Line, one: Sample, corrected: Corrected = CORRECTED, anomaly: float = nan) -> list[Any]:
+    link.component.publisher.publish(one, corrected, anomaly)
     return link.hear()
 
 
@@ -55,14 +55,14 @@ def test_raw(line: Line) -> None:
 
 
 def test_raw_of_an_instrument_that_says_little(line: Line) -> None:
-    plain = Sample(Reading((1.0, 2.0, 3.0)), START, CORRECTED, START)
+    plain = sample(reading=Reading((1.0, 2.0, 3.0)))
     (raw,) = line.only(publish(line, plain), "MAG_RAW")
     assert raw.flags == 0
     assert (raw.count_x, raw.sequence, raw.power_cycle) == (0, 0, 0)
 
 
 def test_field(line: Line) -> None:
-    (field,) = line.only(publish(line, sample(telemetry_age=0.25, anomaly=-12.5)), "MAG_FIELD")
+    (field,) = line.only(publish(line, sample(age=0.25), anomaly=-12.5), "MAG_FIELD")
     assert field.total_field == CORRECTED.total_field  # double: not rounded
     assert (field.x, field.y, field.z) == CORRECTED.field
     assert (field.sigma_x, field.sigma_y, field.sigma_z) == CORRECTED.field_sigma
@@ -82,7 +82,7 @@ def test_standard_messages(line: Line) -> None:
     assert {one.name: one.value for one in named} == pytest.approx(
         {"mag_total": 50_123.456789, "mag_sigma": 1.5}
     )
-    named = line.only(publish(line, sample(START + 2_500_000, anomaly=-3.0)), "NAMED_VALUE_FLOAT")
+    named = line.only(publish(line, sample(START + 2_500_000), anomaly=-3.0), "NAMED_VALUE_FLOAT")
     assert {one.name for one in named} == {"mag_total", "mag_sigma", "mag_anom"}
     assert {one.time_boot_ms for one in named} == {2500}
 
@@ -111,6 +111,6 @@ def test_the_latest_sample_on_request(line: Line) -> None:
 
 
 def test_nan_is_published_as_nan(line: Line) -> None:
-    one = Sample(Reading((nan, 1.0, 2.0)), START, Corrected(nan, nan, (nan,) * 3, (nan,) * 3, 16), START)
-    (field,) = line.only(publish(line, one), "MAG_FIELD")
+    nothing = Corrected(nan, nan, (nan,) * 3, (nan,) * 3, 16)
+    (field,) = line.only(publish(line, sample(), nothing), "MAG_FIELD")
     assert field.total_field != field.total_field

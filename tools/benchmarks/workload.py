@@ -1,4 +1,8 @@
-"""The bridge's input in every benchmark: one configuration, one calibration, one stream of events."""
+"""The bridge's input in every benchmark: one configuration, one calibration, one stream of events.
+
+The field that comes out is the Earth's at the vehicle's position, with noise: with any other, a faulty
+sensor would be measured.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ from collections.abc import Iterator
 from itertools import count
 from math import cos, sin
 from pathlib import Path
+from random import Random
 
 import numpy as np
 
@@ -23,6 +28,8 @@ BEGIN_US = 1_750_000_000_000_000
 TELEMETRY_HZ = 20
 TELEMETRY = ("battpos",) * 8 + ("ballast",) * 8 + ("ATTITUDE",) * 3 + ("GLOBAL_POSITION_INT",)
 """Messages of one second, beside the autopilot's heartbeat."""
+HORIZONTAL, VERTICAL, NOISE = 30_000.0, 42_740.0, 0.5
+"""nT: the Earth's field at 49.5 N, 57.8 W, and the noise of an axis."""
 OPTIONS = {"sensitivity": 5e-5, "reference_voltage": 5.0}
 CONFIG = """
 [sensor]
@@ -68,10 +75,10 @@ def calibration() -> Calibration:
             Parameter("ballast", "cm3", 0.0, 400.0, 200.0, 200.0),
         ),
         terms=terms,
-        coefficients=random.normal(size=size) * 100.0,
+        coefficients=random.normal(size=size) * 5.0,
         covariance=root @ root.T / size,
         noise=Noise(1.0),
-        reference=Reference(50_000.0),
+        reference=Reference(52_217.0),
         boresight=Boresight((0.01, -0.02, 0.03), (tuple(small[0]), tuple(small[1]), tuple(small[2]))),
         method="auto",
     )
@@ -101,6 +108,7 @@ class Feed:
         self._fluxgate: Encoder = open_encoder("digitizer", OPTIONS)
         self._messages = count()
         self._samples = count()
+        self._random = Random(1)
 
     def events(self, seconds: int, hertz: int, begin_us: int) -> Iterator[Event]:
         """Yield the events of `seconds`: `hertz` readings and 20 messages a second, and the heartbeat."""
@@ -118,10 +126,15 @@ class Feed:
     def reading(self, hertz: int) -> bytes:
         """Return the next frame of the digitizer."""
         t = next(self._samples) / hertz
-        field = (30_000.0 * sin(0.1 * t), 30_000.0 * cos(0.1 * t), 40_000.0 + 10.0 * sin(t))
+        noise = self._random.gauss
+        x = HORIZONTAL * sin(0.1 * t) + noise(0.0, NOISE)
+        y = HORIZONTAL * cos(0.1 * t) + noise(0.0, NOISE)
+        z = VERTICAL + noise(0.0, NOISE)
         delay = 0.1 / hertz
         return self._fluxgate.encode(
-            Reading(field, device_time=t, channel_delay=(0.0, delay, 2 * delay), temperature=12.5, supply=3.7)
+            Reading(
+                (x, y, z), device_time=t, channel_delay=(0.0, delay, 2 * delay), temperature=12.5, supply=3.7
+            )
         )
 
     def heartbeat(self) -> bytes:
