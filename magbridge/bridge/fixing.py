@@ -22,6 +22,7 @@ HELD_US = 60_000_000
 """µs of good GPS, after which the autopilot's position is that of the GPS."""
 ASK_US = 5_000_000
 """µs between two requests for the origin of the local frame."""
+OVERRATED = "ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
 UNANSWERED = 3
 """Commands in a row without an answer before that is told."""
 HINTS = {
@@ -120,7 +121,8 @@ class Fixing:
         self._kind.send(self._component.outbox, fix, *self._component.peer)
         self.sent += 1
         self._state("fixes go to the autopilot: GPS is lost")
-        self._watch(fix.sigma)
+        if not self._kind.fused:
+            self._await_answer()
         return True
 
     def _fix(self, at: Reckoned | None, resets: int, now_us: int) -> Fix | str:
@@ -134,7 +136,7 @@ class Fixing:
         pose = self._frame.pose(now_us, at.latitude, at.longitude) if self._kind.local else None
         if isinstance(pose, str):
             return pose
-        return Fix(
+        fix = Fix(
             time_us=now_us + self._component.codec.utc_offset_us,
             latitude=at.latitude,
             longitude=at.longitude,
@@ -145,18 +147,16 @@ class Fixing:
             pose=pose,
             resets=resets,
         )
+        if self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._kind.overrated(fix):
+            return OVERRATED
+        return fix
 
-    def _watch(self, sigma: float) -> None:
-        """Tell what the receiver will make of a fix, where that is not what it says, or that it is silent."""
-        announcer, limit = self._component.announcer, self._kind.trusted_to
-        if self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and sigma > limit:
-            text = f"the autopilot takes fixes for {limit:g} m or better: it will claim too much"
-            announcer.state("trust", text, MAV_SEVERITY.WARNING)
-        if self._kind.fused:
-            return
+    def _await_answer(self) -> None:
+        """Count a fix that the autopilot has not yet answered; tell where it answers none."""
         self._waiting += 1
         if self._waiting > UNANSWERED:
-            announcer.state("answer", "the autopilot does not answer fixes", MAV_SEVERITY.WARNING)
+            text = "the autopilot does not answer fixes"
+            self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
 
     def _answer(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
         if message["command"] != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self.sent:

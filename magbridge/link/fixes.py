@@ -219,7 +219,7 @@ class Kind(NamedTuple):
     local : bool
         It holds a :class:`Pose`.
     trusted_to : float
-        m: the receiver takes a larger sigma for this one.
+        m: ArduPilot takes a larger sigma for this one.
     least : float
         Hz below which the receiver takes the source for dead.
     """
@@ -231,6 +231,12 @@ class Kind(NamedTuple):
     local: bool = False
     trusted_to: float = inf
     least: float = 0.0
+
+    def overrated(self, fix: Fix) -> bool:
+        """Return whether ArduPilot, given such fixes at this rate, will claim to know its position better."""
+        if self.trusted_to == inf:
+            return False
+        return widened(fix, 1.0 / max(self.rate, self.least)).sigma > self.trusted_to
 
 
 FIXES: dict[str, Kind] = {

@@ -115,7 +115,10 @@ class ArduPilot(Autopilot):
         place, unfused = (message["x"], message["y"]), (self._now_us - self._fused_us) * 1e-6
         reset = self._reset_counter not in (None, message["reset_counter"])  # get_reset_timestamp_ms
         self._reset_counter = message["reset_counter"]
-        if reset or unfused > RETRY:
+        if reset:  # ResetPositionNE: what is claimed stays, and the position is fused as ever
+            self.filter.position = place
+            self._resets += 1
+        if unfused > RETRY:  # ResetPosition
             self.filter.reset(place, sigma**2)
             self._resets += 1
         elif self.filter.distance(place, variance) > GATE:

@@ -138,17 +138,25 @@ def test_an_autopilot_that_does_not_answer_is_told() -> None:
     assert bench.said("answer") == ["the autopilot does not answer fixes"]
 
 
-def test_that_ardupilot_believes_odometry_too_much_is_told() -> None:
+def test_what_ardupilot_would_believe_too_much_is_not_sent() -> None:
+    """Its EKF takes no external position for worse than 10 m, and five alike a second for five new ones."""
     bench = Bench("ODOMETRY")
     bench.hear("HEARTBEAT", autopilot=ARDUPILOT)
     bench.hear("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
     bench.hear("ATTITUDE")
     bench.hear("LOCAL_POSITION_NED", z=1.0)
-    bench.fix(sigma=3.0)
-    assert bench.said("claim") == []
+    (first,) = bench.fix(sigma=1.5)
+    bench.to(0.2)
+    (second,) = bench.fix(sigma=1.5)
+    assert first["pose_covariance"][0] == pytest.approx(1.5**2)
+    assert 7.0 < second["pose_covariance"][0] ** 0.5 <= 10.0, "widened, as ArduPilot still takes it"
+    for k, sigma in enumerate((1.7, 30.0, 150.0)):
+        bench.to(0.4 + 0.2 * k)
+        assert bench.fix(sigma=sigma) == []
     bench.to(5)
-    bench.fix(sigma=30.0)
-    assert bench.said("claim") == ["the autopilot takes fixes for 10 m or better: it will claim too much"]
+    assert bench.said("claim") == [
+        "no fixes to the autopilot: ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
+    ]
 
 
 def test_a_fix_soon_after_another_is_widened_where_it_is_fused() -> None:
