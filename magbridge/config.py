@@ -85,6 +85,8 @@ class Link(Table, frozen=True):
         bit/s, where the link is a serial device.
     signing_key : str or None
         File of 32 bytes; packets are signed and unsigned ones refused.
+    others_rate : float
+        kB/s that all peers but the autopilot's get together, on ``udpin`` and ``tcpin``.
     parameters : str or None
         File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a
         configuration called ``bridge.toml``.
@@ -96,6 +98,7 @@ class Link(Table, frozen=True):
     autopilot: SystemId = 1
     baudrate: Baudrate = 57600
     signing_key: Name | None = None
+    others_rate: NotNegative = 1000.0
     parameters: Name | None = None
 
     def __post_init__(self) -> None:

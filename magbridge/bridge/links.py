@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 
 from magbridge.bridge.address import parse
 from magbridge.bridge.peers import Peers
@@ -31,6 +32,7 @@ def open_link(
     key: str = "link.url",
     *,
     autopilot: tuple[int, int] | None = None,
+    budget: float = inf,
     signed: bool = False,
 ) -> Port:
     """Return the (unopened) port for a MAVLink URL.
@@ -45,6 +47,8 @@ def open_link(
         What an error names.
     autopilot : (int, int) or None
         System and component that a link with many peers answers before all others.
+    budget : float
+        Bytes/s that all other peers get together there.
     signed : bool
         Peers are answered once :meth:`Port.credit` has named a frame of theirs.
 
@@ -68,4 +72,4 @@ def open_link(
         raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error
     if kind in OWN:
         return OWN[kind](url, (host, port))
-    return SHARED[kind](url, (host, port), Peers(autopilot, signed=signed), signed)
+    return SHARED[kind](url, (host, port), Peers(autopilot, budget=budget, signed=signed), signed)

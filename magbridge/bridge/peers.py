@@ -58,19 +58,26 @@ class Peers:
     ----------
     autopilot : (int, int) or None
         System and component whose peer goes before all others.
+    budget : float
+        Bytes/s that all but the autopilot's get together.
     signed : bool
         A frame is valid once :meth:`credit` has named it; else if it is a known message.
 
     Attributes
     ----------
-    ignored : int
-        Bytes that nobody looked at, because their sender had used up its share.
+    ignored, withheld : int
+        Bytes that nobody looked at, because their sender had used up its share; and that others than the
+        autopilot did not get, because the budget was used up.
     notices : deque of str
         What is to be told about them, each once.
     """
 
-    def __init__(self, autopilot: tuple[int, int] | None = None, *, signed: bool = False) -> None:
+    def __init__(
+        self, autopilot: tuple[int, int] | None = None, *, budget: float = inf, signed: bool = False
+    ) -> None:
         self._autopilot, self._signed = autopilot, signed
+        self._budget = self._purse = budget
+        self._paid = time.monotonic()
         self._peers: dict[Hashable, Peer] = {}
         self._frames: list[bytes] = []
         self._stray: list[bytes] = []
@@ -80,7 +87,7 @@ class Peers:
         self._answered: list[Peer] = []
         self._look = 0.0
         self._told: set[str] = set()
-        self.ignored = 0
+        self.ignored = self.withheld = 0
         self.notices: deque[str] = deque(maxlen=8)
 
     def receive(self, address: Hashable, data: bytes) -> None:
@@ -143,6 +150,20 @@ class Peers:
         self._tell(f"more than {ANSWERED} peers: the others are not answered", len(valid) > ANSWERED)
         self._tell("the autopilot speaks from several addresses", pilots > 1)
         return self._answered
+
+    def affords(self, peer: Peer | None, size: int) -> bool:
+        """Say whether `size` bytes may go to a peer (None: one that has said nothing), and count them."""
+        now = time.monotonic()
+        if self._budget == inf or (peer is not None and now - peer.pilot < TIMEOUT):
+            return True
+        self._purse = min(self._purse + (now - self._paid) * self._budget, self._budget)  # of a second
+        self._paid = now
+        if size > self._purse:
+            self.withheld += size
+            self._tell(f"others get {self._budget / 1e3:g} kB/s in all: link.others_rate", True)
+            return False
+        self._purse -= size
+        return True
 
     def route(self, sender: tuple[int, int]) -> Peer | None:
         """Return the peer from which a system and component was last heard, if it is answered."""

@@ -66,7 +66,9 @@ def run(path: Path) -> None:
     sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
     own = config.link
     who, signed = (own.system, own.autopilot), own.signing_key is not None
-    link = open_link(own.url, own.baudrate, str(config.path), autopilot=who, signed=signed)
+    link = open_link(
+        own.url, own.baudrate, str(config.path), autopilot=who, budget=1e3 * own.others_rate, signed=signed
+    )
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)

@@ -7,9 +7,10 @@ import socket
 import time
 from collections.abc import Iterable
 from contextlib import suppress
+from typing import cast
 
 from magbridge.bridge.address import resolve
-from magbridge.bridge.peers import Peers
+from magbridge.bridge.peers import Peer, Peers
 from magbridge.bridge.port import Port
 from magbridge.bridge.stream import Stream
 from magbridge.errors import PortError
@@ -189,13 +190,10 @@ class TcpServer(Port):
 
     def write(self, data: bytes) -> None:
         """Send to those clients that are to be answered; without one, `data` are dropped."""
-        chosen = [fd for fd in self._chosen() if fd in self._clients]
+        peers = self._chosen()
+        chosen = [fd for fd, peer in peers.items() if self._peers.affords(peer, len(data))]
         for fd in chosen:
-            client = self._clients[fd]
-            try:
-                client.write(data)
-            except PortError:
-                self._dismiss(fd)
+            self._write_one(fd, data)
         if not chosen:
             self.dropped += len(data)
         elif (first := self._clients.get(chosen[0])) is not None:  # of the others nobody wants to know
@@ -205,18 +203,22 @@ class TcpServer(Port):
     def write_to(self, sender: tuple[int, int], data: bytes) -> None:
         """Send only to the client from which a system and component was last heard."""
         peer = self._peers.route(sender)
-        if peer is not None and isinstance(fd := peer.address, int) and fd in self._clients:
-            try:
-                self._clients[fd].write(data)
-            except PortError:
-                self._dismiss(fd)
+        if peer is not None and peer.address in self._clients and self._peers.affords(peer, len(data)):
+            self._write_one(peer.address, data)
 
-    def _chosen(self) -> list[int]:
-        """Return the descriptors of those to send to, in the order in which to send."""
-        valid = [peer.address for peer in self._peers.answered()]
-        chosen = [address for address in valid if isinstance(address, int)]
+    def _write_one(self, fd: int, data: bytes) -> None:
+        """Send to one client; one that leaves is no error."""
+        try:
+            self._clients[fd].write(data)
+        except PortError:
+            self._dismiss(fd)
+
+    def _chosen(self) -> dict[int, Peer | None]:
+        """Return those to send to by their descriptors, in the order in which to send."""
+        valid = {cast(int, peer.address): peer for peer in self._peers.answered()}
+        chosen: dict[int, Peer | None] = {fd: peer for fd, peer in valid.items() if fd in self._clients}
         if not self._signed:
-            chosen += [fd for fd in self._clients if fd not in chosen]
+            chosen |= {fd: None for fd in self._clients if fd not in chosen}
         return chosen
 
     @property

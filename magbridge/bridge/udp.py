@@ -120,13 +120,14 @@ class UdpPort(Port):
             self._send(data, None)
             return
         for peer in self._peers.answered():
-            self._send(data, peer.address)
+            if self._peers.affords(peer, len(data)):
+                self._send(data, peer.address)
 
     def write_to(self, sender: tuple[int, int], data: bytes) -> None:
         """Send only to the peer from which a system and component was last heard."""
         if self._peers is None:
             self._send(data, None)
-        elif (peer := self._peers.route(sender)) is not None:
+        elif (peer := self._peers.route(sender)) is not None and self._peers.affords(peer, len(data)):
             self._send(data, peer.address)
 
     def _send(self, data: bytes, peer: Any) -> None:

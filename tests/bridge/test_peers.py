@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from math import inf
 from typing import Any
 
 import pytest
@@ -31,8 +32,8 @@ def header(size: int) -> bytes:
 
 
 @contextmanager
-def opened(kind: str, *, signed: bool = False) -> Iterator[tuple[Port, Any]]:
-    port = open_link(f"{kind}:127.0.0.1:0", 0, autopilot=PILOT, signed=signed)
+def opened(kind: str, *, budget: float = inf, signed: bool = False) -> Iterator[tuple[Port, Any]]:
+    port = open_link(f"{kind}:127.0.0.1:0", 0, autopilot=PILOT, budget=budget, signed=signed)
     port.open()
     with socket.socket(fileno=os.dup(port.fds()[0])) as own:
         place = own.getsockname()
@@ -163,6 +164,37 @@ def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
     assert sum(one.component == 1 for one in frames) == 1000
     assert sum(one.component == 190 for one in frames) <= SHARE / len(beat())
     assert both.ignored > 10 * KNOWN * 900
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+def test_others_share_a_budget_and_the_autopilot_has_none(kind: str) -> None:
+    """One that only listens by TCP is one of them; files count as well."""
+    with opened(kind, budget=2000.0) as (port, place), ExitStack() as stack:
+        make = socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM
+        everyone = [stack.enter_context(socket.socket(socket.AF_INET, make)) for _ in range(3)]
+        for one in everyone:
+            one.connect(place)
+        for k, one in enumerate(everyone[: 2 if kind == "tcpin" else 3]):
+            one.send(beat(1 + k))
+        hear(port, (2 if kind == "tcpin" else 3) * len(beat()))
+        while select.select(port.fds(), [], [], 0.05)[0]:
+            port.read()  # accepts the last one
+        begun = time.monotonic()
+        for _ in range(20):
+            port.write(bytes(500))
+        port.write_to((1, 2), bytes(500))
+        time.sleep(0.05)
+        got = [0, 0, 0]
+        for k, one in enumerate(everyone):
+            while select.select([one], [], [], 0)[0]:
+                got[k] += len(one.recv(65536))
+        allowed = 2000.0 * (1.0 + time.monotonic() - begun)
+        assert got[0] == 20 * 500
+        assert 2000 <= got[1] + got[2] <= allowed
+        assert port.notice() == "others get 2 kB/s in all: link.others_rate"
+        assert port.notice() == ""
+        time.sleep(1.0)
+        assert answered(everyone, port) == [0, 1, 2]
 
 
 def test_connections_never_turn_the_autopilot_out() -> None:
