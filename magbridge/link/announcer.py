@@ -51,6 +51,10 @@ class Announcer:
                 chunk_seq=i,
             )
 
+    def forget(self, key: str) -> None:
+        """Announce the state of `key` anew when it comes next, whatever it was."""
+        self._last.pop(key, None)
+
     def state(
         self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, again: bool = False
     ) -> None:

@@ -6,6 +6,7 @@ from typing import Final
 
 from magbridge.link.announcer import Announcer
 from magbridge.link.clock import VehicleClock
+from magbridge.link.losses import Losses
 from magbridge.link.timers import Timers
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE, MESSAGES
@@ -19,9 +20,6 @@ BACK_MS: Final = 1_000
 """ms by which ``time_boot_ms`` must go back to mean more than packets out of order."""
 BELIEVED = 3
 """Messages in a row from a new boot clock before it is believed: a single one may just be late."""
-WINDOW: Final = 64
-"""Frames by which one may come late and no longer count as lost."""
-ALL: Final = (1 << WINDOW) - 1
 LEAP_MS: Final = 10_000
 """ms by which ``time_boot_ms`` may run ahead of our clock, or lag behind other messages', before it counts as
 another autopilot's."""
@@ -41,8 +39,8 @@ class Vehicle:
     ----------
     clock : VehicleClock
         Reset when the autopilot reboots.
-    reboots, frames_lost : int
-        Number of restarts of the boot clock; number of frames missing by the autopilot's sequence numbers.
+    reboots : int
+        Number of restarts of the boot clock.
     """
 
     def __init__(
@@ -50,15 +48,19 @@ class Vehicle:
     ) -> None:
         self.system, self.component, self.autopilot = system, component, autopilot
         self.clock = VehicleClock()
-        self.reboots = self.frames_lost = 0
+        self.reboots = 0
         self.state = MAG_PORT_STATE.ABSENT
         self._announcer, self._timers = announcer, timers
-        self._sequence: int | None = None
-        self._missing = 0  # bit k: the frame k before the latest has not come
+        self._losses = Losses(system, announcer, timers)
         self._boot_ms = self._boot_us = 0
         self._stamps: dict[int, int] = {}  # the last boot time (ms) of each kind of message
         self._behind = 0
         self._changes: list[int] = []
+
+    @property
+    def frames_lost(self) -> int:
+        """Number of frames missing by the autopilot's sequence numbers."""
+        return self._losses.of(self.autopilot)
 
     def hear(self, message: Message, t_us: int) -> bool:
         """Take note of a message; return whether it is telemetry of our vehicle."""
@@ -70,8 +72,8 @@ class Vehicle:
                 "twin", f"another program speaks as {self.system}:{self.component}", MAV_SEVERITY.WARNING
             )
             return False
+        self._losses.count(message.component, message.sequence, t_us)
         if message.component == self.autopilot:
-            self._count(message.sequence)
             if message.id in BOOT_TIMES:
                 self._watch_boot(message.id, BOOT_TIMES[message.id].get(message.payload), t_us)
             elif message.id == HEARTBEAT:
@@ -88,21 +90,6 @@ class Vehicle:
                 f"vehicle {message.system} is on the link too: ignored",
                 MAV_SEVERITY.NOTICE,
             )
-
-    def _count(self, sequence: int) -> None:
-        """Count lost frames; one that comes late is no longer counted, and a duplicate changes nothing."""
-        if self._sequence is None:
-            self._sequence = sequence
-        ahead = (sequence - self._sequence + 128) % 256 - 128
-        if -WINDOW < ahead <= 0:
-            late = self._missing & 1 << -ahead
-            self.frames_lost -= late != 0
-            self._missing ^= late
-            return
-        # far behind: the sender restarted
-        self.frames_lost += max(ahead - 1, 0)
-        self._missing = (self._missing << ahead | (1 << ahead) - 2) & ALL if ahead > 0 else 0
-        self._sequence = sequence
 
     def _present(self, t_us: int) -> None:
         who = f"autopilot {self.system}:{self.autopilot}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable
+from itertools import count
 from math import isnan
 
 import pytest
@@ -118,6 +119,23 @@ def test_late_frames_are_not_lost(link: Line) -> None:
     order = [four + i for four in range(0, 400, 4) for i in (2, 0, 3, 1)]
     link.give(b"".join(frames[i] for i in order if i not in (0, 1, 101, 203)))
     assert link.component.vehicle.frames_lost == 2
+
+
+def test_whose_frames_are_lost_is_told(link: Line) -> None:
+    """Of each component; once while it lasts, and again when it begins anew."""
+    payload, tenths = Codec(1, 25), count((link.now - START) // 100_000 + 1)
+
+    def ten_seconds(lost: int) -> list[str]:
+        said = []
+        for k in range(100):
+            frame = payload.pack("NAMED_VALUE_FLOAT", name="battpos", value=k)
+            said += link.texts(link.give(link.autopilot.pack("ATTITUDE") + (frame if k >= lost else b"")))
+            said += link.texts(link.to(0.1 * next(tenths)))
+        return [text for text in said if "are lost" in text]
+
+    told = ["more than 1% of the frames of 1:25 are lost"]
+    assert [ten_seconds(lost) for lost in (0, 2, 3, 20, 1, 0, 5, 0)] == [[], [], told, [], [], [], told, []]
+    assert link.component.vehicle.frames_lost == 0, "the autopilot's"
 
 
 def exchange(

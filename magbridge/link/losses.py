@@ -1,0 +1,95 @@
+"""Frames that are missing by their sender's numbers, and whose they are."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from magbridge.link.announcer import Announcer
+from magbridge.link.timers import Timers
+from magbridge.mavlink.dialect import MAV_SEVERITY
+
+__all__ = ["Losses", "Numbers"]
+
+WINDOW: Final = 64
+"""Frames by which one may come late and no longer count as lost."""
+ALL: Final = (1 << WINDOW) - 1
+LOOK_US = 10_000_000
+"""µs over which a share is computed."""
+MANY, LEAST = 0.01, 3
+"""The share, and the number, of lost frames from which on it is told."""
+WATCHED: Final = 16
+"""Components that are watched."""
+
+
+class Numbers:
+    """The frames of one component.
+
+    Attributes
+    ----------
+    heard, lost : int
+        Frames that came, and those that are missing.
+    """
+
+    __slots__ = ("_last", "_missing", "heard", "lost")
+
+    def __init__(self, first: int) -> None:
+        self.heard = self.lost = 0
+        self._last = first
+        self._missing = 0  # bit k: the frame k before the latest has not come
+
+    def count(self, number: int) -> None:
+        """Count a frame; one that comes late is no longer lost, and a duplicate changes nothing."""
+        self.heard += 1
+        ahead = (number - self._last + 128) % 256 - 128
+        if -WINDOW < ahead <= 0:
+            late = self._missing & 1 << -ahead
+            self.lost -= late != 0
+            self._missing ^= late
+            return
+        # far behind: the sender restarted
+        self.lost += max(ahead - 1, 0)
+        self._missing = (self._missing << ahead | (1 << ahead) - 2) & ALL if ahead > 0 else 0
+        self._last = number
+
+
+class Losses:
+    """Counts the lost frames of each component of one vehicle, and tells which loses many.
+
+    Parameters
+    ----------
+    system : int
+    announcer, timers
+        The link's.
+    """
+
+    def __init__(self, system: int, announcer: Announcer, timers: Timers) -> None:
+        self._system, self._announcer, self._timers = system, announcer, timers
+        self._numbers: dict[int, Numbers] = {}
+        self._before: dict[int, tuple[int, int]] = {}
+
+    def count(self, component: int, number: int, t_us: int) -> None:
+        """Take note of a frame's number."""
+        numbers = self._numbers.get(component)
+        if numbers is None:
+            if len(self._numbers) >= WATCHED:
+                return
+            if not self._numbers:
+                self._timers.every("losses", LOOK_US, self._look, t_us + LOOK_US)
+            numbers = self._numbers[component] = Numbers(number)
+        numbers.count(number)
+
+    def of(self, component: int) -> int:
+        """Return how many frames of a component are lost."""
+        numbers = self._numbers.get(component)
+        return 0 if numbers is None else numbers.lost
+
+    def _look(self, _: int) -> None:
+        for component, numbers in self._numbers.items():
+            heard, lost = self._before.get(component, (0, 0))
+            self._before[component] = numbers.heard, numbers.lost
+            heard, lost = numbers.heard - heard, numbers.lost - lost
+            if lost >= LEAST and lost > MANY * (heard + lost):
+                text = f"more than {MANY:.0%} of the frames of {self._system}:{component} are lost"
+                self._announcer.state(f"losses {component}", text, MAV_SEVERITY.WARNING)
+            elif heard and not lost:
+                self._announcer.forget(f"losses {component}")
