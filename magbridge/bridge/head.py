@@ -73,6 +73,7 @@ def declarations(
             "match": ",".join(f"{field}={value}" for field, value in one.match.items()),
             "scale": one.scale,
             "offset": one.offset,
+            "component": one.component or 0,
         }
         for name, one in telemetry.items()
     ]

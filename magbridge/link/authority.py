@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from magbridge.config import Telemetry
 from magbridge.link.announcer import Announcer
-from magbridge.mavlink import Message
+from magbridge.mavlink import Message, Source
 from magbridge.mavlink.dialect import MAV_SEVERITY, MAV_TYPE
 
 __all__ = ["Authority", "Sources"]
@@ -51,9 +51,6 @@ class Authority:
 class Sources:
     """Lets each telemetry parameter come from one component at a time, and tells where two send it.
 
-    Without a ``component`` in the configuration, that is the first heard, but the autopilot goes before all
-    others; another takes its place when the parameter has become stale.
-
     Parameters
     ----------
     telemetry : mapping of str to Telemetry
@@ -66,26 +63,21 @@ class Sources:
     def __init__(
         self, telemetry: Mapping[str, Telemetry], system: int, autopilot: int, announcer: Announcer
     ) -> None:
-        self._system, self._autopilot, self._announcer = system, autopilot, announcer
-        self._only = {name: one.component for name, one in telemetry.items()}
-        self._patience_us = {name: round(one.max_age * 1e6) for name, one in telemetry.items()}
-        self._now: dict[str, tuple[int, int]] = {}  # the component that counts, and when it was heard (µs)
+        self._system, self._announcer = system, announcer
+        self._of = {
+            name: Source(autopilot, round(one.max_age * 1e6), one.component)
+            for name, one in telemetry.items()
+        }
 
     def admit(self, name: str, component: int, time_us: int) -> bool:
         """Say whether a value of the parameter `name` counts that came from `component`."""
-        known, heard_us = self._now.get(name, (component, time_us))
-        wanted = self._only[name]
-        silent = time_us - heard_us > self._patience_us[name]
-        if wanted is not None:
-            counts = component == wanted
-        else:
-            counts = component in (known, self._autopilot) or silent
-        if not counts:
+        source = self._of[name]
+        before = source.component
+        if not source.admit(component, time_us):
             text = f"{name} also from {self._system}:{component}: not used"
             self._announcer.state(f"source {name} {component}", text, MAV_SEVERITY.WARNING)
             return False
-        if known != component:
-            text = f"{name} now from {self._system}:{component}, not {known}"
+        if component != before and before is not None:
+            text = f"{name} now from {self._system}:{component}, not {before}"
             self._announcer.state(f"source {name}", text, MAV_SEVERITY.WARNING)
-        self._now[name] = component, time_us
         return True

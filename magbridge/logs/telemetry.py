@@ -25,7 +25,6 @@ that the log has a source for. Damaged bytes are skipped and counted in the attr
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import chain
 from math import isclose, isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,9 +38,9 @@ from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_columns import whole
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction
-from magbridge.logs.telemetry_survey import Survey, survey
+from magbridge.logs.telemetry_survey import AUTOPILOT, Survey, survey
 from magbridge.logs.telemetry_writer import FileWriter
-from magbridge.mavlink import LogReader, Record, spec
+from magbridge.mavlink import LogReader, Message, Record, Source, spec
 from magbridge.records import Channel
 
 if TYPE_CHECKING:
@@ -125,6 +124,12 @@ class Rows:
         for one in survey.declared:
             if one.message != self._source:
                 self._declared.setdefault(one.message, []).append((self._slot[one.column], one.find))
+        self._sources = {  # as live: of several components that send a value, one counts
+            self._slot[column]: Source(
+                AUTOPILOT, round(1e6 * survey.attrs.get(f"telemetry.{column}.max_age", MAX_AGE)), wanted
+            )
+            for column, wanted in survey.wanted.items()
+        }
         aged = [one for one in survey.columns if survey.ours and AGE + one in survey.columns]
         self._aged = [(self._slot[AGE + one], self._slot[one]) for one in aged]
         self._to_step_us = survey.stepped_us
@@ -133,30 +138,36 @@ class Rows:
     def put(self, record: Record) -> None:
         """Take the next record of the log."""
         message = record.message
-        number, payload = message.id, message.payload
+        number = message.id
         if number == STEP:
             self._to_step_us -= message["step"]
         if message.system != self._survey.system:
             return
         if not (self._survey.ours and record.channel == Channel.SENT):
-            if number == NAMED.id:
-                _, value, letters = NAMED.struct.unpack(payload)
-                for slot, scale, offset in self._named.get(letters, ()):
-                    self._note(record.time_us, slot, value * scale + offset)
-            mine = self._survey.senders.get(number) == message.component
-            values = self._tables.get(number, ()) if mine else ()
-            for slot, get in chain(values, self._declared.get(number, ())):
-                if (known := get(payload)) is not None:
-                    self._note(record.time_us, slot, known)
+            self._take(message, record.time_us)
         if number == self._source and message.component == self._survey.component:
-            columns = self._make(payload)
+            columns = self._make(message.payload)
             for one in self._counted:
-                exact = one.find(payload)
+                exact = one.find(message.payload)
                 if exact is not None and isclose(exact, columns.get(one.column, nan), rel_tol=SINGLE):
                     columns[one.column] = exact
             self._row(record.time_us, columns)
         elif number == FIELD and self.rows:
-            self._correct(correction(payload))
+            self._correct(correction(message.payload))
+
+    def _take(self, message: Message, time_us: int) -> None:
+        """Note the telemetry in a message, from the component that each column is taken from."""
+        number, payload, component = message.id, message.payload, message.component
+        if self._survey.senders.get(number) == component:
+            for slot, get in self._tables.get(number, ()):
+                self._note(time_us, slot, get(payload))
+        found = [(slot, find(payload)) for slot, find in self._declared.get(number, ())]
+        if number == NAMED.id:
+            _, raw, letters = NAMED.struct.unpack(payload)
+            found += [(slot, raw * scale + offset) for slot, scale, offset in self._named.get(letters, ())]
+        for slot, value in found:
+            if value is not None and self._sources[slot].admit(component, time_us):
+                self._note(time_us, slot, value)
 
     def _note(self, time_us: int, slot: int, value: float) -> None:
         self._values[slot], self._stamps[slot] = value, time_us

@@ -86,13 +86,15 @@ def _telemetry(
                 if value.column in survey.columns and value.column not in raw
             ]
     named = np.flatnonzero(sent & (block.number == NAMED.id))
+    senders = block.component[named]
     if len(named):
         payloads = block.payloads(named)
         offset = NAMED.fields["value"].offset
         values = payloads[:, offset : offset + 4].copy().view("<f4")[:, 0].astype(np.float64)
         letters = payloads[:, NAMED.fields["name"].offset :]
         for name, columns in survey.named.items():
-            here = np.flatnonzero((letters == np.frombuffer(name, np.uint8)).all(axis=1))
+            here = (letters == np.frombuffer(name, np.uint8)).all(axis=1)
+            here = np.flatnonzero(here & (senders == survey.speakers.get(name, -1)))
             if len(here):
                 which = named[here]
                 found += [

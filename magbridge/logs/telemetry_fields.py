@@ -109,6 +109,8 @@ class Declared(Value):
         Id of the message that holds it.
     match : dict of str to str
         Values that other fields of the message must have, as text.
+    component : int or None
+        The only sender that counts.
     """
 
     def __init__(self, said: Message) -> None:
@@ -117,6 +119,7 @@ class Declared(Value):
         self._unknown = ()
         layout = spec(said["message"])
         self.message = layout.id
+        self.component: int | None = said["component"] or None
         self.match = dict(part.split("=", 1) for part in said["match"].split(",") if part)
         self._others = [(layout.fields[name], text) for name, text in self.match.items()]
 

@@ -22,7 +22,7 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.blocks import Block, blocks
 from magbridge.records import Channel
 
-__all__ = ["Survey", "survey"]
+__all__ = ["AUTOPILOT", "Survey", "survey"]
 
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
@@ -54,6 +54,11 @@ class Survey:
         Column to unit, of each column that has a value at least once.
     named : dict of bytes to list of (str, float, float)
         ``NAMED_VALUE_FLOAT.name`` to columns, each with scale and offset.
+    speakers : dict of bytes to int
+        ``NAMED_VALUE_FLOAT.name`` to the component that it is taken from: the autopilot (1), else who sent
+        most.
+    wanted : dict of str to int or None
+        Each telemetry column, with the only component that it may come from, if there is one.
     declared : list of Declared
         Columns that the log itself declares to be in other messages.
     attrs : dict
@@ -71,6 +76,7 @@ class Survey:
         self._senders: dict[int, Counter[tuple[int, int]]] = {}
         self._known: dict[tuple[int, int, int], dict[str, str]] = {}
         self._named: dict[int, dict[bytes, str]] = {}
+        self._speakers: dict[tuple[int, bytes], Counter[int]] = {}
         self._declared: dict[str, Declared] = {}
         self._open: dict[tuple[int, int, int], list[Value]] = {}
         self._asked: dict[str, float] = {}
@@ -131,9 +137,16 @@ class Survey:
     def _name(self) -> None:
         """Map each ``NAMED_VALUE_FLOAT`` to the columns that the log declares, else to its name."""
         self.named: dict[bytes, list[tuple[str, float, float]]] = {}
+        self.speakers = {
+            letters: AUTOPILOT if AUTOPILOT in senders else senders.most_common(1)[0][0]
+            for (system, letters), senders in self._speakers.items()
+            if system == self.system
+        }
         self.declared: list[Declared] = []
+        self.wanted: dict[str, int | None] = {}
         notes: list[str] = []
         for one in self._declared.values():
+            self.wanted[one.column] = one.component
             self.columns[one.column] = one.unit
             if self.ours and one.message not in (RAW, FIELD):
                 self.columns[AGE + one.column] = "s"
@@ -150,6 +163,7 @@ class Survey:
                         f"NAMED_VALUE_FLOAT {name!r} is read as {own}: the log has a {name} of its own"
                     )
                 self.named[letters] = [(own, 1.0, 0.0)]
+                self.wanted[own] = None
                 self.columns.setdefault(own, "1")
         if notes:
             self.attrs["notes"] = "\n".join(notes)
@@ -194,9 +208,11 @@ class Survey:
             return self._values((system, component, number), block.payloads(which))
         if number == NAMED.id:
             letters = block.payloads(which)[:, NAMED.fields["name"].offset :]
-            for k in np.unique(letters, axis=0, return_index=True)[1].tolist():
-                message = block.message(int(which[k]))
-                self._named.setdefault(system, {})[bytes(letters[k])] = message["name"]
+            _, first, counts = np.unique(letters, axis=0, return_index=True, return_counts=True)
+            for k, n in zip(first.tolist(), counts.tolist(), strict=True):
+                name = bytes(letters[k])
+                self._named.setdefault(system, {})[name] = block.message(int(which[k]))["name"]
+                self._speakers.setdefault((system, name), Counter())[component] += n
             return False
         if number in (RAW, FIELD, COLUMN, STEP):
             known = self._known.setdefault((system, component, number), {})

@@ -6,6 +6,7 @@ from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
 from magbridge.mavlink.secrets import SECRET
 from magbridge.mavlink.signing import Signing, Stream, load_key, readable_by_all
+from magbridge.mavlink.source import Source
 from magbridge.mavlink.tape import TapeReader, TapeWriter
 from magbridge.mavlink.tlog import LogReader, Record, pack_record, pack_records
 
@@ -18,6 +19,7 @@ __all__ = [
     "Message",
     "Record",
     "Signing",
+    "Source",
     "Spec",
     "Stream",
     "TapeReader",

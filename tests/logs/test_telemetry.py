@@ -152,6 +152,32 @@ def test_a_bridges_own_log(tmp_path: Path) -> None:
     assert not {"mag", "sensor_supply"} & set(back.data_vars)
 
 
+@pytest.mark.parametrize(("wanted", "expected"), [(0, [7, 1, 2]), (99, [7, 8, 9])])
+def test_of_two_components_a_bridges_log_is_read_as_it_was_corrected(
+    tmp_path: Path, wanted: int, expected: list[float]
+) -> None:
+    """The autopilot's value from the first on, unless the configuration names another component."""
+    log, ours = Log(), (1, 191)
+    log.say(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    for column, what in (
+        ("battpos", {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=battpos"}),
+        ("ballast", {"message": "DEBUG_FLOAT_ARRAY", "field": "data[0]", "match": "array_id=7"}),
+    ):
+        log.say(
+            0, "MAG_COLUMN", by=ours, channel=Channel.STATE, column=column, scale=1, component=wanted, **what
+        )
+    for k in range(3):
+        for component, value in ((99, 7 + k), (1, k)):
+            by: dict[str, Any] = {"by": (1, component), "channel": Channel.LINK}
+            if k or component != 1:
+                log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=value, **by)
+                log.say(k, "DEBUG_FLOAT_ARRAY", array_id=7, data=[value, *[0] * 57], **by)
+        log.say(k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S, x=1.0, y=2.0, z=3.0)
+    back = log.read(tmp_path)
+    np.testing.assert_array_equal(back["battpos"], expected)
+    np.testing.assert_array_equal(back["ballast"], expected)
+
+
 @pytest.mark.parametrize("step", [-3600 * S, 3600 * S, 50 * 31_557_600 * S])
 def test_a_clock_that_is_set_costs_no_rows_and_dates_those_before(tmp_path: Path, step: int) -> None:
     """The records' stamps go on; what is published is dated by the clock as it is set."""

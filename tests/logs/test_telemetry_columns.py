@@ -71,6 +71,18 @@ def test_a_named_value_never_takes_a_column_with_a_source(tmp_path: Path) -> Non
     assert any("named_heading" in note for note in noted(back.attrs))
 
 
+def test_a_named_value_is_the_autopilots_where_two_send_it(tmp_path: Path) -> None:
+    log = Log()
+    for k in range(5):
+        log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=k)
+        log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=-9.0, component=99)
+        log.say(k, "NAMED_VALUE_FLOAT", name="ballast", value=200.0 + k, component=99)
+        log.say(k, "RAW_IMU", xmag=100 + k)
+    back = logs.read(log.write(tmp_path))
+    np.testing.assert_array_equal(back["battpos"], range(5))
+    np.testing.assert_array_equal(back["ballast"], 200.0 + np.arange(5))
+
+
 def test_a_gimbals_attitude_is_not_the_vehicles(tmp_path: Path) -> None:
     log = Log()
     for k in range(5):
