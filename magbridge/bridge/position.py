@@ -78,9 +78,9 @@ class Position:
         if abs(utc_us - self._vector_us) > MAX_AGE_US:
             from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
 
-            assert self._where is not None
-            latitude, longitude, depth = self._where
-            north, east, down = igrf(longitude, latitude, depth, utc_us * 1e-6)[0].tolist()
+            assert self.where is not None
+            latitude, longitude = self.where
+            north, east, down = igrf(longitude, latitude, self._depth, utc_us * 1e-6)[0].tolist()
             self._vector, self._vector_us = (north, east, down), utc_us
         return self._vector
 
