@@ -55,8 +55,12 @@ PATIENCE: Final = 6
 FASTEST: Final = 12
 """Samples in a row that lie on one side of the median before its steps grow, and by how many times at most:
 twenty times the noise is learned in half the samples, and white noise passes for more no oftener."""
-ENOUGH: Final = 100
-"""Second differences from which on their median says something of the noise."""
+SWIFT: Final = 60
+"""The n-th step is at least SWIFT/n such factors: at the start the noise is learned in a few samples."""
+ENOUGH: Final = 5
+UNSURE: Final = 4.0
+"""Second differences from which on their median says something of the noise; after n it may be 1 + UNSURE/n
+times as far off as later."""
 INNOVATION: Final = 4.0 / 3.0 / (6.0 * 0.6745**2)
 """Variance of an innovation over the square of that median. White noise of variance v gives innovations from
 a level with gain 1/2 the variance 4/3 v, second differences 6 v, and the median of a normal variable's
@@ -64,7 +68,8 @@ absolute value is 0.6745 sigma."""
 CLIP: Final = 16.0
 """Squares beyond this many times the usual (of slopes) or the gate (of outliers) count as this much."""
 NOISY: Final = 2.5
-"""How many times the scatter of innovations that the calibration's noise gives is added to sigma."""
+"""How many times the scatter of innovations that the calibration's noise gives is added to sigma, until it is
+half of that."""
 LOUD: Final = 5.0
 """How many times is reported."""
 REPEATS: Final = 256
@@ -142,6 +147,7 @@ class Plausibility:
         self._values: tuple[float, ...] = ()
         self._candidate, self._agreed = nan, 0
         self._bends = self._accepted = 0
+        self._noisy = False
         self._run, self._rising = 0, False  # of second differences on one side of their median
         self._moved = self._largest = 0.0
         self._jumps = self._wrong = 0
@@ -319,7 +325,7 @@ class Plausibility:
             rising = bend > self._median
             self._run = self._run + 1 if rising == self._rising else 0
             self._rising = rising
-            step = STEP ** min(max(self._run - PATIENCE, 1), FASTEST)
+            step = STEP ** max(min(max(self._run - PATIENCE, 1), FASTEST), SWIFT // (self._bends + 1))
             self._median *= step if rising else 1.0 / step
             self._variance = INNOVATION * self._median * self._median
             self._bends += 1
@@ -365,9 +371,12 @@ class Plausibility:
                 more = self._largest * self._largest
             else:
                 self._moved = self._largest = 0.0
-        if self._known and self._bends > ENOUGH and variance > NOISY * NOISY * self._floor:
-            more += variance
-            if variance > LOUD * LOUD * self._floor:
+        if self._known and self._bends >= ENOUGH:
+            ratio = (variance / self._floor) ** 0.5
+            self._noisy = ratio > NOISY * (0.5 if self._noisy else 1.0 + UNSURE / self._bends)
+            if self._noisy:
+                more += variance
+            if ratio > LOUD * (1.0 + UNSURE / self._bends):
                 self._notify("noise", f"noise of {variance**0.5:.0f} nT: sigma is widened")
         return more
 

@@ -182,6 +182,22 @@ def test_more_noise_than_the_calibration_s_widens_sigma_within_a_hundred_samples
     assert len(told) == len(set(told))
 
 
+@pytest.mark.parametrize("times", [5.0, 20.0])
+def test_noise_from_the_start_on_widens_sigma_within_ten_samples(times: float) -> None:
+    wrong = []
+    for seed in range(8):
+        flight = Flight(n=2000, seed=seed)
+        before = np.linalg.norm(flight.raw, axis=1)
+        flight.raw += np.random.default_rng(seed).normal(0.0, times, flight.raw.shape)
+        flags, sigma, _ = flight.judge()
+        wrong.append((flags == 0) & (np.abs(np.linalg.norm(flight.raw, axis=1) - before) > 3.0 * sigma))
+    assert np.mean(wrong) < 0.006
+    assert np.mean(np.array(wrong)[:, 10:]) < 0.004
+    _, quiet, told = Flight(n=2000).judge()
+    assert (quiet[50:] == SIGMA).all()
+    assert told == []
+
+
 def test_without_a_position_only_what_is_nowhere_on_earth_is_wrong() -> None:
     flight = Flight(n=50)
     assert not flight.judge(reference=nan)[0].any()
