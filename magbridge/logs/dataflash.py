@@ -232,6 +232,8 @@ def _decoded(data: Bytes, kind: _Kind, at: IndexArray, wanted: Collection[str]) 
     fields, texts, offset = {}, {}, HEAD
     for name, letter in zip(kind.columns, kind.letters, strict=False):
         layout = np.dtype(LETTERS.get(letter, "V1"))
+        if letter not in LETTERS or offset + layout.itemsize > kind.length:
+            break  # how long a field of an unknown letter is, and so where the next begins, is not known
         if name in wanted and layout.kind in "iuf":
             fields[name] = _gather(data, at, layout, offset).astype(np.float64) / OWN_SCALE.get(letter, 1.0)
         elif name in wanted and layout.kind == "S":

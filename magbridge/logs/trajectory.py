@@ -92,7 +92,10 @@ def chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Seque
     columns, left_out = _columns(path, file, dimension, clock)
     units = {one.name: str(getattr(one.variable, "units", "1")) for one in columns}
     meanings = {one.name: str(getattr(one.variable, "long_name", "")) for one in columns}
-    attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
+    try:
+        attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
+    except AttributeError as error:  # netCDF4's, of a damaged attribute
+        raise FormatError(path, f"its attributes cannot be read: {error}") from None
     if "heading_reference" not in attrs and any(_is_magnetic(one) for one in columns):
         attrs["heading_reference"] = "magnetic"
     for row in range(0, total, rows):

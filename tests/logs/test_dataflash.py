@@ -73,6 +73,19 @@ def test_a_log_in_which_no_record_joins_another_holds_none(records: int, tmp_pat
     assert (ours.records, ours.skipped) == ({}, 90 * records)
 
 
+def test_of_a_record_with_a_field_of_unknown_length_what_stands_before_it_is_read(tmp_path: Path) -> None:
+    """And nothing beyond the record's end, whatever a damaged description says."""
+    log = Log({"MAG": (14, "Qhh", "TimeUS,MagX,MagY")})
+    odd = described(14, 15, "MAG", "Qh?nZ", "TimeUS,MagX,Odd,MagY,MagZ")
+    rows = b"".join(log.record("MAG", 1000 * k, k, -k) for k in range(5))
+    path = tmp_path / "log.bin"
+    path.write_bytes(described(128, 89, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns") + odd + rows)
+    ours = read_binary(path, {"MAG": {"TimeUS", "MagX", "MagY", "MagZ"}}).records["MAG"]
+    assert ours.fields.keys() == {"TimeUS", "MagX"}
+    assert ours.fields["MagX"].tolist() == [0, 1, 2, 3, 4]
+    assert not ours.texts
+
+
 @pytest.mark.real
 def test_a_real_log_is_as_pymavlink_reads_it(real_data: Path) -> None:
     path = real_data / "ardusub" / "small.BIN"
