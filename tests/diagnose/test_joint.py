@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from posed import right
 
-from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.inference.joint import RIDGE, fit_joint
 
 ROWS = 300
 
@@ -20,4 +21,19 @@ def test_numbers_of_one_size_that_say_the_same_share_what_they_say() -> None:
     twice = [np.column_stack([x, x, 0.0 * x]) for x in (a, b)]
     fit = fit_joint(problem, [x.__getitem__ for x in twice], 1, spectra=[np.ones((1, 3)), np.ones((1, 3))])
     np.testing.assert_allclose(fit.coefficients, [1.5, 1.5, 0.0, -1.0, -1.0, 0.0], atol=0.1)
-    assert np.isfinite(fit.log_likelihood)
+
+
+def test_a_likelihood_is_the_gaussian_s_less_what_the_priors_cost() -> None:
+    """White noise at its likeliest size, and an effect that no noise with a memory takes for its own."""
+    rng = np.random.default_rng(5)
+    column = rng.choice([-1.0, 1.0], (ROWS, 1))
+    y = 3.0 * column[:, 0] + rng.normal(size=ROWS)
+    problem = replace(right(ROWS), residual=y)
+    fits = [fit_joint(problem, [], 1), fit_joint(problem, [column.__getitem__], 1)]
+    naive = [
+        -0.5 * ROWS * (np.log(2.0 * np.pi * np.mean(left**2)) + 1.0) for left in (fit.left for fit in fits)
+    ]
+    gained = fits[1].log_likelihood - fits[0].log_likelihood
+    assert gained == pytest.approx(naive[1] - naive[0] - 0.5 * RIDGE * fits[1].coefficients[0] ** 2, rel=0.05)
+    assert gained > 200.0
+    assert fits[1].coefficients[0] == pytest.approx(3.0, abs=0.2)

@@ -1,0 +1,102 @@
+"""The noise of residuals: its size and memory as it was drawn, whatever the outliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise, memory
+
+N = 4000
+STEPS = np.r_[np.inf, np.ones(N - 1)]
+
+
+def drawn(rho: float, sigma: float = 4.0, seed: int = 1) -> FloatArray:
+    """Draw an AR(1) of that 1-sigma."""
+    rng = np.random.default_rng(seed)
+    e = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(0.0, sigma, N + 500))
+    return np.asarray(e[500:])
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.4, 0.9])
+def test_size_and_memory_are_those_that_were_drawn(rho: float) -> None:
+    noise = estimate_noise(drawn(rho), STEPS, 0.0)
+    assert noise.autocorrelation == pytest.approx(rho, abs=0.03)
+    assert noise.sigma == pytest.approx(4.0, rel=0.08)
+    assert noise.white == 0.0
+    assert noise.shape == (noise.autocorrelation, 0.0)
+
+
+def test_white_noise_has_no_memory_and_few_samples_tell_of_none() -> None:
+    assert estimate_noise(drawn(0.0), STEPS, 0.0).autocorrelation == 0.0
+    short = slice(0, 30)
+    assert estimate_noise(drawn(0.9)[short], STEPS[short], 0.0).autocorrelation == 0.0
+    enough = slice(0, 60)
+    assert estimate_noise(drawn(0.9)[enough], STEPS[enough], 0.0).autocorrelation > 0.4
+
+
+def test_neighbours_across_a_gap_are_no_neighbours() -> None:
+    """Two interleaved halves, each of which turns its sign at every gap."""
+    e = drawn(0.95)
+    steps = np.where(np.arange(N) % 2 == 0, np.inf, 1.0)
+    e[2::4] *= -1.0
+    e[3::4] *= -1.0
+    assert estimate_noise(e, steps, 0.0).autocorrelation == pytest.approx(0.95, abs=0.03)
+
+
+def test_a_walk_is_bounded_and_perfect_data_have_a_sigma_above_zero() -> None:
+    walk = estimate_noise(np.cumsum(drawn(0.0)), STEPS, 0.0)
+    assert walk.autocorrelation == 0.99
+    perfect = estimate_noise(np.zeros(N), STEPS, 0.0)
+    assert 0.0 < perfect.sigma < 1e-6
+    assert perfect.rejected == 0
+
+
+def test_outliers_are_left_out_and_counted() -> None:
+    e = drawn(0.0)
+    e[100::200] += 400.0
+    noise = estimate_noise(e, STEPS, 0.0)
+    assert noise.rejected == 20
+    assert noise.weight is not None
+    assert np.flatnonzero(noise.weight == 0.0).tolist() == list(range(100, N, 200))
+    assert noise.sigma == pytest.approx(4.0, rel=0.05)
+    assert noise.autocorrelation == 0.0
+    assert estimate_noise(drawn(0.0), STEPS, 0.0).weight is None
+
+
+def test_every_number_that_was_fitted_counts() -> None:
+    few = slice(0, 100)
+    plain, fitted = (estimate_noise(drawn(0.0)[few], STEPS[few], free).sigma for free in (0.0, 36.0))
+    assert fitted / plain == pytest.approx(1.0 / 0.8)
+    assert estimate_noise(drawn(0.0)[few], STEPS[few], 500.0).sigma > fitted, "more numbers than samples"
+
+
+def test_what_a_fit_has_absorbed_of_slow_noise_is_given_back() -> None:
+    """Residuals of a straight line in each of many short runs, beside what was drawn."""
+    e, runs = drawn(0.9), np.arange(N) // 40
+    X = np.column_stack([np.ones(40), np.linspace(-1.0, 1.0, 40)])
+    H = X @ np.linalg.inv(X.T @ X) @ X.T
+    left = np.concatenate([part - H @ part for part in e.reshape(-1, 40)])
+    steps = np.where(np.diff(runs, prepend=-1) > 0, np.inf, 1.0)
+    C = 16.0 * 0.9 ** np.abs(np.subtract.outer(np.arange(40), np.arange(40)))
+    missing = C - (np.eye(40) - H) @ C @ (np.eye(40) - H).T
+    doubt = float(np.mean(np.diag(missing))), float(np.mean(np.diag(missing, 1)))
+    without, given = (estimate_noise(left, steps, 0.0, d).autocorrelation for d in ((0.0, 0.0), doubt))
+    assert without < 0.85
+    assert given == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_slow_part_is_believed_only_where_it_is_likelier() -> None:
+    alone = estimate_noise(drawn(0.5), STEPS, 0.0)
+    assert memory(drawn(0.5), STEPS, alone) is alone
+    short = NoiseModel(4.0, 0.19)
+    assert memory(drawn(0.19), STEPS, short) is short
+    both = drawn(0.98, 8.0) + drawn(0.0, 4.0, seed=2)
+    found = memory(both, STEPS, estimate_noise(both, STEPS, 0.0))
+    assert found.autocorrelation == pytest.approx(0.98, abs=0.01)
+    assert found.white == pytest.approx(0.2, abs=0.05)
+    again = estimate_noise(both, STEPS, 0.0, shape=found.shape)
+    assert again.shape == found.shape
+    assert again.sigma == pytest.approx(80.0**0.5, rel=0.15)

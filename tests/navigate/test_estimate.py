@@ -1,0 +1,110 @@
+"""The estimate's own rules: what a start forgets, when there are many hypotheses, how wide a search is."""
+
+from __future__ import annotations
+
+from math import hypot
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from voyages.simulated import Map, blocks, synthetic, voyage
+
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.estimate import SPREADS, Estimate
+from magbridge.navigate.integrity import Verdict
+from magbridge.navigate.model import Block
+from magbridge.navigate.options import Options
+from magbridge.navigate.record import State
+
+HOUR_US = 3_600_000_000
+
+
+def begun(grid: AnomalyGrid, options: Options, first: Block, sigma: float) -> Estimate:
+    estimate = Estimate(grid, options)
+    estimate.start(first.time_us - 1, sigma)
+    return estimate
+
+
+@pytest.fixture(scope="module")
+def measured(grid: AnomalyGrid, options: Options) -> list[tuple[Block, float]]:
+    return list(blocks(voyage(grid, options, 3, hours=1.0), grid, options))
+
+
+def test_a_start_forgets_what_dead_reckoning_had_gathered(
+    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]]
+) -> None:
+    first = measured[0][0]
+    fresh = begun(grid, options, first, 30.0)
+    late = Estimate(grid, options)
+    late.start(first.time_us - 24 * HOUR_US, 30.0)
+    late.predict(first.time_us - 1, 0.0)
+    assert late.P[0, 0] > 100.0 * fresh.P[0, 0]
+    late.start(first.time_us - 1, 30.0)
+    for block, metres in measured[:40]:
+        for one in (fresh, late):
+            one.update(block, metres)
+        assert late.state is fresh.state
+    np.testing.assert_array_equal(late.P, fresh.P)
+    for one in (fresh, late):
+        one.correct(one.x[:2] + 1e4, 30.0)
+    assert late.jumps[-1] == fresh.jumps[-1], "and so is what dead reckoning alone is allowed"
+    assert fresh.jumps[-1].allowed < 100.0
+
+
+@pytest.mark.parametrize(("sigma", "many"), [(5.0, False), (2_000.0, True)])
+def test_a_wide_start_has_many_hypotheses_and_a_narrow_one_has_one(
+    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]], sigma: float, *, many: bool
+) -> None:
+    estimate = begun(grid, options, measured[0][0], sigma)
+    block, metres = measured[0]
+    there = grid.look_up(block.longitude, block.latitude, block.depth).anomaly
+    seen = estimate.update(block._replace(anomaly=there), metres)
+    assert (estimate.hypotheses > 100) == many
+    assert (estimate.hypotheses == 1) != many
+    assert seen.accepted
+    block, metres = measured[1]
+    assert not estimate.update(block._replace(anomaly=block.anomaly + 1e4), metres).accepted
+
+
+def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
+    grid: AnomalyGrid, options: Options
+) -> None:
+    """Over rock five times as rough as the map's, which the map does not explain at any place or level."""
+    elsewhere = synthetic(Map(150, 1500), 9)
+    estimate, widths = None, []
+    for block, metres in blocks(voyage(elsewhere, options, 5, hours=0.5), grid, options):
+        estimate = estimate or begun(grid, options, block, 200.0)
+        jumps = len(estimate.jumps)
+        estimate.update(block, metres)
+        assert not estimate.valid
+        if len(estimate.jumps) > jumps:
+            assert estimate.jumps[-1].cause == Verdict.NOWHERE.value
+            assert estimate.state is State.LOST
+            widths.append((float(estimate.P[0, 0]) ** 0.5, estimate.jumps[-1].allowed))
+        if len(widths) == len(SPREADS):
+            break
+    expected = [
+        hypot(spread * grid.correlation_length, allowed)
+        for spread, (_, allowed) in zip(SPREADS, widths, strict=True)
+    ]
+    assert [width for width, _ in widths] == pytest.approx(expected, rel=1e-6)
+    assert max(widths)[0] > 3.5 * min(widths)[0]
+
+
+def test_rivals_of_a_filter_that_was_confirmed_begin_half_as_far_away(
+    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]]
+) -> None:
+    """A start wider than they reach confirms it; either way they reach what dead reckoning may be off."""
+    first = measured[0][0]
+    length = grid.correlation_length
+    for sigma, confirmed in ((50.0, False), (1.1 * length, True)):
+        estimate = begun(grid, replace(options, start_sigma=sigma), first, sigma)
+        for block, metres in measured:
+            estimate.update(block, metres)
+            if estimate._monitor is not None:
+                break
+        assert estimate._monitor is not None
+        spread = float(estimate._monitor.elsewhere.moments()[1][0, 0]) ** 0.5
+        alone = float(estimate._alone[0, 0]) ** 0.5
+        reach = max(alone, 0.5 * length) if confirmed else max(alone, length)
+        assert spread == pytest.approx(hypot(reach, float(estimate.P[0, 0]) ** 0.5), rel=0.2)

@@ -1,0 +1,224 @@
+"""Small changes made to the heart of magbridge, one at a time, and whether its tests see them.
+
+    python3 tools/mutate.py                          ten changes to each module of the table below
+    python3 tools/mutate.py link/fixes -n 30         thirty to one
+    python3 tools/mutate.py --seed 2 -n 5            others
+
+A comparison is turned, an operator exchanged, a number changed, a statement left out; then the tests of the
+module's own room run, until the first that fails. What lives is printed with its line: either nothing tests
+that, or the change changes nothing that matters, which only a reader can tell. Nothing is written: the change
+is made as the module is imported, in a fork of a process that has imported the libraries.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import importlib
+import io
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rich.console import Console
+from terminal import command_line, table
+
+ROOT = Path(__file__).resolve().parents[1]
+TESTS = {
+    "link/fixes": "link/test_fixes.py",
+    "link/telemetry": "link/test_telemetry.py",
+    "sensors/clock": "sensors/test_clock.py",
+    "bridge/sensor_line": "bridge/test_sensor_line.py",
+    "calibration/fitting/solve": "calibration/test_solve.py calibration/test_fit.py",
+    "calibration/fitting/noise": "calibration/test_noise.py calibration/test_fit.py",
+    "diagnose/inference/evidence": "diagnose/test_evidence.py",
+    "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py navigate/test_navigator.py",
+    "plausibility": "test_plausibility.py test_correction.py",
+    "direction": "test_direction.py",
+}
+"""The tests that have to see a change to each module."""
+SLOWER = 5.0
+"""Times the tests' own duration after which a change counts as seen: it made them hang."""
+LIBRARIES = (
+    "msgspec",
+    "numpy",
+    "pytest",
+    "scipy.linalg",
+    "scipy.optimize",
+    "scipy.stats",
+    "xarray",
+)
+OTHER: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt,
+    ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is,
+    ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
+    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.Mod: ast.Mult, ast.FloorDiv: ast.Mult,
+    ast.Pow: ast.Mult, ast.LShift: ast.RShift, ast.RShift: ast.LShift, ast.MatMult: ast.Add,
+}  # fmt: skip
+
+
+def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str]]:
+    """Yield every node that may be changed, and how: an operator, a number, a condition or a statement."""
+    skipped: set[ast.AST] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.AnnAssign | ast.arg):
+            skipped.update(ast.walk(node.annotation) if node.annotation else ())
+        if isinstance(node, ast.FunctionDef):
+            skipped.update(ast.walk(node.returns) if node.returns else ())
+        if isinstance(node, ast.JoinedStr) or _is_name_list(node) or _is_for_types(node):
+            skipped.update(ast.walk(node))
+    for node in ast.walk(tree):
+        if node in skipped:
+            continue
+        match node:
+            case ast.Compare() if type(node.ops[0]) in OTHER:
+                yield node, "operator"
+            case ast.BinOp() | ast.AugAssign() | ast.BoolOp() if type(node.op) in OTHER:
+                yield node, "operator"
+            case ast.UnaryOp(op=ast.Not() | ast.USub()):
+                yield node, "unary"
+            case ast.Constant(value=bool() | int() | float()):
+                yield node, "number"
+            case ast.If() | ast.IfExp() | ast.While():
+                yield node, "condition"
+            case (
+                ast.Expr(value=ast.Call())
+                | ast.Raise()
+                | ast.AugAssign()
+                | ast.Assign(targets=[ast.Attribute()])
+            ):
+                yield node, "statement"
+
+
+def _is_name_list(node: ast.AST) -> bool:
+    return isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__"
+
+
+def _is_for_types(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+
+
+def change(tree: ast.Module, number: int, rng: random.Random) -> tuple[int, str]:
+    """Make the change of that number in a tree; return its line, and what was changed."""
+    node, how = list(changes(tree))[number]
+    before = ast.unparse(node).splitlines()[0]
+    new: Any = node  # of any kind: what is set below exists there
+    match node, how:
+        case ast.Compare(), _:
+            new.ops[0] = OTHER[type(node.ops[0])]()
+        case _, "operator":
+            new.op = OTHER[type(new.op)]()
+        case ast.UnaryOp(op=ast.USub()), _:
+            new.op = ast.UAdd()
+        case ast.UnaryOp(), _:
+            new.operand = ast.UnaryOp(ast.Not(), node.operand)
+        case ast.Constant(value=bool()), _:
+            new.value = not node.value
+        case ast.Constant(), _:
+            new.value = rng.choice([new.value + 1, new.value * 2 or 3, -new.value or 2])
+        case _, "condition":
+            new.test = ast.UnaryOp(ast.Not(), new.test)
+        case _:
+            _leave_out(tree, node)
+            return new.lineno, f"without {before}"
+    ast.fix_missing_locations(tree)
+    return new.lineno, f"{before}  ->  {ast.unparse(node).splitlines()[0]}"
+
+
+def _leave_out(tree: ast.Module, statement: Any) -> None:
+    """Put ``pass`` in place of a statement."""
+    for parent in ast.walk(tree):
+        for _, body in ast.iter_fields(parent):
+            if isinstance(body, list) and statement in body:
+                body[body.index(statement)] = ast.copy_location(ast.Pass(), statement)
+
+
+class Changed(MetaPathFinder, Loader):
+    """Imports one module from a tree instead of its file."""
+
+    def __init__(self, name: str, path: Path, tree: ast.Module) -> None:
+        self.name, self.path, self.tree = name, path, tree
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:  # noqa: ARG002
+        """Answer for that module only."""
+        if fullname != self.name:
+            return None
+        return spec_from_file_location(fullname, self.path, loader=self)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Run the tree."""
+        exec(compile(self.tree, str(self.path), "exec"), module.__dict__)
+
+
+def run(module: str, tests: list[str], tree: ast.Module | None, limit: float) -> str:
+    """Run the tests in a fork with the tree in place of the module; return how they ended."""
+    child = os.fork()
+    if not child:
+        import pytest  # noqa: PLC0415 - imported before the fork
+
+        if tree is not None:
+            name = "magbridge." + module.replace("/", ".")
+            sys.meta_path.insert(0, Changed(name, ROOT / f"magbridge/{module}.py", tree))
+        sink = io.StringIO()
+        with redirect_stdout(sink), redirect_stderr(sink):
+            code = pytest.main([*tests, "-x", "-q", "-n0", "-p", "no:cacheprovider", "-p", "no:randomly"])
+        os._exit(code)
+    until = time.monotonic() + limit
+    while time.monotonic() < until:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return "lives" if status == 0 else "seen"
+        time.sleep(0.02)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return "seen"
+
+
+def main() -> int:
+    """Change each module so many times; print what lives, and the share that was seen."""
+    parser = command_line(__doc__)
+    parser.add_argument("modules", nargs="*", metavar="MODULE", help=f"of {' '.join(TESTS)}")
+    parser.add_argument("-n", type=int, default=10, help="changes to each")
+    parser.add_argument("--seed", type=int, default=1)
+    chosen = parser.parse_args()
+    os.chdir(ROOT)
+    for library in LIBRARIES:
+        importlib.import_module(library)
+    shown = table("Changes", "module", "may be changed", "tried", "seen", left=("module",))
+    tried = seen = 0
+    for module in chosen.modules or TESTS:
+        tests = [f"tests/{one}" for one in TESTS[module].split() if (ROOT / "tests" / one).exists()]
+        whole = ast.parse((ROOT / f"magbridge/{module}.py").read_text())
+        count = len(list(changes(whole)))
+        began = time.monotonic()
+        if run(module, tests, None, 600.0) != "lives":
+            sys.exit(f"{module}: {' '.join(tests)}: fail without a change")
+        limit = 10.0 + SLOWER * (time.monotonic() - began)
+        rng, own = random.Random(f"{chosen.seed} {module}"), 0
+        for number in rng.sample(range(count), min(chosen.n, count)):
+            tree = copy.deepcopy(whole)
+            line, what = change(tree, number, rng)
+            ended = run(module, tests, tree, limit)
+            own += ended == "seen"
+            if ended != "seen":
+                print(f"lives: magbridge/{module}.py:{line}: {what}", flush=True)
+        shown.add_row(module, str(count), str(min(chosen.n, count)), str(own))
+        tried, seen = tried + min(chosen.n, count), seen + own
+    Console().print(shown)
+    print(f"{seen} of {tried} seen, {100 * seen / max(tried, 1):.0f} %")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
