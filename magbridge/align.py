@@ -197,6 +197,10 @@ class Aligner:
 
     Attributes
     ----------
+    tracks : tuple of Track
+        Of the inputs.
+    by_name : dict of str to Track
+        Of the inputs, and of what else is watched.
     late_since_us : int
         µs, not 0 while what comes may have waited, at most since then.
     """
@@ -211,6 +215,15 @@ class Aligner:
         self._before_us = NEVER
         self._before_field, self._before_delay = (nan, nan, nan), (0.0, 0.0, 0.0)
         self._period_us, self._step_us = 0.0, 0
+
+    def watch(self, name: str, max_age: float) -> None:
+        """Follow what the calibration does not need (yet): it makes no sample doubtful."""
+        if name not in self.by_name:
+            self.by_name[name] = Track(Input(name, nan, nan, max_age))
+
+    def follow(self, names: tuple[str, ...]) -> None:
+        """Let the inputs be `names`, in the order of another calibration; each is an input or watched."""
+        self.tracks = tuple([self.by_name[name] for name in names])
 
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
         """Replace the settings, and the ages (s) after which the parameters named in `ages` are stale."""

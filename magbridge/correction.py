@@ -21,8 +21,10 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
 from magbridge.direction import Direction
 from magbridge.field.igrf import magnitude
+from magbridge.field.nearby import HeldField
 from magbridge.field.reference import main_field
 from magbridge.learning import Learner
+from magbridge.learning.model import TEMPERATURE
 from magbridge.plausibility import Plausibility
 from magbridge.records import BEYOND, Corrected, Quality, Reading
 from magbridge.toml import convert
@@ -32,8 +34,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TEMPERATURE", "Correction", "correct_rows"]
 
-TEMPERATURE = "sensor_temperature"
-"""The one parameter that comes with the reading itself, not as telemetry."""
 MAX_AGE = 30.0
 """s after which telemetry is stale, unless :meth:`magbridge.align.Aligner.tune` has said otherwise."""
 
@@ -54,7 +54,7 @@ class Correction:
     def __init__(
         self, calibration: Calibration | None, settings: Align | None = None, learner: Learner | None = None
     ) -> None:
-        self.learner = learner
+        self.learner, self.held_field = learner, HeldField()
         self._given = settings is not None
         calibration = calibration if calibration is not None else identity()
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
@@ -63,7 +63,9 @@ class Correction:
         )
         self.aligner = Aligner(inputs, settings or Align(), calibration.sensor.power_cycle)
         self.names = tuple(one.name for one in inputs)
-        self._wants_temperature = TEMPERATURE in self.names
+        for name in learner.watched if learner is not None else ():
+            self.aligner.watch(name, MAX_AGE)
+        self._wants_temperature = TEMPERATURE in self.aligner.by_name
         self._corrector = Corrector(calibration)
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
         # what has no calibration is not expected to be the Earth's field
@@ -89,8 +91,6 @@ class Correction:
     def telemetry(self, name: str, value: float, time_us: int, *, guessed: bool = False) -> None:
         """Take a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
         self.aligner.telemetry(name, time_us, value, guessed=guessed)
-        if self.learner is not None:
-            self.learner.telemetry(name, value)
 
     def reading(
         self,
@@ -139,7 +139,7 @@ class Correction:
             turned = self.direction.check(sample.time_us, x, y, z)
             quality |= self.direction.flags
         if self.learner is not None:
-            quality |= self._learn(reading, sample, quality, main_field, where, restarted=restarted)
+            quality |= self._learn(sample, quality, main_field, where, restarted=restarted)
             judged += self.learner.variance
         if sample.sigma or sample.spans or judged or turned:
             more = judged + (self._more(sample) if sample.sigma or sample.spans else 0.0)
@@ -150,7 +150,6 @@ class Correction:
 
     def _learn(
         self,
-        reading: Reading,
         sample: Sample,
         quality: int,
         main_field: float,
@@ -168,20 +167,24 @@ class Correction:
             self._corrector.regressors,
             sample.values,
             quality,
-            faulty=self.plausibility is None or self.plausibility.fault,
+            faulty=self.plausibility is not None and self.plausibility.fault,
             reference=main_field,
             where=where,
-            temperature=reading.temperature,
+            watched=[self.aligner.by_name[name].at(sample.time_us)[0] for name in self.learner.watched],
         )
         return self.learner.flags
 
     def _use(self, calibration: Calibration) -> None:
-        """Correct with another calibration of the same terms from now on."""
-        by = self._corrector.replace(calibration)
+        """Correct from now on with another calibration, of the same terms or with effects more or fewer."""
+        self.aligner.follow(calibration.channels)
+        values = [track.last for track in self.aligner.tracks]
+        by = self._corrector.replace(calibration, values)
         if self._raised is not None:
-            self._raised.replace(calibration.at_level())
-        if self.plausibility is not None:
-            self.plausibility.explain(by)
+            self._raised.replace(calibration.at_level(), values)
+        if self.plausibility is None:
+            self.plausibility = Plausibility(calibration.noise.sensor)
+        elif self.learner is not None:
+            self.plausibility.explain(by, jumps=not self.learner.renewed)
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
         """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""
@@ -234,9 +237,12 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
     level = np.full(len(results), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
-    vectors = main_field(deployment)
-    main_fields = magnitude(vectors)
-    known, places, attitudes = main_fields.tolist(), _places(deployment), _attitudes(deployment)
+    vectors, places, attitudes = main_field(deployment), _places(deployment), _attitudes(deployment)
+    if correction.learner is None:
+        main_fields = magnitude(vectors)
+    else:
+        main_fields = _as_live(correction.held_field, deployment)
+    known = main_fields.tolist()
     for row, reading, stamp in _readings(correction, deployment):
         if correction.direction is not None and attitudes is not None:
             correction.direction.expect(*vectors[row].tolist())
@@ -274,6 +280,18 @@ def _attitudes(deployment: xr.Dataset) -> list[list[float]] | None:
     return attitudes
 
 
+def _as_live(held: HeldField, deployment: xr.Dataset) -> FloatArray:
+    """Return the main field (n,), nT, at every row as a bridge computes it; NaN where it is not known."""
+    n = deployment.sizes["time"]
+    depth = deployment["depth"].to_numpy().astype(float) if "depth" in deployment else np.zeros(n)
+    utc_us = np.rint(np.asarray(deployment["time"].to_numpy(), float) * 1e6).astype(np.int64).tolist()
+    found = np.full(n, nan)
+    for row, (place, down) in enumerate(zip(_places(deployment), np.nan_to_num(depth).tolist(), strict=True)):
+        if place is not None:
+            found[row] = held.at((*place, down), utc_us[row])
+    return found
+
+
 def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
     """Flag again what a bridge flagged as late, with its sigma: rows do not tell how long they waited."""
     if not {"quality", "total_field_sigma"} <= set(deployment):
@@ -296,8 +314,8 @@ def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[
     times = np.asarray(deployment["time"].to_numpy(), float)
     stamps = (np.rint(times * 1e6).astype(np.int64) & ~3).tolist()
     delays = [np.nan_to_num(np.array(column(f"mag_time_{axis}")) - times).round(6).tolist() for axis in "xyz"]
-    wanted = [*correction.names, *(correction.learner.currents if correction.learner is not None else ())]
-    telemetry = [(name, column(name), column(AGE + name)) for name in wanted if name != TEMPERATURE]
+    wanted = [name for name in correction.aligner.by_name if name != TEMPERATURE]
+    telemetry = [(name, column(name), column(AGE + name)) for name in wanted]
     cycles = column("power_cycle")
     channels = zip(*(column(f"mag_{axis}") for axis in "xyz"), strict=True)
     rows = zip(stamps, channels, zip(*delays, strict=True), column(TEMPERATURE), cycles, strict=True)

@@ -195,13 +195,15 @@ class Plausibility:
         self.fault = self.flags != 0
         return more + self._doubt(time_us)
 
-    def explain(self, by: float) -> None:
-        """Take note that another calibration moves the total field `by` nT, and explains past jumps."""
+    def explain(self, by: float, *, jumps: bool) -> None:
+        """Take note that another calibration moves the total field `by` nT, and may explain past jumps."""
         if by == by:  # noqa: PLR0124 - compiled, quicker than a call
             self._level += by
             self._candidate += by
             self._last += by
             self._last_but_one += by
+        if not jumps:
+            return
         self._mark = nan
         self._moved = self._largest = 0.0
         self._jumps = self._until_us = 0

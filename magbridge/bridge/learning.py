@@ -20,6 +20,8 @@ __all__ = ["Learning", "keep", "kept_path", "open_learner"]
 
 LEARNING = spec("MAG_LEARNING")
 ACCEPT, FORGET = 1.0, 2.0
+KEEP_US = 600_000_000
+"""µs between files of a calibration that is only renewed."""
 
 
 def open_learner(config: Config, calibration: Calibration | None) -> Learner | None:
@@ -74,6 +76,7 @@ class Learning:
         self._first_id = self._id = calibration_id(learner.calibration)
         self._first = learner.first
         self._rate: Rate = component.rates["MAG_LEARNING"]
+        self._kept_us = 0
         component.parameters.watch(self._tune)
         self._tune("")
 
@@ -99,7 +102,9 @@ class Learning:
             self._published = learner.calibration
             self._id = calibration_id(learner.calibration)
             component.use_calibration(self._id)
-            self.to_keep.append(learner.calibration)
+            if not learner.renewed or time_us - self._kept_us > KEEP_US:
+                self._kept_us = time_us
+                self.to_keep.append(learner.calibration)
         if learner.first is not self._first:
             self._first, self._first_id = learner.first, calibration_id(learner.first)
         if learner.enabled and self._rate.due(time_us):

@@ -53,8 +53,9 @@ class Position:
         """Take a GLOBAL_POSITION_INT."""
         latitude, longitude, altitude = message["lat"] * 1e-7, message["lon"] * 1e-7, message["alt"] * 1e-3
         if latitude or longitude:  # an autopilot that does not know its position sends 0, 0
-            self.where, self._depth = (latitude, longitude), -altitude
-            self._when_us, self._evaluated_us = time_us, 0
+            if self.where != (latitude, longitude) or self._depth != -altitude:
+                self.where, self._depth, self._evaluated_us = (latitude, longitude), -altitude, 0
+            self._when_us = time_us
 
     def main_field(self, time_us: int, utc_us: int) -> float:
         """Return the IGRF's total field in nT; NaN where position or date is not known, or no model holds.

@@ -109,14 +109,22 @@ class Corrector:
         self._places: dict[tuple[float, ...], int] = {}
         self._there: list[Linear] = []
         self._field = (nan, nan, nan)
+        self._time_us = 0
 
     @property
     def regressors(self) -> list[float]:
         """The regressors at the last sample: the monomials, then those of effects."""
         return self._last
 
-    def replace(self, calibration: Calibration) -> float:
-        """Go on with other coefficients of the same terms; effects keep their state.
+    def replace(self, calibration: Calibration, values: Sequence[float] = ()) -> float:
+        """Go on with other coefficients of the same terms, or with effects more or fewer at the end.
+
+        Parameters
+        ----------
+        calibration : Calibration
+            Effects that it has in common with the one before keep their state.
+        values : sequence of float
+            Its channels at the last sample; needed where it has effects more.
 
         Returns
         -------
@@ -127,6 +135,15 @@ class Corrector:
         self.calibration, self._kernel, self._omega = calibration, calibration.kernel, _omega(calibration)
         self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
         self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
+        self._wanted = len(calibration.channels)
+        del self._steps[len(calibration.effects) :]
+        regressors = self._last[: len(self._weights)]
+        for effect in calibration.effects[len(self._steps) :]:
+            step = effect.begin(calibration.channels, self._kernel)
+            self._steps.append(step)
+            if self._last:
+                regressors += step(self._time_us, *self._field, values)
+        self._last = regressors
         if not self._last:
             return nan
         self._prepared = prepare(self._kernel.sums_of_one(self._last))
@@ -166,6 +183,7 @@ class Corrector:
                 f"found {len(values)}"
             )
         hx, hy, hz = self._field = field
+        self._time_us = time_us
         values = tuple(values)
         if values != self._values or self._steps:
             self._values, self._flags = values, self._flags_of(values)

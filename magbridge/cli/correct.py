@@ -101,16 +101,17 @@ def correct(
         complain(doubt)
     if save is not None and not learn:
         raise WrongUse("--save writes what was learned: give --learn, too")
-    correction, tally, whole = Correction(known), _Tally(), False
+    tally, whole = _Tally(), False
+    correction: Correction | None = None
     pieces: list[dict[str, Any]] = []
     drawn: list[xr.Dataset] = []
     with Writer(output) as writer:
         for part in track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting"):
-            if not pieces:
+            if correction is None:
                 note_missing(known, part)
                 note_no_date(part)
-                if learn:
-                    correction.learner = _learner(known, part, calibration)
+                learner = _learner(known, part, calibration) if learn else None
+                correction = Correction(known, learner=learner)
             pieces.append(part.attrs)
             sampled = part[list(CHANNELS)].to_array().notnull()
             corrected = _beside(part, correct_rows(correction, part), known, calibration)
@@ -138,7 +139,7 @@ def correct(
     if doubt := tally.doubt():
         complain(f"{calibration}: {doubt}")
     facts, summary = tally.facts(), tally.summary()
-    if correction.learner is not None:
+    if correction is not None and correction.learner is not None:
         summary += _keep_learned(correction.learner, known, facts, save)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 

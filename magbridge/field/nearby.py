@@ -13,7 +13,7 @@ import numpy as np
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.igrf import coverage, total_field
 
-__all__ = ["NearbyField"]
+__all__ = ["HeldField", "NearbyField"]
 
 
 REACH = 20_000.0
@@ -22,6 +22,39 @@ DEEP = 2_000.0
 """m, depth up to which it is fitted."""
 LONG = 20 * 86_400.0
 """s before and after the time that it is fitted at."""
+
+
+AGAIN_US = 1_000_000
+"""µs after which the field at the same place is computed anew."""
+
+
+class HeldField:
+    """Intensity of the main field at a vehicle's positions as they come: live and ashore the same bits."""
+
+    def __init__(self) -> None:
+        self._model = NearbyField()
+        self._where = (np.nan, np.nan, np.nan)
+        self._when_us, self._field = 0, np.nan
+
+    def at(self, where: tuple[float, float, float], utc_us: int) -> float:
+        """Return the total field in nT; what was computed for this place less than a second ago holds.
+
+        Parameters
+        ----------
+        where : tuple of 3 float
+            deg, deg, m: latitude, longitude, depth.
+        utc_us : int
+            µs since 1970 UTC.
+
+        Raises
+        ------
+        OutOfRange
+            As :func:`~magbridge.field.igrf.total_field`.
+        """
+        if where != self._where or abs(utc_us - self._when_us) > AGAIN_US:
+            self._field = self._model.at(*where, utc_us * 1e-6)[0]
+            self._where, self._when_us = where, utc_us
+        return self._field
 
 
 class NearbyField:

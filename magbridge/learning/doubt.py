@@ -14,6 +14,12 @@ With :math:`a \sim N(0, I)` in the unit :math:`\tau` of each cause, the log-like
 a mixture over all sizes, so none needs to be known. Of each cause several onsets are tested, begun anew
 every 4, 16, 64 ... samples, and at the first sample that stands out. As L starts from 0, :math:`e^L` is a
 martingale of mean 1 each time, and exceeds :math:`e^h` by chance with probability :math:`e^{-h}` at most.
+
+A cause is learned by giving the estimator what its test knows: the amplitude is
+:math:`\hat a = (I + M)^{-1} y`, of covariance :math:`(I + M)^{-1}`, and moves the state by
+:math:`-G \hat a`, G being what the filter has taken in, :math:`\Xi`, and the cause's own coefficients
+(Friedland 1969, IEEE Trans. Automatic Control 14:359). Of several causes that fit, each counts as much as
+:math:`e^L` says.
 """
 
 from __future__ import annotations
@@ -23,8 +29,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.learning.estimator import Estimator
+from magbridge.learning.model import TEMPERATURE, Model
 
 __all__ = ["CAUSES", "Alarm", "Doubt", "Signs"]
 
@@ -66,12 +73,10 @@ class Signs(NamedTuple):
         s.
     offset : (3,) array
         Derivative of the residual by the offset of each axis.
-    temperature : float
-        degC; NaN where unknown.
     positions : tuple of float
         Parameters, scaled to their range.
-    currents : tuple of float
-        A; NaN where unknown.
+    watched : tuple of float
+        degC and A: temperature and currents; NaN where unknown.
     clock : float
         nT/s: how the residual changes with the telemetry's time.
     level : float
@@ -80,11 +85,18 @@ class Signs(NamedTuple):
 
     time: float
     offset: FloatArray
-    temperature: float
     positions: tuple[float, ...]
-    currents: tuple[float, ...]
+    watched: tuple[float, ...]
     clock: float
     level: float
+
+
+class Cause(NamedTuple):
+    """One to test: its name, the telemetry it follows, and the states (3,) that would take it up, if any."""
+
+    name: str
+    channel: str
+    states: IndexArray | None
 
 
 class Alarm(NamedTuple):
@@ -100,8 +112,6 @@ class Alarm(NamedTuple):
         s, when the likeliest began.
     size : float
         nT, root mean square of what it adds to the total field.
-    amplitude : float
-        nT, of the offset that would be as large: what the estimator has to be opened by.
     strength : float
         L of the likeliest.
     """
@@ -110,7 +120,6 @@ class Alarm(NamedTuple):
     channels: tuple[str, ...]
     since: float
     size: float
-    amplitude: float
     strength: float
 
 
@@ -119,28 +128,34 @@ class Doubt:
 
     Parameters
     ----------
-    positions, currents : tuple of str
-        Names of the parameters, and of telemetry in ampere.
-    states : int
-        The estimator's.
+    model : Model
+    estimator : Estimator
+        Whose innovations are tested; it may be replaced by another one that learns the same.
     """
 
-    def __init__(self, positions: tuple[str, ...], currents: tuple[str, ...], states: int) -> None:
-        causes = [("offset_step", ""), ("offset_drift", ""), ("temperature_offset", "sensor_temperature")]
-        causes += [("unmodelled_actuator", name) for name in positions]
-        causes += [("current_field", name) for name in currents]
-        causes += [("clock_offset", ""), ("map_error", "")]
-        self.rows = [cause for cause in causes for _ in PERIODS]
+    def __init__(self, model: Model, estimator: Estimator) -> None:
+        self._offsets, self._states, self._origin = estimator.offsets, estimator.states, model.origin
+        causes = [
+            Cause("offset_step", "", estimator.offsets),
+            Cause("offset_drift", "", estimator.slope),
+            *(Cause("unmodelled_actuator", name, model.slots(name)) for name in model.parameters),
+            Cause("temperature_offset", TEMPERATURE, model.slots(TEMPERATURE)),
+            *(Cause("current_field", name, model.slots(name)) for name in model.watched[1:]),
+            Cause("clock_offset", "", None),
+            Cause("map_error", "", None),
+        ]
+        self._causes = [cause for cause in causes for _ in PERIODS]
+        names = [cause.name for cause in self._causes]
         self._period = np.tile(PERIODS, len(causes))
-        self._unit = np.array([CAUSES[name] for name, _ in causes])
-        self._since_onset = np.array([name not in FROM_ZERO for name, _ in causes], float)
-        self._no_vector = np.array([name in ("clock_offset", "map_error") for name, _ in causes])
-        self._states, self._noisier = states, 1.0
+        self._unit = np.array([CAUSES[name] for name in names])
+        self._since_onset = np.array([name not in FROM_ZERO for name in names], float)
+        self._no_vector = np.array([name in ("clock_offset", "map_error") for name in names])
+        self._noisier = 1.0
         self.restart()
 
     def restart(self) -> None:
         """Forget all evidence; what is known of the noise stays."""
-        many = len(self.rows)
+        many = len(self._causes)
         self._M = np.zeros((many, 3, 3))
         self._raw = np.zeros((many, 3, 3))
         self._y = np.zeros((many, 3))
@@ -148,12 +163,13 @@ class Doubt:
         self._start = np.zeros(many)  # of each row's regressor
         self._onset = np.zeros(many)  # s
         self._count = np.full(many, self._period)
+        self._now = 0.0
         self.statistic = np.zeros(many)
+        self._amplitude = np.zeros((many, 3))
 
-    def propagate(self, F: FloatArray) -> None:
-        """Move what the filter has taken in, as the nuisance's transition F (3, 3) moves it."""
-        tail = self._state[-len(F) :]
-        self._state[-len(F) :] = np.tensordot(F, tail, 1)
+    def propagate(self, estimator: Estimator, F: FloatArray, seconds: float) -> None:
+        """Move what the filter has taken in on, as :meth:`.Estimator.propagate`, which returned F (3, 3)."""
+        estimator.advance(self._state, F, seconds)
 
     def test(self, estimator: Estimator, signs: Signs) -> Alarm | None:
         """Test the estimator's prediction; return what no longer fits, if anything."""
@@ -168,11 +184,9 @@ class Doubt:
         self._raw += f[:, :, None] * f[:, None, :]
         self._y += phi * (estimator.residual / S)
         W = self._M + np.eye(3)
-        amplitude = np.linalg.solve(W, self._y[:, :, None])[:, :, 0]
-        self.statistic = 0.5 * np.sum(self._y * amplitude, axis=1) - 0.5 * np.log(np.linalg.det(W))
-        if float(self.statistic.max()) > LEAST:
-            return self._alarm(np.asarray(amplitude))
-        return None
+        self._amplitude = np.asarray(np.linalg.solve(W, self._y[:, :, None])[:, :, 0])
+        self.statistic = 0.5 * np.sum(self._y * self._amplitude, axis=1) - 0.5 * np.log(np.linalg.det(W))
+        return self._alarm() if float(self.statistic.max()) > LEAST else None
 
     def updated(self, gain: FloatArray) -> None:
         """Take note that the estimator was updated with `gain` (n,)."""
@@ -180,20 +194,9 @@ class Doubt:
 
     def _signatures(self, signs: Signs, stands_out: bool) -> FloatArray:
         """(rows, 3) what one unit of each does to the residual; onsets whose time is over begin anew."""
-        now = np.nan_to_num(
-            np.array(
-                [
-                    1.0,
-                    signs.time / 3600.0,
-                    signs.temperature,
-                    *signs.positions,
-                    *signs.currents,
-                    signs.clock,
-                    signs.level,
-                ]
-            )
-        )
-        regressor = np.repeat(now, len(PERIODS))
+        self._now = signs.time
+        now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
+        regressor = np.repeat(np.nan_to_num(np.array(now)), len(PERIODS))
         self._count += 1
         over = (self._count > self._period) & (self.statistic < PROMISING)
         if stands_out:
@@ -204,26 +207,60 @@ class Doubt:
             self._y[begins] = 0.0
             self._state[:, begins] = 0.0
             self._start[begins], self._onset[begins], self._count[begins] = regressor[begins], signs.time, 1
-        regressor -= np.repeat(self._since_onset, len(PERIODS)) * self._start
-        f = (regressor * np.repeat(self._unit, len(PERIODS)))[:, None] * signs.offset
-        alone = np.repeat(self._no_vector, len(PERIODS))
-        f[alone] = 0.0
-        f[alone, 0] = (regressor * np.repeat(self._unit, len(PERIODS)))[alone]
+        amount = (regressor - self._since_onset * self._start) * self._unit
+        f = amount[:, None] * signs.offset
+        f[self._no_vector] = 0.0
+        f[self._no_vector, 0] = amount[self._no_vector]
         return np.asarray(f)
 
-    def _alarm(self, amplitude: FloatArray) -> Alarm:
+    @property
+    def _fitting(self) -> list[int]:
+        """The rows that fit, the likeliest first."""
         order = np.argsort(-self.statistic, kind="stable").tolist()
-        best = order[0]
-        fits = [row for row in order if self.statistic[row] > self.statistic[best] - RIVALS]
-        named = list(dict.fromkeys(self.rows[row] for row in fits))
-        a, n = amplitude[best], float(self._count[best])
-        size = sqrt(max(float(a @ self._raw[best] @ a) / n, 0.0))
-        spread = float(np.linalg.norm(a)) * CAUSES[self.rows[best][0]]
+        return [row for row in order if self.statistic[row] > self.statistic[order[0]] - RIVALS]
+
+    def _alarm(self) -> Alarm:
+        fits = self._fitting
+        best = fits[0]
+        named = list(dict.fromkeys(self._causes[row][:2] for row in fits))
+        a, n = self._amplitude[best], float(self._count[best])
         return Alarm(
             causes=tuple(dict.fromkeys(cause for cause, _ in named)),
             channels=tuple(channel for _, channel in named),
             since=float(self._onset[best]),
-            size=size,
-            amplitude=max(size, min(spread, 10.0 * size)),
+            size=sqrt(max(float(a @ self._raw[best] @ a) / n, 0.0)),
             strength=float(self.statistic[best]),
         )
+
+    def learned(self) -> tuple[FloatArray, FloatArray] | None:
+        """Return what the causes that fit move the state by (n,), and its further covariance (n, n).
+
+        None where no coefficient can take up the likeliest.
+        """
+        fits = self._fitting
+        if self._causes[fits[0]].states is None:
+            return None
+        rows = [row for row in fits if self._causes[row].states is not None]
+        share = np.exp(self.statistic[rows] - self.statistic[rows[0]])
+        share /= share.sum()
+        by, covariance = np.zeros(self._states), np.zeros((self._states, self._states))
+        for weight, row in zip(share.tolist(), rows, strict=True):
+            G, a = self._moves(row), self._amplitude[row]
+            V = np.linalg.inv(self._M[row] + np.eye(3)) + np.outer(a, a)
+            covariance += weight * G @ V @ G.T
+            by -= weight * G @ a
+        return by, np.asarray(covariance - np.outer(by, by))
+
+    def _moves(self, row: int) -> FloatArray:
+        """(n, 3) G: by what one unit of a row's cause has moved the filter from the truth."""
+        cause, unit, start = self._causes[row], float(self._unit[row]), float(self._start[row])
+        G = self._state[:, row].copy()
+        assert cause.states is not None
+        if cause.name == "offset_drift":
+            G[cause.states, range(3)] += unit / 3600.0
+            G[self._offsets, range(3)] += unit * (self._now / 3600.0 - start)
+            return np.asarray(G)
+        G[cause.states, range(3)] += unit
+        if self._since_onset[row]:
+            G[self._offsets, range(3)] -= unit * (start - self._origin(cause.channel))
+        return np.asarray(G)

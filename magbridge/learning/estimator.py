@@ -1,8 +1,10 @@
 """The calibration's coefficients as the state of a Kalman filter, beside what is not the calibration's.
 
+The state is the coefficients, the slope of the offset (nT/s, an axis), and the three of :mod:`.nuisance`.
+
 Covariance form: the variance of every prediction, which judging and doubt need with each sample, is then a
-by-product, and a prior that is certain of some combinations (as a fit that could not estimate them) needs no
-inverse; the state is relinearised at each sample.
+by-product, and a prior that is certain of some combinations (as a fit that could not estimate them, or an
+effect that nothing speaks for) needs no inverse; the state is relinearised at each sample.
 
 Where a sample says little about the coefficients that rock could not explain as well, they are
 *considered*, not learned: their gain is zero, and their uncertainty stays in the variance (Schmidt 1966;
@@ -14,21 +16,29 @@ Joseph's form holds for any gain)::
 from __future__ import annotations
 
 from math import exp, sqrt
+from typing import Final
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.errors import CalibrationError
 from magbridge.learning.nuisance import STATES, Nuisance
 
-__all__ = ["Estimator", "constant_offsets"]
+__all__ = ["BESIDE", "SLOPE", "Estimator"]
 
-TELLING = 0.01
+SLOPE: Final = 3
+"""States of the offset's slope."""
+BESIDE: Final = SLOPE + STATES
+"""States that are no coefficients."""
+TELLING: Final = 0.01
 """Share of a prediction's variance that comes from the coefficients and varies along the track: from here on
 the sample tells something of them."""
-NEAR = 250.0
+NEAR: Final = 250.0
 """m over which the mean derivative is followed, a quarter of the rock's length: what varies within is not
 rock."""
+LONG: Final = 1000
+"""Samples over which the mean derivative of the total field is followed."""
+LASTING: Final = 6.0 * 3600.0
+"""s over which the slope of a drift changes by its own size."""
 
 
 class Estimator:
@@ -63,26 +73,35 @@ class Estimator:
         creep: float,
     ) -> None:
         self.size = K = len(coefficients)
-        self._x = np.concatenate([coefficients, np.zeros(STATES)])
-        self._P = np.zeros((K + STATES, K + STATES))
+        self.states = K + BESIDE
+        self._x = np.concatenate([coefficients, np.zeros(BESIDE)])
+        self._P = np.zeros((self.states, self.states))
         self._P[:K, :K] = covariance
-        self._P[K:, K:] = nuisance.initial
-        self._offsets, self._nuisance = offsets, nuisance
-        self.creep = creep
+        self._P[-STATES:, -STATES:] = nuisance.initial
+        self.offsets, self.slope = offsets, np.arange(K, K + SLOPE)
+        self._nuisance, self._creep = nuisance, creep
+        self._slope_walk = 0.0  # (nT/s)² a second; 0: there is no slope
         self._near: FloatArray | None = None
+        self._mean = np.zeros(K)
+        self._stay = 1.0
         self.residual, self.variance, self.telling = 0.0, 1.0, False
-        self._h = np.zeros(K + STATES)
-        self._Ph = np.zeros(K + STATES)
+        self._h = np.zeros(self.states)
+        self._Ph = np.zeros(self.states)
+
+    def know(
+        self, coefficients: FloatArray, beside: FloatArray, covariance: FloatArray, nuisance: Nuisance
+    ) -> None:
+        """Take what a fit says for all that is known of coefficients (K,) and nuisance (3,), jointly."""
+        self._nuisance = nuisance
+        both = np.r_[: self.size, self.states - STATES : self.states]
+        self._x[both] = np.concatenate([coefficients, beside])
+        self._P[:] = 0.0
+        self._P[np.ix_(both, both)] = covariance
 
     @property
     def coefficients(self) -> FloatArray:
         """The coefficients (K,) as learned so far."""
         return self._x[: self.size]
-
-    @property
-    def beside(self) -> FloatArray:
-        """The states (3,) of what is not the calibration's."""
-        return self._x[self.size :]
 
     @property
     def covariance(self) -> FloatArray:
@@ -92,51 +111,77 @@ class Estimator:
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ root.T)
 
+    def follow(self, s: float) -> None:
+        """Follow how the total field changes with the coefficients; s is the last residual's scale."""
+        self._mean += (s * self._h[: self.size] - self._mean) / LONG
+
+    def at_level_of(self, published: FloatArray) -> FloatArray:
+        """Return the likeliest coefficients (K,) whose mean field is that of those `published` (K,).
+
+        Rock and reference hide the level, so that what is learned of it is chance: what need not, shall not
+        change it.
+        """
+        K = self.size
+        toward = self._P[:K, :K] @ self._mean
+        by = float(self._mean @ (published - self.coefficients))
+        return np.asarray(self.coefficients + toward * (by / float(self._mean @ toward)))
+
     def open(self, variance: float) -> None:
         """Let the offsets be unknown by a further `variance` (nT²) an axis."""
-        self._P[self._offsets, self._offsets] += variance
+        self._P[self.offsets, self.offsets] += variance
+
+    def shift(self, by: FloatArray, covariance: FloatArray) -> None:
+        """Move the state by `by` (n,), which is known to a further `covariance` (n, n)."""
+        self._x += by
+        self._P += covariance
+        self._slope_walk = float(np.trace(self._P[np.ix_(self.slope, self.slope)])) / 3.0 / LASTING
+
+    def advance(self, state: FloatArray, F: FloatArray, seconds: float) -> None:
+        """Move `state` (n, ...) on in place, over a time; F (3, 3) is the nuisance's transition."""
+        state[-STATES:] = np.tensordot(F, state[-STATES:], 1)
+        if self._slope_walk:
+            state[self.offsets] += seconds * state[self.slope]
 
     def propagate(self, metres: float, seconds: float) -> FloatArray:
         """Move on by a way and a time; return the transition (3, 3) of what is not the calibration's."""
-        K, P = self.size, self._P
+        P = self._P
         F, Q = self._nuisance.over(metres, seconds)
-        self._x[K:] = F @ self._x[K:]
-        P[K:] = F @ P[K:]
-        P[:, K:] = P[:, K:] @ F.T
-        P[K:, K:] += Q
-        self.open(self.creep * self.creep * seconds)
-        if self._near is not None:
-            self._stay = exp(-metres / NEAR)
+        self.advance(self._x, F, seconds)
+        self.advance(P, F, seconds)
+        self.advance(P.T, F, seconds)
+        P[-STATES:, -STATES:] += Q
+        P[self.slope, self.slope] += self._slope_walk * seconds
+        self.open(self._creep * self._creep * seconds)
+        self._stay = exp(-metres / NEAR)
         return F
 
     def predict(self, e: float, s: float, by_coefficients: FloatArray) -> None:
         """Take a sample's residual at the present coefficients, its derivatives (K,): set the innovation."""
         K, h = self.size, self._h
         h[:K] = by_coefficients
-        h[K], h[K + 1], h[K + 2] = -1.0 / s, 0.0, -1.0
+        h[-STATES:] = -1.0 / s, 0.0, -1.0
         if self._near is None:
             self._near = by_coefficients.copy()
         else:
             self._near += (1.0 - self._stay) * (by_coefficients - self._near)
         self._Ph = self._P @ h
         self.variance = float(h @ self._Ph) + self._nuisance.white
-        self.residual = e + float(h[K:] @ self._x[K:])
+        self.residual = e + float(h[-STATES:] @ self._x[-STATES:])
         varying = by_coefficients - self._near
-        P = self._P[:K, :K]
-        self.telling = float(varying @ P @ varying) > TELLING * self.variance
+        self.telling = float(varying @ self._P[:K, :K] @ varying) > TELLING * self.variance
 
     def update(self, *, learn: bool) -> FloatArray:
-        """Take the predicted sample in; return the gain (K + 3,).
+        """Take the predicted sample in; return the gain (n,).
 
         Parameters
         ----------
         learn : bool
-            Whether the coefficients may learn from it; else they are considered.
+            Whether coefficients and slope may learn from it; else they are considered.
         """
         S, P, Ph = self.variance, self._P, self._Ph
         gain = Ph / S
         if not learn:
-            gain[: self.size] = 0.0
+            gain[:-STATES] = 0.0
         self._x -= gain * self.residual
         cross = np.outer(gain, Ph)
         P -= cross
@@ -152,27 +197,3 @@ class Estimator:
     def sigma(self) -> float:
         """1-sigma of the innovation, nT."""
         return sqrt(self.variance)
-
-
-def constant_offsets(tensor: FloatArray) -> IndexArray:
-    """Return which coefficients are the constant offset of x, y and z, and nothing else.
-
-    Parameters
-    ----------
-    tensor : (K, m, 9) array
-        As :func:`~magbridge.calibration.compilation.coefficient_tensor`.
-
-    Raises
-    ------
-    CalibrationError
-        There is none for an axis.
-    """
-    found = []
-    for axis in range(3):
-        only = np.zeros(tensor.shape[1:])
-        only[0, 6 + axis] = 1.0
-        same = np.flatnonzero((tensor == only).all(axis=(1, 2)))
-        if not same.size:
-            raise CalibrationError("a calibration without a constant offset is not learned")
-        found.append(int(same[0]))
-    return np.array(found)

@@ -2,48 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from math import isnan, nan
+from math import isnan
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.field.geodesy import separation
 from magbridge.learning.doubt import Alarm, Doubt, Signs
-from magbridge.learning.estimator import Estimator, constant_offsets
-from magbridge.learning.judge import CANDIDATE, FIXED, PUBLISHED, Judge
-from magbridge.learning.nuisance import STATES, Nuisance
+from magbridge.learning.estimator import Estimator
+from magbridge.learning.judge import FIRST, LEARNED, Judge
+from magbridge.learning.model import Model
+from magbridge.learning.nuisance import Nuisance
 from magbridge.learning.observation import Observation, observe
 from magbridge.learning.report import Notice, State
+from magbridge.learning.start import Start
 from magbridge.records import Quality, Vector
 
 __all__ = ["Learner"]
 
-UNFIT: Final = int(
-    Quality.STALE_TELEMETRY | Quality.MOVING | Quality.SATURATED | Quality.LATE_JOIN | Quality.UNCALIBRATED
-)
+UNFIT: Final = int(Quality.STALE_TELEMETRY | Quality.MOVING | Quality.SATURATED | Quality.LATE_JOIN)
 """Samples that nothing is learned from."""
+NONE: Final = "none"
+"""The method of a calibration that is none."""
+LINEAR: Final = 300.0
+"""nT, 1-sigma of an axis's offset: from here on it is fitted anew as a whole."""
 CREEP: Final = 3.0 / 86_400.0**0.5
 """nT per square root of a second: an offset walks by 3 nT a day."""
-FASTER: Final = 10.0
-"""Times faster while the data are not explained, and for some time after."""
-CREEPING: Final = frozenset({"offset_drift", "temperature_offset"})
-"""Causes that go on after their first part was learned."""
-LEARNABLE: Final = CREEPING | {"offset_step", "unmodelled_actuator"}
-"""Causes that the calibration's coefficients can take up, if only in part."""
+SURE: Final = 12.0
+"""By which a doubt's log-likelihood ratio has to grow until it is learned what is behind it."""
+PATIENCE: Final = 256
+"""Telling samples after which that is decided at the latest."""
 MORE: Final = 2.0
 """By which an alarm's log-likelihood ratio has to grow to be news."""
+GONE: Final = 9.0
+"""Log-likelihood ratio below which it is not learned any more, but gone."""
 QUIET: Final = 300
 """Telling samples without an alarm after which its cause is gone."""
-STEADY: Final = 2000
-"""Telling samples without one after which offsets creep no faster than usual."""
 OUTLIER: Final = 5.0
 AGREE: Final = 3
 """An innovation beyond so many sigmas is not learned from, unless it is the third in a row."""
+APART: Final = 0.3
+"""Of the noise: the published total field is renewed when it is so far from what is learned."""
+RENEW: Final = 32, 256
+"""Samples after which it may be, and is in any case."""
 SHORT_US: Final = 3_600_000_000
 """µs without a sample to learn from after which that is told."""
 
@@ -62,20 +69,22 @@ class Learner:
     max_rate : float
         Hz: samples to learn from, at most.
     currents : tuple of str
-        Names of telemetry in ampere, for :meth:`telemetry`.
+        Names of telemetry in ampere.
 
     Attributes
     ----------
     calibration : Calibration
         The one to publish.
+    watched : tuple of str
+        Telemetry that :meth:`sample` wants: the temperature, and the currents.
     flags : int
         Of the last sample: ``unexplained``, or 0.
     variance : float
         nT², to add to that of the total field while the data are not explained.
+    renewed : bool
+        The calibration to publish has changed last by what was learned since, for no reason of its own.
     notices : list of Notice
         What has changed since the caller last emptied it.
-    currents : tuple of str
-        As given.
     enabled, frozen : bool
         Not enabled, nothing happens; frozen, it judges and doubts, but learns nothing.
 
@@ -95,18 +104,16 @@ class Learner:
         currents: tuple[str, ...] = (),
     ) -> None:
         self.first = self.calibration = calibration
-        self._tensor = coefficient_tensor(calibration)[0]
-        self._flat = self._tensor.reshape(len(self._tensor), -1)
-        self._offsets = constant_offsets(self._tensor)
+        self._model = Model(calibration, currents)
+        self.watched = self._model.watched
         self._turn_on = turn_on
+        self._unfit = UNFIT if calibration.method == NONE else UNFIT | int(Quality.UNCALIBRATED)
+        self._start: Start | None
+        self._spread = spread
         self._nuisance = Nuisance(calibration.noise, spread)
-        self._kappa = 0.0
         self._period_us = round(1e6 / max_rate)
-        self._scaling = [(one.centre, one.scale) for one in calibration.parameters]
-        self.currents = currents
-        self._currents = dict.fromkeys(currents, nan)
         self.enabled, self.frozen = True, False
-        self.flags, self.variance = 0, 0.0
+        self.flags, self.variance, self.renewed = 0, 0.0, False
         self.notices: list[Notice] = []
         self.samples = 0
         self._alarm: Alarm | None = None
@@ -116,31 +123,33 @@ class Learner:
     def state(self) -> State:
         """How learning stands."""
         rms = np.sqrt(self._judge.mean_square).tolist()
-        alarm = self._alarm
+        alarm, judge, published = self._alarm, self._judge, self.calibration is not self.first
         causes = alarm.causes if alarm else ()
         since, size = (round(alarm.since * 1e6), alarm.size) if alarm else (0, 0.0)
-        return State(self.samples, (rms[0], rms[1], rms[2]), self._judge.better, causes, since, size)
+        better = -judge.worse if published else judge.better
+        return State(self.samples, (rms[FIRST], rms[published], rms[LEARNED]), better, causes, since, size)
 
     def learned(self) -> Calibration:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
-        origin = f"{calibration_id(self.calibration):08x}"
+        origin = f"{calibration_id(self.first):08x}"
         method = self.first.method if "learned" in self.first.method else f"{self.first.method}, learned"
-        return replace(
-            self.first,
-            coefficients=self._estimator.coefficients,
-            covariance=self._estimator.covariance,
-            method=method,
-            inputs=self.calibration.inputs | {f"calibration {origin}": f"{self.samples} samples later"},
-        )
+        estimator = self._estimator
+        coefficients = estimator.coefficients
+        if self.first.method == NONE and self.calibration is not self.first:
+            coefficients = estimator.at_level_of(self._coefficients)
+        made = self._model.calibration(coefficients, estimator.covariance)
+        if self.first.method == NONE:
+            method = "learned"
+        inputs = self.first.inputs | {f"calibration {origin}": f"{self.samples} samples later"}
+        return replace(made, method=method, inputs=inputs, noise=self._noise)
 
     def accept(self) -> None:
         """Let what is learned be the calibration that nothing rolls back, and the doubt be known."""
         if self.samples:
-            self._challenge()
-            self._publish(CANDIDATE, "accepted: what was learned")
+            self._publish("accepted: what was learned")
             self.first = self.calibration
-            self._weights[FIXED] = self._weights[PUBLISHED]
-            self._judge.settle()
+            self._weights[FIRST] = self._weights[LEARNED]
+            self._judge.restart()
         self._settle("acknowledged")
 
     def forget(self) -> None:
@@ -152,35 +161,27 @@ class Learner:
 
     def _forget(self) -> None:
         self._judge = Judge(self._nuisance)
-        self._restart(self.first)
-        self._weights = [self._weights_of(self.first.coefficients)] * 3
-        self._candidate = self.first
-        self.samples = 0
+        self._restart()
+        self._weights = [self._model.weights(self._model.coefficients(self.first)[0])] * 2
+        self.samples = self._quiet = self._doubted = 0
+        self._sure = 0.0
         self._last_us = self._told_us = 0
         self._where: tuple[float, float] | None = None
+        self._before: FloatArray | None = None
 
-    def _restart(self, calibration: Calibration) -> None:
-        """Begin to learn from a calibration, whose offsets may have changed at this power-on."""
-        self._estimator = Estimator(
-            calibration.coefficients, calibration.covariance, self._offsets, self._nuisance, CREEP
-        )
+    def _restart(self) -> None:
+        """Begin to learn from the first calibration, whose offsets may have changed at this power-on."""
+        coefficients, covariance = self._model.coefficients(self.first)
+        self._estimator = Estimator(coefficients, covariance, self._model.offsets, self._nuisance, CREEP)
         self._estimator.open(self._turn_on**2)
-        positions = tuple(one.name for one in calibration.parameters)
-        states = len(calibration.coefficients) + STATES
-        self._doubt = Doubt(positions, tuple(self._currents), states)
-        self._outliers = self._quiet = 0
+        self._doubt = Doubt(self._model, self._estimator)
+        self._outliers = self._since_renewed = 0
+        self._noise, self._start = self.first.noise, None
+        if np.trace(covariance[np.ix_(self._model.offsets, self._model.offsets)]) > 3.0 * LINEAR**2:
+            self._start = Start(self._model, coefficients, covariance, self.first.reference.field)
 
     def _notify(self, text: str, *, grave: bool = False) -> None:
         self.notices.append(Notice(text, self._now_us * 1e-6, grave))
-
-    def _weights_of(self, coefficients: FloatArray) -> FloatArray:
-        """(m, 9) what each regressor adds to the nine coefficients, nT."""
-        return np.asarray((coefficients @ self._flat).reshape(self._tensor.shape[1:]))
-
-    def telemetry(self, name: str, value: float) -> None:
-        """Take a value of telemetry that the calibration does not need."""
-        if name in self._currents:
-            self._currents[name] = value
 
     def restarted(self) -> None:
         """Take note that the sensor was powered anew: its offsets may have changed."""
@@ -197,7 +198,7 @@ class Learner:
         faulty: bool,
         reference: float,
         where: tuple[float, float] | None,
-        temperature: float = nan,
+        watched: Sequence[float],
     ) -> None:
         """Take a sample that was corrected.
 
@@ -219,42 +220,45 @@ class Learner:
             nT, H_e; NaN where the position is not known.
         where : tuple of 2 float or None
             deg, latitude and longitude.
-        temperature : float
-            degC, at the sensor.
+        watched : sequence of float
+            As :attr:`watched`; NaN where unknown.
         """
         if not self.enabled:
             return
         self._now_us = time_us
-        if quality & UNFIT or faulty or isnan(reference) or where is None:
+        if quality & self._unfit or faulty or isnan(reference) or where is None:
             self._nothing(time_us)
             return
         if 0 <= time_us - self._last_us < 0.99 * self._period_us:
             return
-        phi = np.array(regressors)
+        phi = self._model.regressors(regressors, watched)
         if not np.isfinite(phi).all():
             return
         metres, seconds = self._moved(time_us, where)
-        live, e, offset = self._observe(field, phi, reference)
-        signs = Signs(
-            time_us * 1e-6,
-            offset,
-            temperature,
-            tuple((v - c) / s for v, (c, s) in zip(values, self._scaling, strict=False)),
-            tuple(self._currents.values()),
-            self._clock(field, phi, reference, live.e, seconds),
-            -1.0 / live.s,
+        before, self._before = self._before, phi
+        estimator = self._estimator
+        F = estimator.propagate(metres, seconds)
+        self._doubt.propagate(estimator, F, seconds)
+        weights = self._model.weights(estimator.coefficients)
+        live = self._observe(field, phi @ weights, reference)
+        clock = 0.0
+        if before is not None and 0.0 < seconds < 30.0:  # what it would be, were telemetry a second late
+            clock = (self._observe(field, before @ weights, reference).e - live.e) / seconds
+        positions = tuple(self._model.scaled(values))
+        signs = Signs(time_us * 1e-6, live.by_nine[6:], positions, tuple(watched), clock, -1.0 / live.s)
+        estimator.predict(live.e, live.s, self._model.derivative(phi, live.by_nine))
+        first = self._observe(field, phi @ self._weights[FIRST], reference)
+        self._judge.judge(
+            *self._nuisance.over(metres, seconds), first.e, first.s, estimator.residual, estimator.variance
         )
-        F = self._estimator.propagate(metres, seconds)
-        self._doubt.propagate(F)
-        self._judge.judge(*self._nuisance.over(metres, seconds), e, live.s)
-        self._learn(live, phi, signs)
-        self._decide()
-        self._aged(seconds)
-
-    def _aged(self, seconds: float) -> None:
-        """Let what is published age, while offsets creep faster than its sigma knows."""
-        if self._alarm is None and self._estimator.creep > CREEP:
-            self.variance += (self._estimator.creep**2 - CREEP**2) * seconds
+        if self._start is not None:
+            if not self.frozen:
+                self._begin(self._start, due=self._start.add(field, phi, reference, metres, seconds))
+        else:
+            self._learn(signs)
+        published = self._observe(field, phi @ self._weights[LEARNED], reference)
+        estimator.follow(live.s)
+        self._decide((published.e - live.e) * live.s)
 
     def _nothing(self, time_us: int) -> None:
         """Say once an hour or more passes without a sample to learn from."""
@@ -271,107 +275,129 @@ class Learner:
         north, east = separation(*before, *where)
         return (north * north + east * east) ** 0.5, max(time_us - last_us, 0) * 1e-6
 
-    def _observe(
-        self, field: Vector, phi: FloatArray, reference: float
-    ) -> tuple[Observation, FloatArray, FloatArray]:
-        """Return what is learned's observation, all residuals that are judged, and de by the offset."""
-        F_0 = self.first.reference.field
-        live_weights = self._weights_of(self._estimator.coefficients)
-        e = np.empty(3)
-        for which in (FIXED, PUBLISHED, CANDIDATE):
-            nine = phi @ self._weights[which]
-            e[which] = observe(field, nine, F_0, reference, self._kappa).e
-        live = observe(field, phi @ live_weights, F_0, reference, self._kappa)
-        return live, e, live.by_nine[6:]
+    def _observe(self, field: Vector, nine: FloatArray, reference: float) -> Observation:
+        return observe(field, nine, self.first.reference.field, reference)
 
-    def _clock(self, field: Vector, phi: FloatArray, reference: float, e: float, seconds: float) -> float:
-        """Return by how much the residual changes if telemetry is a second late, nT/s."""
-        before, self._phi = getattr(self, "_phi", phi), phi
-        if not 0.0 < seconds < 30.0:
-            return 0.0
-        weights = self._weights_of(self._estimator.coefficients)
-        late = observe(field, before @ weights, self.first.reference.field, reference, self._kappa)
-        return (late.e - e) / seconds
-
-    def _learn(self, live: Observation, phi: FloatArray, signs: Signs) -> None:
-        """Predict the sample, doubt, and learn from it."""
+    def _learn(self, signs: Signs) -> None:
+        """Doubt what was predicted, and learn from it."""
         estimator = self._estimator
-        by_coefficients = self._flat @ np.outer(phi, live.by_nine).ravel()
-        estimator.predict(live.e, live.s, by_coefficients)
         far = abs(estimator.residual) > OUTLIER * estimator.sigma
         self._outliers = self._outliers + 1 if far else 0
         alarm = self._doubt.test(estimator, signs)
-        if alarm is not None and self._raise(alarm):
-            estimator.open(alarm.amplitude**2)
-            estimator.predict(live.e, live.s, by_coefficients)
-        if far and self._outliers < AGREE and alarm is None:
+        if alarm is not None:
+            self._raise(alarm)
+        if far and self._outliers < AGREE and self._alarm is None:
             return
         learn = estimator.telling and not self.frozen
         self._doubt.updated(estimator.update(learn=learn))
         self.samples += learn
-        self._quiet += learn
+        self._quiet += estimator.telling
+        self._doubted += estimator.telling
+        self._since_renewed += 1
 
-    def _raise(self, alarm: Alarm) -> bool:
-        """Begin to doubt, or know better what is doubted; return whether there is anything new."""
+    def _begin(self, start: Start, *, due: bool) -> None:
+        """Learn from a sample while next to nothing is known; fit all so far where that is due."""
+        estimator = self._estimator
+        if not due:
+            estimator.update(learn=True)
+            self.samples += 1
+            self._since_renewed += 1
+            return
+        fitted = start.fit(estimator.coefficients, self._nuisance)
+        self._noise = msgspec.structs.replace(self._noise, sensor=fitted.noise)
+        self._nuisance = Nuisance(self._noise, self._spread)
+        estimator.know(fitted.coefficients, fitted.beside, fitted.covariance, self._nuisance)
+        self._judge.restart(self._nuisance)
+        if self.calibration is not self.first:
+            self._renew()
+        if start.over:
+            self._start = None
+
+    def _raise(self, alarm: Alarm) -> None:
+        """Begin to doubt, or know better what is doubted."""
         standing = self._alarm
         if standing is not None and alarm.strength < standing.strength + MORE:
-            return False
+            return
         self._quiet = 0
         self._alarm = alarm
-        self._estimator.creep = FASTER * CREEP
         self.flags, self.variance = int(Quality.UNEXPLAINED), alarm.size**2
         if standing is None:
-            self._judge.hurry()
+            self._doubted, self._sure = 0, alarm.strength + SURE
             names = " or ".join(alarm.causes[:2]).replace("_", " ")
             self._notify(f"unexplained: {alarm.size:.0f} nT, {names}", grave=True)
         elif standing.causes != alarm.causes and len(alarm.causes) == 1:
             self._notify(f"unexplained: it is {alarm.causes[0].replace('_', ' ')}", grave=True)
-        return True
 
     def _settle(self, how: str) -> None:
         """End the doubt."""
         if self._alarm is None:
             return
-        if not set(self._alarm.causes) & CREEPING:
-            self._estimator.creep = CREEP
         self._alarm = None
         self.flags, self.variance = 0, 0.0
         self._doubt.restart()
         self._notify(f"explained again: {how}")
 
-    def _decide(self) -> None:
-        """Publish what predicts better, go back to what does, and end a doubt whose cause is gone."""
-        judge = self._judge
-        if judge.roll_back and self.calibration is not self.first:
-            self._publish(FIXED, "rolled back: the first calibration predicts better")
-            self._restart(self.first)
-        elif judge.adopt and not self.frozen and not self._beyond_learning():
-            self._publish(CANDIDATE, "learned")
-            self._settle("learned")
-        elif judge.stale and not self.frozen:
-            self._challenge()
-        if self._quiet > STEADY and self._estimator.creep > CREEP:
-            self._estimator.creep = CREEP
-            self.variance = 0.0 if self._alarm is None else self.variance
-        if self._alarm is not None and self._quiet > QUIET and judge.better < 1.0:
+    def _decide(self, apart: float) -> None:
+        """Publish what predicts better, go back to what does, and end a doubt whose cause is known or gone.
+
+        Parameters
+        ----------
+        apart : float
+            nT, of the published total field from what is learned.
+        """
+        judge, alarm = self._judge, self._alarm
+        if alarm is not None and not self.frozen:
+            if self._quiet > QUIET:
+                self._settle("gone")
+            elif alarm.strength > self._sure or self._doubted > PATIENCE:
+                self._take_up()
+        published = self.calibration is not self.first
+        if published and judge.roll_back:
+            self._roll_back()
+        elif self.frozen or self._alarm is not None:
+            return
+        elif not published and judge.adopt:
+            self._publish("learned")
+        elif published:
+            least, most = RENEW
+            due = abs(apart) > APART * self._noise.sensor and self._since_renewed >= least
+            if due or self._since_renewed >= most:
+                self._renew()
+
+    def _take_up(self) -> None:
+        """Learn what is behind the doubt, if coefficients can take it up."""
+        if float(self._doubt.statistic.max()) < GONE:
             self._settle("gone")
+            return
+        moved = self._doubt.learned()
+        if moved is None:
+            return
+        self._estimator.shift(*moved)
+        self._publish("learned")
+        self._settle("learned")
 
-    def _beyond_learning(self) -> bool:
-        """Whether what is doubted is nothing that coefficients can learn: they would follow it badly."""
-        return self._alarm is not None and not set(self._alarm.causes) & LEARNABLE
+    def _roll_back(self) -> None:
+        self.calibration = self.first
+        self._weights[LEARNED] = self._weights[FIRST]
+        self._judge.restart()
+        self._restart()
+        self._tell_change("rolled back: the first calibration predicts better", LEARNED, FIRST)
 
-    def _challenge(self) -> None:
-        """Let what is learned so far be the candidate."""
-        self._candidate = self.learned()
-        self._weights[CANDIDATE] = self._weights_of(self._candidate.coefficients)
-        self._judge.challenge(self._estimator.beside, soon=self._estimator.creep > CREEP)
+    def _renew(self) -> None:
+        """Publish what is learned so far."""
+        self.calibration = self.learned()
+        self._coefficients = self._model.coefficients(self.calibration)[0]
+        self._weights[LEARNED] = self._model.weights(self._coefficients)
+        self._since_renewed, self.renewed = 0, True
 
-    def _publish(self, which: int, how: str) -> None:
-        before, after = (float(value) ** 0.5 for value in self._judge.mean_square[[PUBLISHED, which]])
-        self.calibration = self._candidate if which == CANDIDATE else self.first
-        self._weights[PUBLISHED] = self._weights[which]
-        self._judge.publish(which)
-        if self._alarm is None:
-            self.variance = 0.0
+    def _publish(self, how: str) -> None:
+        before = LEARNED if self.calibration is not self.first else FIRST
+        self._renew()
+        self._judge.worse = 0.0
+        self._tell_change(how, before, LEARNED)
+
+    def _tell_change(self, how: str, before: int, after: int) -> None:
+        self.renewed = False
+        rms = np.sqrt(self._judge.mean_square)
         name = calibration_id(self.calibration)
-        self._notify(f"{how} {name:08x}: {before:.1f} to {after:.1f} nT")
+        self._notify(f"{how} {name:08x}: {rms[before]:.1f} to {rms[after]:.1f} nT")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import nan
+
 import numpy as np
 import pytest
 
@@ -77,6 +79,7 @@ def learn(learner: Learner, world: World, *, added: np.ndarray | None = None, qu
             faulty=False,
             reference=FIELD,
             where=world.where[n],
+            watched=(nan,),
         )
         if learner.flags:
             doubted.append(n)

@@ -18,12 +18,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.residual import NormalEquations
 from magbridge.calibration.terms import Exponents
+
+if TYPE_CHECKING:
+    from magbridge.calibration.residual import NormalEquations  # it brings scipy, which the live path lacks
 
 __all__ = ["FACTOR_MASS", "Prior", "PriorFamily", "gain_rotation", "polynomial_prior"]
 
@@ -54,7 +57,9 @@ class Prior:
 
     def reduce(self, normal: NormalEquations) -> NormalEquations:
         """Return normal equations in c (K) as those in z (q)."""
-        return NormalEquations(self.E.T @ normal.hessian @ self.E, self.E.T @ normal.gradient, normal.cost)
+        return normal._replace(
+            hessian=self.E.T @ normal.hessian @ self.E, gradient=self.E.T @ normal.gradient
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,165 @@
+r"""From nothing: all samples so far fitted at once, while a calibration is too unknown for a filter.
+
+A vehicle's hard iron moves the reading by thousands of nanotesla, over which the field's magnitude is not
+linear: a Kalman filter that was linearised at a wrong guess stays wrong. So the samples since the start are
+kept, and fitted anew by Gauss-Newton when their number has doubled. Residuals and derivatives are whitened
+by the filter of :mod:`.nuisance`; with :math:`c = c_0 + L z, z \sim N(0, I)`, a step solves
+
+.. math:: (I + L^T J^T J L)\, z = -L^T J^T (r + J (c_0 - c))
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.prior import polynomial_prior
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.learning.model import Model
+from magbridge.learning.nuisance import STATES, Nuisance
+from magbridge.learning.observation import Observation, observe
+from magbridge.records import Vector
+
+__all__ = ["LAST", "Fitted", "Start", "class_prior"]
+
+FIRST: Final = 32
+LAST: Final = 4096
+"""Samples at which they are fitted first and last: 2 minutes and 4.5 hours of 0.25 Hz."""
+STEPS: Final = 12
+"""Of Gauss-Newton, at most."""
+SMALL: Final = 0.01
+"""Prior sigmas: a step this small is the last."""
+NOISE: Final = 2.0
+"""nT, 1-sigma of a channel's noise, until the samples say more."""
+ENOUGH: Final = 256
+"""Samples from which on they do."""
+
+
+def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, order: int = 3) -> Calibration:
+    """Return what is expected of any vehicle: an identity, and how far from it.
+
+    Parameters
+    ----------
+    parameters : tuple of Parameter
+        Its moving masses.
+    field : float
+        nT, F_0.
+    order : int
+        Of the polynomials.
+
+    Notes
+    -----
+    The widths are those that the fit begins with (:mod:`magbridge.calibration.fitting.prior`), each with its
+    own uncertainty: the mean of a log-normal's square.
+    """
+    exponents = full_order(len(parameters), order)
+    family = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
+    square = np.exp(2.0 * (family.constant + family.design @ family.centre))
+    square *= np.exp(2.0 * ((family.design * family.spread) ** 2).sum(axis=1))
+    return Calibration(
+        parameters=parameters,
+        terms=(Polynomial(exponents=exponents),),
+        coefficients=np.zeros(len(square)),
+        covariance=(family.E * square) @ family.E.T,
+        noise=Noise(NOISE),
+        reference=Reference(field),
+        method="none",
+    )
+
+
+class Fitted(NamedTuple):
+    """What the samples say.
+
+    Attributes
+    ----------
+    coefficients : (K,) array
+    beside : (3,) array
+        The nuisance after the last sample.
+    covariance : (K + 3, K + 3) array
+        Of both.
+    noise : float
+        nT, 1-sigma of a channel.
+    """
+
+    coefficients: FloatArray
+    beside: FloatArray
+    covariance: FloatArray
+    noise: float
+
+
+class Start:
+    """Keeps the samples since the start.
+
+    Parameters
+    ----------
+    model : Model
+    coefficients, covariance : (K,), (K, K) arrays
+        The prior.
+    field : float
+        nT, F_0.
+    """
+
+    def __init__(self, model: Model, coefficients: FloatArray, covariance: FloatArray, field: float) -> None:
+        self._model, self._prior, self._field = model, coefficients, field
+        values, vectors = np.linalg.eigh(covariance)
+        seen = values > values[-1] * 1e-14
+        self._root = vectors[:, seen] * np.sqrt(values[seen])
+        self._samples: list[tuple[Vector, FloatArray, float, float, float]] = []
+        self._next = FIRST
+
+    def add(self, field: Vector, phi: FloatArray, reference: float, metres: float, seconds: float) -> bool:
+        """Keep a sample, its regressors (m,), reference, way and time since the last; say whether to fit."""
+        self._samples.append((field, phi, reference, metres, seconds))
+        if len(self._samples) < self._next:
+            return False
+        self._next *= 2
+        return True
+
+    @property
+    def over(self) -> bool:
+        """Whether a filter can go on alone."""
+        return len(self._samples) >= LAST
+
+    def fit(self, coefficients: FloatArray, nuisance: Nuisance) -> Fitted:
+        """Fit all samples, beginning at `coefficients` (K,)."""
+        c, z = coefficients, np.full(self._root.shape[1], np.inf)
+        for _ in range(STEPS):
+            r, J, beside, B, Pb = self._whitened(c, nuisance)
+            JL = J @ self._root
+            H = np.eye(JL.shape[1]) + JL.T @ JL
+            before, z = z, np.asarray(np.linalg.solve(H, -JL.T @ (r + J @ (self._prior - c))))
+            step = self._prior + self._root @ z - c
+            c, beside, r = c + step, beside + B @ step, r + J @ step
+            if float(np.abs(z - before).max()) < SMALL:
+                break
+        rms = float(np.sqrt(np.mean(r * r)))
+        noise = float(np.sqrt(nuisance.white)) * (rms if len(r) >= ENOUGH else 1.0)
+        both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
+        covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
+        covariance[-STATES:, -STATES:] += Pb
+        return Fitted(c, beside, covariance, noise)
+
+    def _whitened(
+        self, c: FloatArray, nuisance: Nuisance
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return residuals (n,) and derivatives (n, K), white; nuisance, its derivative and covariance."""
+        weights = self._model.weights(c)
+        n, K = len(self._samples), len(c)
+        out = np.empty((n, K + 1))
+        states, P = np.zeros((STATES, K + 1)), nuisance.initial.copy()
+        for k, (field, phi, reference, metres, seconds) in enumerate(self._samples):
+            F, Q = nuisance.over(metres, seconds)
+            one: Observation = observe(field, phi @ weights, self._field, reference)
+            row = np.concatenate([[one.e], self._model.derivative(phi, one.by_nine)])
+            h = np.array([-1.0 / one.s, 0.0, -1.0])
+            P, states = F @ P @ F.T + Q, F @ states
+            Ph = P @ h
+            S = float(h @ Ph) + nuisance.white
+            row += h @ states
+            states -= np.outer(Ph / S, row)
+            P -= np.outer(Ph / S, Ph)
+            out[k] = row / np.sqrt(S)
+        return out[:, 0], out[:, 1:], states[:, 0], states[:, 1:], P
