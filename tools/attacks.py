@@ -105,14 +105,17 @@ def again(attacker: Attacker, _: int) -> None:
     attacker.say(RECORDED[0])
 
 
-def connect(attacker: Attacker, _: int) -> None:
-    """Open connections and leave them open."""
+def connect(attacker: Attacker, _: int, words: bytes = b"") -> None:
+    """Open connections, say something, and leave them open."""
     for _ in range(5):
         line = socket.socket()
         line.setblocking(False)
         with suppress(OSError):
             line.connect(attacker.rig.autopilot.address)
         attacker.lines.append(line)
+    for line in attacker.lines:
+        with suppress(OSError):
+            line.send(words)
     for line in attacker.lines[:-200]:
         line.close()
     del attacker.lines[:-200]
@@ -164,12 +167,23 @@ ATTACKS = (
            lambda a, k: a.say(ftp(Opcode.OPEN_READ if k < 2 else Opcode.BURST, b"parameter.json", k, 239))),
     Attack("valid heartbeats of 40 stations", "udpin, others", 40,
            lambda a, _: a.say(BEAT), "more than 8 peers"),
+    Attack("reboots of the autopilot that never were", "udpin", 1,
+           lambda a, k: a.say(frame(1, 1, "ATTITUDE", time_boot_ms=k % 4)), "several addresses", spoofs=True),
+    Attack("1,000 texts a second, to all", "udpin", 1,
+           lambda a, k: a.say(frame(1, 99, "STATUSTEXT", text=f"nothing {k}", severity=2), 5)),
+    Attack("commands without end", "udpin", 1,
+           lambda a, k: a.say(frame(255, 190, "COMMAND_LONG", **to_us(command=k % 1000)), 5),
+           "commands a second"),
+    Attack("our own heartbeat, sent back", "udpin", 1,
+           lambda a, _: a.say(frame(1, 191, "HEARTBEAT", type=18, autopilot=8)), "another program speaks"),
     Attack("nothing, by TCP", "tcpin", 0, lambda _a, _k: None),
     Attack("1,000 connections a second", "tcpin", 0, connect),
+    Attack("1,000 connections a second, each with half a frame", "tcpin", 0,
+           lambda a, k: connect(a, k, BEAT[:-9])),
 )  # fmt: skip
 
 
-def run(rig: Rig, attack: Attack) -> tuple[float, float, int, str]:
+def run(rig: Rig, attack: Attack, seconds: float = SECONDS) -> tuple[float, float, int, str]:
     """Attack; return the shares lost in and out, bytes that the strangers got, and what was told."""
     rig.until_well()
     before, mark, sent, said = rig.fresh_status(), rig.mark, [0], set(rig.said())
@@ -179,13 +193,13 @@ def run(rig: Rig, attack: Attack) -> tuple[float, float, int, str]:
         def retell(genuine: bytes) -> list[bytes]:
             for k in range(10):
                 attack.act(attacker, sent[0])
-                rig.autopilot.send(genuine if not k else rig.autopilot.telemetry())
+                rig.autopilot.send(rig.autopilot.telemetry() if k else genuine)
                 sent[0] += 1
             RECORDED[0] = genuine
             return []
 
         with rig.autopilot.retelling(retell):
-            rig.run(SECONDS)
+            rig.run(seconds)
         after = rig.fresh_status()
         got = attacker.answered()
         for line in attacker.lines:

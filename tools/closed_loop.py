@@ -105,6 +105,8 @@ def one(case: Case) -> list[str]:
     lost = (with_us.seconds > LOST) & (with_us.seconds < case.hours * HOUR - BACK)
     fed = lost & (with_us.sent > 0)
     fed &= np.cumsum(fed) > LOST  # once it has settled
+    if not fed.any():  # none was sent
+        fed = lost
     obeying, ignoring = rms(with_us.error[lost]), rms(without.error[lost])
     said = [text for second, text in with_us.texts if FOLLOWS in text and second < case.hours * HOUR - BACK]
     back = with_us.seconds > case.hours * HOUR - BACK

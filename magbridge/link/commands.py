@@ -24,6 +24,10 @@ CALIBRATES = (
     MAV_CMD.DO_ACCEPT_MAG_CAL,
     MAV_CMD.DO_CANCEL_MAG_CAL,
 )
+MOST = 100
+"""Commands of one sender that are executed within a second; more are rejected for the time being."""
+SENDERS = 64
+"""Senders that are counted; in a second with more of them, the others count as one."""
 AUTOPILOT_VERSION, MESSAGE_INTERVAL = spec("AUTOPILOT_VERSION").id, spec("MESSAGE_INTERVAL").id
 
 
@@ -62,6 +66,8 @@ class Commands:
     ) -> None:
         self._outbox, self._authority, self._announcer = outbox, authority, announcer
         self._messages, self._interval_us, self._set_rate = messages, interval_us, set_rate
+        self._second_us = 0
+        self._asked: dict[tuple[int, int], int] = {}
         self._commands = {
             MAV_CMD.REQUEST_MESSAGE: self._request,
             MAV_CMD.SET_MESSAGE_INTERVAL: self._set_interval,
@@ -79,7 +85,11 @@ class Commands:
         if target == 0 and not self._only_us(number, values[0]):
             return
         command = self._commands.get(number)
-        if number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._authority.may_change(message):
+        if self._is_flood(message.system, message.component):
+            text = f"more than {MOST} commands a second from {message.system}:{message.component}"
+            self._announcer.state("flood", text, MAV_SEVERITY.WARNING)
+            result = MAV_RESULT.TEMPORARILY_REJECTED
+        elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._authority.may_change(message):
             text = f"{message.system}:{message.component} may not set a rate: no station, no autopilot"
             self._announcer.state("rate", text, MAV_SEVERITY.WARNING, again=True)
             result = MAV_RESULT.DENIED
@@ -93,6 +103,17 @@ class Commands:
             target_system=message.system,
             target_component=message.component,
         )
+
+    def _is_flood(self, system: int, component: int) -> bool:
+        """Count a command; return whether its sender has sent too many within a second."""
+        now_us = self._outbox.codec.now_us
+        if now_us - self._second_us >= 1_000_000:
+            self._second_us, self._asked = now_us, {}
+        who = (system, component) if (system, component) in self._asked else (0, 0)
+        if len(self._asked) < SENDERS:
+            who = system, component
+        self._asked[who] = self._asked.get(who, 0) + 1
+        return self._asked[who] > MOST
 
     def _unsupported(self, number: int) -> MAV_RESULT:
         if number in CALIBRATES:

@@ -1,12 +1,15 @@
-"""A running bridge on a network that is not friendly; tools/attacks.py measures more of the kind."""
+"""A running bridge on a network that is not friendly: all that tools/attacks.py knows, and one siege."""
 
 from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
+import pytest
+from attacks import ALLOWED, ATTACKS, Attack, run
 from checks import replays
 from rig import Rig
 
@@ -53,3 +56,32 @@ def test_a_signed_bridge_that_anyone_can_reach(make_rig: MakeRig) -> None:
     assert not any("old time stamp" in text for text in rig.said())
     replays(rig)
     assert not any(SECRET[:6] in path.read_bytes() for path in rig.logs)
+
+
+@pytest.fixture(scope="module")
+def besieged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Rig]]:
+    """Return the bridge that is reached by a link; one for all attacks on it."""
+    rigs: dict[str, Rig] = {}
+
+    def reached_by(link: str) -> Rig:
+        if link not in rigs:
+            folder: Path = tmp_path_factory.mktemp("rig")
+            kind = "udpin" if link == "signed" else link.partition(",")[0]
+            rigs[link] = Rig(folder, kind, key=KEY if link == "signed" else None)
+            rigs[link].start()
+        return rigs[link]
+
+    yield reached_by
+    for rig in rigs.values():
+        rig.close()
+        rig.fluxgate.unplug()
+
+
+@pytest.mark.parametrize("attack", ATTACKS, ids=lambda one: one.name)
+def test_an_attack_costs_the_autopilot_nothing_or_is_told(
+    besieged: Callable[[str], Rig], attack: Attack
+) -> None:
+    rig = besieged(attack.link)
+    lost, out, _, told = run(rig, attack, 0.3)
+    assert max(lost, out) <= ALLOWED or told
+    assert any(attack.told in text for text in rig.said()), "each once while it lasts"

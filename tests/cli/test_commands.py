@@ -7,6 +7,8 @@ import os
 import pty
 import re
 import select
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -307,3 +309,16 @@ def test_only_what_the_sensor_measured_is_corrected(
     calm = (before | after) & Quality.MOVING == 0
     assert calm.sum() > 200
     np.testing.assert_allclose(out["total_field"][calm], whole["total_field"][calm], atol=0.1)
+
+
+def test_the_dialect_for_other_programs(command: Command) -> None:
+    """A new folder; mavgen takes the XML as it stands, pymavlink the module."""
+    assert "magbridge.xml" in command("dialect", "-o", "made/dialect").out
+    folder = Path("made/dialect")
+    again = Path("again.py")
+    mavgen = ["-m", "pymavlink.tools.mavgen", "--lang=Python3", "--wire-protocol=2.0", "-o", again]
+    subprocess.run([sys.executable, *mavgen, folder / "magbridge.xml"], check=True, capture_output=True)
+    names = {"MAVLINK_MSG_ID_MAG_FIELD", "MAVLINK_MSG_ID_MAG_COLUMN", "MAVLINK_MSG_ID_HEARTBEAT"}
+    for module in (again, folder / "magbridge.py", folder / "magbridge_ardupilotmega.py"):
+        text = module.read_text(encoding="utf-8")
+        assert all(f"{name} = " in text for name in names)

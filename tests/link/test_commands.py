@@ -8,8 +8,10 @@ from typing import Any
 import pytest
 from line import Line
 
+from magbridge.mavlink import Codec
+
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
-FIELD, HEARTBEAT, STATUS, HIGHRES_IMU, VERSION = 60101, 0, 60102, 105, 148
+FIELD, HEARTBEAT, STATUS, HIGHRES_IMU, VERSION, METADATA = 60101, 0, 60102, 105, 148, 397
 GET, SET, REQUEST, CAPABILITIES, START_MAG_CAL = 510, 511, 512, 520, 42424
 
 
@@ -119,3 +121,17 @@ def test_the_acknowledgement_is_addressed(link: Line) -> None:
     frame = next(frame for _, frame in reversed(link.sent) if frame[7] == 77)
     assert ack.result == UNSUPPORTED
     assert frame[10 + 8 : 10 + 10] == bytes((255, 190))  # target_system, target_component
+
+
+def test_a_flood_is_rejected_and_told_once_and_costs_nobody_else(link: Line) -> None:
+    """Of metadata, say: the first hundred of a second are answered."""
+    results = [result(link, link.command(REQUEST, METADATA)) for _ in range(300)]
+    assert results == [ACCEPTED] * 100 + [TEMPORARILY_REJECTED] * 200
+    others = Codec(255, 191)
+    ask = {"target_system": 1, "target_component": 191, "command": REQUEST, "param1": METADATA}
+    heard = link.give(others.pack("COMMAND_LONG", **ask))
+    assert [one.result for one in link.only(heard, "COMMAND_ACK")] == [ACCEPTED]
+    told = [text for _, text in link.component.announcer.said if "commands a second" in text]
+    assert told == ["more than 100 commands a second from 255:190"]
+    link.to(2.0)
+    assert result(link, link.command(REQUEST, METADATA)) == ACCEPTED
