@@ -315,9 +315,9 @@ def test_the_dialect_for_other_programs(command: Command) -> None:
     """A new folder; mavgen takes the XML as it stands, pymavlink the module."""
     assert "magbridge.xml" in command("dialect", "-o", "made/dialect").out
     folder = Path("made/dialect")
-    again = Path("again.py")
-    mavgen = ["-m", "pymavlink.tools.mavgen", "--lang=Python3", "--wire-protocol=2.0", "-o", again]
-    subprocess.run([sys.executable, *mavgen, folder / "magbridge.xml"], check=True, capture_output=True)
+    again, xml = Path("again.py"), str(folder / "magbridge.xml")
+    mavgen = ["-m", "pymavlink.tools.mavgen", "--lang=Python3", "--wire-protocol=2.0", "-o", str(again), xml]
+    subprocess.run([sys.executable, *mavgen], check=True, capture_output=True)
     names = {"MAVLINK_MSG_ID_MAG_FIELD", "MAVLINK_MSG_ID_MAG_COLUMN", "MAVLINK_MSG_ID_HEARTBEAT"}
     for module in (again, folder / "magbridge.py", folder / "magbridge_ardupilotmega.py"):
         text = module.read_text(encoding="utf-8")
