@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import count
-from math import cos, sin
+from math import atan2, cos, sin
 from pathlib import Path
 from random import Random
 
@@ -28,8 +28,10 @@ BEGIN_US = 1_750_000_000_000_000
 TELEMETRY_HZ = 20
 TELEMETRY = ("battpos",) * 8 + ("ballast",) * 8 + ("ATTITUDE",) * 3 + ("GLOBAL_POSITION_INT",)
 """Messages of one second, beside the autopilot's heartbeat."""
-HORIZONTAL, VERTICAL, NOISE = 30_000.0, 42_740.0, 0.5
+HORIZONTAL, VERTICAL, NOISE = 19_000.0, 48_640.0, 0.5
 """nT: the Earth's field at 49.5 N, 57.8 W, and the noise of an axis."""
+DECLINATION = -0.32
+"""rad."""
 OPTIONS = {"sensitivity": 5e-5, "reference_voltage": 5.0}
 CONFIG = """
 [sensor]
@@ -148,7 +150,8 @@ class Feed:
         boot_ms = (time_us - BEGIN_US) // 1000 % (1 << 32)
         t = number / TELEMETRY_HZ
         if name == "ATTITUDE":
-            return self._autopilot.pack(name, time_boot_ms=boot_ms, roll=0.1 * sin(t), pitch=-0.3, yaw=1.0)
+            yaw = DECLINATION + atan2(-cos(0.1 * t), sin(0.1 * t))
+            return self._autopilot.pack(name, time_boot_ms=boot_ms, roll=0.02 * sin(t), pitch=-0.03, yaw=yaw)
         if name == "GLOBAL_POSITION_INT":
             return self._autopilot.pack(
                 name, time_boot_ms=boot_ms, lat=495_000_000 + number, lon=-578_000_000, alt=-50_000
