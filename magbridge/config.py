@@ -114,9 +114,25 @@ class Link(Table, frozen=True):
 class Telemetry(Table, frozen=True):
     """``[telemetry.NAME]``: a field of a message that becomes the parameter NAME.
 
-    ``value = scale * message.field + offset``. `field` may carry an index, ``actuator[2]``. `match` holds
-    values that other fields of the message must have. `max_age` is in s; an older value is stale. Only what
-    `component` sends counts; without it, the autopilot's, else what the first sends that is heard.
+    ``value = scale * message.field + offset``.
+
+    Attributes
+    ----------
+    message : str
+        The MAVLink message, ``NAMED_VALUE_FLOAT``.
+    field : str
+        One of its fields, also with an index: ``actuator[2]``.
+    match : dict
+        Values that other fields of the message must have.
+    scale, offset : float
+        As above.
+    unit : str
+        Of the parameter, as in the calibration.
+    max_age : float
+        s; an older value is stale.
+    component : int or None
+        Only what this component sends counts; without it, the autopilot's, else what the first sends that is
+        heard.
     """
 
     message: str
@@ -136,7 +152,13 @@ class Telemetry(Table, frozen=True):
 
 
 class CalibrationFile(Table, frozen=True):
-    """``[calibration]``: the ``cal.json`` to correct with."""
+    """``[calibration]``: what to correct with.
+
+    Attributes
+    ----------
+    file : str
+        The ``cal.json``.
+    """
 
     file: Name
 
@@ -220,13 +242,21 @@ class Learning(Table, frozen=True):
 
 
 class Log(Table, frozen=True):
-    """``[log]``: where the telemetry log goes, and when a new file begins."""
+    """``[log]``: where the telemetry log goes, and when a new file begins.
+
+    Attributes
+    ----------
+    directory : str
+        The folder.
+    max_size : float
+        MB of a file.
+    max_age : float
+        h that a file covers.
+    """
 
     directory: str
     max_size: Positive = 64.0
-    """MB."""
     max_age: Positive = 24.0
-    """h."""
 
 
 class Config(Table, frozen=True):

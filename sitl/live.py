@@ -37,9 +37,12 @@ from sitl.dataset import segments
 from sitl.replay.emulation import emulate
 from sitl.replay.setup import bridge_toml
 from sitl.scenario import load
-from sitl.twin import simulate
+from sitl.twin import Twin, simulate
 
-__all__ = ["flying"]
+__all__ = ["MAP", "flying"]
+
+MAP = "grid.nc"
+"""The anomaly map of the glider's world, in its folder."""
 
 PARAMETERS = ("battpos", "ballast")
 RATE = 1.0
@@ -57,7 +60,7 @@ def flying(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> I
     Parameters
     ----------
     folder : Path
-        For the deployment, its calibration, the bridge's configuration and its log.
+        For the deployment, its calibration, its world's map, the bridge's configuration and its log.
     seed : int
         Which random glider.
     say : callable
@@ -98,7 +101,9 @@ def _prepare(folder: Path, seed: int) -> xr.Dataset:
     """Simulate, fit, and return the survey."""
     scenario = load("demo")
     instrument = msgspec.structs.replace(scenario.instrument, rate=RATE)
-    deployment = simulate(msgspec.structs.replace(scenario, instrument=instrument), seed)
+    scenario = msgspec.structs.replace(scenario, instrument=instrument)
+    deployment = simulate(scenario, seed)
+    Twin.draw(scenario, seed).anomaly_map().save(folder / MAP)
     write(deployment, folder / "deployment.nc")
     parts = segments(deployment)
     training = unfiltered(observations(parts["calibration"], PARAMETERS), scenario.instrument.corner)

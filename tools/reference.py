@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
 
+    from magbridge.sensors.options import Option
+
 ROOT = Path(__file__).resolve().parents[1]
+TWICE = re.compile(r"^(magbridge (?:fleet )?)(?:fleet )?(\w+) (?:fleet )?\2(?=\s)", re.MULTILINE)
 ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):(<code>)(?:~[\w.]*\.)?([\w.]+)")
 
 
@@ -51,29 +54,41 @@ def commands() -> str:
     page = app.generate_docs(output_format="markdown", recursive=True, include_hidden=False)
     start = page.index("\n## Table of Contents")
     listed = page.index("**Commands**", start)
-    return "# Commands\n\n" + page[listed:]
+    # a usage of our own already says the command's name, which cyclopts puts before it
+    return "# Commands\n\n" + TWICE.sub(r"\1\2", page[listed:])
 
 
 def configuration() -> Iterator[str]:
     """Yield the page of ``bridge.toml``: its tables as they are defined, and the options of every driver."""
     from magbridge.config import Config  # noqa: PLC0415 - imports the program only where pages are made
+    from magbridge.navigate import Options  # noqa: PLC0415
     from magbridge.sensors import DRIVERS  # noqa: PLC0415
-    from magbridge.sensors.options import options_of  # noqa: PLC0415
+    from magbridge.sensors.options import attributes_of, options_of, told_of  # noqa: PLC0415
 
     yield "# bridge.toml\n\nWhat every key means, its type and its default. Paths are relative to the file.\n"
     for name, held in get_type_hints(Config).items():
         table = next((one for one in (held, *get_args(held)) if _is_table(one)), None)
         if table is not None:
-            options = f"{{heading: '{name}', show_bases: false}}"
-            yield f"::: {table.__module__}.{table.__name__}\n    options: {options}\n"
+            yield from (f"## {name}", "", told_of(table), "")
+            yield from _keys(attributes_of(table))
         elif name == "publish":
-            yield from ("## publish", "", "Message = rate in Hz; 0 with every sample, negative never.", "")
+            yield from (
+                "## publish",
+                "",
+                "`[publish]`: message = rate in Hz; 0 with every sample, negative never.",
+                "",
+            )
     yield "## sensor.options\n\nThe keys that each driver has; `magbridge drivers NAME` prints them.\n"
     for driver in sorted(DRIVERS):
-        rows = [(f"`{one.name}`", one.kind, _default(one.default), one.meaning) for one in options_of(driver)]
         yield f"### {driver}\n"
-        yield from _table(("option", "type", "default", ""), rows)
-    yield "## navigation.options\n\n::: magbridge.navigate.Options\n    options: {heading_level: 3}\n"
+        yield from _keys(options_of(driver))
+    yield "## navigation.options\n"
+    yield from _keys(attributes_of(Options))
+
+
+def _keys(options: Iterable[Option]) -> Iterator[str]:
+    rows = ((f"`{one.name}`", one.kind, _default(one.default), one.meaning) for one in options)
+    return _table(("key", "type", "default", ""), rows)
 
 
 def _is_table(kind: object) -> bool:

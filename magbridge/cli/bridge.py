@@ -74,7 +74,7 @@ def demo(
 def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
     """Fly the demonstration's glider into the page until interrupted."""
     from magbridge.monitor.serve import serve
-    from sitl.live import flying
+    from sitl.live import MAP, flying
 
     def say(text: str) -> None:
         print(text, file=sys.stderr)
@@ -82,7 +82,7 @@ def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
     with new_folder(out):
         out.mkdir(parents=True, exist_ok=True)
         with flying(out, seed, say) as link:
-            serve(link, 0, "127.0.0.1", port, show=show)
+            serve(link, 0, "127.0.0.1", port, grid=out / MAP, show=show)
 
 
 @command("run --config bridge.toml [--check]")

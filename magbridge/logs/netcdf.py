@@ -148,7 +148,11 @@ class FileWriter:
                 attrs["flag_meanings"] = " ".join(str(flag.name).lower() for flag in Quality)
             if name not in COORDINATES and coordinates:
                 attrs["coordinates"] = coordinates
-            variable.setncatts({key: value for key, value in attrs.items() if key != "units" or not flags})
+            if flags:
+                attrs.pop("units", None)
+            elif attrs.get("units") == "deg":
+                attrs["units"] = "degree"  # UDUNITS knows no deg
+            variable.setncatts(attrs)
             variable.setncatts({"column": name})
             self._variables[name] = variable
 

@@ -63,6 +63,8 @@ class State:
 
     Attributes
     ----------
+    began : float
+        When its first message came; inf before.
     heard, sampled, reported, navigated : float
         When its last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION came; -inf before the first.
     interval, report_interval : float
@@ -90,6 +92,7 @@ class State:
 
     def __init__(self, bridge: tuple[int, int] | None = None, sequence: int = -1) -> None:
         self.bridge = bridge
+        self.began = inf
         self.heard = self.sampled = self.reported = self.navigated = -inf
         self.interval = self.report_interval = 0.0
         self.received = self.lost = 0
@@ -132,6 +135,7 @@ class State:
         gap = (message.sequence - self._sequence - 1) % 256
         self.lost += gap if gap < 128 else 0  # a larger step is a message that comes late
         self._sequence, self.heard = message.sequence, now
+        self.began = min(self.began, now)
         self.received += 1
         if handle := self._handlers.get(message.id):
             handle(message, now)

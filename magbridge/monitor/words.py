@@ -29,6 +29,8 @@ FLAGS = {
 }
 ROUTINE = {"moving", "no_boresight", "late_join"}
 """Flags that come and go, or stay, in a mission where nothing is wrong: they are shown, and alarm nobody."""
+STARTING = 15.0
+"""s after its first message in which a bridge may still be waiting for its sensor and its autopilot."""
 HUGE = 1e9
 """No figure of the page is as large: what is, is written with its power of ten."""
 LOSSES = {
@@ -137,11 +139,12 @@ def whereabouts(state: State, now: float) -> dict[str, tuple[str, bool]]:
 def conditions(state: State, now: float) -> dict[str, str]:
     """Return what a person should look at, as :meth:`Alarms.update` takes it: key and words of each."""
     wrong = {name: FLAGS[name] for name in state.flags if name not in ROUTINE}
-    if quiet := silence(state, now):
+    starting = now - state.began < STARTING
+    if (quiet := silence(state, now)) and not starting:
         wrong["silence"] = quiet.split(" for ")[0].capitalize()
     for line in ("Sensor", "Autopilot", "Log"):
         text, _ = health(state, now)[line]
-        if state.status and text in {"silent", "lost", "failed"}:
+        if state.status and not starting and text in {"silent", "lost", "failed"}:
             wrong[line] = f"{line}: {text}"
     if state.navigation.get("state") == MAG_NAVIGATION_STATE.LOST:
         wrong["navigation"] = "The position by the field is lost"

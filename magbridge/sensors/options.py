@@ -10,7 +10,7 @@ import msgspec
 from magbridge.plugins import plugins
 from magbridge.sensors import DRIVERS, driver_class
 
-__all__ = ["Option", "driver_names", "options_of"]
+__all__ = ["Option", "attributes_of", "driver_names", "options_of", "told_of"]
 
 
 class Option(NamedTuple):
@@ -50,16 +50,22 @@ def options_of(driver: str) -> list[Option]:
     ConfigError
         No such driver.
     """
-    struct: Any = driver_class(driver, "options").Options
+    return sorted(attributes_of(driver_class(driver, "options").Options), key=lambda one: not one.required)
+
+
+def attributes_of(struct: Any) -> list[Option]:
+    """Return the fields of a msgspec struct with what its docstring tells of each."""
     told = _attributes(struct.__doc__ or "")
-    options = [
-        Option(field.name, *told.get(field.name, ("", "")), field.default)._replace(default=_default(field))
+    return [
+        Option(name, kind, _default(field), meaning)
         for field in msgspec.structs.fields(struct)
+        for name, (kind, meaning) in [(field.name, told.get(field.name, ("", "")))]
     ]
-    return sorted(
-        (Option(one.name, one.kind, one.default, told.get(one.name, ("", ""))[1]) for one in options),
-        key=lambda one: not one.required,
-    )
+
+
+def told_of(struct: Any) -> str:
+    """Return a struct's docstring up to its attributes, as one paragraph."""
+    return " ".join((struct.__doc__ or "").partition("Attributes\n")[0].split())
 
 
 def _default(field: Any) -> Any:
@@ -72,12 +78,12 @@ def _attributes(docstring: str) -> dict[str, tuple[str, str]]:
     """Return name -> type and meaning of the section 'Attributes' of a numpydoc docstring."""
     section = docstring.partition("Attributes\n")[2]
     found: dict[str, tuple[str, str]] = {}
-    name = ""
+    names: list[str] = []  # several may share a line: ``scale, offset : float``
     for line in section.splitlines():
-        if match := re.fullmatch(r" {4}(\w+) : (.+)", line):
-            name = match[1]
-            found[name] = match[2], ""
-        elif name and line.startswith(" " * 8):
-            kind, meaning = found[name]
-            found[name] = kind, f"{meaning} {line.strip()}".strip()
+        if match := re.fullmatch(r" {4}(\w+(?:, \w+)*) : (.+)", line):
+            names = match[1].split(", ")
+            found |= dict.fromkeys(names, (match[2], ""))
+        elif names and line.startswith(" " * 8):
+            kind, meaning = found[names[0]]
+            found |= dict.fromkeys(names, (kind, f"{meaning} {line.strip()}".strip()))
     return found

@@ -111,5 +111,5 @@ def _crossings(
         dots = ax.scatter(longitude, latitude, c=after, s=14, cmap="PuOr", vmin=-edge, vmax=edge)
         figure.colorbar(dots, ax=ax, shrink=0.85)
         rms = [float(np.sqrt(np.mean(one**2))) for one in misties]
-        title = f"{len(after)} crossovers: {rms[0]:.1f} nT RMS before levelling, {rms[1]:.1f} after (shown)"
+        title = f"{len(after)} crossovers: mis-ties after levelling\n{rms[1]:.1f} nT RMS, before {rms[0]:.1f}"
     _geographic(ax, samples.origin[0], title)

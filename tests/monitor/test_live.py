@@ -12,6 +12,7 @@ from magbridge.bridge.links import open_link
 from magbridge.mavlink import Codec
 from magbridge.mavlink.dialect import MAG_PORT_STATE
 from magbridge.monitor.fleet import Fleet
+from magbridge.monitor.track import read_background
 
 live = pytest.importorskip("sitl.live", reason="the analysis extra is not installed")
 
@@ -33,6 +34,10 @@ def test_a_glider_is_flown_into_the_page(tmp_path: Path) -> None:
             port.flush()
         port.close()
     assert {"battpos", "ballast"} <= set(state.telemetry)
+    west, south, east, north = read_background(tmp_path / live.MAP).box  # beneath the track
+    assert west < state.reported_track.latest.longitude < east
+    assert south < state.reported_track.latest.latitude < north
+    assert not list(state.alarms)  # starting is nothing to look at
     assert state.reported_track.latest.latitude == pytest.approx(49.52, abs=0.1)
     assert state.status["sensor_state"] == MAG_PORT_STATE.OK
     assert state.samples[-1]["total_field"] == pytest.approx(52_200, abs=500)

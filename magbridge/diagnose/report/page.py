@@ -73,7 +73,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>'
-        f"<style>\n{STYLE.read_text('utf-8')}</style></head><body>{content}</body></html>\n"
+        f"<style>\n{STYLE.read_text('utf-8')}</style></head><body><main>{content}</main></body></html>\n"
     )
 
 
