@@ -19,19 +19,16 @@ import csv
 import json
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import product
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from engine import add_engine, in_order
 from rich.console import Console
-from rich.progress import track
 from scipy.optimize import least_squares
 from terminal import command_line, table
 
@@ -224,24 +221,6 @@ def show(rows: list[Row], console: Console) -> None:
         console.print(shown)
 
 
-def measure(cases: list[Case], jobs: int) -> list[Row]:
-    """Run all cases, `jobs` at a time; the rows come back in the order of the cases."""
-    rows: list[Row] = []
-    # one core for each process spawned below
-    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        waiting = [pool.submit(run, case) for case in cases]
-        progress = Console(stderr=True)
-        for count, done in enumerate(
-            track(as_completed(waiting), "gliders", len(waiting), console=progress), 1
-        ):
-            rows += done.result()
-            if not progress.is_terminal and count % 10 == 0:
-                print(f"{count} of {len(waiting)}", file=sys.stderr, flush=True)
-    order = {(case.masses, case.noise): k for k, case in enumerate(cases)}
-    return sorted(rows, key=lambda row: (order[row.masses, row.noise], row.seed))
-
-
 def arguments() -> argparse.Namespace:
     """Return what the command line asks for."""
     parser = command_line(__doc__)
@@ -262,7 +241,7 @@ def arguments() -> argparse.Namespace:
         default=40,
         help="gliders that the peers are given (12 s each): two masses, first noise",
     )
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    add_engine(parser)
     parser.add_argument("--out", type=Path, help="folder for accuracy.csv and accuracy.txt")
     return parser.parse_args()
 
@@ -284,7 +263,7 @@ def main() -> None:
         )
         for masses, noise, seed in product(chosen.masses, chosen.noise, range(chosen.seeds))
     ]
-    rows = measure(cases, chosen.jobs)
+    rows = [row for some in in_order(run, [(case,) for case in cases], chosen) for row in some]
     show(rows, console)
     if chosen.out:
         chosen.out.mkdir(parents=True, exist_ok=True)

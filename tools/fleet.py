@@ -11,15 +11,13 @@ some of its runs, with the fleet's prior and without, and scored on its survey a
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ProcessPoolExecutor
 from itertools import product
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import xarray as xr
+from engine import add_engine, in_order
 from rich.console import Console
 from terminal import command_line, table
 
@@ -163,7 +161,7 @@ def main() -> None:
         "--mounted", action="store_true", help="the fleet knows where masses usually sit (drawn: 6 cm off)"
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    add_engine(parser)
     options = parser.parse_args()
     flights = [
         Flight(vehicle, number, options.refit, options.every, options.seed)
@@ -171,16 +169,15 @@ def main() -> None:
         for number in range(options.deployments)
     ]
     last = options.deployments - 1
-    os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
-        told = list(pool.map(lesson, [one for one in flights if one.number < last]))
-        where = {name: Mounting(MOUNTINGS[name].at, MOUNTINGS[name].travel) for name in MASSES}
-        mounted = {f"vehicle {k}": where for k in range(options.vehicles)} if options.mounted else {}
-        fleet = learn_fleet([one for one in told if isinstance(one, Lesson)], mounted)
-        scored = [one for one in flights if one.number == last]
-        refit = f"refit {last // options.every}"
-        priors = [fleet.known(f"vehicle {one.vehicle}", refit) for one in scored]
-        rows = [row for some in pool.map(score, scored, [options.runs] * len(scored), priors) for row in some]
+    told = in_order(lesson, [(one,) for one in flights if one.number < last], options)
+    where = {name: Mounting(MOUNTINGS[name].at, MOUNTINGS[name].travel) for name in MASSES}
+    mounted = {f"vehicle {k}": where for k in range(options.vehicles)} if options.mounted else {}
+    fleet = learn_fleet([one for one in told if isinstance(one, Lesson)], mounted)
+    scored = [one for one in flights if one.number == last]
+    refit = f"refit {last // options.every}"
+    priors = [fleet.known(f"vehicle {one.vehicle}", refit) for one in scored]
+    cases = [(one, options.runs, prior) for one, prior in zip(scored, priors, strict=True)]
+    rows = [row for some in in_order(score, cases, options) for row in some]
     console = Console(width=110)
     for error in (one for one in told if isinstance(one, str)):
         console.print(f"not learnt from: {error}")

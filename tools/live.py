@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from engine import add_engine, in_order
 from rich.console import Console
 from terminal import command_line, table
 
@@ -248,18 +249,16 @@ def main() -> None:
     parser.add_argument("--size", type=float, default=20.0, help="nT of a change, in times its kind's unit")
     parser.add_argument("--changes", nargs="+", default=list(CHANGES), choices=list(CHANGES))
     parser.add_argument("-v", action="store_true", help="print what is announced")
+    add_engine(parser)
     asked = parser.parse_args()
     shown = table(
         f"{asked.seeds} gliders, {asked.hours:g} h, {asked.size:g} nT",
         "", "fixed", "published", "95 %", "sigma", "delay", "among", "alone", "false alarms", "moved",
     )  # fmt: skip
-    for name in asked.changes:
-        rows = np.array(
-            [
-                run(name, seed, asked.hours, asked.size)
-                for seed in range(asked.first, asked.first + asked.seeds)
-            ]
-        )
+    seeds = range(asked.first, asked.first + asked.seeds)
+    cases = [(name, seed, asked.hours, asked.size) for name in asked.changes for seed in seeds]
+    done = np.array(in_order(run, cases, asked)).reshape(len(asked.changes), len(seeds), -1)
+    for name, rows in zip(asked.changes, done, strict=True):
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             middle, high, mean = np.nanmedian(rows, 0), np.nanquantile(rows, 0.95, 0), np.nanmean(rows, 0)

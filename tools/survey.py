@@ -24,8 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from engine import add_engine, in_order
 from rich.console import Console
-from rich.progress import track
 from survey_real import REAL
 from terminal import command_line, table
 
@@ -253,6 +253,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
     parser.add_argument("--real", type=Path, help="folder of real surveys, instead of gliders")
     parser.add_argument("--out", type=Path, help="CSV of all gliders")
+    add_engine(parser)
     return parser.parse_args()
 
 
@@ -264,7 +265,7 @@ def main() -> None:
             console.print(name, *row(chosen.real))
         return
     todo = list(cases(chosen))
-    rows = [run(*case) for case in track(todo, "gliders", console=Console(stderr=True))]
+    rows = in_order(run, todo, chosen)
     show(rows, console)
     if chosen.out:
         with chosen.out.open("w", newline="") as file:

@@ -29,7 +29,7 @@ from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 from magbridge.toml import check_entries, convert, load_toml
 
-__all__ = ["Mounting", "mounted_prior", "read_vehicle"]
+__all__ = ["LATENT", "Mounting", "mounted_prior", "read_vehicle"]
 
 Vector = tuple[float, float, float]
 
