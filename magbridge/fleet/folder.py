@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from hashlib import sha256
+from io import BytesIO
 from pathlib import Path
 
 import msgspec
@@ -98,7 +99,9 @@ class FolderCatalogue(Catalogue):
         name = sha256("".join(frame["key"]).encode()).hexdigest()[:40]
         path = self.folder / table / f"{name}.parquet"
         if not path.exists():
+            whole = BytesIO()  # polars hides why it cannot write to a file
+            frame.write_parquet(whole, compression="zstd")
             with atomic_path(path) as beside:
                 beside.parent.mkdir(exist_ok=True)
-                frame.write_parquet(beside, compression="zstd")
+                beside.write_bytes(whole.getbuffer())
         return path

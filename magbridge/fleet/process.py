@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from itertools import groupby
 from typing import NamedTuple
@@ -50,6 +51,7 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
     PortError
         Nothing answers there.
     """
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is raised
     if scheduler:
         try:
             client = Client(scheduler, timeout=PATIENCE)
@@ -65,7 +67,7 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
             threads_per_worker=1,
             memory_limit=memory,
             dashboard_address=None,
-            silence_logs=logging.ERROR,
+            silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,
     ):
@@ -99,6 +101,11 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
     """Process deployments; yield what came of each as it is done.
 
     A task whose worker is lost is given to another; one that is killed leaves nothing but what is done.
+
+    Raises
+    ------
+    PortError
+        The scheduler was lost.
     """
     folder = catalogue.results.resolve()
     futures = {client.submit(work, job, folder, pure=False): job for job in todo}
@@ -109,6 +116,9 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
         except KilledWorker:
             line = f"{job.vehicle['vehicle']} {job.deployment}: its workers were killed (out of memory?)"
             done = Done({}, line)
+        except CancelledError as error:
+            address = client.scheduler_info()["address"] if client.scheduler else str(client)
+            raise PortError(address, "the dask scheduler was lost: run again to do what is left") from error
         future.release()
         yield _kept(catalogue, job, done)
     catalogue.compact()

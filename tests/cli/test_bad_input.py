@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from commands import Command
+from disks import full_disk
 
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.fit import METHODS
@@ -170,13 +170,8 @@ def test_bad_input_gets_one_line_and_leaves_nothing(
 def test_a_full_disk_gets_one_line_and_leaves_nothing(
     suffix: str, room: int, deployment: Path, here: Path, command: Command
 ) -> None:
-    """The limit of a file's size stands for the disk's end: the reason told is the system's own."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-    try:
+    with full_disk(room):
         line = command.refuses("convert", deployment, "-o", f"x{suffix}")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert line == f"x{suffix}: cannot be written: File too large"
     assert list(here.iterdir()) == []
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
+from disks import full_disk
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import save
@@ -67,15 +67,12 @@ def test_where_one_file_cannot_be_written_none_is(found: tuple[Diagnosis, Path],
 
 
 def test_a_full_disk_names_the_file_that_has_no_room(found: tuple[Diagnosis, Path], tmp_path: Path) -> None:
-    """The limit of a file's size stands for the disk's end."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     for room, name in ((0, "calibration.json"), (300_000, "report.html")):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-        try:
-            with pytest.raises(WriteError, match=rf"doubt/{name}: cannot be written: File too large"):
-                files.write(found[0], tmp_path / "doubt")
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        with (
+            full_disk(room),
+            pytest.raises(WriteError, match=rf"doubt/{name}: cannot be written: File too large"),
+        ):
+            files.write(found[0], tmp_path / "doubt")
         assert not list(tmp_path.iterdir())
 
 

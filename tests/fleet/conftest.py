@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
-from fleets import FLEET, fly
+from fleets import FLEET, catalogue_of, fly
+
+from magbridge.fleet.folder import FolderCatalogue as Catalogue
+from magbridge.fleet.process import client_of, jobs, process
 
 
 @pytest.fixture(scope="session")
@@ -16,3 +21,16 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fly(folder / f"{name}.nc", vehicle, number)
     (folder / "fleet.toml").write_text(FLEET)
     return folder
+
+
+@pytest.fixture(scope="session")
+def done(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
+    """The fleet's catalogue, processed by two workers, one of which is killed on the way."""
+    catalogue = catalogue_of(tmp_path_factory.mktemp("done"), flown)
+    with client_of("", 2, "2 GiB") as client:
+        victim = next(iter(client.run(os.getpid).values()))
+        for number, outcome in enumerate(process(catalogue, jobs(catalogue), client)):
+            assert not outcome.failures
+            if not number:
+                os.kill(victim, signal.SIGKILL)
+    return catalogue

@@ -3,48 +3,25 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fleets import fly
+from disks import full_disk
+from fleets import catalogue_of, content, fly
 
 from magbridge.calibration.file import decode_calibration, load
 from magbridge.cli import main
-from magbridge.fleet.catalogue import TABLES, Row
+from magbridge.errors import WriteError
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
 from magbridge.fleet.memory import current, lessons
-from magbridge.fleet.process import client_of, jobs, new_jobs, process
+from magbridge.fleet.process import jobs, new_jobs
 from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
 from magbridge.fleet.status import status
 from magbridge.fleet.work import work
 from magbridge.logs import read, write
 
 MAY = Deployment("may", ())
-
-
-def catalogue_of(folder: Path, flown: Path) -> Catalogue:
-    assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", str(folder / "fleet")]) == 0
-    return Catalogue(folder / "fleet")
-
-
-def content(catalogue: Catalogue) -> dict[str, list[Row]]:
-    return {table: catalogue.rows(table) for table in TABLES}
-
-
-@pytest.fixture(scope="module")
-def done(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> Catalogue:
-    """The fleet's catalogue, processed by two workers, one of which is killed on the way."""
-    catalogue = catalogue_of(tmp_path_factory.mktemp("done"), flown)
-    with client_of("", 2, "2 GiB") as client:
-        victim = next(iter(client.run(os.getpid).values()))
-        for number, outcome in enumerate(process(catalogue, jobs(catalogue), client)):
-            assert not outcome.failures
-            if not number:
-                os.kill(victim, signal.SIGKILL)
-    return catalogue
 
 
 def test_every_deployment_is_done_once(done: Catalogue) -> None:
@@ -152,6 +129,23 @@ def test_what_is_wrong_with_the_moment_is_not_on_record(tmp_path: Path) -> None:
     refused = work(job, tmp_path / "results")
     assert refused.tables == {}
     assert "comet may" in refused.hindrance
+
+
+def test_a_full_disk_is_a_line_and_nothing_is_on_record(flown: Path, tmp_path: Path) -> None:
+    catalogue = catalogue_of(tmp_path, flown)
+    job = jobs(catalogue)[0]
+    with full_disk(2000):
+        refused = work(job, catalogue.results)
+        assert refused.tables == {}
+        assert refused.hindrance.startswith("one first: ")
+        assert refused.hindrance.endswith(".nc: cannot be written: File too large")
+        with pytest.raises(WriteError, match=r"done/.*\.parquet: cannot be written: File too large"):
+            catalogue.add(
+                "done", [{**job.mark, "job": str(k), "diagnosed": 0, "mapped": 0} for k in range(999)]
+            )
+    assert catalogue.rows("done") == []
+    assert [path for path in catalogue.folder.rglob("*") if "partial" in path.name] == []
+    assert len(new_jobs(catalogue, jobs(catalogue))) == 3
 
 
 def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 from gliders import make
 
+from magbridge.cli import main
+from magbridge.fleet.catalogue import TABLES, Row
+from magbridge.fleet.folder import FolderCatalogue as Catalogue
 from magbridge.logs import write
 from magbridge.logs.deployment import deployment
 
@@ -27,6 +30,17 @@ def fly(path: Path, vehicle: int, number: int, start: float | None = None, senso
     attrs = {"sensor": sensor} if sensor else {}
     write(deployment(path, when, columns, {"battpos": "in"}, attrs), path)
     return path
+
+
+def catalogue_of(folder: Path, flown: Path) -> Catalogue:
+    """Return a new catalogue with the vehicles and logs of a folder's fleet.toml."""
+    assert main(["fleet", "add", str(flown / "fleet.toml"), "--catalogue", str(folder / "fleet")]) == 0
+    return Catalogue(folder / "fleet")
+
+
+def content(catalogue: Catalogue) -> dict[str, list[Row]]:
+    """Return all that a catalogue holds."""
+    return {table: catalogue.rows(table) for table in TABLES}
 
 
 FLEET = """
