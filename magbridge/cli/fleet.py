@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter, validators
 
-from magbridge.cli.common import Day, Json, Output, Whole, app, complain, file_to_write, print_result
+from magbridge.cli.common import Day, Json, Output, Whole, app, complain, print_result
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
 
@@ -220,7 +220,7 @@ def show(
     /,
     *,
     catalogue: Where = HERE,
-    html: Annotated[Path | None, Parameter(validator=file_to_write(".html"))] = None,
+    html: Path | None = None,
     json: Json = False,
 ) -> None:
     """Say how a vehicle's coefficients went from deployment to deployment, and when they changed.
@@ -232,13 +232,14 @@ def show(
     catalogue
         The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
     html
-        A page to write, with a picture of each vehicle.
+        Pages to write, with pictures: a file (.html) with all vehicles, or a folder with a page of each
+        and all numbers as fleet.json.
     json
         Print the result as JSON.
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.drift import facts, history
-    from magbridge.fleet.memory import fleets
+    from magbridge.fleet.memory import findings, fleets
     from magbridge.fleet.register import vehicles
 
     there = open_catalogue(catalogue)
@@ -253,9 +254,9 @@ def show(
     if not found:
         raise DataError(f"{there.name}: nothing to show: no deployment has been calibrated")
     if html:
-        from magbridge.fleet.page import write_page
+        from magbridge.fleet.page import write_page, write_pages
 
-        write_page(found, html)
+        (write_page if html.suffix == ".html" else write_pages)(found, html, findings(there))
     told = {name: facts(one) for name, one in found.items()}
     print_result({"vehicles": told}, "\n".join(_lines(told)), json)
 
@@ -311,7 +312,7 @@ def _lines(told: dict[str, dict[str, Any]]) -> list[str]:
         lines.append(f"{name}: {len(one['deployments'])} deployments, {len(changes)} changes")
         lines += [
             f"  {part['date']} {part['deployment']} (refit {part['refit']}): {change['what']} moved by "
-            f"{change['by_nT']:+.0f} nT, {change['sigmas']:.1f} sigma"
+            f"{change['by_nT']:+.0f} nT, {change['sigmas']:.1f} sigma: {change['cause']}"
             for part, change in changes
         ]
     return lines

@@ -24,6 +24,7 @@ from magbridge.fleet.learn import Fleet, Lesson
 
 __all__ = ["Change", "History", "facts", "history"]
 
+FIXED = "hard iron"
 ALARM = 1e-3
 """Chance of a false alarm in a deployment, over all its coefficients."""
 
@@ -42,12 +43,15 @@ class Change:
         Of the move.
     chance : float
         Of one as large in any coefficient of a deployment like the others.
+    cause : str
+        What does such a thing, and whether a refit was on record.
     """
 
     what: str
     by: float
     sigmas: float
     chance: float
+    cause: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,7 @@ def history(fleet: Fleet, vehicle: str) -> History:
     mine = tuple(one for one in fleet.lessons if one.vehicle == vehicle)
     names, places = _looked_at(fleet)
     rows: list[tuple[FloatArray, ...]] = []
-    changes = []
+    changes: list[tuple[Change, ...]] = []
     for lesson in mine:
         before = fleet.known(vehicle, lesson.refit, lesson.time)
         told = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
@@ -94,7 +98,11 @@ def history(fleet: Fleet, vehicle: str) -> History:
         rows.append(
             (before.mean[places], np.sqrt(np.diag(S))[places], after[places], np.sqrt(np.diag(P))[places])
         )
-        changes.append(tuple(_beyond(names, (after - before.mean)[places], np.sqrt(moved), len(rows) > 1)))
+        if len(rows) == 1:  # it has no past
+            changes.append(())
+            continue
+        refitted = lesson.refit not in {one.refit for one in mine[: len(rows) - 1]}
+        changes.append(tuple(_beyond(names, (after - before.mean)[places], np.sqrt(moved), refitted)))
     expected, sigma, found, left = np.array(rows).reshape(len(mine), 4, len(places)).swapaxes(0, 1)
     return History(names, mine, expected, sigma, found, left, tuple(changes))
 
@@ -111,7 +119,10 @@ def facts(history: History) -> dict[str, Any]:
                 "date": datetime.fromtimestamp(lesson.time, UTC).date().isoformat(),
                 **{key: column[k].tolist() for key, column in zip(keys, columns, strict=True)},
                 "changes": [
-                    {"what": one.what, "by_nT": one.by, "sigmas": one.sigmas, "chance": one.chance}
+                    {
+                        "what": one.what, "by_nT": one.by, "sigmas": one.sigmas, "chance": one.chance,
+                        "cause": one.cause,
+                    }
                     for one in history.changes[k]
                 ],
             }
@@ -120,17 +131,26 @@ def facts(history: History) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _beyond(names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, has_past: bool) -> list[Change]:
-    """Return the moves (k,) beyond their sigmas (k,), the farthest first; none where there is no past."""
-    if not has_past:
-        return []
+def _beyond(names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool) -> list[Change]:
+    """Return the moves (k,) beyond their sigmas (k,), the farthest first."""
     found = []
     for name, move, sigma in zip(names, moves, sigmas, strict=True):
         z = abs(move) / max(sigma, 1e-12)
         chance = min(2.0 * float(norm.sf(z)) * len(names), 1.0)
         if chance < ALARM:
-            found.append(Change(name, float(move), float(z), chance))
+            found.append(Change(name, float(move), float(z), chance, _cause(name, refitted)))
     return sorted(found, key=lambda one: -one.sigmas)
+
+
+def _cause(name: str, refitted: bool) -> str:
+    """Return what a technician should look for."""
+    mass, _, _ = name.rpartition(",")
+    what = (
+        "iron that was magnetised, fitted or taken off"
+        if mass == FIXED
+        else f"another pack, moment or place of what {mass} moves"
+    )
+    return f"{what}, {'more than refits do' if refitted else 'and no refit is on record'}"
 
 
 def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
@@ -141,6 +161,6 @@ def _looked_at(fleet: Fleet) -> tuple[tuple[str, ...], list[int]]:
             continue
         mass = next((one.name for one, power in zip(fleet.parameters, powers, strict=True) if power), "")
         for k, axis in enumerate("xyz"):
-            names.append(f"{mass or 'hard iron'}, {axis}")
+            names.append(f"{mass or FIXED}, {axis}")
             places.append(9 * m + 6 + k)
     return tuple(names), places

@@ -21,7 +21,7 @@ from magbridge.fleet.learn import Fleet, Lesson, learn_fleet
 from magbridge.fleet.process import jobs, last_attempts
 from magbridge.fleet.register import current_files, masses, vehicle_named, vehicles
 
-__all__ = ["current", "fleet_of", "fleets", "lessons", "owner", "remember"]
+__all__ = ["current", "findings", "fleet_of", "fleets", "lessons", "owner", "remember"]
 
 
 class _Taught(NamedTuple):
@@ -127,6 +127,16 @@ def remember(catalogue: Catalogue) -> None:
             own, shaped = (one.ravel().tolist() for one in fleet.population.variances)
             of = _name(fleet.lessons, fleet.mounted)
             catalogue.add("populations", [{"of": of, "own": own, "shaped": shaped}])
+
+
+def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
+    """Return what was found in each vehicle's deployments, with their names, in the order of these."""
+    of = {job.name: job for job in jobs(catalogue)}
+    found: dict[str, list[Row]] = {}
+    for row in current(catalogue, "findings"):
+        job = of[row["job"]]
+        found.setdefault(job.vehicle["vehicle"], []).append({"deployment": job.deployment, **row})
+    return {name: sorted(rows, key=lambda row: str(row["deployment"])) for name, rows in found.items()}
 
 
 def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:

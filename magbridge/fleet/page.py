@@ -1,132 +1,196 @@
-"""One page for a fleet, one file: each vehicle's coefficients with their bands, and what left them."""
+"""A fleet as pages: one of all vehicles and one of each, with pictures and no script, in light and dark."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
 from io import StringIO
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
+import msgspec
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.dates import ConciseDateFormatter
 from matplotlib.figure import Figure
 
-from magbridge.files import atomic_path
-from magbridge.fleet.drift import History
+from magbridge.files import atomic_path, new_folder
+from magbridge.fleet.drift import History, facts
 from magbridge.pictures import literal
 
-__all__ = ["write_page"]
+__all__ = ["write_page", "write_pages"]
 
-EXPECTED, FOUND, CHANGED = "#9db4c0", "#253237", "#c1121f"
+INK, BAND, CHANGED, REFIT = "#010101", "#020202", "#030303", "#040404"
+"""Stand-ins in the pictures, for the page's own colours."""
+COLOURS = {INK: "var(--ink)", BAND: "var(--band)", CHANGED: "var(--changed)", REFIT: "var(--faint)"}
+DRAWN: Any = {
+    "svg.hashsalt": "fleet", "svg.fonttype": "none", "font.size": 8.0, "text.color": INK,
+    "axes.labelcolor": INK, "axes.edgecolor": REFIT, "xtick.color": INK, "ytick.color": INK,
+}  # fmt: skip
 STYLE = """
-body {font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem}
-body {color: #253237}
-h1, h2 {font-weight: 600} h2 {margin-top: 2.5rem} svg {max-width: 100%; height: auto}
-table {border-collapse: collapse} td, th {padding: .25rem .9rem .25rem 0; text-align: left}
-th {border-bottom: 1px solid #9db4c0} .changed {color: #c1121f; font-weight: 600}
-td.number {text-align: right; font-variant-numeric: tabular-nums}
+:root {color-scheme: light dark;
+  --ink: #22303c; --paper: #fff; --faint: #9aa5b1; --band: #9db4c0; --changed: #b3261e}
+@media (prefers-color-scheme: dark) {
+  :root {--ink: #dfe5ea; --paper: #12181d; --faint: #6c7883; --band: #42586a; --changed: #ff8a80}
+}
+body {font: 16px/1.5 system-ui, sans-serif; max-width: 66rem; margin: 2rem auto; padding: 0 1rem;
+  color: var(--ink); background: var(--paper)}
+h1, h2 {font-weight: 600; line-height: 1.25} h2 {margin-top: 2.5rem; font-size: 1.2rem}
+a {color: inherit} .faint {opacity: .75}
+.panels {display: grid; grid-template-columns: repeat(auto-fill, minmax(17rem, 1fr)); gap: .6rem}
+.panels svg {width: 100%; height: auto; font-family: inherit}
+.wide {overflow-x: auto} table {border-collapse: collapse; margin: .8rem 0}
+td, th {padding: .25rem .9rem .25rem 0; text-align: left; white-space: nowrap}
+th {border-bottom: 1px solid var(--faint)} .changed {color: var(--changed); font-weight: 600}
+td.words {white-space: normal; min-width: 14rem}
+.number {text-align: right; font-variant-numeric: tabular-nums}
 """
+Findings = Mapping[str, Sequence[Mapping[str, Any]]]
+"""Vehicle -> rows of what was found in its deployments."""
 
 
-def write_page(histories: Mapping[str, History], path: Path) -> None:
-    """Write the page of a fleet.
+def write_pages(histories: Mapping[str, History], folder: Path, findings: Findings) -> None:
+    """Write index.html of a fleet, VEHICLE.html of each, and all numbers as fleet.json.
 
     Parameters
     ----------
     histories : mapping
         Of each vehicle, by its name.
-    path : path
-        The file.
+    folder : path
+        Where to; made where it is not there.
+    findings : mapping
+        Of the vehicles whose deployments were diagnosed: deployment, verdict, cause, channel.
 
     Raises
     ------
     WriteError
-        It cannot be written.
+        They cannot be written.
     """
-    body = "\n".join(
-        [
-            "<h1>Fleet</h1>",
-            *_overview(histories),
-            *(part for item in histories.items() for part in _vehicle(*item)),
-        ]
-    )
+    with new_folder(folder):
+        numbers = {"vehicles": {name: facts(one) for name, one in histories.items()}}
+        with atomic_path(folder / "fleet.json") as beside:
+            beside.write_bytes(msgspec.json.encode(numbers))
+        for name, one in histories.items():
+            back = '<p><a href="index.html">Fleet</a></p>'
+            _write(folder / f"{name}.html", name, [back, *_vehicle(name, one, findings.get(name, ()), "h1")])
+        links = {name: quote(f"{name}.html") for name in histories}
+        _write(folder / "index.html", "Fleet", ["<h1>Fleet</h1>", *_overview(histories, links)])
+
+
+def write_page(histories: Mapping[str, History], path: Path, findings: Findings) -> None:
+    """Write the same as one page; parameters and errors as of :func:`write_pages`."""
+    body = ["<h1>Fleet</h1>", *_overview(histories, {name: f"#{quote(name)}" for name in histories})]
+    for name, one in histories.items():
+        body += _vehicle(name, one, findings.get(name, ()), "h2")
+    _write(path, "Fleet", body)
+
+
+def _write(path: Path, title: str, body: Sequence[str]) -> None:
     text = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1"><title>Fleet</title>'
-        f"<style>{STYLE}</style></head><body>{body}</body></html>\n"
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
     with atomic_path(path) as beside:
         beside.write_text(text, encoding="utf-8")
 
 
-def _overview(histories: Mapping[str, History]) -> Iterator[str]:
+def _table(headings: str, rows: Sequence[str]) -> str:
+    named = "".join(f"<th>{heading}</th>" for heading in headings.split(", "))
+    return f"<div class=wide><table><tr>{named}</tr>{''.join(rows)}</table></div>"
+
+
+def _overview(histories: Mapping[str, History], links: Mapping[str, str]) -> Iterator[str]:
     yield (
         "<p>A vehicle's magnetism is compared with what its earlier deployments, and its fleet, let expect. "
-        "Grey is that expectation with its 2-sigma band, black what the deployment's own runs made of it; "
-        "<span class=changed>red</span> left its band.</p>"
-        "<table><tr><th>vehicle</th><th>deployments</th><th>last</th><th>changes</th></tr>"
+        "The broad band is that expectation (2 sigma), the dot what the deployment's own runs made of it, a "
+        "dotted line a refit; <span class=changed>red</span> left its band.</p>"
     )
+    rows = []
     for name, one in histories.items():
-        count = sum(map(bool, one.changes))
-        told = f"<span class=changed>{count}</span>" if count else "none"
+        told = "; ".join(f"{_day(when)} {escape(', '.join(what))}" for when, what in _changed(one)[-2:])
         last = _day(one.lessons[-1].time) if one.lessons else ""
-        yield (
-            f'<tr><td><a href="#{escape(name)}">{escape(name)}</a></td>'
-            f"<td class=number>{len(one.lessons)}</td><td>{last}</td><td>{told}</td></tr>"
+        rows.append(
+            f'<tr><td><a href="{escape(links[name])}">{escape(name)}</a></td><td class=number>'
+            f"{len(one.lessons)}</td><td>{last}</td><td class=number>{len(_changed(one))}</td>"
+            f"<td class=changed>{told}</td></tr>"
         )
-    yield "</table>"
+    yield _table("vehicle, deployments, last, with changes, latest changes", rows)
 
 
-def _vehicle(name: str, one: History) -> Iterator[str]:
-    yield f'<h2 id="{escape(name)}">{escape(name)}</h2>'
+def _changed(one: History) -> list[tuple[float, list[str]]]:
+    """Return when a vehicle changed, and in what."""
+    return [
+        (lesson.time, list(dict.fromkeys(change.what.rpartition(",")[0] for change in changes)))
+        for lesson, changes in zip(one.lessons, one.changes, strict=True)
+        if changes
+    ]
+
+
+def _vehicle(name: str, one: History, found: Sequence[Mapping[str, Any]], heading: str) -> Iterator[str]:
+    yield f'<{heading} id="{escape(name)}">{escape(name)}</{heading}>'
     if not one.lessons:
         yield "<p>No deployment has been calibrated.</p>"
         return
-    yield _drawn(one)
     rows = [
         f"<tr><td>{_day(lesson.time)}</td><td>{escape(lesson.deployment)}</td><td>{escape(lesson.refit)}</td>"
         f"<td class=changed>{escape(change.what)}</td><td class=number>{change.by:+.0f} nT</td>"
-        f"<td class=number>{change.sigmas:.1f}</td></tr>"
+        f"<td class=number>{change.sigmas:.1f}</td><td class=words>{escape(change.cause)}</td></tr>"
         for lesson, changes in zip(one.lessons, one.changes, strict=True)
         for change in changes
     ]
-    if rows:
-        yield (
-            "<table><tr><th>date</th><th>deployment</th><th>refit</th><th>what moved</th><th>by</th>"
-            f"<th>sigmas</th></tr>{''.join(rows)}</table>"
-        )
-    else:
-        yield "<p>Nothing left its band.</p>"
+    yield (
+        _table("date, deployment, refit, what moved, by, sigmas, as if by", rows)
+        if rows
+        else "<p>Nothing left its band.</p>"
+    )
+    yield f"<div class=panels>{''.join(_panel(one, k) for k in range(len(one.names)))}</div>"
+    if found:
+        yield _table("deployment, verdict, cause, follows", [_found(row) for row in found])
 
 
-def _drawn(one: History) -> str:
-    """Return a vehicle's picture: a row for fixed iron and each mass, a column for each axis."""
-    rows = len(one.names) // 3
-    figure = Figure(figsize=(10.0, 0.4 + 1.7 * rows), layout="constrained")
-    axes = np.atleast_2d(figure.subplots(rows, 3, sharex=True))
-    when = np.array([datetime.fromtimestamp(lesson.time, UTC) for lesson in one.lessons])
-    for k, (ax, name) in enumerate(zip(axes.ravel(), one.names, strict=True)):
-        moved = np.array([any(change.what == name for change in changes) for changes in one.changes])
-        size = 2.0 * one.expected_sigma[:, k]
+def _found(row: Mapping[str, Any]) -> str:
+    words = (str(row[key] or "").replace("_", " ") for key in ("deployment", "verdict", "cause", "channel"))
+    return f"<tr>{''.join(f'<td>{escape(word)}</td>' for word in words)}</tr>"
+
+
+def _panel(one: History, k: int) -> str:
+    """Return the picture of one coefficient from deployment to deployment."""
+    with rc_context(DRAWN):
+        figure = Figure(figsize=(3.4, 2.0))
+        figure.subplots_adjust(0.15, 0.2, 0.98, 0.88)
+        ax = figure.subplots()
+        when = np.array([datetime.fromtimestamp(lesson.time, UTC) for lesson in one.lessons])
+        moved = np.array([any(change.what == one.names[k] for change in changes) for changes in one.changes])
         # the first deployment's expectation is the fleet's: its band would hide all others
         later = slice(1, None) if len(when) > 1 else slice(None)
         ax.errorbar(
-            when[later], one.expected[later, k], size[later], fmt="none", color=EXPECTED, lw=7, alpha=0.6
+            when[later],
+            one.expected[later, k],
+            2.0 * one.expected_sigma[later, k],
+            fmt="none",
+            color=BAND,
+            lw=7,
         )
-        ax.errorbar(when, one.found[:, k], 2.0 * one.found_sigma[:, k], fmt="o", ms=4, lw=1.2, color=FOUND)
-        ax.plot(when[moved], one.found[moved, k], "o", ms=8, color=CHANGED)
-        ax.set_title(name, fontsize=9, loc="left")
-        ax.tick_params(labelsize=8)
+        ax.errorbar(when, one.found[:, k], 2.0 * one.found_sigma[:, k], fmt="o", ms=4, lw=1.2, color=INK)
+        ax.plot(when[moved], one.found[moved, k], "o", ms=7, color=CHANGED)
+        for before, after in zip(one.lessons, one.lessons[1:], strict=False):
+            if before.refit != after.refit:
+                middle = datetime.fromtimestamp((before.time + after.time) / 2.0, UTC)
+                ax.axvline(middle, color=REFIT, lw=0.8, ls=":")  # type: ignore[arg-type]
+        ax.set_title(f"{one.names[k]}, nT", fontsize=9, loc="left")
         ax.margins(x=0.08)
         ax.spines[["top", "right"]].set_visible(False)
         ax.xaxis.set_major_formatter(ConciseDateFormatter(ax.xaxis.get_major_locator()))  # type: ignore[no-untyped-call]
-    for ax in axes[:, 0]:
-        ax.set_ylabel("nT", fontsize=8)
-    literal(figure)
-    drawn = StringIO()
-    figure.savefig(drawn, format="svg", metadata={"Date": None})
-    return drawn.getvalue()[drawn.getvalue().index("<svg") :]
+        literal(figure)
+        drawn = StringIO()
+        figure.savefig(drawn, format="svg", transparent=True, metadata={"Date": None})
+    text = drawn.getvalue()
+    for stand_in, colour in COLOURS.items():
+        text = text.replace(stand_in, colour)
+    return text[text.index("<svg") :]
 
 
 def _day(time: float) -> str:

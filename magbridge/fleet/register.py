@@ -134,8 +134,9 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     Raises
     ------
     WrongUse
-        Another has that name.
+        Another has that name, or it can be no folder's.
     """
+    _check_name(name, "a vehicle")
     row = {"vehicle": name, **{key: getattr(vehicle, key) for key in ("serial", "sensor", "order")}}
     row["parameters"] = list(vehicle.parameters)
     row["mass"] = msgspec.json.encode(vehicle.mass, order="sorted").decode()
@@ -159,9 +160,10 @@ def add_logs(
     Raises
     ------
     WrongUse
-        There is no such vehicle.
+        There is no such vehicle, or the deployment's name can be no folder's.
     """
     vehicle_named(catalogue, vehicle)
+    _check_name(deployment.name, "a deployment")
     before = catalogue.rows("files")
     newest = {row["path"]: row for row in current_files(before)}
     rows, lines = [], []
@@ -207,6 +209,12 @@ def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
             raise ConfigError(fleet, f"deployment {deployment.name}: logs", f"nothing is named {pattern}")
         found += named
     return found
+
+
+def _check_name(name: str, of: str) -> None:
+    """Refuse names that cannot be a folder's: results are kept by them."""
+    if not name.strip() or name.startswith(".") or "/" in name or "\\" in name or not name.isprintable():
+        raise WrongUse(f"{name!r}: expected {of}'s name without slashes, not beginning with a dot")
 
 
 def _told(row: Row) -> str:

@@ -128,6 +128,15 @@ def test_a_log_that_changed_is_another_version(empty: Catalogue, tmp_path: Path)
     assert jobs(empty)[0].name == first
 
 
+@pytest.mark.parametrize("name", ["", "../up", "a\\b", ".hidden", "two\nlines"])
+def test_a_name_that_can_be_no_folders_is_refused(empty: Catalogue, name: str) -> None:
+    with pytest.raises(WrongUse, match="a vehicle's name without slashes"):
+        add_vehicle(empty, name, Vehicle())
+    add_vehicle(empty, "comet", Vehicle())
+    with pytest.raises(WrongUse, match="a deployment's name without slashes"):
+        add_logs(empty, "comet", Deployment(name, ()), [])
+
+
 def test_an_unknown_vehicle_and_a_missing_log(empty: Catalogue, tmp_path: Path) -> None:
     with pytest.raises(WrongUse, match=r"nemo: not a vehicle of .* \(none yet\)"):
         add_logs(empty, "nemo", MAY, [])

@@ -15,6 +15,7 @@ from magbridge.cli import main
 from magbridge.errors import WriteError
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
 from magbridge.fleet.memory import current, lessons
+from magbridge.fleet.page import COLOURS
 from magbridge.fleet.process import jobs, new_jobs
 from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
 from magbridge.fleet.status import status
@@ -166,10 +167,21 @@ def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.
     told = capsys.readouterr().out.splitlines()
     assert told[0] == "comet: 5 deployments, 1 changes"
     assert "d4 (refit spring): hard iron, y moved by +" in told[1]
-    text = page.read_text()
-    assert "<td class=changed>hard iron, y</td>" in text
-    assert "src=" not in text
-    assert 'href="http' not in text
+    assert told[1].endswith("iron that was magnetised, fitted or taken off, and no refit is on record")
+    pages = tmp_path / "pages"
+    assert main(["fleet", "show", "--catalogue", place, "--html", str(pages)]) == 0
+    assert {path.name for path in pages.iterdir()} == {"index.html", "comet.html", "fleet.json"}
+    for text in (page.read_text(), (pages / "comet.html").read_text()):
+        assert "<td class=changed>hard iron, y</td>" in text
+        assert text.count("<svg") == 6
+        assert not any(colour in text for colour in COLOURS)
+        assert "src=" not in text
+        assert 'href="http' not in text
+    assert '<a href="comet.html">' in (pages / "index.html").read_text()
+    (change,) = json.loads((pages / "fleet.json").read_text())["vehicles"]["comet"]["deployments"][4][
+        "changes"
+    ]
+    assert change["what"] == "hard iron, y"
 
 
 def test_a_calibration_starts_from_its_fleet(
