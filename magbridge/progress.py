@@ -20,20 +20,13 @@ PAUSE = 0.1
 
 def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator[T]:
     """Yield `items`; once that has taken two seconds, show on a terminal how far it is."""
-    if not sys.stderr.isatty():
-        yield from items
-        return
-    from rich.console import Console  # noqa: PLC0415 - needed on a terminal only
-    from rich.progress import Progress  # noqa: PLC0415 - likewise
-
-    begun = updated = time.monotonic()
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(what, total=total, visible=False)
+    with _bar(what, total) as update:
+        updated = time.monotonic()
         for done, item in enumerate(items, 1):
             yield item
             now = time.monotonic()
             if now - updated > PAUSE:
-                progress.update(task, completed=done, visible=now - begun > PATIENCE)
+                update(completed=done)
                 updated = now
 
 
@@ -43,19 +36,26 @@ def waiting(what: str) -> Iterator[Callable[[str], object]]:
 
     Yields a function that shows the name of the next step.
     """
+    with _bar(what) as update:
+        yield lambda step: update(description=step)
+
+
+@contextmanager
+def _bar(what: str, total: float | None = None) -> Iterator[Callable[..., object]]:
+    """Show a bar from two seconds on, and the time it has taken; yield a function that updates it."""
     if not sys.stderr.isatty():
-        yield str
+        yield lambda **_: None
         return
     from rich.console import Console  # noqa: PLC0415 - needed on a terminal only
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn  # noqa: PLC0415 - likewise
 
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(what, total=None, visible=False)
+        task = progress.add_task(what, total=total, visible=False)
         appear = Timer(PATIENCE, progress.update, (task,), {"visible": True})
         appear.daemon = True
         appear.start()
         try:
-            yield lambda step: progress.update(task, description=step)
+            yield lambda **fields: progress.update(task, **fields)
         finally:
             appear.cancel()

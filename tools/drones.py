@@ -35,7 +35,7 @@ from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.offered import best_parameters
 from magbridge.errors import MagbridgeError
 from magbridge.logs import Options, read
-from magbridge.logs.compasses import compasses_of
+from magbridge.logs.compasses import compasses_in
 from magbridge.logs.info import movers
 
 NEAR = 8.0
@@ -64,7 +64,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     console = Console(width=120)
     for path in chosen.logs:
-        for number in [str(one.number) for one in compasses_of(read(path).attrs)] or ["0"]:
+        for number in [str(one.number) for one in compasses_in(read(path))] or ["0"]:
             deployment = read(path, options=Options(compass=number))
             try:
                 title, rows = compared(deployment, chosen.peers)

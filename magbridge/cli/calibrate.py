@@ -219,10 +219,11 @@ def _each_compass(
 ) -> None:
     """Calibrate every compass of the logs; DataError: not one could be."""
     from magbridge.logs import read_each
-    from magbridge.logs.compasses import compasses_of
+    from magbridge.logs.compasses import compasses_in
 
     first = replace(reading, compass=None)
-    found = {one.number for log in read_each(files, options=first.options) for one in compasses_of(log.attrs)}
+    with waiting("reading"):
+        found = {one.number for log in read_each(files, options=first.options) for one in compasses_in(log)}
     failed = 0
     for number in sorted(found) or [0]:
         try:
@@ -374,7 +375,8 @@ def plan(
     from magbridge.field.declination import with_true_heading
     from magbridge.logs import read
 
-    deployment = with_true_heading(read(mission, options=reading.options), heading_reference)
+    with waiting("reading"):
+        deployment = with_true_heading(read(mission, options=reading.options), heading_reference)
     note_losses(deployment.attrs)
     known = load(calibration)
     with waiting("planning"):

@@ -256,6 +256,9 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
         stations = [read(base)]
     if not own or not stations:
         return list(logs)
+    if len({station.attrs.get("observatory") for station in stations}) > 1:
+        names = " and ".join(str(station.attrs["source"]) for station in stations)
+        raise WrongUse(f"{names} are of several observatories: give one of them, the nearest")
     station = join(stations)
     note_losses(station.attrs)
     return with_daily_variation(own, station)

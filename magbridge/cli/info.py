@@ -6,7 +6,17 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import AS_THEY_SAY, Json, Reading, command, complain, logs_to_read, print_result
+from magbridge.cli.common import (
+    AS_THEY_SAY,
+    Json,
+    Reading,
+    command,
+    complain,
+    logs_to_read,
+    note_losses,
+    print_result,
+)
+from magbridge.progress import waiting
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -37,8 +47,11 @@ def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> No
 
     found = {}
     for file in files:
-        found[str(file)] = facts_of(read(file, options=reading.options))
+        with waiting("reading"):
+            log = read(file, options=reading.options)
+        found[str(file)] = facts_of(log)
         if not json:
+            note_losses(log.attrs)
             _show(str(file), found[str(file)])
     if json:
         print_result(found, "", as_json=True)
@@ -57,7 +70,7 @@ def _show(file: str, facts: dict[str, Any]) -> None:
         console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
     console.print(_columns(facts, meanings=console.width >= WIDE))
     console.print(_uses(facts))
-    for hint in [*(f"guessed: {guess}" for guess in facts["guessed"]), *facts["hints"]]:
+    for hint in facts["hints"]:
         complain(f"{file}: {hint}")
 
 

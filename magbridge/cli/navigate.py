@@ -25,6 +25,7 @@ from magbridge.cli.common import (
     print_result,
     refuse_unsuited,
 )
+from magbridge.progress import waiting
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -130,7 +131,9 @@ def _corrected(
     from magbridge.field.declination import with_true_heading
     from magbridge.logs import read
 
-    deployment = with_true_heading(read(files, required=CHANNELS, options=reading.options), heading_reference)
+    with waiting("reading"):
+        whole = read(files, required=CHANNELS, options=reading.options)
+    deployment = with_true_heading(whole, heading_reference)
     note_losses(deployment.attrs)
     for doubt in doubts_of(known, calibration):
         complain(doubt)
@@ -177,7 +180,8 @@ def _bound(
     from magbridge.navigate.bound import as_dataset, position_bound
 
     place = ["latitude", "longitude"]
-    plan = read(files, required=place, options=reading.options).dropna("time", subset=place)
+    with waiting("reading"):
+        plan = read(files, required=place, options=reading.options).dropna("time", subset=place)
     grid, options = _continued(read_grid(map), options or Options(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0

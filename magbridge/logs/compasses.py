@@ -19,8 +19,20 @@ import xarray as xr
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import FormatError
 
-__all__ = ["HEALTHY", "Compass", "by_columns", "choose", "compasses_of", "listed", "rate", "said"]
+__all__ = [
+    "HEALTHY",
+    "Compass",
+    "by_columns",
+    "choose",
+    "compasses_in",
+    "compasses_of",
+    "listed",
+    "rate",
+    "said",
+]
 
+OTHER = re.compile(r"mag[1-9]\d*_x$")
+"""Name of the first axis of another compass than the first."""
 HEALTHY = 0.5
 """Least share of its samples in which a compass in use is healthy."""
 ATTRIBUTE = "compasses"
@@ -139,12 +151,11 @@ def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
     FormatError
         There are no such columns.
     """
-    there = [str(name) for name in deployment.data_vars]
-    numbers = [0, *(int(name[3:-2]) - 1 for name in there if re.fullmatch(r"mag[1-9]\d*_x", name))]
     if wanted in (None, "0"):
         return deployment
+    numbers = [one.number for one in _by_names(deployment)]
     if not wanted.isdecimal() or int(wanted) not in numbers:
-        known = " ".join(str(number) for number in sorted(numbers))
+        known = " ".join(str(number) for number in numbers)
         raise FormatError(
             deployment.attrs.get("source", ""), f"expected a compass {wanted!r}; there are: {known}"
         )
@@ -155,6 +166,24 @@ def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
         if name in renamed:
             renamed[name].attrs = dict(COLUMNS[name]._asdict())
     return renamed
+
+
+def compasses_in(log: xr.Dataset) -> list[Compass]:
+    """Return the compasses of a deployment: those that it lists, or those that its columns are."""
+    return compasses_of(log.attrs) or _by_names(log)
+
+
+def _by_names(log: xr.Dataset) -> list[Compass]:
+    """Return a compass for ``mag_x mag_y mag_z``, and for each ``mag2_x ...`` that is there."""
+    others = [str(name) for name in log.data_vars if OTHER.match(str(name))]
+    prefixes = {0: "mag", **{int(name[3:-2]) - 1: name[:-2] for name in others}}
+    found = []
+    for number, prefix in sorted(prefixes.items()):
+        names = [f"{prefix}_{axis}" for axis in "xyz"]
+        if all(name in log for name in names):
+            known = log["time"].to_numpy()[log[names[0]].notnull().to_numpy()]
+            found.append(Compass(number, len(known), rate(known), chosen=not number))
+    return found
 
 
 def compasses_of(attrs: Mapping[Any, Any]) -> list[Compass]:

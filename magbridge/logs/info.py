@@ -11,8 +11,8 @@ from msgspec import to_builtins
 from magbridge.arrays import FloatArray
 from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT
 from magbridge.field.igrf import magnitude
-from magbridge.logs.compasses import compasses_of
-from magbridge.logs.deployment import MEANING, noted, passed_over
+from magbridge.logs.compasses import compasses_in
+from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
 
 __all__ = ["GAP", "USES", "info", "lacking", "movers", "telemetry"]
 
@@ -75,9 +75,8 @@ def info(log: xr.Dataset) -> dict[str, Any]:
     dict
         ``rows``, ``start``, ``end`` (s since 1970), ``interval_s``, ``rate_hz``, ``gaps``, ``longest_gap_s``,
         ``references`` (what heading and time refer to), ``guessed``, ``skipped``,
-        ``notes``, ``compasses``, ``columns`` (name, unit,
-        meaning, share known, lowest, highest, interval of its changes), ``uses`` (command -> what it lacks)
-        and ``hints``.
+        ``losses`` (which name it), ``notes``, ``compasses``, ``columns`` (name, unit, meaning, share known,
+        lowest, highest, interval of its changes), ``uses`` (command -> what it lacks) and ``hints``.
     """
     time = log["time"].to_numpy().astype(float)
     steps = np.diff(time)
@@ -96,7 +95,8 @@ def info(log: xr.Dataset) -> dict[str, Any]:
         "references": {name: str(log.attrs.get(name, default)) for name, default in MEANING.items()},
         "guessed": [part for part in str(log.attrs.get("guessed", "")).split("; ") if part],
         "skipped": passed_over(log.attrs),
-        "compasses": [to_builtins(one) for one in compasses_of(log.attrs)],
+        "compasses": [to_builtins(one) for one in compasses_in(log)],
+        "losses": named_losses(log.attrs),
         "notes": noted(log.attrs),
         "columns": columns,
         "uses": {command: lacking(log, needs) for command, needs in USES.items()},

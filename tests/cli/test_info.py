@@ -118,3 +118,29 @@ def test_a_replay_of_columns_under_other_names(deployment: Path, here: Path, com
 def test_a_survey_by_the_other_compass(deployment: Path, here: Path, command: Command) -> None:
     line = command.refuses("survey", deployment, "--compass", "1", "-o", "map.nc")
     assert line == f"{deployment.name}: expected a compass '1'; there are: 0"
+
+
+def test_compasses_that_are_columns_are_listed(here: Path, command: Command) -> None:
+    axes = {f"{name}_{axis}": np.full(9, 20_000.0) for name in ("mag", "mag3") for axis in "xyz"}
+    log = made("log", START + 0.5 * np.arange(9.0), axes | {"mag2_x": np.ones(9)})
+    assert [(one["number"], one["samples"], one["rate"]) for one in info(log)["compasses"]] == [
+        (0, 9, 2),
+        (2, 9, 2),
+    ]
+    write(log, here / "two.csv")
+    said = command("info", here / "two.csv")
+    assert "compass 0: 2 Hz, 9 samples, read as mag_x mag_y mag_z" in said.out
+    assert "compass 2: 2 Hz, 9 samples\n" in said.out
+
+
+def test_what_was_lost_is_named(here: Path, command: Command) -> None:
+    (here / "one.csv").write_text(
+        "time,depth\n" + "".join(f"{START + k},{k}\n" for k in range(9)) + f"{START},3\n"
+    )
+    said = command("info", here / "one.csv")
+    assert "in the logs: 1 row dropped" in said.err
+    assert "row 11" in said.err
+    assert (
+        "row 11"
+        in json.loads(command("info", here / "one.csv", "--json").out)[str(here / "one.csv")]["losses"][0]
+    )

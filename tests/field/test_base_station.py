@@ -12,7 +12,7 @@ from commands import Command
 from scipy.spatial.transform import Rotation
 
 from magbridge.cli.common import by_base_station
-from magbridge.errors import DataError
+from magbridge.errors import DataError, WrongUse
 from magbridge.field.base_station import with_daily_variation
 from magbridge.field.igrf import igrf
 from magbridge.logs import read, write
@@ -75,3 +75,16 @@ def test_a_station_of_another_day(storm: Path) -> None:
     log, station = read("log.csv"), read("mde.min")
     with pytest.raises(DataError, match=r"^mde\.min: does not cover the time of log\.csv$"):
         with_daily_variation([log.assign_coords(time=log["time"] + 86_400.0)], station)
+
+
+def test_two_observatories_are_not_one_base_station() -> None:
+    time = START + np.arange(9.0)
+    log = deployment("log", time, {"mag_x": np.ones(9)})
+    first, second = (
+        deployment(f"{code}.min", time, {"total_field": np.full(9, 5e4)}, attrs={"observatory": code})
+        for code in ("A", "B")
+    )
+    with pytest.raises(WrongUse, match=r"A\.min and B\.min are of several observatories: give one of them"):
+        by_base_station([log, first, second], None)
+    (found,) = by_base_station([log, first, first.assign_coords(time=time + 9)], None)
+    assert (found["daily_variation"] == 0).all()

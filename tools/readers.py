@@ -1,0 +1,160 @@
+"""How fast logs are read, beside the libraries that others read them with.
+
+    python tools/readers.py [--times 3] LOG...
+
+Each reader has a process of its own, its start and its imports included; Slocum's segments are read together.
+Printed are processor seconds (of all processes; the least of several runs), their ratio, and the largest
+memory. A peer reads the same as far as it can be told to: pymavlink and rosbags are asked for the messages
+that magbridge reads, pyulog for its topics, dbdreader for its sensors; xarray loads all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from magbridge.logs.registry import FORMATS, Format, format_of
+
+OURS = "magbridge"
+
+
+def ours(paths: list[Path]) -> None:
+    """Read as ``magbridge convert`` does."""
+    from magbridge.logs import read_each  # noqa: PLC0415 - its imports are part of what is measured
+
+    read_each(paths)
+
+
+def by_xarray(paths: list[Path]) -> None:
+    """Load every variable."""
+    import xarray as xr  # noqa: PLC0415
+
+    for path in paths:
+        xr.open_dataset(path, decode_times=False).load()
+
+
+def by_pymavlink(paths: list[Path]) -> None:
+    """Read the kinds of messages that magbridge reads."""
+    from pymavlink import mavutil  # noqa: PLC0415
+
+    from magbridge.logs.ardupilot_fields import WANTED  # noqa: PLC0415
+    from magbridge.logs.telemetry_fields import FIELDS  # noqa: PLC0415
+
+    for path in paths:
+        connection: Any = mavutil.mavlink_connection(str(path))
+        kinds = [*WANTED] if format_of(path) is FORMATS["ardupilot"] else [*FIELDS, "NAMED_VALUE_FLOAT"]
+        while connection.recv_match(type=kinds) is not None:
+            pass
+
+
+def by_pyulog(paths: list[Path]) -> None:
+    """Read the topics that magbridge reads."""
+    from pyulog import ULog  # noqa: PLC0415
+
+    from magbridge.logs.px4 import FIELDS, NEEDED  # noqa: PLC0415
+
+    for path in paths:
+        ULog(str(path), [*FIELDS, *NEEDED])
+
+
+def by_rosbags(paths: list[Path]) -> None:
+    """Read and decode the types of messages that magbridge reads."""
+    from rosbags.highlevel import AnyReader  # noqa: PLC0415
+
+    from magbridge.logs.ros_messages import KINDS  # noqa: PLC0415
+
+    for path in paths:
+        with AnyReader([path]) as bag:
+            wanted = [one for one in bag.connections if one.msgtype.replace("/msg/", "/") in KINDS]
+            for connection, _, data in bag.messages(connections=wanted):
+                bag.deserialize(data, connection.msgtype)
+
+
+def by_dbdreader(paths: list[Path]) -> None:
+    """Read the sensors that magbridge reads, of flight and science files."""
+    import dbdreader  # noqa: PLC0415
+
+    from magbridge.logs.slocum import SCIENCE, SENSORS  # noqa: PLC0415
+
+    partners = [path.with_suffix(SCIENCE[path.suffix]) for path in paths if path.suffix in SCIENCE]
+    for path in [*paths, *partners]:
+        file = dbdreader.DBD(str(path), cacheDir=str(path.parent))
+        file.get(file.timeVariable, *(name for name in SENSORS if name in file.parameterNames))
+
+
+PEERS: dict[str, Callable[[list[Path]], None]] = {
+    "netcdf": by_xarray,
+    "ardupilot": by_pymavlink,
+    "telemetry": by_pymavlink,
+    "px4": by_pyulog,
+    "ros": by_rosbags,
+    "slocum": by_dbdreader,
+}
+
+
+def main() -> None:
+    """Print a row for each log, and for all Slocum segments together."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--times", type=int, default=3)
+    parser.add_argument("--reader", default="", help=argparse.SUPPRESS)
+    parser.add_argument("logs", nargs="+", type=Path)
+    chosen = parser.parse_args()
+    if chosen.reader:
+        ({OURS: ours} | PEERS)[chosen.reader](chosen.logs)
+        print(*_used())
+        return
+    table = Table("log", "MB", "magbridge, s", "peer, s", "", "ratio", "memory, MB")
+    for name, paths in _groups(chosen.logs):
+        size = sum(one.stat().st_size for path in paths for one in _files(path))
+        mine, memory = _timed(OURS, paths, chosen.times)
+        theirs, _ = _timed(name, paths, chosen.times)
+        label = paths[0].name if len(paths) == 1 else f"{len(paths)} segments"
+        table.add_row(label, f"{size / 1e6:.0f}", f"{mine:.2f}", f"{theirs:.2f}", PEERS[name].__name__[3:],
+                      f"{mine / theirs:.2f}", f"{memory:.0f}")  # fmt: skip
+    Console().print(table)
+
+
+def _groups(logs: list[Path]) -> list[tuple[str, list[Path]]]:
+    """Return the logs by format: each alone, but segments together."""
+    names = {id(form): name for name, form in FORMATS.items()}
+
+    def of(form: Format) -> str:
+        return names[id(form)]
+
+    segments = [path for path in logs if of(format_of(path)) == "slocum"]
+    single = [(of(format_of(path)), [path]) for path in logs if path not in segments]
+    return single + [(name, list(found)) for name, found in groupby(segments, lambda _: "slocum")]
+
+
+def _files(path: Path) -> list[Path]:
+    return [*path.iterdir()] if path.is_dir() else [path]
+
+
+def _timed(reader: str, paths: list[Path], times: int) -> tuple[float, float]:
+    """Return the least processor time (s) and the memory (MB) of several runs."""
+    command = [sys.executable, __file__, "--reader", reader, *map(str, paths)]
+    found = []
+    for _ in range(times):
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)
+        found.append([float(one) for one in done.stdout.split()[-2:]])
+    return min(one[0] for one in found), max(one[1] for one in found)
+
+
+def _used() -> tuple[float, float]:
+    """Return the processor time (s) of this process and its children, and the memory (MB) of the larger."""
+    parts = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in parts), max(one.ru_maxrss for one in parts) / 1e3
+
+
+if __name__ == "__main__":
+    main()
