@@ -228,7 +228,7 @@ def stalls(length_us: int, every_us: int = 600_000_000) -> Callable[[Events], Ev
 
 def main() -> int:
     parser = command_line(__doc__)
-    parser.add_argument("names", nargs="*", metavar="FAULT", help="; ".join(FAULTS))
+    parser.add_argument("names", nargs="*", metavar="FAULT", help="; ".join(FAULTS).replace("%", "%%"))
     parser.add_argument("--hours", type=float, default=6.0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--clean", type=float, default=0.0, metavar="DAYS")
