@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from math import inf, isfinite
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
@@ -228,7 +228,14 @@ class Learning(Table, frozen=True):
     enabled : bool
         Whether it learns from the start; ``MB_LEARN`` changes that over the link.
     reference : str
-        What the corrected field is compared with: ``igrf``.
+        What the corrected field is compared with: ``igrf``, or an anomaly grid's file, above the IGRF.
+    map_sigma, position_sigma : float
+        nT and m: how well that grid is known, and the vehicle's position on it.
+    prior : str or None
+        Without ``[calibration]``: a calibration file that says what is expected of a vehicle of this class.
+    ranges : dict of str to tuple of 2 float
+        Without both: the parameters of moving masses, each with the least and the greatest value. What is
+        expected is then what any vehicle can have.
     max_rate : float
         Hz: samples that are learned from, at most.
     keep : str or None
@@ -236,9 +243,18 @@ class Learning(Table, frozen=True):
     """
 
     enabled: bool = False
-    reference: Literal["igrf"] = "igrf"
+    reference: Name = "igrf"
+    map_sigma: NotNegative = 20.0
+    position_sigma: NotNegative = 100.0
+    prior: Name | None = None
+    ranges: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
     max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
     keep: Name | None = None
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.ranges.items():
+            if not -1e12 < low < high < 1e12:
+                raise ValueError(f"ranges.{name}: expected the least and the greatest value")
 
 
 class Log(Table, frozen=True):
@@ -278,6 +294,18 @@ class Config(Table, frozen=True):
     path: Path = Path("bridge.toml")
     digest: str = ""
 
+    @property
+    def files(self) -> dict[str, str | None]:
+        """The files that must exist, by their keys; None where a key is not given."""
+        learning = self.learning or Learning()
+        return {
+            "calibration.file": self.calibration.file if self.calibration else None,
+            "link.signing_key": self.link.signing_key,
+            "navigation.map": self.navigation.map if self.navigation else None,
+            "learning.reference": learning.reference if learning.reference != "igrf" else None,
+            "learning.prior": learning.prior,
+        }
+
     def resolve(self, name: str) -> Path:
         """Return the path that `name` means in this file: relative to the file itself."""
         return self.path.parent / Path(name).expanduser()
@@ -302,12 +330,7 @@ def load(path: str | Path) -> Config:
     config = msgspec.structs.replace(
         convert(table, Config, path), path=path, digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     )
-    named = {
-        "calibration.file": config.calibration.file if config.calibration else None,
-        "link.signing_key": config.link.signing_key,
-        "navigation.map": config.navigation.map if config.navigation else None,
-    }
-    for key, name in named.items():
+    for key, name in config.files.items():
         if name is not None and not config.resolve(name).exists():
             raise ConfigError(path, key, f"no such file: {config.resolve(name)}")
     return config

@@ -267,7 +267,7 @@ def main() -> None:
             f"{middle[0]:.2f}", f"{middle[1]:.2f}", f"{high[1]:.2f}", f"{middle[2]:.2f}", f"{middle[3]:.1f}",
             f"{mean[4]:.0%}", f"{mean[5]:.0%}", f"{rows[:, 6].sum():.0f}", f"{high[7]:.1f}",
         )  # fmt: skip
-    Console().print(shown)
+    Console(width=120).print(shown)
 
 
 if __name__ == "__main__":

@@ -139,12 +139,7 @@ def _contents(config: Config) -> Iterator[Finding]:
 
 def _files(config: Config) -> Iterator[Finding]:
     """Yield each file that the configuration names and that is not there."""
-    named = {
-        "calibration.file": config.calibration.file if config.calibration else None,
-        "link.signing_key": config.link.signing_key,
-        "navigation.map": config.navigation.map if config.navigation else None,
-    }
-    for key, name in named.items():
+    for key, name in config.files.items():
         if name is not None and not (file := config.resolve(name)).exists():
             yield Finding(fatal=True, text=str(ConfigError(config.path, key, f"no such file: {file}")))
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from magbridge.bridge.events import Event, Start
+from magbridge.bridge.learning import expected
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration import file as calibration_file
 from magbridge.config import Config
@@ -43,6 +44,8 @@ def set_up(config: Config, start: Start) -> Pipeline:
     calibration = None
     if config.calibration is not None:
         calibration = calibration_file.load(config.resolve(config.calibration.file))
+    elif config.learning is not None:
+        calibration = expected(config)
     key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
     navigate = None
     if config.navigation is not None:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections import deque
+from math import hypot, sqrt
 from pathlib import Path
 
-from magbridge.calibration.file import calibration_id, save
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.file import calibration_id, load, save
+from magbridge.calibration.model import Calibration, Parameter
 from magbridge.config import Config
 from magbridge.errors import CalibrationError, ConfigError, WriteError
 from magbridge.learning import Learner
 from magbridge.learning.doubt import CAUSES
+from magbridge.learning.start import class_prior
 from magbridge.link.component import Component
 from magbridge.link.rates import Rate
 from magbridge.mavlink import spec
 from magbridge.mavlink.dialect import MAG_LEARNING_STATE, MAV_SEVERITY
 
-__all__ = ["Learning", "keep", "kept_path", "open_learner"]
+__all__ = ["Learning", "expected", "keep", "kept_path", "open_learner"]
 
 LEARNING = spec("MAG_LEARNING")
 ACCEPT, FORGET = 1.0, 2.0
@@ -24,33 +26,78 @@ KEEP_US = 600_000_000
 """µs between files of a calibration that is only renewed."""
 
 
-def open_learner(config: Config, calibration: Calibration | None) -> Learner | None:
+def expected(config: Config) -> Calibration | None:
+    """Return what ``[learning]`` expects of a vehicle without a calibration; None without that table.
+
+    Raises
+    ------
+    FormatError, CalibrationError
+        ``learning.prior`` is no calibration.
+    """
+    settings = config.learning
+    if settings is None:
+        return None
+    if settings.prior is not None:
+        return load(config.resolve(settings.prior))
+    parameters = [
+        Parameter(name, config.telemetry[name].unit if name in config.telemetry else "", low, high,
+                  0.5 * (low + high), 0.5 * (high - low))
+        for name, (low, high) in settings.ranges.items()
+    ]  # fmt: skip
+    return class_prior(tuple(parameters))
+
+
+def open_learner(
+    config: Config, calibration: Calibration | None, currents: tuple[str, ...] | None = None
+) -> Learner | None:
     """Return the learner that ``[learning]`` asks for; None without that table, or without a calibration.
+
+    Parameters
+    ----------
+    config : Config
+        The bridge's.
+    calibration : Calibration or None
+        To begin with.
+    currents : tuple of str, optional
+        Names of telemetry in ampere; by default those of ``[telemetry]``.
 
     Raises
     ------
     ConfigError
         The calibration is none that can be learned.
+    FormatError, OutOfRange
+        ``learning.reference`` is no grid.
     """
-    if config.learning is None or calibration is None:
+    if currents is None:
+        currents = tuple(name for name, one in config.telemetry.items() if one.unit == "A")
+    settings = config.learning
+    if settings is None or calibration is None:
         return None
+    grid, spread = None, config.align.reference_sigma
+    if settings.reference != "igrf":
+        from magbridge.field.read import read_grid  # noqa: PLC0415 - it brings scipy
+
+        grid = read_grid(config.resolve(settings.reference))
+        slope = sqrt(2.0) * grid.rms / grid.correlation_length
+        spread = hypot(settings.map_sigma, slope * settings.position_sigma)
     try:
         return Learner(
             calibration,
-            spread=config.align.reference_sigma,
+            grid=grid,
+            spread=spread,
             turn_on=config.align.turn_on_sigma,
-            max_rate=config.learning.max_rate,
-            currents=tuple(name for name, one in config.telemetry.items() if one.unit == "A"),
+            max_rate=settings.max_rate,
+            currents=currents,
         )
     except CalibrationError as error:
-        raise ConfigError(config.path, "learning", str(error)) from error
+        raise ConfigError(config.path, "calibration", str(error)) from error
 
 
 def kept_path(config: Config) -> Path | None:
     """Return where the learned calibration is kept: beside the first, or in ``learning.keep``."""
-    if config.learning is None or config.calibration is None:
+    if config.learning is None:
         return None
-    first = config.resolve(config.calibration.file)
+    first = config.resolve(config.calibration.file if config.calibration else "cal.json")
     folder = config.resolve(config.learning.keep) if config.learning.keep else first.parent
     return folder / f"{first.stem}-learned.json"
 

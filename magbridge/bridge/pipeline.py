@@ -292,8 +292,8 @@ class Pipeline:
             say(f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR)
         elif calibration is None:
             say("no calibration: raw field", MAV_SEVERITY.WARNING)
-            if self._config.learning is not None:
-                say("learning: needs a calibration to begin with", MAV_SEVERITY.WARNING)
+        elif calibration.method == "none":
+            say("no calibration: learned in flight", MAV_SEVERITY.WARNING)
         else:
             say(f"calibration {self._calibration_id:08x}, {calibration.method}")
             if calibration.doubts:

@@ -135,7 +135,7 @@ class Corrector:
         self.calibration, self._kernel, self._omega = calibration, calibration.kernel, _omega(calibration)
         self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
         self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
-        self._wanted = len(calibration.channels)
+        self._wanted, self._base = len(calibration.channels), _base_flags(calibration)
         del self._steps[len(calibration.effects) :]
         regressors = self._last[: len(self._weights)]
         for effect in calibration.effects[len(self._steps) :]:

@@ -29,13 +29,14 @@ from magbridge.cli.common import (
     refuse_unsuited,
 )
 from magbridge.columns import CHANNELS, CORRECTED
-from magbridge.errors import CalibrationError, DataError, WrongUse
+from magbridge.errors import ConfigError, DataError, WrongUse
 from magbridge.progress import track
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from magbridge.calibration.model import Calibration
+    from magbridge.config import Config
     from magbridge.learning import Learner
 
 KEPT = (
@@ -49,9 +50,10 @@ KEPT = (
 @command("correct FILE... --calibration cal.json -o FILE [OPTIONS]")
 def correct(
     *files: Path,
-    calibration: Path,
+    calibration: Path | None = None,
     output: Log,
     learn: bool = False,
+    config: Path | None = None,
     save: Annotated[Path | None, Parameter(validator=file_to_write())] = None,
     picture: Picture = None,
     reading: Reading = AS_THEY_SAY,
@@ -74,12 +76,15 @@ def correct(
     files
         The logs of one deployment.
     calibration
-        The calibration (cal.json).
+        The calibration (cal.json); with --config by default that of the bridge.
     output
         The file to write: total field with its sigma, vector, anomaly and quality flags; beside them the
         log's position, depth, attitude and the calibration's parameters.
     learn
         Learn the calibration on the way, as a bridge with [learning] does; the log needs positions.
+    config
+        With --learn: the bridge.toml whose [learning] and calibration count. It may have no calibration: what
+        is known of the vehicle is then learned from nothing.
     save
         With --learn: where to write the calibration that was published last.
     picture
@@ -89,15 +94,15 @@ def correct(
     json
         Print the result as JSON.
     """
-    logs_to_read(files, output, calibration)
+    source = _source(calibration, config, learn=learn)
+    logs_to_read(files, output, source)
     check_inputs((*files, output), picture)
 
-    from magbridge.calibration.file import load
     from magbridge.correction import Correction, correct_rows
     from magbridge.logs import Writer, read_chunks
 
-    known = load(calibration)
-    for doubt in doubts_of(known, calibration):
+    known, settings = _known(calibration, config)
+    for doubt in doubts_of(known, source):
         complain(doubt)
     if save is not None and not learn:
         raise WrongUse("--save writes what was learned: give --learn, too")
@@ -110,11 +115,11 @@ def correct(
             if correction is None:
                 note_missing(known, part)
                 note_no_date(part)
-                learner = _learner(known, part, calibration) if learn else None
+                learner = _learner(known, part, settings) if learn else None
                 correction = Correction(known, learner=learner)
             pieces.append(part.attrs)
             sampled = part[list(CHANNELS)].to_array().notnull()
-            corrected = _beside(part, correct_rows(correction, part), known, calibration)
+            corrected = _beside(part, correct_rows(correction, part), known, source)
             corrected = corrected.isel(time=sampled.any("variable").to_numpy())
             writer.append(corrected)
             if correction.learner is not None:
@@ -137,29 +142,59 @@ def correct(
     note_losses(*pieces)
     note_settings(*pieces)
     if doubt := tally.doubt():
-        complain(f"{calibration}: {doubt}")
+        complain(f"{source}: {doubt}")
     facts, summary = tally.facts(), tally.summary()
     if correction is not None and correction.learner is not None:
         summary += _keep_learned(correction.learner, known, facts, save)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
 
-def _learner(known: Calibration, log: xr.Dataset, file: Path) -> Learner:
-    """Return a learner with a bridge's settings, which knows of the currents in the log."""
-    from magbridge.config import Align, Learning
-    from magbridge.learning import Learner
+def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Path:
+    """Return the file that says what is known of the vehicle."""
+    if config is not None and not learn:
+        raise WrongUse("--config says how to learn: give --learn, too")
+    source = calibration or config
+    if source is None:
+        raise WrongUse("--calibration is missing, or --learn with --config bridge.toml")
+    return source
 
-    align, settings = Align(), Learning()
-    try:
-        return Learner(
-            known,
-            spread=align.reference_sigma,
-            turn_on=align.turn_on_sigma,
-            max_rate=settings.max_rate,
-            currents=tuple(str(name) for name in log.data_vars if log[name].attrs.get("units") == "A"),
-        )
-    except CalibrationError as error:
-        raise CalibrationError(f"{file}: {error}") from error
+
+def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]:
+    """Return the calibration to begin with, and a bridge's settings.
+
+    Raises
+    ------
+    ConfigError
+        The configuration has no calibration, and no ``[learning]`` that could do without.
+    """
+    from magbridge.bridge.learning import expected
+    from magbridge.calibration.file import load
+    from magbridge.config import Config, Learning, Link, Sensor
+    from magbridge.config import load as load_config
+
+    if config is None:
+        assert file is not None
+        nobody = Sensor(driver="", port="-"), Link(url="-")
+        settings = Config(*nobody, learning=Learning(), path=file)
+    else:
+        settings = load_config(config)
+        if settings.learning is None:
+            raise ConfigError(config, "learning", "missing")
+    if file is None and settings.calibration is not None:
+        file = settings.resolve(settings.calibration.file)
+    known = load(file) if file is not None else expected(settings)
+    assert known is not None
+    return known, settings
+
+
+def _learner(known: Calibration, log: xr.Dataset, settings: Config) -> Learner:
+    """Return a learner with a bridge's settings, which knows of the currents in the log."""
+    from magbridge.bridge.learning import open_learner
+
+    currents = tuple(str(name) for name in log.data_vars if log[name].attrs.get("units") == "A")
+    learner = open_learner(settings, known, None if settings.telemetry else currents)
+    assert learner is not None
+    return learner
 
 
 def _tell(learner: Learner) -> None:

@@ -38,7 +38,8 @@ rock."""
 LONG: Final = 1000
 """Samples over which the mean derivative of the total field is followed."""
 LASTING: Final = 6.0 * 3600.0
-"""s over which the slope of a drift changes by its own size."""
+"""s over which what is known of a drift's slope gets less certain by a factor of e in variance: a drift
+changes, but what was found to be none does not begin anew by itself."""
 
 
 class Estimator:
@@ -80,7 +81,7 @@ class Estimator:
         self._P[-STATES:, -STATES:] = nuisance.initial
         self.offsets, self.slope = offsets, np.arange(K, K + SLOPE)
         self._nuisance, self._creep = nuisance, creep
-        self._slope_walk = 0.0  # (nT/s)² a second; 0: there is no slope
+        self._sloping = False
         self._near: FloatArray | None = None
         self._mean = np.zeros(K)
         self._stay = 1.0
@@ -134,12 +135,12 @@ class Estimator:
         """Move the state by `by` (n,), which is known to a further `covariance` (n, n)."""
         self._x += by
         self._P += covariance
-        self._slope_walk = float(np.trace(self._P[np.ix_(self.slope, self.slope)])) / 3.0 / LASTING
+        self._sloping = bool(self._P[self.slope, self.slope].any())
 
     def advance(self, state: FloatArray, F: FloatArray, seconds: float) -> None:
         """Move `state` (n, ...) on in place, over a time; F (3, 3) is the nuisance's transition."""
         state[-STATES:] = np.tensordot(F, state[-STATES:], 1)
-        if self._slope_walk:
+        if self._sloping:
             state[self.offsets] += seconds * state[self.slope]
 
     def propagate(self, metres: float, seconds: float) -> FloatArray:
@@ -150,7 +151,7 @@ class Estimator:
         self.advance(P, F, seconds)
         self.advance(P.T, F, seconds)
         P[-STATES:, -STATES:] += Q
-        P[self.slope, self.slope] += self._slope_walk * seconds
+        P[self.slope, self.slope] *= 1.0 + seconds / LASTING
         self.open(self._creep * self._creep * seconds)
         self._stay = exp(-metres / NEAR)
         return F

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from math import isnan
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import numpy as np
@@ -24,6 +24,9 @@ from magbridge.learning.report import Notice, State
 from magbridge.learning.start import Start
 from magbridge.records import Quality, Vector
 
+if TYPE_CHECKING:
+    from magbridge.field.grid import AnomalyGrid  # it brings scipy
+
 __all__ = ["Learner"]
 
 UNFIT: Final = int(Quality.STALE_TELEMETRY | Quality.MOVING | Quality.SATURATED | Quality.LATE_JOIN)
@@ -34,9 +37,9 @@ LINEAR: Final = 300.0
 """nT, 1-sigma of an axis's offset: from here on it is fitted anew as a whole."""
 CREEP: Final = 3.0 / 86_400.0**0.5
 """nT per square root of a second: an offset walks by 3 nT a day."""
-SURE: Final = 12.0
+SURE: Final = 6.0
 """By which a doubt's log-likelihood ratio has to grow until it is learned what is behind it."""
-PATIENCE: Final = 256
+PATIENCE: Final = 128
 """Telling samples after which that is decided at the latest."""
 MORE: Final = 2.0
 """By which an alarm's log-likelihood ratio has to grow to be news."""
@@ -62,6 +65,8 @@ class Learner:
     ----------
     calibration : Calibration
         The one to begin with.
+    grid : AnomalyGrid, optional
+        What the field differs by from the main field, outside of which nothing is learned.
     spread : float
         nT, 1-sigma of the Earth's field about its reference.
     turn_on : float
@@ -98,6 +103,7 @@ class Learner:
         self,
         calibration: Calibration,
         *,
+        grid: AnomalyGrid | None = None,
         spread: float = 145.0,
         turn_on: float = 20.0,
         max_rate: float = 1.0,
@@ -109,7 +115,7 @@ class Learner:
         self._turn_on = turn_on
         self._unfit = UNFIT if calibration.method == NONE else UNFIT | int(Quality.UNCALIBRATED)
         self._start: Start | None
-        self._spread = spread
+        self._grid, self._spread = grid, spread
         self._nuisance = Nuisance(calibration.noise, spread)
         self._period_us = round(1e6 / max_rate)
         self.enabled, self.frozen = True, False
@@ -231,6 +237,11 @@ class Learner:
             return
         if 0 <= time_us - self._last_us < 0.99 * self._period_us:
             return
+        if self._grid is not None:
+            reference += self._grid.look_up(where[1], where[0]).anomaly
+            if isnan(reference):
+                self._nothing(time_us)
+                return
         phi = self._model.regressors(regressors, watched)
         if not np.isfinite(phi).all():
             return

@@ -23,7 +23,7 @@ from magbridge.learning.doubt import CAUSES
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.mavlink.dialect import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
-from magbridge.records import Channel
+from magbridge.records import Channel, Quality
 
 PLACE = (49.52, -57.87)
 SAMPLES = 700
@@ -33,8 +33,8 @@ SHIFT = np.array([14.0, -11.0, 13.0])
 LEARNING = "[learning]\nenabled = true\n"
 
 
-def bridge(folder: Path, learning: str = LEARNING) -> Pipeline:
-    """Set up a bridge with a nominal calibration that is known to a nanotesla."""
+def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pipeline:
+    """Set up a bridge with a nominal calibration that is known to a nanotesla, or with none."""
     cal = Calibration(
         parameters=(),
         terms=(Polynomial(exponents=((),)),),
@@ -46,7 +46,8 @@ def bridge(folder: Path, learning: str = LEARNING) -> Pipeline:
     )
     save(cal, folder / "cal.json")
     config = folder / "bridge.toml"
-    head, _, _ = CONFIG.partition("[telemetry")
+    source = CONFIG if known else CONFIG.replace('[calibration]\nfile = "cal.json"\n', "")
+    head, _, _ = source.partition("[telemetry")
     head = head.replace("options = {", f'options = {{unit = "counts", scale = {COUNT}, ')
     config.write_text(
         f'{head}[log]\ndirectory = "logs"\n[publish]\nMAG_FIELD = 0\n{learning}', encoding="utf-8"
@@ -212,7 +213,9 @@ def test_it_is_off_unless_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ('reference = "emag2"', "learning.reference"),
+        ('reference = "emag2.nc"', "learning.reference: no such file"),
+        ('prior = "class.json"', "learning.prior: no such file"),
+        ("ranges = {battpos = [1.0, -1.0]}", "ranges.battpos"),
         ("max_rate = 0.0", "learning.max_rate"),
         ("speed = 3", "learning.speed"),
     ],
@@ -226,3 +229,45 @@ def test_a_wrong_key_is_one_line(tmp_path: Path, text: str, why: str) -> None:
 def test_the_causes_bits_are_those_of_the_dialect() -> None:
     """In the same order."""
     assert [str(cause.name).lower() for cause in MAG_CAUSE] == list(CAUSES)
+
+
+def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
+    """Without a calibration, the field is flagged until there is one; the log gives the same again."""
+    pipeline, sent = bridge(tmp_path, known=False), []
+    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as log:
+        for event in events(tmp_path):
+            sent += pipeline.feed(event)
+            log.extend(pipeline.journal.drain())
+    fields = named(heard(sent), "MAG_FIELD")
+    assert int(fields[0]["flags"]) & Quality.UNCALIBRATED
+    assert fields[0]["total_field_sigma"] > 1000.0
+    assert not int(fields[-1]["flags"]) & Quality.UNCALIBRATED
+    assert fields[-1]["total_field_sigma"] < 200.0
+    assert abs(fields[-1]["total_field"] - 51_900.0) < 400.0
+    assert np.std([one["total_field"] for one in fields[-100:]]) < 15.0
+    out, log_file = tmp_path / "out.nc", sorted((tmp_path / "logs").iterdir())
+    order = [
+        "correct",
+        *map(str, log_file),
+        "--learn",
+        "--config",
+        str(tmp_path / "bridge.toml"),
+        "-o",
+        str(out),
+    ]
+    assert main(order) == 0
+    live = np.array([one["total_field"] for one in fields])
+    np.testing.assert_array_equal(logs.read(out)["total_field"].to_numpy(), live)
+    assert kept_path(load_config(tmp_path / "bridge.toml")) == tmp_path / "cal-learned.json"
+
+
+def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line, and nothing is written."""
+    bridge(tmp_path)
+    log, out = tmp_path / "log.csv", tmp_path / "out.nc"
+    log.write_text("time,mag_x,mag_y,mag_z\n1,2,3,4\n", encoding="utf-8")
+    assert main(["correct", str(log), "-o", str(out)]) == 2
+    assert "--calibration is missing" in capsys.readouterr().err
+    assert main(["correct", str(log), "--config", str(tmp_path / "bridge.toml"), "-o", str(out)]) == 2
+    assert "--learn" in capsys.readouterr().err
+    assert not out.exists()

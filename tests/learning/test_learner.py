@@ -2,95 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import nan
 
 import numpy as np
 import pytest
+from worlds import FIELD, World, calibration, error_of, learn
 
-from magbridge.calibration.correct import Corrector
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.model import Calibration, Noise
 from magbridge.calibration.residual import Samples, residuals, whiten
-from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.field.grid import AnomalyGrid
 from magbridge.learning import Learner
 from magbridge.learning.nuisance import Nuisance
 from magbridge.learning.observation import observe
 from magbridge.records import Quality
-
-MASS = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)
-ORDER = full_order(1, 2)
-FIELD = 50_000.0
-
-
-def calibration(sigma: float = 1.0) -> Calibration:
-    """Return one whose coefficients are uncertain by `sigma` nT each."""
-    K = 9 * len(ORDER)
-    coefficients = np.random.default_rng(3).normal(size=K) * 200.0
-    return Calibration(
-        parameters=(MASS,),
-        terms=(Polynomial(exponents=ORDER),),
-        coefficients=coefficients,
-        covariance=np.eye(K) * sigma**2,
-        noise=Noise(1.0),
-        reference=Reference(FIELD),
-        method="auto",
-    )
-
-
-class World:
-    """A glider that yaws to and fro, pitches up and down and moves its mass, over smooth rock."""
-
-    def __init__(self, truth: Calibration, samples: int, seed: int = 1, *, straight: bool = False) -> None:
-        rng = np.random.default_rng(seed)
-        k = np.arange(samples)
-        leg = k // 60
-        yaw = 0.6 if straight else 0.7 * leg + 0.1 * rng.normal(size=samples)
-        pitch = 0.0 if straight else np.where(leg % 2, 0.45, -0.4) + 0.05 * rng.normal(size=samples)
-        roll = 0.02 * rng.normal(size=samples)
-        north, down = 0.4 * np.cos(yaw) + 0 * k, 0.9
-        x = north * np.cos(pitch) - down * np.sin(pitch)
-        z = north * np.sin(pitch) + down * np.cos(pitch)
-        y = -0.4 * np.sin(yaw) * np.cos(roll) + z * np.sin(roll)
-        unit = np.column_stack([x, y, z])
-        unit /= np.linalg.norm(unit, axis=1)[:, None]
-        self.rock = 60.0 * np.sin(k * 4.0 * 0.35 / 400.0) if straight else 60.0 * np.sin(k * 1.4 / 900.0)
-        self.total = FIELD + self.rock
-        self.mass = np.where(leg % 2, 0.5, -0.5) if not straight else np.zeros(samples)
-        A, T = truth.matrices(self.mass[:, None])
-        self.field = np.linalg.solve(A, (unit * self.total[:, None])[:, :, None])[:, :, 0] + T
-        self.field += rng.normal(size=(samples, 3))
-        self.where: list[tuple[float, float] | None] = [
-            (49.0 + n * 1.4 / 111_000.0, -57.0) for n in range(samples)
-        ]
-
-
-def learn(learner: Learner, world: World, *, added: np.ndarray | None = None, quality: int = 0) -> list[int]:
-    """Give the learner a world's samples; return where it doubted."""
-    corrector, doubted = Corrector(learner.first), []
-    field = world.field if added is None else world.field + added
-    for n, reading in enumerate(field.tolist()):
-        values = (float(world.mass[n]),)
-        corrector.numbers(0, (reading[0], reading[1], reading[2]), values, 0)
-        learner.sample(
-            (n + 1) * 4_000_000,
-            (reading[0], reading[1], reading[2]),
-            corrector.regressors,
-            values,
-            quality,
-            faulty=False,
-            reference=FIELD,
-            where=world.where[n],
-            watched=(nan,),
-        )
-        if learner.flags:
-            doubted.append(n)
-    return doubted
-
-
-def error_of(learned: Calibration, world: World) -> float:
-    """Return the RMS error about its mean of the total field, nT, without the noise."""
-    A, T = learned.matrices(world.mass[:, None])
-    total = np.linalg.norm(np.matmul(A, (world.field - T)[:, :, None])[:, :, 0], axis=1)
-    return float(np.std(total - world.total))
 
 
 def test_one_sample_is_the_fits_own_residual() -> None:
@@ -231,6 +156,105 @@ def test_a_worse_calibration_is_rolled_back() -> None:
     world = World(known, 3000)
     assert any(notice.text.startswith(("learned", "accepted")) for notice in learner.notices)
     assert error_of(learner.calibration, world) < 1.5
+
+
+def grid_of(world: World, scale: float, shift: float = 0.0) -> AnomalyGrid:
+    """Return a map of the world's rock, which runs north; `scale` and `shift` (m) make it a wrong one."""
+    metres = np.arange(-3_000.0, 5_000.0, 100.0)
+    rock = scale * 60.0 * np.sin((metres + shift) / 900.0)
+    latitude = 49.0 + metres / 111_000.0
+    longitude = np.linspace(-57.1, -56.9, 5)
+    return AnomalyGrid(longitude, latitude, np.repeat(rock[:, None], 5, axis=1), altitude=0.0)
+
+
+def test_a_map_tells_the_level_too() -> None:
+    """With the IGRF alone, what is learned may have any level; with a map it has the map's."""
+    known = calibration(30.0)
+    world = World(vehicle_off(known), 1500)
+    errors = {}
+    for name, grid, spread in (("igrf", None, 145.0), ("map", grid_of(world, 1.0), 20.0)):
+        learner = Learner(known, grid=grid, spread=spread)
+        learn(learner, world)
+        A, T = learner.learned().matrices(world.mass[:, None])
+        total = np.linalg.norm(np.matmul(A, (world.field - T)[:, :, None])[:, :, 0], axis=1)
+        errors[name] = abs(float(np.mean(total - world.total)))
+    assert errors["map"] < 12.0
+    assert errors["map"] < errors["igrf"] + 5.0
+
+
+def vehicle_off(known: Calibration) -> Calibration:
+    """Return a calibration that is off by what the known one's sigma lets expect."""
+    off = 30.0 * np.random.default_rng(8).normal(size=len(known.coefficients))
+    return replace(known, coefficients=known.coefficients + off)
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(-1.0, 0.0), (1.0, 1000.0)])
+def test_a_wrong_map_teaches_nothing_wrong(scale: float, shift: float) -> None:
+    """Upside down, or off by a kilometre as a false GPS: what is published stays as good as it was."""
+    known = calibration()
+    world = World(known, 1500)
+    learner = Learner(known, grid=grid_of(world, scale, shift), spread=20.0)
+    learn(learner, world)
+    assert error_of(learner.calibration, world) < 1.3
+
+
+def test_a_month_without_a_fix_changes_nothing() -> None:
+    """It is reported once, and what was published stays."""
+    known = calibration()
+    learner, world = Learner(known), World(known, 600)
+    learn(learner, world)
+    before = learner.calibration
+    field = tuple(world.field[0].tolist())
+    for hour in range(24 * 30):
+        learner.sample(
+            2_400_000_000 + hour * 3_600_000_000, field, [1.0, 0.5, 0.25], (0.5,), 0,
+            faulty=False, reference=nan, where=None, watched=(nan,),
+        )  # fmt: skip
+    assert learner.calibration is before
+    told = [notice.text for notice in learner.notices if "hour" in notice.text]
+    assert told == ["learning: an hour without a sample to learn from"]
+
+
+def test_a_spoofed_current_is_not_learned_from() -> None:
+    """Telemetry that jumps at random has nothing to do with the field: no term of it is published."""
+    known, rng = calibration(), np.random.default_rng(4)
+    learner = Learner(known, currents=("pump_current",))
+    learn(
+        learner,
+        World(known, 1200),
+        watched=np.column_stack([np.full(1200, nan), 50.0 * rng.normal(size=1200)]),
+    )
+    assert learner.calibration.effects == ()
+    assert learner.flags == 0
+
+
+def test_a_pumps_current_becomes_a_term() -> None:
+    """The learned calibration carries it, and needs its telemetry."""
+    known, n = calibration(), 1500
+    current = np.where(np.arange(n) % 50 < 12, 2.0, 0.0)
+    added = current[:, None] * np.array([8.0, -6.0, 9.0]) * (np.arange(n) > 500)[:, None]
+    learner = Learner(known, currents=("pump_current",))
+    learn(learner, World(known, n), added=added, watched=np.column_stack([np.full(n, 4.0), current]))
+    assert learner.calibration.channels == ("battpos", "pump_current")
+    assert learner.calibration.coefficients[-3:] == pytest.approx([8.0, -6.0, 9.0], abs=1.5)
+    assert "current field" in " ".join(notice.text for notice in learner.notices)
+
+
+def test_a_temperature_becomes_a_term() -> None:
+    """Of the coefficients that it has, whatever the offset was learned to be meanwhile."""
+    known, n = calibration(), 2400
+    temperature = -10.0 + 12.0 / (1.0 + np.exp(-(np.arange(n) - 1200.0) / 150.0))
+    per_degree = np.array([4.0, -3.0, 5.0])
+    learner = Learner(known)
+    added = (temperature - temperature[0])[:, None] * per_degree
+    learn(learner, World(known, n), added=added, watched=temperature[:, None])
+    shifted = World(known, n)
+    assert "sensor_temperature" in learner.calibration.channels
+    shifted.field += added[-1]
+    last = learner.calibration.without_effects()
+    coefficients = last.coefficients.copy()
+    coefficients[6:9] += learner.calibration.coefficients[-3:] * 12.0
+    assert error_of(replace(last, coefficients=coefficients), shifted) < 2.5
 
 
 def test_no_more_than_max_rate_is_learned_from() -> None:

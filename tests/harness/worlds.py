@@ -1,0 +1,97 @@
+"""Worlds to learn in: a glider that turns, dives and moves its mass over smooth rock."""
+
+from __future__ import annotations
+
+from math import nan
+
+import numpy as np
+
+from magbridge.calibration.correct import Corrector
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.learning import Learner
+
+__all__ = ["FIELD", "MASS", "World", "calibration", "error_of", "learn"]
+
+MASS = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)
+ORDER = full_order(1, 2)
+FIELD = 50_000.0
+
+
+def calibration(sigma: float = 1.0) -> Calibration:
+    """Return one whose coefficients are uncertain by `sigma` nT each."""
+    K = 9 * len(ORDER)
+    coefficients = np.random.default_rng(3).normal(size=K) * 200.0
+    return Calibration(
+        parameters=(MASS,),
+        terms=(Polynomial(exponents=ORDER),),
+        coefficients=coefficients,
+        covariance=np.eye(K) * sigma**2,
+        noise=Noise(1.0),
+        reference=Reference(FIELD),
+        method="auto",
+    )
+
+
+class World:
+    """A glider that yaws to and fro, pitches up and down and moves its mass, over smooth rock."""
+
+    def __init__(self, truth: Calibration, samples: int, seed: int = 1, *, straight: bool = False) -> None:
+        rng = np.random.default_rng(seed)
+        k = np.arange(samples)
+        leg = k // 60
+        yaw = 0.6 if straight else 0.7 * leg + 0.1 * rng.normal(size=samples)
+        pitch = 0.0 if straight else np.where(leg % 2, 0.45, -0.4) + 0.05 * rng.normal(size=samples)
+        roll = 0.02 * rng.normal(size=samples)
+        north, down = 0.4 * np.cos(yaw) + 0 * k, 0.9
+        x = north * np.cos(pitch) - down * np.sin(pitch)
+        z = north * np.sin(pitch) + down * np.cos(pitch)
+        y = -0.4 * np.sin(yaw) * np.cos(roll) + z * np.sin(roll)
+        unit = np.column_stack([x, y, z])
+        unit /= np.linalg.norm(unit, axis=1)[:, None]
+        self.rock = 60.0 * np.sin(k * 4.0 * 0.35 / 400.0) if straight else 60.0 * np.sin(k * 1.4 / 900.0)
+        self.total = FIELD + self.rock
+        self.mass = np.where(leg % 2, 0.5, -0.5) if not straight else np.zeros(samples)
+        A, T = truth.matrices(self.mass[:, None])
+        self.field = np.linalg.solve(A, (unit * self.total[:, None])[:, :, None])[:, :, 0] + T
+        self.field += rng.normal(size=(samples, 3))
+        self.where: list[tuple[float, float] | None] = [
+            (49.0 + n * 1.4 / 111_000.0, -57.0) for n in range(samples)
+        ]
+
+
+def learn(
+    learner: Learner,
+    world: World,
+    *,
+    added: np.ndarray | None = None,
+    quality: int = 0,
+    watched: np.ndarray | None = None,
+) -> list[int]:
+    """Give the learner a world's samples; return where it doubted."""
+    corrector, doubted = Corrector(learner.first), []
+    field = world.field if added is None else world.field + added
+    for n, reading in enumerate(field.tolist()):
+        values = (float(world.mass[n]),)
+        corrector.numbers(0, (reading[0], reading[1], reading[2]), values, 0)
+        learner.sample(
+            (n + 1) * 4_000_000,
+            (reading[0], reading[1], reading[2]),
+            corrector.regressors,
+            values,
+            quality,
+            faulty=False,
+            reference=FIELD,
+            where=world.where[n],
+            watched=(nan,) if watched is None else watched[n].tolist(),
+        )
+        if learner.flags:
+            doubted.append(n)
+    return doubted
+
+
+def error_of(learned: Calibration, world: World) -> float:
+    """Return the RMS error about its mean of the total field, nT, without the noise."""
+    A, T = learned.matrices(world.mass[:, None])
+    total = np.linalg.norm(np.matmul(A, (world.field - T)[:, :, None])[:, :, 0], axis=1)
+    return float(np.std(total - world.total))
