@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from magbridge.bridge.pipeline import check
+from magbridge.bridge.needs import check
 from magbridge.calibration.model import Calibration, Parameter, identity
 from magbridge.config import load
 from magbridge.errors import ConfigError

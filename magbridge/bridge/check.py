@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from magbridge.bridge.links import LINKS, open_link
-from magbridge.bridge.pipeline import unmet
+from magbridge.bridge.needs import unmet
 from magbridge.bridge.serial_port import serial_line
 from magbridge.calibration import file as calibration_file
 from magbridge.calibration.model import Calibration

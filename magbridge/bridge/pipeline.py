@@ -14,14 +14,13 @@ from magbridge.bridge.events import Event, Start
 from magbridge.bridge.head import beginning, declarations
 from magbridge.bridge.journal import Journal
 from magbridge.bridge.learning import Learning, open_learner
+from magbridge.bridge.needs import check
 from magbridge.bridge.position import Position
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
-from magbridge.columns import may_be
 from magbridge.config import Align, Config
-from magbridge.correction import TEMPERATURE, Correction
-from magbridge.errors import ConfigError
+from magbridge.correction import Correction
 from magbridge.link.authority import Sources
 from magbridge.link.component import Component, check_publish
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
@@ -37,7 +36,7 @@ from magbridge.version import __version__
 if TYPE_CHECKING:
     from magbridge.bridge.navigation import Navigation  # imports filterpy, which few vehicles have
 
-__all__ = ["Pipeline", "unmet"]
+__all__ = ["Pipeline"]
 
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
@@ -328,32 +327,3 @@ class Pipeline:
             self._changes.log_lost,
             self._changes.log_state,
         )
-
-
-def check(calibration: Calibration, config: Config) -> None:
-    """Check that the link will provide what the calibration needs.
-
-    Raises
-    ------
-    ConfigError
-        A parameter that ``[telemetry]`` lacks, or that comes in another unit.
-    """
-    for error in unmet(calibration, config):
-        raise error
-
-
-def unmet(calibration: Calibration, config: Config) -> list[ConfigError]:
-    """Return what the calibration needs and the link will not provide: each as :func:`check` raises it."""
-    units, errors = calibration.units, []
-    for name in calibration.channels:
-        if name == TEMPERATURE:
-            continue
-        if name not in config.telemetry:
-            missing = "missing: the calibration needs this parameter"
-            errors.append(ConfigError(config.path, f"telemetry.{name}", missing))
-            continue
-        unit = config.telemetry[name].unit
-        if not may_be(unit, units.get(name, "")):
-            expected = f"expected {units[name]!r}, the calibration's unit, not {unit!r}"
-            errors.append(ConfigError(config.path, f"telemetry.{name}.unit", expected))
-    return errors
