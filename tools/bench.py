@@ -32,7 +32,7 @@ __all__ = ["BENCHMARKS"]
 BENCHMARKS: dict[str, tuple[str, int]] = {
     "processor": ("benchmarks.processor:processor", 15),
     "latency": ("benchmarks.latency:latency", 5),
-    "files": ("benchmarks.files:files", 4),
+    "files": ("benchmarks.files:files", 2),
     "replay": ("benchmarks.replay:replay", 5),
     "start": ("benchmarks.start:start", 5),
     "commands": ("benchmarks.commands:commands", 7),
