@@ -76,10 +76,17 @@ class Shapes:
         Vehicle -> D (K, s); one that is not there has none.
     groups : (s,) array
         Number of the group that each column shares its variance with.
+    rest : float or (K,) array
+        Share of the physical widths by which coefficients are expected to vary besides.
     """
 
     of: Mapping[str, FloatArray]
     groups: IndexArray
+    rest: FloatArray | float = EXPECTED[1]
+
+    def expected(self, K: int) -> FloatArray:
+        """Return the shares (3, K) by which coefficients are expected to vary, before any fleet is seen."""
+        return np.stack([np.broadcast_to(size, K) for size in (EXPECTED[0], self.rest, EXPECTED[2])])
 
 
 class Variances(NamedTuple):
@@ -97,9 +104,9 @@ class Variances(NamedTuple):
     shaped: FloatArray
 
     @classmethod
-    def expected(cls, K: int, s: int) -> Variances:
+    def expected(cls, K: int, shapes: Shapes) -> Variances:
         """Return what is expected before any fleet is seen."""
-        return cls(np.square(EXPECTED)[:, None] * np.ones((1, K)), np.full(s, EXPECTED[1] ** 2))
+        return cls(np.square(shapes.expected(K)), np.full(len(shapes.groups), EXPECTED[1] ** 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +227,7 @@ def learn(
     variances : Variances, optional
         Those to take, instead of learning them.
     """
-    start = variances or Variances.expected(len(groups), len(shapes.groups))
+    start = variances or Variances.expected(len(groups), shapes)
     found, sums = _round(start, observed, groups, shapes)
     for turn in range(1, (0 if variances else ROUNDS) + 1):
         old = found.variances
@@ -236,15 +243,17 @@ def learn(
 def _renewed(sums: _Sums, groups: IndexArray, shapes: Shapes) -> Variances:
     """Return the mode of the variances' posterior: of count differences of each member, and of the prior."""
 
-    def mode(squares: FloatArray, count: int, of: IndexArray, expected: float) -> FloatArray:
-        inner = np.bincount(of, squares) + WORTH * expected**2
-        return np.asarray((inner / (count * np.bincount(of) + WORTH + 2.0))[of])
+    def mode(squares: FloatArray, count: int, of: IndexArray, expected: FloatArray) -> FloatArray:
+        members = np.bincount(of)
+        inner = np.bincount(of, squares) + WORTH * np.bincount(of, expected**2) / members
+        return np.asarray((inner / (count * members + WORTH + 2.0))[of])
 
     own = [
         mode(squares, count, groups, size)
-        for squares, count, size in zip(sums.own, sums.counts, EXPECTED, strict=True)
+        for squares, count, size in zip(sums.own, sums.counts, shapes.expected(len(groups)), strict=True)
     ]
-    return Variances(np.array(own), mode(sums.shaped, sums.refits, shapes.groups, EXPECTED[1]))
+    sizes = np.full(len(shapes.groups), EXPECTED[1])
+    return Variances(np.array(own), mode(sums.shaped, sums.refits, shapes.groups, sizes))
 
 
 def _round(
@@ -311,7 +320,8 @@ def _log_prior(variances: Variances, groups: IndexArray, shapes: Shapes) -> floa
     _, first = np.unique(groups, return_index=True)
     _, one = np.unique(shapes.groups, return_index=True)
     v = np.append(variances.own[:, first], variances.shaped[one])
-    expected = np.append(np.repeat(np.square(EXPECTED), len(first)), np.full(len(one), EXPECTED[1] ** 2))
+    own = np.square(shapes.expected(len(groups)))[:, first]
+    expected = np.append(own, np.full(len(one), EXPECTED[1] ** 2))
     return float(-np.sum((0.5 * WORTH + 1.0) * np.log(v) + 0.5 * WORTH * expected / v))
 
 

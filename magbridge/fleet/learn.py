@@ -26,6 +26,8 @@ from magbridge.fleet.shapes import shape_groups, shapes_of
 
 __all__ = ["Fleet", "Lesson", "learn_fleet"]
 
+REST = 0.01
+"""Share of the physical widths that a refit of a mounted mass moves besides what a dipole does."""
 NOWHERE: Mapping[str, Mapping[str, Mounting]] = {}
 FIELD = 50_000.0
 """nT, the F_0 that a fleet's coefficients refer to."""
@@ -160,7 +162,7 @@ def _shapes(
     whole = {vehicle: where for vehicle, where in mounted.items() if where.keys() == names}
     if not whole:
         return NONE
-    first = learn(observed, groups, variances=Variances.expected(len(groups), 0))
+    first = learn(observed, groups, variances=Variances.expected(len(groups), NONE))
     found = {}
     for vehicle, where in whole.items():
         past = [one for one in observed if one.vehicle == vehicle]
@@ -169,7 +171,8 @@ def _shapes(
         mean, P = first.expected(vehicle, past, "")
         D = shapes_of(where, exponents, parameters, FIELD, basis @ mean, basis @ P @ basis.T)
         found[vehicle] = np.asarray(np.linalg.solve(basis, D))
-    return Shapes(found, shape_groups(len(parameters)))
+    moves = np.repeat([sum(powers) > 0 for powers in exponents], 9)
+    return Shapes(found, shape_groups(len(parameters)), np.where(moves, REST, NONE.rest))
 
 
 def _whole_range(lessons: Sequence[Lesson]) -> tuple[Parameter, ...]:

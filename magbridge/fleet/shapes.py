@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.mounted_masses import LATENT, Mounting, mounted_prior
+from magbridge.calibration.fitting.mounted_masses import LATENT, Mounting, mass_columns, mounted_prior
 from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
@@ -56,8 +56,18 @@ def shapes_of(
         z = np.asarray(np.linalg.solve(pull @ prior.E + prior.precision, pull @ (mean - prior.offset)))
         assert family.renew is not None
         family = family.renew(z)
-    latent = (family.E * family.widths(family.centre))[:, len(mean) :]
-    return np.asarray(latent.reshape(len(mean), -1, LATENT)[:, :, : 3 * KINDS].reshape(len(mean), -1))
+    size, order = len(mean), max(map(sum, exponents))
+    shapes = np.zeros((len(exponents), 9, len(mounted), 3 * KINDS))
+    latents = z[size:].reshape(-1, LATENT), family.widths(family.centre)[size:].reshape(-1, LATENT)
+    for i, (name, mass, latent, width) in enumerate(
+        zip(mounted.keys(), mounted.values(), *latents, strict=True)
+    ):
+        k = [one.name for one in parameters].index(name)
+        by = mass_columns(np.array(mass.at), np.array(mass.travel), parameters[k], order, latent) * width
+        for n in range(order + 1):
+            row = exponents.index(tuple(n * (j == k) for j in range(len(parameters))))
+            shapes[row, :, i] = by[n, :, : 3 * KINDS]
+    return shapes.reshape(size, -1)
 
 
 def shape_groups(masses: int) -> IndexArray:

@@ -29,7 +29,7 @@ from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 from magbridge.toml import check_entries, convert, load_toml
 
-__all__ = ["LATENT", "Mounting", "mounted_prior", "read_vehicle"]
+__all__ = ["LATENT", "Mounting", "mass_columns", "mounted_prior", "read_vehicle"]
 
 Vector = tuple[float, float, float]
 
@@ -92,16 +92,36 @@ class _Mass:
 
     def columns(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``dc/dl`` (order, 9, 12) and c (order, 9): its coefficients c at latent numbers l."""
-        moment, pulled, shift, stretch = latent.reshape(4, 3)
-        induced = gain_rotation() @ pulled
-        p = self.parameter.centre + self.parameter.scale * chebyshev.chebpts1(4 * len(self.rows) + 4)
-        r = self.at + shift + p[:, None] * (self.travel + stretch)
-        # moments stay scaled by the measured distance, or a shift would change them too
-        by = dipole_columns(r, moment, induced, float(np.linalg.norm(self.at)))
-        by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
-        by = np.concatenate([by, by[6:] * p[:, None]])
-        powers = expand_dipole(by, len(self.rows))[:, 1:]  # the constant is absorbed by the hard iron
-        return np.moveaxis(powers, 0, -1), np.tensordot(latent[:6], powers[:6], 1)
+        by = mass_columns(self.at, self.travel, self.parameter, len(self.rows), latent)
+        moved = by[1:]  # the constant is absorbed by the hard iron
+        return moved, moved[..., :6] @ latent[:6]
+
+
+def mass_columns(
+    at: FloatArray, travel: FloatArray, parameter: Parameter, order: int, latent: FloatArray
+) -> FloatArray:
+    """Return ``dc/dl`` (order + 1, 9, 12) of a mass: its coefficients, the constant first, by latent numbers.
+
+    Parameters
+    ----------
+    at, travel : (3,) arrays
+        m, and m per unit of the parameter.
+    parameter : Parameter
+        That moves it.
+    order : int
+        Of the highest power.
+    latent : (12,) array
+        Moment (nT), induced moment (nT), shift (m), change of the travel (m per unit).
+    """
+    moment, pulled, shift, stretch = latent.reshape(4, 3)
+    induced = gain_rotation() @ pulled
+    p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * order + 4)
+    r = at + shift + p[:, None] * (travel + stretch)
+    # moments stay scaled by the measured distance, or a shift would change them too
+    by = dipole_columns(r, moment, induced, float(np.linalg.norm(at)))
+    by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
+    by = np.concatenate([by, by[6:] * p[:, None]])
+    return np.moveaxis(expand_dipole(by, order), 0, -1)
 
 
 def mounted_prior(
