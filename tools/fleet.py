@@ -30,8 +30,8 @@ from magbridge.calibration.model import Calibration, Noise, Reference
 from magbridge.calibration.residual import rms
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
-from magbridge.fleet.hierarchy import LEVELS
 from magbridge.fleet.learn import Lesson, learn_fleet
+from magbridge.fleet.variances import LEVELS
 from sitl import Twin, load, segments, simulate
 from sitl.bound import oracle
 from sitl.dataset import at_rest, corrected

@@ -29,30 +29,24 @@ and back, :math:`x | p \sim N(L^{-1}(h + S^{-1} p), L^{-1})`. A difference d spl
 parts, with the covariance Q and the shape B (V and I, or U and D), contributes:
 :math:`b | d \sim N(Q B^T S^{-1} d,\ Q - Q B^T S^{-1} B Q)`. The variances maximise the likelihood by
 expectation-maximisation (Laird & Ware 1982, Biometrics 38:963), each with a scaled inverse chi-squared prior
-worth :data:`WORTH` differences, so that a level with few members keeps a plausible size.
+worth :data:`.WORTH` differences, so that a level with few members keeps a plausible size.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.known import Information
+from magbridge.fleet.variances import NONE, Shapes, Spread, Sums, Variances, log_prior, renewed, spreads_of
 
-__all__ = ["LEVELS", "NONE", "Observed", "Population", "Shapes", "Variances", "learn"]
+__all__ = ["Observed", "Population", "learn"]
 
-LEVELS = ("vehicle", "refit", "power-up")
-"""What coefficients vary with, from the root down."""
-EXPECTED = (1.0, 0.1, 0.02)
-"""Shares of the physical widths by which they are expected to vary with each, before any fleet is seen."""
-WORTH = 2.0
-"""Differences that this expectation is worth."""
 ROUNDS, STILL = 60, 0.02
 """Rounds of expectation-maximisation at most; change of a log variance below which they end."""
 
@@ -67,56 +61,13 @@ class Observed:
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes:
-    """How refits move coefficients together.
-
-    Attributes
-    ----------
-    of : dict
-        Vehicle -> D (K, s); one that is not there has none.
-    groups : (s,) array
-        Number of the group that each column shares its variance with.
-    rest : float or (K,) array
-        Share of the physical widths by which coefficients are expected to vary besides.
-    """
-
-    of: Mapping[str, FloatArray]
-    groups: IndexArray
-    rest: FloatArray | float = EXPECTED[1]
-
-    def expected(self, K: int) -> FloatArray:
-        """Return the shares (3, K) by which coefficients are expected to vary, before any fleet is seen."""
-        return np.stack([np.broadcast_to(size, K) for size in (EXPECTED[0], self.rest, EXPECTED[2])])
-
-
-class Variances(NamedTuple):
-    """How far members differ from their parents.
-
-    Attributes
-    ----------
-    own : (3, K) array
-        Of each coefficient, at each of :data:`LEVELS`.
-    shaped : (s,) array
-        Of the size of each shape, from refit to refit.
-    """
-
-    own: FloatArray
-    shaped: FloatArray
-
-    @classmethod
-    def expected(cls, K: int, shapes: Shapes) -> Variances:
-        """Return what is expected before any fleet is seen."""
-        return cls(np.square(shapes.expected(K)), np.full(len(shapes.groups), EXPECTED[1] ** 2))
-
-
-@dataclass(frozen=True, eq=False)
 class Population:
     """A fleet's variances, and what all but each vehicle say of the fleet's mean.
 
     Attributes
     ----------
     variances : Variances
-        Of the differences at each of :data:`LEVELS`.
+        Of the differences at each of :data:`.LEVELS`.
     shapes : Shapes
         How refits move the coefficients of each vehicle.
     total : Information
@@ -148,7 +99,7 @@ class Population:
         refit : str
             Its refit: one of the past, or another.
         """
-        by_vehicle, by_refit, by_power_up = _spreads(self.variances, self.shapes, vehicle)
+        by_vehicle, by_refit, by_power_up = spreads_of(self.variances, self.shapes, vehicle)
         known = self.each.get(vehicle)
         others = self.total if known is None else _minus(self.total, known)
         mean, P = _moments(others)
@@ -163,15 +114,6 @@ class Population:
         return mean, P + by_power_up.S
 
 
-class _Spread(NamedTuple):
-    """Covariance S of a difference, its inverse W, log determinant, and the parts it is made of: Q, B."""
-
-    S: FloatArray
-    W: FloatArray
-    log_det: float
-    parts: tuple[tuple[FloatArray, FloatArray], ...]
-
-
 @dataclass(frozen=True, eq=False)
 class _Passed:
     """A node's message to its parent, with what the way down needs: ``x | p ~ N(G p + g, R)``."""
@@ -181,31 +123,6 @@ class _Passed:
     g: FloatArray
     R: FloatArray
     score: float
-
-
-class _Sums:
-    """Expected squares of all differences at each level, and of all shapes' sizes; how many there are."""
-
-    def __init__(self, K: int, s: int) -> None:
-        self.own, self.shaped = np.zeros((len(LEVELS), K)), np.zeros(s)
-        self.counts = [0] * len(LEVELS)
-        self.refits = 0
-
-    def add(self, level: int, dd: FloatArray, spread: _Spread) -> None:
-        """Count a difference whose expected d d^T is `dd` (K, K)."""
-        self.counts[level] += 1
-        (own, *shaped) = (
-            q + ((Y := (q[:, None] * B.T) @ spread.W) @ (dd - spread.S) * Y).sum(axis=1)
-            for q, B in spread.parts
-        )
-        self.own[level] += own
-        for squares in shaped:
-            self.shaped += squares
-            self.refits += 1
-
-
-NONE = Shapes({}, np.zeros(0, np.intp))
-"""Nothing is known of how refits move coefficients."""
 
 
 def learn(
@@ -231,7 +148,7 @@ def learn(
     found, sums = _round(start, observed, groups, shapes)
     for turn in range(1, (0 if variances else ROUNDS) + 1):
         old = found.variances
-        new = _renewed(sums, groups, shapes)
+        new = renewed(sums, groups, shapes)
         found, sums = _round(new, observed, groups, shapes)
         found = replace(found, rounds=turn)
         moved = np.log(np.append(new.own, new.shaped) / np.append(old.own, old.shaped))
@@ -240,28 +157,12 @@ def learn(
     return found
 
 
-def _renewed(sums: _Sums, groups: IndexArray, shapes: Shapes) -> Variances:
-    """Return the mode of the variances' posterior: of count differences of each member, and of the prior."""
-
-    def mode(squares: FloatArray, count: int, of: IndexArray, expected: FloatArray) -> FloatArray:
-        members = np.bincount(of)
-        inner = np.bincount(of, squares) + WORTH * np.bincount(of, expected**2) / members
-        return np.asarray((inner / (count * members + WORTH + 2.0))[of])
-
-    own = [
-        mode(squares, count, groups, size)
-        for squares, count, size in zip(sums.own, sums.counts, shapes.expected(len(groups)), strict=True)
-    ]
-    sizes = np.full(len(shapes.groups), EXPECTED[1])
-    return Variances(np.array(own), mode(sums.shaped, sums.refits, shapes.groups, sizes))
-
-
 def _round(
     variances: Variances, observed: Sequence[Observed], groups: IndexArray, shapes: Shapes = NONE
-) -> tuple[Population, _Sums]:
+) -> tuple[Population, Sums]:
     """Go up and down the tree once."""
     K = len(groups)
-    spreads = {one.vehicle: _spreads(variances, shapes, one.vehicle) for one in observed}
+    spreads = {one.vehicle: spreads_of(variances, shapes, one.vehicle) for one in observed}
     tree: dict[str, dict[str, list[_Passed]]] = defaultdict(lambda: defaultdict(list))
     for one in observed:
         tree[one.vehicle][one.refit].append(_up(one.information, spreads[one.vehicle][2]))
@@ -279,7 +180,7 @@ def _round(
     total = _summed([Information(np.eye(K), np.zeros(K)), *(one.told for one in top.values())])
     mean, P = _moments(total)
     score = 0.5 * (total.vector @ mean - np.linalg.slogdet(total.precision)[1])
-    sums = _Sums(K, len(shapes.groups))
+    sums = Sums(K, len(shapes.groups))
     for vehicle, at in top.items():
         by = spreads[vehicle]
         score += at.score
@@ -290,42 +191,12 @@ def _round(
             for leaf in tree[vehicle][refit]:
                 score += leaf.score
                 _down(leaf, *here, sums, 2, by[2])
-    score += _log_prior(variances, groups, shapes)
+    score += log_prior(variances, groups, shapes)
     each = {name: one.told for name, one in top.items()}
     return Population(variances, shapes, total, each, float(score)), sums
 
 
-def _spreads(variances: Variances, shapes: Shapes, vehicle: str) -> tuple[_Spread, _Spread, _Spread]:
-    """Return how a vehicle differs from the fleet, its refits from it, and power-ups from their refit."""
-    D = shapes.of.get(vehicle)
-    return (
-        _spread(variances.own[0]),
-        _spread(variances.own[1], *(() if D is None else ((variances.shaped, D),))),
-        _spread(variances.own[2]),
-    )
-
-
-def _spread(own: FloatArray, *shaped: tuple[FloatArray, FloatArray]) -> _Spread:
-    """Return ``S = diag(own) + D diag(u) D^T`` for each u, D of `shaped`."""
-    S, W, log_det = np.diag(own), np.diag(1.0 / own), float(np.log(own).sum())
-    for u, D in shaped:
-        S = S + (D * u) @ D.T
-        factor = cho_factor(S)
-        W, log_det = cho_solve(factor, np.eye(len(S))), 2.0 * float(np.log(np.diag(factor[0])).sum())
-    return _Spread(S, np.asarray(W), log_det, ((own, np.eye(len(own))), *shaped))
-
-
-def _log_prior(variances: Variances, groups: IndexArray, shapes: Shapes) -> float:
-    """Scaled inverse chi-squared, for one member of each group."""
-    _, first = np.unique(groups, return_index=True)
-    _, one = np.unique(shapes.groups, return_index=True)
-    v = np.append(variances.own[:, first], variances.shaped[one])
-    own = np.square(shapes.expected(len(groups)))[:, first]
-    expected = np.append(own, np.full(len(one), EXPECTED[1] ** 2))
-    return float(-np.sum((0.5 * WORTH + 1.0) * np.log(v) + 0.5 * WORTH * expected / v))
-
-
-def _up(own: Information, spread: _Spread) -> _Passed:
+def _up(own: Information, spread: Spread) -> _Passed:
     """Integrate a node out whose difference from its parent has that covariance."""
     L = own.precision + spread.W
     factor = cho_factor(L)
@@ -338,7 +209,7 @@ def _up(own: Information, spread: _Spread) -> _Passed:
 
 
 def _down(
-    node: _Passed, mean: FloatArray, P: FloatArray, sums: _Sums, level: int, spread: _Spread
+    node: _Passed, mean: FloatArray, P: FloatArray, sums: Sums, level: int, spread: Spread
 ) -> tuple[FloatArray, FloatArray]:
     """Return a node's mean and covariance from its parent's; count the difference."""
     own = node.G @ mean + node.g

@@ -21,8 +21,9 @@ from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import DataError
-from magbridge.fleet.hierarchy import NONE, Observed, Population, Shapes, Variances, learn
+from magbridge.fleet.hierarchy import Observed, Population, learn
 from magbridge.fleet.shapes import shape_groups, shapes_of
+from magbridge.fleet.variances import NONE, Shapes, Variances
 
 __all__ = ["Fleet", "Lesson", "learn_fleet"]
 

@@ -16,10 +16,10 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.errors import DataError, WrongUse
 from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.fleet.given import GIVEN
-from magbridge.fleet.hierarchy import LEVELS, Variances
 from magbridge.fleet.learn import Fleet, Lesson, learn_fleet
 from magbridge.fleet.process import jobs, last_attempts
 from magbridge.fleet.register import current_files, masses, vehicle_named, vehicles
+from magbridge.fleet.variances import LEVELS, Variances
 
 __all__ = ["current", "findings", "fleet_of", "fleets", "lessons", "owner", "remember"]
 
