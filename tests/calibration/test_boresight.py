@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.boresight import field_body, find_boresight
+from magbridge.calibration.fitting.boresight import field_body, find_boresight, magnetic_headings
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import identity
@@ -31,6 +32,34 @@ def test_boresight_is_found_and_makes_the_vector_right() -> None:
     vector = correct(replace(identity(), boresight=found), data.field, data.parameters, data.time).vector
     np.testing.assert_allclose(vector, body, atol=12.0)
     assert find_boresight(identity(), replace(data, attitude=None)) is None
+
+
+@pytest.mark.parametrize(("pitch", "turn"), [(0.0, 17.4), (24.0, 7.4)])
+def test_magnetic_headings_that_are_taken_for_true_are_told(pitch: float, turn: float) -> None:
+    """A level vehicle's mounting looks turned by the declination; a glider's by less than half of it."""
+    rng = np.random.default_rng(2)
+    n = 2000
+    north, east, _ = ned = np.array([16e3, -5e3, 46e3])
+    attitude = np.radians(
+        np.column_stack([rng.normal(0, 1, n), rng.choice([-pitch, pitch], n), rng.uniform(0, 360, n)])
+    )
+    field = field_body(attitude, np.tile(ned, (n, 1))) + rng.normal(0, 1, (n, 3))
+    right = Observations(
+        field, np.full(n, np.linalg.norm(ned)), np.empty((n, 0)), runs=np.arange(n) // 100,
+        attitude=attitude, reference_ned=np.tile(ned, (n, 1)),
+    )  # fmt: skip
+    read = attitude - [0.0, 0.0, np.arctan2(east, north)]
+    assert magnetic_headings(identity(), right) == ""
+    said = magnetic_headings(identity(), replace(right, attitude=read))
+    assert "headings look magnetic: with the declination of -17.4 degrees" in said
+    found = np.degrees(np.linalg.norm(find_boresight(identity(), replace(right, attitude=read)).rotation))
+    assert found == pytest.approx(turn, abs=0.7)
+    warnings = fit(replace(right, attitude=read), "nominal").warnings
+    assert [text for text in warnings if text.startswith("the headings look magnetic")]
+    assert not [text for text in fit(right, "nominal").warnings if "headings" in text]
+    # a mounting that is turned by about as much as D, of a glider, leaves no mismatch, and nothing is said
+    turned = replace(right, field=Rotation.from_euler("z", 10.0, degrees=True).apply(field))
+    assert magnetic_headings(identity(), turned) == ""
 
 
 def test_a_reversed_channel_gets_no_boresight_and_is_said() -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 from msgspec.structs import replace as with_options
 
+from magbridge.calibration.residual import rms
 from magbridge.field.geodesy import metres_per_degree, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
+from magbridge.navigate.bound import position_bound
 from magbridge.navigate.model import prior, transition
 from magbridge.navigate.options import Options
 from voyages.simulated import PLACE, START, Map, blocks, sail, synthetic, voyage
@@ -94,20 +97,32 @@ def magnav(folder: Path) -> None:
     because its filter estimates the errors of the inertial unit.
     """
     grid, ds = flight(folder)
-    print("\n## MagNav.jl's published flight: 100 s, 83 m/s; its script promises 7 m\n")
     names = ("gps_latitude", "gps_longitude", "dr_latitude", "dr_longitude")
-    inertial_start = float(ds["dr_latitude"][0]), float(ds["dr_longitude"][0])
-    inertial = [separation(*a) for a in zip(*(ds[name].to_numpy() for name in names), strict=True)]
-    print(f"{'inertial track as given':<44}{np.sqrt(np.mean(np.sum(np.square(inertial), axis=1))):6.1f} m")
+    true, off = ds[list(names[:2])].to_dataframe().to_numpy(), np.stack([ds[name] for name in names], axis=1)
+    inertial = [separation(*row) for row in off.tolist()]
+    steps = [np.hypot(*separation(*here, *there)) for here, there in pairwise(true.tolist())]
+    seconds = float(ds["time"][-1] - ds["time"][0])
+    print(
+        f"\n## MagNav.jl's published flight: {seconds:.0f} s, {sum(steps) / seconds:.0f} m/s; "
+        "its script promises 7 m\n"
+    )
+    print(f"{'inertial track as given':<58}{np.sqrt(np.mean(np.sum(np.square(inertial), axis=1))):6.1f} m")
     for label, start, current, drift in (
         ("start 3 m, inertial 0.01 m/s (its settings)", 3.0, 0.01, 0.01),
         ("start 100 m, inertial 0.5 m/s", 100.0, 0.5, 0.1),
     ):
         motion = {"start_sigma": start, "current_sigma": current, "drift": drift}
-        options = Options(bias_sigma=3.0, bias_time=600.0, map_sigma=3.0, **motion)
-        result = navigate(ds, grid, options, start=inertial_start)
-        error, smooth = (
-            float(np.sqrt((result[f"{p}error_north"] ** 2 + result[f"{p}error_east"] ** 2).mean()))
-            for p in ("", "smoothed_")
-        )
-        print(f"{label:<44}{error:6.1f} m, smoothed {smooth:.1f} m")
+        for interval in (Options().interval, 0.0):
+            options = Options(bias_sigma=3.0, bias_time=600.0, map_sigma=3.0, interval=interval, **motion)
+            result = navigate(ds, grid, options, start=tuple(off[0, 2:].tolist()))
+            error, smooth = (
+                float(np.sqrt((result[f"{p}error_north"] ** 2 + result[f"{p}error_east"] ** 2).mean()))
+                for p in ("", "smoothed_")
+            )
+            bound = position_bound(
+                grid, ds["time"], true[:, 0], true[:, 1], options, 3.0, float(ds["depth"].mean()), 1.0
+            )
+            print(
+                f"{label}, interval {interval:.0f} s".ljust(58)
+                + f"{error:6.1f} m, smoothed {smooth:.1f} m; bound {rms(bound.sigma):.1f} m"
+            )

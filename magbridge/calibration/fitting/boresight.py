@@ -23,12 +23,14 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Boresight, Calibration
 from magbridge.errors import CalibrationError
 
-__all__ = ["field_body", "find_boresight"]
+__all__ = ["field_body", "find_boresight", "magnetic_headings"]
 
 FEWEST = 30
 """Samples with attitude and direction that a boresight takes."""
 MISMATCH = 10.0
 """deg, median angle that no rotation removes: masses leave less, a reversed channel or angle more."""
+NEAR, LEAST = 2.0, 0.5
+"""deg, within which angles are the same; and the least mismatch, of a compass, that one is compared with."""
 COMPASS_SIGMA = np.radians(0.5)
 """rad, compass error common to all runs, which their scatter does not show."""
 
@@ -45,6 +47,51 @@ def field_body(attitude: FloatArray, field_ned: FloatArray) -> FloatArray:
     """
     body_to_world = Rotation.from_euler("ZYX", attitude[:, ::-1])
     return np.asarray(body_to_world.inv().apply(np.array(field_ned)))
+
+
+def _vectors(calibration: Calibration, data: Observations) -> FloatArray:
+    """Return the corrected vectors (n, 3) in sensor axes, nT."""
+    k = len(calibration.parameters)
+    return correct(replace(calibration, boresight=None), data.field, data.parameters[:, :k], data.time).vector
+
+
+def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
+    """Return the rotation of vectors b to v, (n, 3) each, and the median angle that it leaves, deg."""
+    rotation, _ = Rotation.align_vectors(v, b)
+    turned = rotation.apply(b)
+    left = np.arctan2(np.linalg.norm(np.cross(v, turned), axis=1), np.sum(v * turned, axis=1))
+    return rotation, float(np.degrees(np.median(left)))
+
+
+def magnetic_headings(calibration: Calibration, data: Observations) -> str:
+    """Say so where the field points as if headings were measured from magnetic north; else return "".
+
+    Notes
+    -----
+    Headings short of the declination D turn every vector by D about the vertical. Of a vehicle that stays
+    level that is a boresight of D, and the mounting looks turned. Of one that dives and climbs at a pitch p
+    it is no rotation of the sensor: the best one is ``D cos p cos^2 I / (cos^2 p cos^2 I + sin^2 p (1 +
+    sin^2 I) / 2)`` about z, I the inclination (7.4 deg of 17.6 at p = 24 and I = 70 deg), and leaves angles
+    that a correct heading does not.
+    """
+    known, attitude, reference_ned = data.directed()
+    if known.sum() < FEWEST or calibration.effects:
+        return ""
+    declination = np.arctan2(reference_ned[:, 1], reference_ned[:, 0])
+    D = float(np.degrees(np.arctan2(np.sin(declination).mean(), np.cos(declination).mean())))
+    b = _vectors(calibration, data.part(known))
+    yawed = attitude + np.column_stack([np.zeros((len(b), 2)), declination])
+    as_read, left = _wahba(field_body(attitude, reference_ned), b)
+    as_true, rest = _wahba(field_body(yawed, reference_ned), b)
+    turn, rest_turn = np.degrees([as_read.magnitude(), as_true.magnitude()])
+    level = abs(turn - abs(D)) < NEAR and rest_turn < NEAR
+    if abs(D) < 2.0 * NEAR or not (left > 2.0 * max(rest, LEAST) or level):
+        return ""
+    return (
+        f"the headings look magnetic: with the declination of {D:+.1f} degrees added, the sensor is turned "
+        f"by {rest_turn:.1f} degrees and not by {turn:.1f}, and {rest:.1f} not {left:.1f} are left "
+        "(--heading-reference magnetic)"
+    )
 
 
 def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
@@ -64,13 +111,10 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
     if known.sum() < FEWEST or calibration.effects:
         return None
     part = data.part(known)
-    k = len(calibration.parameters)
-    b = correct(replace(calibration, boresight=None), part.field, part.parameters[:, :k], part.time).vector
-    v = field_body(attitude, reference_ned)
-    rotation, _ = Rotation.align_vectors(v, b)
+    v, b = field_body(attitude, reference_ned), _vectors(calibration, part)
+    rotation, angle = _wahba(v, b)
     turned = rotation.apply(b)
     score = np.cross(v, turned - v)
-    angle = np.degrees(np.median(np.arctan2(np.linalg.norm(score, axis=1), np.sum(v * turned, axis=1))))
     if angle > MISMATCH:
         raise CalibrationError(
             f"however the sensor is turned, the field lies {angle:.0f} degrees (median) from where roll, "

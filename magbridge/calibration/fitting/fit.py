@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.boresight import find_boresight
+from magbridge.calibration.fitting.boresight import find_boresight, magnetic_headings
 from magbridge.calibration.fitting.crossings import crosses_itself, far_off, jumped, left_open
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.known import Information
@@ -218,6 +218,8 @@ def _judged(found: Fit, data: Observations) -> Fit:
         except CalibrationError as error:
             mismatch.append(str(error))
             data = replace(data, attitude=None)
+        if magnetic := magnetic_headings(calibration, data):
+            mismatch.append(magnetic)
     ratio = expected_ratio(apart_from_level(calibration), data)
     doubts = tuple(_doubts(ratio, calibration.noise.sensor, heading_gap(data)))
     if ratio > UNSUPPORTED:
