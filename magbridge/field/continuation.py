@@ -83,10 +83,21 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     hole = np.isnan(grid.anomaly)
     anomaly, vertical = (np.where(hole, np.nan, idctn(surveyed * g, norm="ortho")) for g in (gain, k * gain))
     there = AnomalyGrid(
-        grid.longitude, grid.latitude, anomaly, grid.sigma, -level, grid.name, filled(vertical)
+        grid.longitude,
+        grid.latitude,
+        anomaly,
+        grid.sigma,
+        -level,
+        grid.name,
+        filled(vertical),
+        sigma_length=grid.sigma_length,
     )
     sigma2, steepness2 = float(error2.mean()), float((k * k * error2).mean())
     return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
+
+
+ALIKE = 0.25
+"""Share of the wavelength that is smoothed away, within which what was taken out has one sign."""
 
 
 def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
@@ -116,7 +127,10 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     long = low(whole)
     removed = np.sqrt(np.maximum(low((whole - long) ** 2), 0.0))
     anomaly, sigma = np.where(hole, np.nan, long), np.hypot(np.nan_to_num(grid.sigma), removed)
-    return AnomalyGrid(grid.longitude, grid.latitude, anomaly, sigma, grid.altitude, grid.name)
+    return AnomalyGrid(
+        grid.longitude, grid.latitude, anomaly, sigma, grid.altitude, grid.name,
+        sigma_length=max(grid.sigma_length, ALIKE * wavelength),
+    )  # fmt: skip
 
 
 def _growth(k: FloatArray, height: float, terms: int) -> FloatArray:

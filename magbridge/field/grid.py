@@ -59,6 +59,8 @@ class AnomalyGrid:
     vertical : array_like, (ny, nx), optional
         nT/m, vertical gradient at that altitude, positive if the anomaly grows downward; without it the map
         is the same at every depth.
+    sigma_length : float, optional
+        m, within which errors of that sigma are alike; 0: those of any two samples are independent.
 
     Raises
     ------
@@ -75,6 +77,7 @@ class AnomalyGrid:
         altitude: float = nan,
         name: str = "grid",
         vertical: ArrayLike | None = None,
+        sigma_length: float = 0.0,
     ) -> None:
         values = np.array(anomaly, float)
         x, flip_x = _axis(longitude, name, "longitude")
@@ -94,7 +97,7 @@ class AnomalyGrid:
             raise FormatError(
                 name, f"expected an anomaly, found a median of {median:.0f} nT: subtract the IGRF first"
             )
-        self.name, self.altitude = name, float(altitude)
+        self.name, self.altitude, self.sigma_length = name, float(altitude), float(sigma_length)
         self.longitude, self.latitude, self.anomaly, self.sigma = x, y, values, scatter
         self.vertical = None if vertical is None else np.asarray(vertical, float)[order]
         self._x0, self._dx = float(x[0]), float(x[-1] - x[0]) / (x.size - 1)

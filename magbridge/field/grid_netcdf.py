@@ -60,6 +60,8 @@ def netcdf(path: Path) -> Parts:
     options: dict[str, Any] = {"unit": str(grid.attrs.get("units", "")), "axes": axes}
     if sigmas:
         options["sigma"] = flat[sigmas[0]].transpose(*order).to_numpy()
+        length = flat[sigmas[0]].attrs.get("length_m", 0.0)
+        options["sigma_length"] = float(length) if isinstance(length, (int, float, np.number)) else 0.0
     altitude = grid.attrs.get("altitude", data.attrs.get("altitude"))
     if altitude is not None:
         try:
@@ -122,10 +124,12 @@ def write(grid: AnomalyGrid, path: str | Path) -> None:
         name: (name, getattr(grid, name), {"units": f"degrees_{way}", "standard_name": name})
         for name, way in zip(over, ("north", "east"), strict=True)
     }
-    fields = {
+    fields: dict[str, tuple[Any, RealArray, dict[str, Any]]] = {
         "anomaly": (over, grid.anomaly, {"units": "nT", "long_name": "magnetic anomaly"}),
         "sigma": (over, grid.sigma, {"units": "nT", "long_name": "1-sigma of the magnetic anomaly"}),
     }
+    if grid.sigma_length:
+        fields["sigma"][2]["length_m"] = grid.sigma_length  # within which its errors are alike
     attrs: dict[str, object] = {"Conventions": "CF-1.8", "title": "magnetic anomaly"}
     if isfinite(grid.altitude):
         attrs |= {"altitude": grid.altitude, "altitude_units": "m above the ellipsoid"}

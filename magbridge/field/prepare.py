@@ -163,6 +163,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
             np.sqrt(variance) / count,
             first.altitude,
             " + ".join(Path(grid.name).name for grid in grids),
+            sigma_length=max(grid.sigma_length for grid in grids),
         )
     return merged, apart
 
@@ -214,7 +215,9 @@ def _masked(grid: AnomalyGrid, polygon: FloatArray) -> AnomalyGrid:
 
 def _like(grid: AnomalyGrid, values: FloatArray, altitude: float | None = None) -> AnomalyGrid:
     level = grid.altitude if altitude is None else altitude
-    return AnomalyGrid(grid.longitude, grid.latitude, values, grid.sigma, level, grid.name)
+    return AnomalyGrid(
+        grid.longitude, grid.latitude, values, grid.sigma, level, grid.name, sigma_length=grid.sigma_length
+    )
 
 
 def _cover(axes: Sequence[FloatArray], step: float) -> FloatArray:

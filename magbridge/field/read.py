@@ -94,8 +94,9 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     longitude, latitude, fields = geographic(path, x, y, fields, options.get("axes", Axes()))
     altitude = options.get("altitude", nan)
     return AnomalyGrid(
-        longitude, latitude, fields["anomaly"], fields.get("sigma", 0.0), altitude, name=str(path)
-    )
+        longitude, latitude, fields["anomaly"], fields.get("sigma", 0.0), altitude, name=str(path),
+        sigma_length=options.get("sigma_length", 0.0),
+    )  # fmt: skip
 
 
 def without_fill(path: str | Path, values: RealArray) -> RealArray:

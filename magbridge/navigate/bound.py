@@ -13,7 +13,7 @@ from magbridge.errors import OutOfRange
 from magbridge.field.geodesy import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate.model import N_STATES, block_length, measurement_row, prior, transition
+from magbridge.navigate.model import N_STATES, block_length, measurement_row, prior, repeated, transition
 from magbridge.navigate.options import Options
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def position_bound(
         )
     lat, lon = np.interp(at, corners, lat), wrap(np.interp(at, corners, lon))
     metres = np.diff(np.interp(at, corners, along), prepend=0.0)
-    local = grid.evaluate(lon, lat)
+    local, alike = grid.evaluate(lon, lat), repeated(grid, metres)
     main = total_field(lon, lat, depth, at)
     per_latitude, per_longitude = metres_per_degree(lat)
     slope_north = (total_field(lon, lat + STEP, depth, at) - main) / (STEP * per_latitude)
@@ -117,7 +117,7 @@ def position_bound(
         if np.isfinite(local.anomaly[i]):
             row = measurement_row(local.north[i] + slope_north[i], local.east[i] + slope_east[i])
             gain = P @ row.T
-            P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + local.variance[i])
+            P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + alike[i] * local.variance[i])
         covariance[i], unaided[i] = P, np.sqrt(alone[0, 0] + alone[1, 1])
     reached = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
     return Bound(at, lat, lon, covariance, reached, unaided)

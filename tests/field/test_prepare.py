@@ -11,7 +11,9 @@ from magbridge.errors import OutOfRange, WrongUse
 from magbridge.field.continuation import continued, smoothed
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
+from magbridge.field.grid_netcdf import write
 from magbridge.field.prepare import continue_upward, draw_steps, merge, prepare, surveyed_at
+from magbridge.field.read import read_grid
 
 LON, LAT = np.linspace(-58.1, -57.9, 81), np.linspace(49.45, 49.55, 61)
 
@@ -169,6 +171,20 @@ def test_smoothing_is_by_wavelength_and_what_goes_becomes_sigma() -> None:
         assert share == pytest.approx(kept, abs=0.02)
         gone = (1.0 - kept) * 100.0 / np.sqrt(2.0)
         assert np.sqrt(np.mean(less.sigma[middle] ** 2)) == pytest.approx(np.hypot(3.0, gone), rel=0.1)
+
+
+def test_what_was_smoothed_away_is_alike_over_a_quarter_of_its_wavelength_in_the_file_too(
+    tmp_path: Path,
+) -> None:
+    rough = AnomalyGrid(LON, LAT, np.random.default_rng(0).normal(size=(61, 81)))
+    less, _ = prepare([rough], smooth=2.0)
+    assert (rough.sigma_length, less.sigma_length) == (0.0, 500.0)
+    raised = continue_upward(AnomalyGrid(LON, LAT, rough.anomaly, 1.0, 60.0, sigma_length=9.0), 50.0)
+    assert raised.sigma_length == 9.0
+    write(less, tmp_path / "map.nc")
+    assert read_grid(tmp_path / "map.nc").sigma_length == 500.0
+    write(rough, tmp_path / "map.nc")
+    assert read_grid(tmp_path / "map.nc").sigma_length == 0.0
 
 
 def test_smoothing_keeps_a_constant_and_the_holes() -> None:
