@@ -40,8 +40,8 @@ __all__ = ["navigate"]
 @command("navigate FILE... --calibration cal.json --map grid.nc -o FILE [OPTIONS]")
 def navigate(
     *files: Path,
-    map: Path,  # noqa: A002 - the flag's name
     output: Log,
+    map: Path | None = None,  # noqa: A002 - the flag's name
     calibration: Path | None = None,
     config: Path | None = None,
     bound: bool = False,
@@ -53,7 +53,8 @@ def navigate(
 ) -> None:
     """Find the track by matching the corrected field to an anomaly map.
 
-    Writes the filtered and the smoothed track with covariance and innovations.
+    Writes the filtered and the smoothed track with covariance and innovations. Without --map the track is
+    bent to where it meets the field again that it met itself: one smoothed track, and what it was worth.
 
     With --bound, FILE is a planned track (time, latitude, longitude; its corners suffice), and the result is
     the smallest position error that any filter could reach along it.
@@ -62,10 +63,10 @@ def navigate(
     ----------
     files
         The logs of one deployment, with telemetry for dead reckoning; or the plan.
-    map
-        The anomaly grid.
     output
         The file to write.
+    map
+        The anomaly grid. Without one: localisation in the survey's own field.
     calibration
         The calibration (cal.json). For a plan it gives the sensor noise; without it 1 nT.
     config
@@ -91,6 +92,8 @@ def navigate(
 
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
+        if map is None:
+            raise WrongUse("--bound: expected --map, what the track is worth depends on it")
         _bound(files, map, output, options, known, every, picture, reading, json)
         return
     if known is None or calibration is None:
@@ -105,13 +108,20 @@ def navigate(
     deployment = _corrected(files, known, calibration, heading_reference, reading)
     if options is None:
         options = informed(Options(), known, float(deployment["total_field_sigma"].median()))
-    grid, options = _continued(read_grid(map), options, deployment)
-    track = find_way(deployment, grid, options)
-    write(track, output)
-    if picture:
-        from magbridge.navigate.draw import draw_navigation
+    if map is None:
+        from magbridge.navigate.own_survey import localise
 
-        draw_navigation(track, grid, picture)
+        if picture:
+            raise WrongUse("--picture: expected --map, which the tracks are drawn on")
+        track = localise(deployment, options)
+    else:
+        grid, options = _continued(read_grid(map), options, deployment)
+        track = find_way(deployment, grid, options)
+        if picture:
+            from magbridge.navigate.draw import draw_navigation
+
+            draw_navigation(track, grid, picture)
+    write(track, output)
     for finding in track.attrs["findings"].splitlines():
         complain(finding)
     facts, summary = _judged(track)

@@ -23,7 +23,7 @@ from magbridge.navigate.record import Record
 from magbridge.navigate.reference_track import REFERENCES, reference_track, with_errors
 from magbridge.progress import track
 
-__all__ = ["MOTIONS", "first_position", "motion_of", "navigate"]
+__all__ = ["MOTIONS", "UNITS", "columns_of", "first_position", "motion_of", "navigate", "samples_of"]
 
 MOTIONS: dict[str, dict[str, str]] = {
     "velocity": {"velocity_north": "velocity_north", "velocity_east": "velocity_east"},
@@ -81,11 +81,11 @@ def navigate(
     """
     source = str(deployment.attrs.get("source", "deployment"))
     options = options or Options()
-    time, field, sigma = _samples(deployment, source)
+    time, field, sigma = samples_of(deployment, source)
     motion = motion_of(deployment, source)
     navigator = Navigator(grid, options)
     latitude, longitude = start if start is not None else first_position(deployment, source)
-    moves = _columns(deployment, MOTIONS[motion] | {"depth": "depth"})
+    moves = columns_of(deployment, MOTIONS[motion] | {"depth": "depth"})
     records: list[Record] = []
     states: list[tuple[FloatArray, FloatArray, FloatArray, FloatArray, int]] = []
 
@@ -113,7 +113,7 @@ def navigate(
     return result.assign_attrs(findings="\n".join(findings))
 
 
-def _samples(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArray, RealArray]:
+def samples_of(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArray, RealArray]:
     """Return time, total field and its sigma; NaN where a sample must not be used."""
     if "total_field" not in deployment:
         raise FormatError(source, "expected total_field: correct the log with a calibration first")
@@ -145,7 +145,7 @@ def _glides(deployment: xr.Dataset) -> bool:
     return bool(steep.mean() > 0.5 and agree.mean() > 0.8) if steep.size else False
 
 
-def _columns(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, RealArray]:
+def columns_of(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, RealArray]:
     """Return the columns that the log has, under their other names."""
     return {
         name: deployment[column].to_numpy().astype(float)

@@ -29,7 +29,7 @@ from magbridge.calibration.fitting.field_search import (
     nodes_for,
 )
 from magbridge.calibration.fitting.joint import Linear, Reduced, Sums, add_up, eliminate
-from magbridge.calibration.fitting.latent import Group, slow_functions, with_groups
+from magbridge.calibration.fitting.latent import NOTHING, Group, slow_functions, with_groups
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
@@ -55,10 +55,6 @@ FINE, ENOUGH = 4.0, 8_000
 """Nodes a length, as long as there are no more than enough: a map shows what coarser ones leave out."""
 CHUNK = 16_384
 """Rows at a time."""
-NOTHING = PriorFamily(
-    np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
-)
-"""A prior of no coefficients."""
 
 
 class _Problem:

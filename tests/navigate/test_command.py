@@ -107,3 +107,15 @@ def test_wrong_use_is_one_line(command: Command) -> None:
         Path("other.toml").write_text(f"[navigation.options]\n{text}\n")
         said = command.refuses(*TRACK, *CALIBRATED, "--config", "other.toml", code=2)
         assert f"navigation.options.{line}" in said
+
+
+def test_without_a_map_the_track_is_bent_to_its_own_survey(command: Command, here: Path) -> None:
+    """One smoothed track with its covariance; what can only be done with a map is refused in a line."""
+    said = command("navigate", "log.nc", *CALIBRATED, "--config", "bridge.toml", "-o", "own.nc")
+    assert "dead reckoning alone" in said.err
+    track = read([Path("own.nc")])
+    assert (track["covariance_nn"] > 0.0).all()
+    for words in (("--bound", "log.nc"), ("log.nc", "--picture", "a.png")):
+        said = command("navigate", *words, *CALIBRATED, "-o", "none.nc", code=2)
+        assert "expected --map" in said.err
+        assert not Path("none.nc").exists()

@@ -10,7 +10,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.observations import Observations
 
-__all__ = ["crossed", "crosses_itself", "far_off", "jumped", "left_open"]
+__all__ = ["courses", "crossed", "crosses_itself", "far_off", "jumped", "left_open"]
 
 TURNED = 30.0
 """deg between two courses that cross."""
@@ -36,7 +36,7 @@ def crosses_itself(data: Observations) -> bool:
     if data.place is None:
         return False
     whole = np.isfinite(data.place[:, :2]).all(axis=1)
-    place, course = _courses(data.place[whole & ~far_off(data.place[:, :2]), :2])
+    place, course = courses(data.place[whole & ~far_off(data.place[:, :2]), :2])
 
     def often(cell: float) -> bool:
         places = len(np.unique(np.floor(place / cell), axis=0))
@@ -49,7 +49,7 @@ def left_open(data: Observations, length: float) -> Iterator[str]:
     """Say, in a pilot's words, what keeps rock of a `length`, m, from being told from the vehicle's field."""
     if data.place is None or data.unmapped is None or not data.unmapped.all():
         return
-    place, course = _courses(data.place[:, :2])
+    place, course = courses(data.place[:, :2])
     if not len(place) or np.ptp(place, axis=0).max() < SHARE * length:
         return  # all at one place: the rock is a constant
     cells, reversed_cells = crossed(place, course, SHARE * length)
@@ -101,7 +101,7 @@ def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, in
     return across, back
 
 
-def _courses(place: FloatArray) -> tuple[FloatArray, FloatArray]:
+def courses(place: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the places (m, 2) between which the vehicle moved, and the courses there (m,), rad."""
     moved = _thinned(place)
     step = np.diff(place[moved], axis=0)

@@ -100,7 +100,7 @@ def maximise(quadratic: Quadratic, family: PriorFamily, eta: FloatArray, sigma: 
     scale = np.append(family.spread, SIGMA_STEP)
 
     def downhill(x: FloatArray) -> tuple[float, FloatArray]:
-        if np.abs(x[:-1]).max() > FARTHEST:
+        if np.abs(x[:-1]).max(initial=0.0) > FARTHEST:
             return 1e300, 0.0 * x
         at = middle + scale * x
         value, slope, _ = evidence(quadratic, family, at[:-1], at[-1])

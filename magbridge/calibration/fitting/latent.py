@@ -13,7 +13,7 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.prior import PriorFamily
 
-__all__ = ["Group", "slow_functions", "with_groups"]
+__all__ = ["NOTHING", "Group", "slow_functions", "with_groups"]
 
 APART = 3.0 * 3600.0
 """s without a sample, after which what changes slowly starts anew."""
@@ -21,6 +21,10 @@ FASTEST = 1.5 * 3600.0
 """s, half the period of the fastest slow change."""
 MOST = 60
 """Slow functions of one stretch of a log, at most."""
+NOTHING = PriorFamily(
+    np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
+)
+"""A prior of no coefficients."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,62 @@
+"""Localisation without a map: the track is bent to where the field that it met repeats itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magbridge.arrays import FloatArray
+from magbridge.field.geodesy import offset
+from magbridge.field.igrf import total_field
+from magbridge.navigate.options import Options
+from magbridge.navigate.own_survey import localise
+from magbridge.navigate.reference_track import errors
+
+START, HOURS, DT = (49.5, -57.9), 3.0, 60.0
+OPTIONS = Options(start_sigma=1.0, current_sigma=0.03, drift=0.05, bias_sigma=1.0)
+
+
+def flown(*, straight: bool) -> xr.Dataset:
+    """A current of 3 cm/s carries a glider off, over rock of 40 nT and 700 m: back and forth, or ahead."""
+    rng = np.random.default_rng(4)
+    time = np.arange(0.0, HOURS * 3600.0, DT)
+    leg = (time // 1800.0).astype(int)
+    course = np.radians(0.0 * leg if straight else np.array([20.0, 140.0, 260.0])[leg % 3])
+    true = np.cumsum(0.6 * DT * np.stack([np.cos(course), np.sin(course)], axis=1), axis=0)
+    drift = np.outer(time, [0.03, -0.02])
+    latitude, longitude = offset(*START, true[:, 0], true[:, 1])
+    dr_latitude, dr_longitude = offset(*START, *(true - drift).T)
+    k, phase = rng.normal(0, 1 / 700.0, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
+    rock: FloatArray = 40.0 * np.sqrt(2 / 400) * np.cos(true @ k.T + phase).sum(axis=1)
+    when = 1.4e9 + time
+    field = total_field(longitude, latitude, 0.0, when) + rock + rng.normal(0, 1.0, len(time))
+    columns = {
+        "total_field": field, "dr_latitude": dr_latitude, "dr_longitude": dr_longitude,
+        "truth_latitude": latitude, "truth_longitude": longitude,
+    }  # fmt: skip
+    return xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": when})
+
+
+def test_a_track_that_comes_back_finds_its_drift() -> None:
+    """Off by less than half of dead reckoning, and by no more than its sigma says; start given, no map."""
+    track = localise(flown(straight=False), OPTIONS, start=START)
+    error, reckoned = (float((one**2).mean()) ** 0.5 for one in errors(track))
+    assert error < 0.5 * reckoned
+    sigma = float((track["covariance_nn"] + track["covariance_ee"]).mean()) ** 0.5
+    assert 0.3 < error / sigma < 2.0
+    assert sigma < 0.6 * float((track["unaided_sigma"] ** 2).mean()) ** 0.5
+    assert track["valid"].all()
+
+
+def test_a_straight_track_learns_nothing_and_says_so() -> None:
+    track = localise(flown(straight=True), OPTIONS, start=START)
+    sigma = (track["covariance_nn"] + track["covariance_ee"]) ** 0.5
+    assert float(sigma[-1]) > 0.5 * float(track["unaided_sigma"][-1])
+    assert "adds little to dead reckoning" in track.attrs["findings"]
+
+
+@pytest.mark.parametrize("missing", ["total_field", "dr_latitude"])
+def test_what_is_missing_is_named(missing: str) -> None:
+    with pytest.raises(ValueError, match=r"expected (total_field|a motion)"):
+        localise(flown(straight=True).drop_vars([missing, "truth_latitude", "truth_longitude"]), OPTIONS)
