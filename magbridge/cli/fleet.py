@@ -162,8 +162,9 @@ def process(
         Print the result as JSON.
     """
     from magbridge.fleet.catalogue import open_catalogue
+    from magbridge.fleet.job import jobs, new_jobs
     from magbridge.fleet.memory import remember
-    from magbridge.fleet.process import client_of, jobs, new_jobs
+    from magbridge.fleet.process import client_of
     from magbridge.fleet.process import process as run
 
     there = open_catalogue(catalogue, results)

@@ -2,7 +2,7 @@
 
 :mod:`.catalogue` is what is known, in a folder of Parquet files (:mod:`.folder`) or in a database
 (:mod:`.postgres`); :mod:`.register` and :mod:`.given` put vehicles, logs and calibrations there.
-:mod:`.process` finds what is new and runs :mod:`.work` on each deployment, in parallel.
+:mod:`.job` is what there is to do, and :mod:`.process` runs :mod:`.work` on each, in parallel.
 :mod:`.hierarchy` is the statistics of coefficients over vehicles, refits and power-ups (:mod:`.variances`,
 :mod:`.shapes`), :mod:`.learn` teaches it, :mod:`.memory` is a catalogue's, :mod:`.drift` tells what changed
 and when, and :mod:`.page` shows it.

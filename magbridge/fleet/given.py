@@ -17,16 +17,15 @@ from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import WrongUse
+from magbridge.fleet.job import GIVEN
 from magbridge.fleet.register import Deployment, vehicle_named
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
     from magbridge.fleet.catalogue import Catalogue, Row
 
-__all__ = ["GIVEN", "add_calibration"]
+__all__ = ["add_calibration"]
 
-GIVEN = "given"
-"""In the place of a job's name."""
 DETERMINED = 0.25
 """Share of the prior's variance that is left, below which the data have determined a direction."""
 

@@ -15,9 +15,8 @@ from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import DataError, WrongUse
 from magbridge.fleet.catalogue import Catalogue, Row
-from magbridge.fleet.given import GIVEN
+from magbridge.fleet.job import GIVEN, jobs, last_attempts
 from magbridge.fleet.learn import Fleet, Lesson, learn_fleet
-from magbridge.fleet.process import jobs, last_attempts
 from magbridge.fleet.register import current_files, masses, vehicle_named, vehicles
 from magbridge.fleet.variances import LEVELS, Variances
 

@@ -1,23 +1,22 @@
-"""Find what is new in a catalogue and process it, a deployment a task, on dask.distributed."""
+"""Process deployments of a catalogue, each a task, on dask.distributed."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from itertools import groupby
 from typing import NamedTuple
 
 import dask
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from magbridge.errors import PortError
-from magbridge.fleet.catalogue import Catalogue, Row
-from magbridge.fleet.register import current_files, vehicles
-from magbridge.fleet.work import Done, Job, work
+from magbridge.fleet.catalogue import Catalogue
+from magbridge.fleet.job import Job
+from magbridge.fleet.work import Done, work
 
-__all__ = ["Outcome", "client_of", "jobs", "last_attempts", "new_jobs", "process"]
+__all__ = ["Outcome", "client_of", "process"]
 
 START = "120s"
 """Until processes of this machine are up: they import much, and it may be busy."""
@@ -74,29 +73,6 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
         yield client
 
 
-def jobs(catalogue: Catalogue, *, diagnose: bool = False, maps: bool = False) -> list[Job]:
-    """Return every deployment of a catalogue as a job, processed or not.
-
-    Parameters
-    ----------
-    catalogue : Catalogue
-        Its files and vehicles.
-    diagnose, maps : bool
-        Whether each is also to be diagnosed, and mapped.
-    """
-    known = vehicles(catalogue)
-
-    def whose(row: Row) -> tuple[str, str, str]:
-        return row["vehicle"], row["deployment"], row["refit"]
-
-    rows = sorted(current_files(catalogue.rows("files")), key=whose)
-    return [
-        Job(known[vehicle], deployment, refit, tuple(files), diagnose, maps)
-        for (vehicle, deployment, refit), files in groupby(rows, whose)
-        if vehicle in known
-    ]
-
-
 def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[Outcome]:
     """Process deployments; yield what came of each as it is done.
 
@@ -122,34 +98,6 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
         future.release()
         yield _kept(catalogue, job, done)
     catalogue.compact()
-
-
-def new_jobs(catalogue: Catalogue, every: list[Job], *, retry: bool = False) -> list[Job]:
-    """Return the jobs of which the catalogue has no result; with `retry`, also those with failures."""
-    done = catalogue.rows("done")
-    last = last_attempts(done)
-    has = {(row["job"], what) for row in done for what in ("diagnosed", "mapped") if row[what]}
-    failed = set[str]()
-    if retry:
-        rows = catalogue.rows("failures", ["job", "attempt"])
-        failed = {row["job"] for row in rows if row["attempt"] == last.get(row["job"])}
-    todo = []
-    for job in every:
-        more = job.name in failed
-        wanted = (job.diagnose and (job.name, "diagnosed") not in has) or (
-            job.map and (job.name, "mapped") not in has
-        )
-        if more or wanted or job.name not in last:
-            todo.append(job._replace(attempt=last.get(job.name, 1) + more))
-    return todo
-
-
-def last_attempts(done: Iterable[Row]) -> dict[str, int]:
-    """Return the last attempt at each job, from the rows of what is done."""
-    last: dict[str, int] = {}
-    for row in done:
-        last[row["job"]] = max(row["attempt"], last.get(row["job"], 0))
-    return last
 
 
 def _kept(catalogue: Catalogue, job: Job, done: Done) -> Outcome:

@@ -6,8 +6,7 @@ from collections import Counter
 from typing import Any
 
 from magbridge.fleet.catalogue import Catalogue
-from magbridge.fleet.given import GIVEN
-from magbridge.fleet.process import jobs, last_attempts, new_jobs
+from magbridge.fleet.job import GIVEN, jobs, last_attempts, new_jobs
 
 __all__ = ["status"]
 

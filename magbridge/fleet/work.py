@@ -9,11 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import msgspec
 import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
@@ -36,42 +34,12 @@ from magbridge.survey.run import samples_of, survey
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
     from magbridge.fleet.catalogue import Row
+    from magbridge.fleet.job import Job
 
-__all__ = ["Done", "Job", "work"]
+__all__ = ["Done", "work"]
 
 PIECE = 20_000
 """Rows that are corrected at a time."""
-
-
-class Job(NamedTuple):
-    """A deployment to process: its vehicle's row, and those of its logs."""
-
-    vehicle: Row
-    deployment: str
-    refit: str
-    files: tuple[Row, ...]
-    diagnose: bool = False
-    map: bool = False
-    attempt: int = 1
-
-    @property
-    def sensor(self) -> str:
-        """The sensor it flew with; empty: whichever."""
-        return str(next((row["sensor"] for row in self.files if row["sensor"]), self.vehicle["sensor"]))
-
-    @property
-    def mark(self) -> Row:
-        """What each of its results begins with."""
-        return {"job": self.name, "attempt": self.attempt}
-
-    @property
-    def name(self) -> str:
-        """What its results are made of, as 32 hexadecimal digits: other logs or parameters, another name."""
-        made_of = (
-            self.vehicle["vehicle"], self.deployment, self.refit, self.sensor,
-            self.vehicle["parameters"], self.vehicle["order"], sorted({row["sha256"] for row in self.files}),
-        )  # fmt: skip
-        return sha256(msgspec.json.encode(made_of)).hexdigest()[:32]
 
 
 class Done(NamedTuple):

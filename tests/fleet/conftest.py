@@ -10,7 +10,8 @@ import pytest
 from fleets import FLEET, catalogue_of, fly
 
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
-from magbridge.fleet.process import client_of, jobs, process
+from magbridge.fleet.job import jobs
+from magbridge.fleet.process import client_of, process
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
 from magbridge.fleet import folder as room
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
-from magbridge.fleet.process import jobs
+from magbridge.fleet.job import jobs
 from magbridge.fleet.register import (
     Deployment,
     Vehicle,

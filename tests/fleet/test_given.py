@@ -11,8 +11,8 @@ from fleets import fly
 from magbridge.calibration.file import load
 from magbridge.cli import main
 from magbridge.fleet.folder import FolderCatalogue
+from magbridge.fleet.job import jobs
 from magbridge.fleet.memory import fleet_of, lessons
-from magbridge.fleet.process import jobs
 from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
 from magbridge.fleet.status import status
 from magbridge.fleet.work import work

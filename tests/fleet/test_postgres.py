@@ -17,7 +17,7 @@ from databases import program, server
 from magbridge.cli import main
 from magbridge.errors import FormatError, PortError
 from magbridge.fleet.catalogue import TABLES, Catalogue, open_catalogue
-from magbridge.fleet.process import jobs
+from magbridge.fleet.job import jobs
 from magbridge.fleet.work import work
 
 pytestmark = pytest.mark.skipif(

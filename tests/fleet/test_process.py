@@ -14,9 +14,9 @@ from magbridge.calibration.file import decode_calibration, load
 from magbridge.cli import main
 from magbridge.errors import WriteError
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
+from magbridge.fleet.job import jobs, new_jobs
 from magbridge.fleet.memory import current, lessons
 from magbridge.fleet.page import COLOURS
-from magbridge.fleet.process import jobs, new_jobs
 from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
 from magbridge.fleet.status import status
 from magbridge.fleet.work import work
