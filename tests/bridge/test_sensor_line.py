@@ -135,6 +135,22 @@ def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
     assert line.stranger == (sent == [])
 
 
+def test_what_turns_out_to_be_a_gps_gets_no_further_commands() -> None:
+    timers, codec = Timers(), Codec(1, 191)
+    announcer, commands = Announcer(Outbox(codec), timers), (b"1", b"2", b"3")
+    line = SensorLine("hmr2300", lambda: commands, 10_000_000, announcer, timers, 0, searching=True)
+    line.opened(0)
+    sent = []
+    for now_us in range(0, 2_000_000, 10_000):
+        timers.advance(now_us, lambda _: None)
+        sent += line.to_send
+        line.to_send.clear()
+        if sent and not line.stranger:
+            line.mumbled(GGA, now_us)
+    assert sent == [b"1"]
+    assert line.stranger
+
+
 def test_commands_are_a_tenth_of_a_second_apart() -> None:
     """An instrument answers one before it reads the next."""
     timers, codec = Timers(), Codec(1, 191)

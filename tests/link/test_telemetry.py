@@ -93,6 +93,17 @@ def test_the_messages_own_time() -> None:
     micros = (boot_ms * 1000 - 100_000) % (1 << 32)  # wraps every 71 minutes
     (one,) = values(telemetry, "SERVO_OUTPUT_RAW", clock, time_usec=micros, servo1_raw=1500)
     assert one == ("servo", 1500.0, NOW - 100_000)
+    fix = {"gps": Telemetry("GPS_RAW_INT", "satellites_visible")}
+    (one,) = values(fix, "GPS_RAW_INT", clock, time_usec=boot_ms * 1000 - 50_000, satellites_visible=9)
+    assert one == ("gps", 9.0, NOW - 50_000)
+    (one,) = values(fix, "GPS_RAW_INT", clock, time_usec=NOW - 50_000, satellites_visible=9)
+    assert one[2] == NOW  # UNIX time, of another clock
+
+
+def test_the_first_of_an_array_is_number_zero() -> None:
+    telemetry = {f"a{k}": Telemetry("ACTUATOR_OUTPUT_STATUS", f"actuator[{k}]") for k in (0, 31)}
+    got = values(telemetry, "ACTUATOR_OUTPUT_STATUS", actuator=[0.5 * k for k in range(32)])
+    assert got == [("a0", 0.0, NOW), ("a31", 15.5, NOW)]
 
 
 @pytest.mark.parametrize(
