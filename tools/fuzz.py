@@ -248,15 +248,17 @@ def blind(session: Session, read: Read, seeds: list[bytes], count: int, seconds:
     session.save()
 
 
-def guided(session: Session, name: str, folder: Path, seeds: list[bytes], count: int) -> None:
+def guided(session: Session, name: str, folder: Path, count: int) -> None:
     """Let atheris choose by coverage; what it finds useful stays in the target's folder ``corpus``."""
     import atheris  # type: ignore[import-not-found,import-untyped,unused-ignore]  # optional, for this alone
 
-    with atheris.instrument_imports(include=["magbridge"]):
+    # what is imported here is watched: also that which the first reading imports
+    with atheris.instrument_imports(include=["magbridge"]), contextlib.suppress(MagbridgeError):
         read = TARGETS[name].open(folder)
+        read(b"")
     corpus = session.folder / "corpus"
     corpus.mkdir(exist_ok=True)
-    for k, seed in enumerate(seeds):
+    for k, seed in enumerate(SEEDS[name](folder)):
         (corpus / f"seed{k}").write_bytes(seed)
     options = [f"-runs={count}", f"-seed={session.state['seed'] + 1}", "-max_len=100000", "-verbosity=0"]
 
@@ -310,11 +312,11 @@ def main() -> None:
     for name in names:
         with _folder() as folder:
             session = Session(name, chosen.o, chosen.seed)
-            seeds = SEEDS[name](folder)
             if chosen.guided:
-                guided(session, name, folder, seeds, chosen.n)
+                guided(session, name, folder, chosen.n)
             else:
-                blind(session, TARGETS[name].open(folder), seeds, chosen.n, chosen.seconds)
+                read, seeds = TARGETS[name].open(folder), SEEDS[name](folder)
+                blind(session, read, seeds, chosen.n, chosen.seconds)
     report(chosen.o)
 
 
