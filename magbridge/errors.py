@@ -124,6 +124,20 @@ class PluginError(MagbridgeError, RuntimeError):
         super().__init__(f"{plugin}: {self.fault}")
 
 
+def _installed_from() -> str:
+    """Return what pip takes magbridge from again: the file or folder that it came from, else its name."""
+    import json  # noqa: PLC0415 - needed only in this error
+    from importlib.metadata import PackageNotFoundError, distribution  # noqa: PLC0415 - slow to import
+    from urllib.parse import unquote, urlsplit  # noqa: PLC0415 - as above
+
+    try:
+        told = distribution("magbridge").read_text("direct_url.json")
+    except PackageNotFoundError:  # run from its sources
+        told = None
+    url = urlsplit(json.loads(told or "{}").get("url", ""))
+    return unquote(url.path) if url.scheme == "file" else "magbridge"
+
+
 class MissingExtra(MagbridgeError, ImportError):
     """An optional dependency that is not installed: names the extra that brings it."""
 
@@ -131,4 +145,4 @@ class MissingExtra(MagbridgeError, ImportError):
 
     def __init__(self, package: str, extra: str) -> None:
         self.package, self.extra = package, extra
-        super().__init__(f"{package} is not installed: pip install 'magbridge[{extra}]'")
+        super().__init__(f"{package} is not installed: pip install '{_installed_from()}[{extra}]'")

@@ -32,6 +32,14 @@ def found() -> tuple[mb.Calibration, Observations]:
     return mb.fit(data, method="nominal").calibration, data
 
 
+def test_a_notebook_shows_a_fit_with_its_warnings() -> None:
+    fit = mb.fit(mb.observations(log, ("battpos", "ballast")), method="nominal")
+    shown = fit._repr_html_()
+    assert "&lt;Fit: " in shown
+    assert fit.warnings
+    assert shown.count("<li>") == len(fit.warnings)
+
+
 def test_a_corrected_log(found: tuple[mb.Calibration, Observations]) -> None:
     corrected = mb.correct_rows(mb.Correction(found[0]), log)
     axes = Figure().subplots()

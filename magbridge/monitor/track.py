@@ -10,7 +10,7 @@ from math import atan2, cos, isfinite, pi, sin, sqrt
 from pathlib import Path
 from typing import Any
 
-from magbridge.errors import FormatError
+from magbridge.errors import MissingExtra
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.monitor.chart import GREY, INSIDE, TOOLS
 from magbridge.monitor.history import TrackPoint
@@ -58,7 +58,9 @@ def read_background(path: Path) -> Background:
     Raises
     ------
     FormatError
-        It is no grid, or the analysis extra is not installed.
+        It is no grid.
+    MissingExtra
+        The analysis extra is not installed.
     """
     try:
         import numpy as np  # noqa: PLC0415 - most pages show no grid
@@ -66,9 +68,7 @@ def read_background(path: Path) -> Background:
 
         from magbridge.field.read import read_grid  # noqa: PLC0415 - as above
     except ImportError as error:
-        raise FormatError(
-            path, f"{error.name} is not installed: pip install 'magbridge[analysis]'"
-        ) from error
+        raise MissingExtra(str(error.name), "analysis") from error
     grid = read_grid(path)
     every = max(1, -(-max(grid.anomaly.shape) // PIXELS))
     values = grid.anomaly[::-every, ::every]

@@ -144,3 +144,14 @@ def test_what_was_lost_is_named(here: Path, command: Command) -> None:
         "row 11"
         in json.loads(command("info", here / "one.csv", "--json").out)[str(here / "one.csv")]["losses"][0]
     )
+
+
+def test_a_log_without_a_date_is_given_one(here: Path, command: Command) -> None:
+    """Also where pydantic is installed, as it is with the page: it would take the day for a moment."""
+    write(made("log", np.arange(9.0), {"mag_x": np.ones(9)}).assign_attrs(time_reference="boot"), "boot.csv")
+    assert "times count from a start" in command("info", "boot.csv").err
+    facts = json.loads(command("info", "boot.csv", "--json", "--date", "2024-06-01").out)["boot.csv"]
+    assert facts["start"] == np.datetime64("2024-06-01", "s").astype(float)
+    assert facts["references"]["time_reference"] == "utc"
+    for wrong in ("2024-06-01T10:00", "1717200000", "yesterday"):
+        assert f"expected YYYY-MM-DD, not {wrong}" in command("info", "boot.csv", "--date", wrong, code=2).err

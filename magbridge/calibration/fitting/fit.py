@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from html import escape
 from importlib import import_module
 from typing import Any
 
@@ -91,6 +92,11 @@ class Fit:
     def __repr__(self) -> str:
         doubts = f", {len(self.calibration.doubts)} doubts" if self.calibration.doubts else ""
         return f"<Fit: {self.rms:.2f} nT RMS of {len(self.residual)} samples{doubts}; {self.calibration!r}>"
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook, with the warnings."""
+        warnings = "".join(f"<li>{escape(warning)}</li>" for warning in self.warnings)
+        return f"<p>{escape(repr(self))}</p>" + f"<ul>{warnings}</ul>" * bool(warnings)
 
     @property
     def supported(self) -> bool:
