@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Annotated
@@ -24,6 +26,7 @@ from magbridge.cli.common import (
     note_losses,
     print_result,
 )
+from magbridge.errors import WrongUse
 from magbridge.progress import track, waiting
 
 
@@ -32,6 +35,7 @@ def convert(
     *files: Path,
     output: Log,
     heading_reference: Heading = None,
+    metadata: Path | None = None,
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
@@ -45,17 +49,22 @@ def convert(
         The file to write; its suffix sets the format: .csv .mcap .nc .parquet .tlog.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
+    metadata
+        A metadata.toml that says of people, platform and sensor what OceanGliders OG1.0 demands: the netCDF
+        is then a file of OG1.0.
     reading
         How to read the logs.
     json
         Print the result as JSON.
     """
-    logs_to_read(files, output)
+    logs_to_read(files, output, metadata)
+    if metadata and output.suffix.lower() != ".nc":
+        raise WrongUse(f"--metadata: goes with a netCDF (.nc), not with {output}")
 
     from magbridge.logs import Writer, read_chunks
 
     rows, pieces = 0, []
-    with Writer(output) as writer:
+    with Writer(output, _og(metadata) if metadata else None) as writer:
         for part in track(read_chunks(files, options=reading.options), "reading"):
             pieces.append(part.attrs)
             if heading_reference:
@@ -65,6 +74,13 @@ def convert(
             names = [str(name) for name in part.data_vars]
     note_losses(*pieces)
     print_result({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
+
+
+def _og(metadata: Path) -> Callable[[Path], None]:
+    """Return what makes a netCDF a file of OG1.0."""
+    from magbridge.logs.og import complete, read_metadata
+
+    return partial(complete, metadata=read_metadata(metadata))
 
 
 @command("simulate SCENARIO -o FILE [OPTIONS]")

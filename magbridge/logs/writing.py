@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -43,21 +44,23 @@ class Writer:
     """A file that grows by deployments, one after the other in time, and appears when it is complete.
 
     The columns are those of the first deployment; a later one that lacks a column has NaN there. When the
-    block raises, nothing is left behind.
+    block raises, nothing is left behind. `finish` may add to the file once all rows are in it.
 
     >>> with Writer("out.nc") as writer:  # doctest: +SKIP
     ...     for dataset in read_chunks("in.tlog"):
     ...         writer.append(dataset)
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self._path = Path(path)
+    def __init__(self, path: str | os.PathLike[str], finish: Callable[[Path], None] | None = None) -> None:
+        self._path, self._finish = Path(path), finish
         self._open = format_of(self._path, write=True).load().FileWriter
         self._columns: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._file = self._open(stack.enter_context(atomic_path(self._path)))
+            path = stack.enter_context(atomic_path(self._path))
+            stack.push(lambda kind, *_: self._finish(path) if self._finish and kind is None else None)
+            self._file = self._open(path)
             stack.callback(self._file.close)
             self._stack = stack.pop_all()
         return self

@@ -18,6 +18,7 @@ from magbridge.cli.common import app
 from magbridge.config import load
 from magbridge.fleet.register import read_fleet
 from magbridge.logs.mapping import declared
+from magbridge.logs.og import read_metadata
 from magbridge.navigate.options import Options
 from magbridge.toml import convert
 
@@ -93,6 +94,8 @@ def test_a_block_of_toml_is_read_by_what_reads_such_a_file(block: Block, here: P
         assert read_vehicle(file)
     elif "[vehicle." in block.text:
         assert read_fleet(file)
+    elif "[platform]" in block.text:
+        assert read_metadata(file)
     elif "[project]" in block.text:
         templates = ROOT.glob("examples/*/pyproject.toml")
         points = [tomllib.loads(one.read_text("utf-8"))["project"]["entry-points"] for one in templates]

@@ -1,0 +1,169 @@
+"""OceanGliders OG1.0: what a glider's file must say beyond its measurements.
+
+A ``metadata.toml`` says of people, platform and sensor what no log knows. Positions of GPS fixes are those of
+``gps_latitude`` and ``gps_longitude``, where a log has them.
+
+References
+----------
+OceanGliders format 1.0.0, https://oceangliderscommunity.github.io/OG-format-user-manual/OG_Format.html
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+
+from magbridge.errors import ConfigError, FormatError
+from magbridge.logs.cf import EPOCH, floats
+from magbridge.toml import Table, convert, load_toml
+
+__all__ = ["Metadata", "complete", "read_metadata"]
+
+TIME_FORMAT = "%Y%m%dT%H%M%S"
+ATTRIBUTES = (
+    *("title", "contributor_name", "contributor_email", "contributor_role", "contributor_role_vocabulary"),
+    *("contributing_institutions", "contributing_institutions_role"),
+    *("contributing_institutions_role_vocabulary", "rtqc_method"),
+)
+"""Global attributes that are mandatory and that nobody else can know."""
+PLATFORM = {
+    "PLATFORM_SERIAL_NUMBER": "glider serial number",
+    "PLATFORM_MODEL": "model of the glider",
+    "WMO_IDENTIFIER": "wmo id",
+}
+"""Mandatory variables of the platform, and their long names."""
+SENSOR = "sensor_model", "sensor_model_vocabulary", "sensor_type_vocabulary", "sensor_serial_number"
+"""Mandatory attributes of the sensor's variable, and the serial number that is part of its name."""
+GLIDERS = {
+    "platform": "sub-surface gliders",
+    "platform_vocabulary": "https://vocab.nerc.ac.uk/collection/L06/current/27/",
+}
+PLACES = {
+    "TIME": {"valid_min": 1e9, "valid_max": 4e9, "vocabulary": "TIME"},
+    "LATITUDE": {"valid_min": -90.0, "valid_max": 90.0, "vocabulary": "LAT"},
+    "LONGITUDE": {"valid_min": -180.0, "valid_max": 180.0, "vocabulary": "LON"},
+    "DEPTH": {"valid_max": 10_000.0, "vocabulary": "DEPTH"},  # a surface at -2 cm must not be masked
+}
+MEASURED = ("MAG_X", "MAG_Y", "MAG_Z", "TOTAL_FIELD", "FIELD_X", "FIELD_Y", "FIELD_Z", "ANOMALY")
+"""Variables that the magnetometer gives."""
+FIXES = {"LATITUDE": "gps_latitude", "LONGITUDE": "gps_longitude"}
+UNKNOWN = "the log does not say which positions are fixes"
+
+
+class Metadata(Table, frozen=True):
+    """A ``metadata.toml``.
+
+    Attributes
+    ----------
+    attributes : dict of str to str
+        Global attributes, any.
+    platform : dict of str to str
+        Variables of the platform, as ``WMO_IDENTIFIER``.
+    sensor : dict of str to str
+        Attributes of the magnetometer's variable, as ``sensor_model``.
+    """
+
+    attributes: dict[str, str]
+    platform: dict[str, str]
+    sensor: dict[str, str]
+
+
+def read_metadata(path: Path) -> Metadata:
+    """Read a ``metadata.toml``.
+
+    Raises
+    ------
+    ConfigError
+        Missing, not TOML, or without a key that OG1.0 demands.
+    """
+    found = convert(load_toml(path), Metadata, path)
+    demanded = {"attributes": ATTRIBUTES, "platform": PLATFORM, "sensor": SENSOR}
+    for table, keys in demanded.items():
+        for key in keys:
+            if not getattr(found, table).get(key):
+                raise ConfigError(path, f"{table}.{key}", "missing key")
+    return found
+
+
+def complete(path: Path, metadata: Metadata) -> None:
+    """Add to a trajectory that :mod:`.netcdf` has written what makes it a file of OG1.0.
+
+    Raises
+    ------
+    FormatError
+        It has no positions and depths.
+    """
+    with netCDF4.Dataset(path, "a") as file:
+        for name in PLACES:
+            if name not in file.variables:
+                raise FormatError(path, "expected this column: OG1.0 demands it", column=name.lower())
+        known = {name: floats(file[name]) for name in PLACES}
+        _deployed(file, known)
+        start = datetime.fromtimestamp(float(file["DEPLOYMENT_TIME"][...]), UTC).strftime(TIME_FORMAT)
+        trajectory = f"{metadata.platform['PLATFORM_SERIAL_NUMBER']}_{start}"
+        file["TRAJECTORY"][...] = trajectory
+        file.setncatts(
+            GLIDERS
+            | {"id": f"{trajectory}_delayed", "start_date": start}
+            | {"date_created": datetime.now(UTC).strftime(TIME_FORMAT)}
+            | metadata.attributes
+            | {"Conventions": f"{file.Conventions}, OG-1.0"}
+        )
+        for name, text in metadata.platform.items():
+            _scalar(file, name, str, text, long_name=PLATFORM.get(name, name.replace("_", " ").lower()))
+        for name, attributes in PLACES.items():
+            term = attributes["vocabulary"]
+            told = {key: value for key, value in attributes.items() if key != "vocabulary"}
+            vocabulary = f"https://vocab.nerc.ac.uk/collection/OG1/current/{term}/"
+            file[name].setncatts(told | {f"{name.lower()}_vocabulary": vocabulary})
+        _fixes(file, known)
+        _sensor(file, metadata.sensor)
+
+
+def _scalar(file: Any, name: str, kind: Any, value: object, **attributes: object) -> None:
+    variable = file.createVariable(name, kind)
+    variable.setncatts(attributes)
+    variable[...] = value
+
+
+def _deployed(file: Any, known: dict[str, Any]) -> None:
+    """Say when and where the mission began: at the first row whose place is known."""
+    placed = np.isfinite(known["LATITUDE"]) & np.isfinite(known["LONGITUDE"])
+    first = int(np.argmax(placed))
+    when = {"standard_name": "time", "calendar": "gregorian", "units": EPOCH}
+    _scalar(file, "DEPLOYMENT_TIME", "f8", known["TIME"][first], long_name="date of deployment", **when)
+    for name, unit in (("latitude", "degrees_north"), ("longitude", "degrees_east")):
+        place = {"long_name": f"{name} of deployment", "standard_name": name, "units": unit}
+        _scalar(file, f"DEPLOYMENT_{name.upper()}", "f8", known[name.upper()][first], **place)
+
+
+def _fixes(file: Any, known: dict[str, Any]) -> None:
+    """Add the places of the GPS fixes, with their times; unknown where the log has none apart."""
+    there = {name: file.variables.get(column.upper()) for name, column in FIXES.items()}
+    nothing = np.full(len(known["TIME"]), np.nan)
+    fixed = {name: nothing if one is None else floats(one) for name, one in there.items()}
+    when = np.where(np.isfinite(fixed["LATITUDE"]), known["TIME"], np.nan)
+    for name, values in {"TIME": when, **fixed}.items():
+        variable = file.createVariable(
+            f"{name}_GPS", "f8", file[name].dimensions, zlib=True, complevel=1, fill_value=np.nan
+        )
+        kept = ("standard_name", "calendar", "units")
+        variable.setncatts({key: file[name].getncattr(key) for key in kept if key in file[name].ncattrs()})
+        variable.long_name = f"{name.lower()} of each GPS location"
+        if None in there.values():
+            variable.comment = UNKNOWN
+        variable[:] = values
+
+
+def _sensor(file: Any, sensor: dict[str, str]) -> None:
+    """Add the magnetometer's variable, and name it in what it has measured."""
+    name = "SENSOR_MAGNETOMETER_" + "".join(c if c.isalnum() else "_" for c in sensor["sensor_serial_number"])
+    variable = file.createVariable(name, str)
+    variable.setncatts({"long_name": sensor["sensor_model"], **sensor})
+    for measured in MEASURED:
+        if measured in file.variables:
+            file[measured].sensor = name
