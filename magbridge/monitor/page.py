@@ -12,6 +12,7 @@ from magbridge.monitor.alarm_panel import AlarmPanel
 from magbridge.monitor.bundle import bundle
 from magbridge.monitor.charts import Telemetry, TotalField, TrackMap
 from magbridge.monitor.history import TIERS
+from magbridge.monitor.learning_panel import LearningPanel
 from magbridge.monitor.link import StationLink, now
 from magbridge.monitor.panels import Figures, Flags, Health, Navigation, Parameters, Texts
 from magbridge.monitor.state import State
@@ -78,6 +79,7 @@ class Page:
                 with ui.element().classes(f"{GRID} sm:grid-cols-2 content-start"):
                     self._health = Health(state, moment)
             self._navigation = Navigation(state, moment)
+            self._learning = LearningPanel(self._station, state)
             with ui.element().classes(f"{GRID} lg:grid-cols-[minmax(0,2fr)_minmax(0,3fr)] items-start"):
                 self._track = TrackMap(self._background)
                 self._telemetry = Telemetry()
@@ -105,6 +107,7 @@ class Page:
             self._flags,
             self._health,
             self._navigation,
+            self._learning,
             self._texts,
             self._parameters,
         ):

@@ -24,6 +24,8 @@ SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
 """Samples, parameters, and series of telemetry that are kept at most."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
 """States of the position filter in which it says where the vehicle is."""
+ORDERS = {"MB_LEARN_DO"}
+"""Parameters that go back to 0 once what was asked is done."""
 FIX_2D = 2
 """GPS_FIX_TYPE from which a receiver knows its place."""
 TEMPERATURE = "Temperature, °C"
@@ -71,8 +73,8 @@ class State:
         s between its last two MAG_FIELDs, and MAG_STATUSes; 0 before the second.
     received, lost : int
         Its messages received, and those missing by their sequence numbers.
-    field, status, navigation : dict
-        The last MAG_FIELD, MAG_STATUS and MAG_NAVIGATION; empty before the first.
+    field, status, navigation, learning : dict
+        The last MAG_FIELD, MAG_STATUS, MAG_NAVIGATION and MAG_LEARNING; empty before the first.
     flags : dict of str to tuple of 2 float
         The flags shown, by their public names: since when, and when last set.
     samples : deque of dict
@@ -99,6 +101,7 @@ class State:
         self.field: dict[str, Any] = {}
         self.status: dict[str, Any] = {}
         self.navigation: dict[str, Any] = {}
+        self.learning: dict[str, Any] = {}
         self.flags: dict[str, tuple[float, float]] = {}
         self.samples: deque[dict[str, Any]] = deque(maxlen=SAMPLES)
         self.total, self.telemetry = Series(), dict[str, Series]()
@@ -117,6 +120,7 @@ class State:
                 "MAG_RAW": self._raw,
                 "MAG_STATUS": self._status,
                 "MAG_NAVIGATION": self._navigation,
+                "MAG_LEARNING": self._learning,
                 "STATUSTEXT": self._text,
                 "PARAM_VALUE": self._value,
             }.items()
@@ -209,6 +213,7 @@ class State:
         before, self.status = self.status.get("uptime", 0), message.fields
         if self.status["uptime"] < before:  # the bridge restarted, perhaps with other parameters
             self.parameters.clear()
+            self.learning = {}
             self._count = 0
             self.lost = self._lost_before  # its sequence numbers began anew
         self._lost_before = self.lost
@@ -219,6 +224,9 @@ class State:
             nn, ne, ee = (self.navigation[f"covariance_{axes}"] for axes in ("nn", "ne", "ee"))
             latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
             self.estimated.add(TrackPoint(latitude, longitude, (nn, ne, ee)))
+
+    def _learning(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
+        self.learning = message.fields
 
     def _text(self, message: Message, now: float) -> None:
         number, piece = message["id"], message["chunk_seq"]
@@ -242,7 +250,7 @@ class State:
         one.value = value
         if one.asked is None:
             return
-        if isclose(one.asked, value, rel_tol=1e-6):
+        if isclose(one.asked, value, rel_tol=1e-6) or (name in ORDERS and value == 0.0):
             one.error = ""
         elif one.error == WAITING:
             return  # of a list that somebody asked for meanwhile; our request is repeated

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import time
 from enum import IntEnum
 from math import hypot, isfinite, nan, sqrt
 
 from magbridge.field.geodesy import worse_axis
-from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_NAVIGATION_STATE, MAG_PORT_STATE
+from magbridge.mavlink.dialect import (
+    MAG_CAUSE,
+    MAG_LEARNING_STATE,
+    MAG_LOG_STATE,
+    MAG_NAVIGATION_STATE,
+    MAG_PORT_STATE,
+)
 from magbridge.monitor.state import State
 
-__all__ = ["FLAGS", "ago", "conditions", "health", "measured", "silence", "whereabouts"]
+__all__ = ["FLAGS", "ago", "conditions", "health", "learnt", "measured", "silence", "whereabouts"]
 
 SILENT, SLOW = 3.0, 30.0
 """s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field and of the
@@ -31,6 +38,8 @@ ROUTINE = {"moving", "no_boresight", "late_join"}
 """Flags that come and go, or stay, in a mission where nothing is wrong: they are shown, and alarm nobody."""
 STARTING = 15.0
 """s after its first message in which a bridge may still be waiting for its sensor and its autopilot."""
+LAST = 4_102_444_800
+"""s since 1970: no bridge began to doubt after 2099."""
 HUGE = 1e9
 """No figure of the page is as large: what is, is written with its power of ten."""
 LOSSES = {
@@ -134,6 +143,31 @@ def whereabouts(state: State, now: float) -> dict[str, tuple[str, bool]]:
         ),
         "Last update": (f"{ago(now - state.navigated)} ago" if state.navigation else "–", True),
     }
+
+
+def learnt(state: State) -> dict[str, tuple[str, bool]]:
+    """Return what the bridge says of its learning: each item's name to its text, and whether all is well."""
+    get = state.learning.get
+    causes = [cause for cause in MAG_CAUSE if get("causes", 0) & cause]
+    since = time.gmtime(min(get("doubt_since", 0) * 1e-6, LAST))
+    size = _number(get("doubt_size", nan), ".0f", unit="nT")[0]
+    doubted = f"{size} since {time.strftime('%d %b %H:%M', since)} UTC"
+    names = ", ".join(str(cause.name).lower().replace("_", " ") for cause in causes)
+    errors = (_number(get(f"rms_{which}", nan), ".2f", unit="nT")[0] for which in ("first", "published"))
+    return {
+        "State": (_word(MAG_LEARNING_STATE, get("state", 0)), True),
+        "Published": (_calibration(get("calibration_id", 0), get("first_calibration_id", 0)), True),
+        "Error of prediction, first": (next(errors), True),
+        "Error of prediction, published": (next(errors), True),
+        "Not explained": (doubted if causes else "nothing", not causes),
+        "Causes that fit": (names or "–", not causes),
+        "Samples learned from": (f"{get('samples', 0):,}", True),
+        "Error of prediction, learned so far": (_number(get("rms_learned", nan), ".2f", unit="nT")[0], True),
+    }
+
+
+def _calibration(published: int, first: int) -> str:
+    return f"{published:08x}" + (", the first" if published == first else f"; the first is {first:08x}")
 
 
 def conditions(state: State, now: float) -> dict[str, str]:

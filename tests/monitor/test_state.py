@@ -20,7 +20,7 @@ from magbridge.monitor.fleet import MOST, Fleet
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.state import TEMPERATURE, State
 from magbridge.monitor.track import series as track_series
-from magbridge.monitor.words import ago, health, measured, silence, whereabouts
+from magbridge.monitor.words import ago, health, learnt, measured, silence, whereabouts
 from magbridge.records import Quality
 from magbridge.version import __version__
 
@@ -363,3 +363,35 @@ def test_another_run_s_parameters_are_fetched_anew(air: Air) -> None:
     assert not air.state.parameters
     exchange.run(4)
     assert len(air.state.parameters) == len(exchange.bridge.parameters.names)
+
+
+def test_what_is_learned_is_shown_in_words(air: Air) -> None:
+    """Both predictions, the doubt with its causes, whatever a stranger sends as its time."""
+    air.field(NOW)
+    assert learnt(air.state)["Not explained"] == ("nothing", True)
+    doubt = {"doubt_since": 1_780_000_000_000_000, "doubt_size": 12.4, "causes": 1 | 4}
+    errors = {"rms_first": 15.25, "rms_published": 1.5, "rms_learned": 1.25, "samples": 4321}
+    ids = {"calibration_id": 0xABC, "first_calibration_id": 0xDEF}
+    air.say(NOW, "MAG_LEARNING", state=3, **doubt, **errors, **ids)
+    shown = {name: text for name, (text, _) in learnt(air.state).items()}
+    assert shown["State"] == "learned"
+    assert shown["Published"] == "00000abc; the first is 00000def"
+    assert (shown["Error of prediction, first"], shown["Error of prediction, published"]) == (
+        "15.25 nT",
+        "1.50 nT",
+    )
+    assert shown["Not explained"] == "12 nT since 28 May 20:26 UTC"
+    assert shown["Causes that fit"] == "offset step, temperature offset"
+    air.say(NOW, "MAG_LEARNING", doubt_since=2**64 - 1, doubt_size=nan, causes=0xFFFF, state=9)
+    assert learnt(air.state)["Not explained"][1] is False
+
+
+def test_an_order_that_goes_back_to_zero_was_taken(air: Air) -> None:
+    """MB_LEARN_DO answers 0: what was asked is done."""
+    air.field(NOW)
+    air.say(NOW, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
+    air.state.set("MB_LEARN_DO", 2.0)
+    assert [name for name, _ in air.fleet.due(NOW + 1.0)].count("PARAM_SET") == 1
+    air.say(NOW + 1.1, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
+    assert air.state.parameters["MB_LEARN_DO"].error == ""
+    assert air.state.parameters["MB_LEARN_DO"].asked is None

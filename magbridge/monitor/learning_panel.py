@@ -1,0 +1,54 @@
+"""The panel of what a bridge learns: two predictions, its doubts, and buttons to accept and forget."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from nicegui import ui
+
+from magbridge.monitor.link import StationLink
+from magbridge.monitor.state import State
+from magbridge.monitor.widgets import GRID, INK, RED, card, fact
+from magbridge.monitor.words import learnt
+
+__all__ = ["LearningPanel"]
+
+DO = "MB_LEARN_DO"
+ORDERS = {
+    "Accept": (1.0, "What was learned is the calibration from now on, and the doubt is acknowledged"),
+    "Forget": (2.0, "Go back to the first calibration, and learn anew"),
+}
+
+
+class LearningPanel:
+    """What one bridge learns; hidden where it does not."""
+
+    def __init__(self, station: StationLink, state: State) -> None:
+        self._station, self._state = station, state
+        with ui.element().classes("w-full") as self._box, card("Learning in flight"):
+            with ui.element().classes(f"{GRID} md:grid-cols-2 gap-y-1"):
+                self._labels = [fact(name) for name in learnt(state)]
+            with ui.row().classes("gap-x-4"):
+                self._buttons = [
+                    ui.button(name, on_click=partial(self._order, value))
+                    .props("dense no-caps outline size=sm padding='4px 10px'")
+                    .classes("!text-slate-700 dark:!text-slate-200")
+                    .tooltip(meaning)
+                    for name, (value, meaning) in ORDERS.items()
+                ]
+            self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
+
+    def show(self, state: State, _now: float) -> None:
+        """Show the last MAG_LEARNING."""
+        self._box.set_visibility(bool(state.learning))
+        for label, (text, well) in zip(self._labels, learnt(state).values(), strict=True):
+            label.set_text(text)
+            label.style(f"color: {INK if well else RED}")
+        for button in self._buttons:
+            button.set_enabled(DO in state.parameters)
+        self._answer.set_text(state.parameters[DO].error if DO in state.parameters else "")
+
+    def _order(self, value: float) -> None:
+        with self._station.lock:
+            if DO in self._state.parameters:
+                self._state.set(DO, value)

@@ -1,0 +1,97 @@
+"""How good a bridge gets that begins without a calibration: error and sigma against hours, and the figure.
+
+Random gliders survey rock of 60 nT in a criss-cross, with the IGRF as the only reference and no calibration
+run. Printed and drawn: the RMS error about its mean of the published field over the noise floor, in each
+stretch of the survey, and its claimed sigma, with and without the error of the level, which nobody sees.
+
+    python tools/live_nothing.py --seeds 4 --hours 24 -o docs/learning-from-nothing.svg
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import live
+import numpy as np
+from rich.console import Console
+from terminal import command_line, table
+
+from magbridge.calibration.model import Parameter
+from magbridge.learning import Learner
+from magbridge.learning.start import class_prior
+from magbridge.records import Quality
+
+EDGES = (0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.5, 2.25, 3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0)
+"""h."""
+FLOOR = 1.0
+"""nT, the noise of the simulated sensor's channels."""
+
+
+def run(seed: int, hours: float) -> np.ndarray:
+    """Return, of each stretch, the error about its mean, the mean error, the claimed sigma; nT."""
+    _, log = live.fly("nothing", seed, hours)
+    parameters = []
+    for name in live.MASSES:
+        low, high = float(log[name].min()), float(log[name].max())
+        parameters.append(Parameter(name, "", low, high, 0.5 * (low + high), 0.5 * (high - low)))
+    prior = class_prior(tuple(parameters))
+    seen = live.learn(Learner(prior), prior, log)
+    time, error = live.hours(log), seen.total - log["truth_total_field"].to_numpy()
+    rest = (seen.quality & int(Quality.MOVING | Quality.STALE_TELEMETRY)) == 0
+    rows = np.full((len(EDGES) - 1, 3), np.nan)
+    for row, low, high in zip(rows, EDGES[:-1], EDGES[1:], strict=True):
+        here = rest & (time >= low) & (time < high)
+        if here.sum() > 10:
+            row[:] = np.std(error[here]), np.mean(error[here]), np.median(seen.sigma[here])
+    return rows
+
+
+def draw(results: np.ndarray, file: Path) -> None:
+    """Draw error and sigma (seeds, stretches, 3) against hours."""
+    import matplotlib.pyplot as plt  # noqa: PLC0415 - only here
+
+    middle = np.sqrt(np.array(EDGES[:-1]) * np.array(EDGES[1:]))
+    figure, axes = plt.subplots(figsize=(7.0, 4.2), constrained_layout=True)
+    for one in results:
+        axes.plot(middle, one[:, 0], color="tab:blue", alpha=0.35, lw=1)
+        axes.plot(middle, np.abs(one[:, 1]), color="tab:orange", alpha=0.35, lw=1)
+    axes.plot(middle, np.nanmedian(results[:, :, 0], 0), "o-", color="tab:blue", label="error about the mean")
+    level = np.nanmedian(np.abs(results[:, :, 1]), 0)
+    axes.plot(middle, level, "s-", color="tab:orange", label="error of the level")
+    axes.plot(middle, np.nanmedian(results[:, :, 2], 0), "k--", label="claimed sigma, of both")
+    axes.axhline(FLOOR, color="0.5", lw=1, label="noise of the sensor")
+    axes.set(xscale="log", yscale="log", xlabel="hours since the start", ylabel="nT")
+    axes.set_xticks([0.1, 0.3, 1, 3, 6, 12, 24], ["0.1", "0.3", "1", "3", "6", "12", "24"])
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(file)
+
+
+def main() -> None:
+    """Run, print and draw."""
+    parser = command_line(__doc__)
+    parser.add_argument("--seeds", type=int, default=4, help="gliders")
+    parser.add_argument("--first", type=int, default=0, help="the first glider")
+    parser.add_argument("--hours", type=float, default=24.0, help="of the survey")
+    parser.add_argument("-o", "--output", type=Path, help="where to draw")
+    asked = parser.parse_args()
+    results = np.array([run(seed, asked.hours) for seed in range(asked.first, asked.first + asked.seeds)])
+    shown = table(
+        f"{asked.seeds} gliders", "hours", "about the mean", "worst", "level", "sigma", "error/sigma"
+    )
+    for k, (low, high) in enumerate(pairwise(EDGES)):
+        std, mean, sigma = results[:, k].T
+        if np.isfinite(std).any():
+            rms = np.sqrt(np.nanmean((std**2 + mean**2) / sigma**2))
+            shown.add_row(
+                f"{low:g} to {high:g}", f"{np.nanmedian(std) / FLOOR:.2f}", f"{np.nanmax(std) / FLOOR:.2f}",
+                f"{np.nanmedian(np.abs(mean)):.0f}", f"{np.nanmedian(sigma):.0f}", f"{rms:.2f}",
+            )  # fmt: skip
+    Console(width=100).print(shown)
+    if asked.output is not None:
+        draw(results, asked.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""The peer of learning in flight: MagNav.jl's online filter, the linear one, on our samples.
+
+There (``ekf_online`` in MagNav.jl; Canciani 2022, IEEE Trans. Aerospace and Electronic Systems 58:420) the 18
+coefficients of Tolles and Lawson are states beside a first-order Gauss-Markov field: permanent, induced and
+eddy-current terms, which are products of the direction cosines, their squares and their rates. It has no
+terms for masses that move, so it gets the field corrected by the fixed calibration, and learns what is left.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["online"]
+
+PERMANENT, INDUCED, EDDY = 20.0, 20.0, 5.0
+"""nT, prior 1-sigma of the three kinds: a power-on's change of offset; an eddy term at a turn of 1 deg/s."""
+WALK = 3.0 / 86_400.0**0.5
+"""nT per square root of a second, as ours."""
+PAIRS = tuple((i, j) for i in range(3) for j in range(i, 3))
+
+
+def features(vector: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """(n, 18) of Tolles and Lawson, of the measured vector (n, 3)."""
+    u = vector / np.linalg.norm(vector, axis=1)[:, None]
+    rate = np.gradient(u, time, axis=0) / np.radians(1.0)
+    induced = [u[:, i] * u[:, j] for i, j in PAIRS]
+    eddy = [u[:, i] * rate[:, j] for i in range(3) for j in range(3)]
+    return np.column_stack([u, *induced, *eddy])
+
+
+def online(
+    vector: np.ndarray,
+    total: np.ndarray,
+    reference: np.ndarray,
+    time: np.ndarray,
+    use: np.ndarray,
+    noise: float,
+    field: tuple[float, float],
+) -> np.ndarray:
+    """Return the total field (n,), nT, as the filter would have corrected it sample by sample.
+
+    Parameters
+    ----------
+    vector, total : (n, 3), (n,) arrays
+        nT, corrected by the fixed calibration.
+    reference : (n,) array
+        nT.
+    time : (n,) array
+        s.
+    use : (n,) bool array
+        Samples to learn from.
+    noise : float
+        nT.
+    field : tuple of 2 float
+        nT and s: 1-sigma and time constant of the Gauss-Markov field.
+    """
+    A = features(vector, time)
+    x = np.zeros(19)
+    P = np.diag(np.r_[[PERMANENT**2] * 3, [INDUCED**2] * 6, [EDDY**2] * 9, field[0] ** 2])
+    out = np.empty(len(time))
+    last = time[0]
+    for k in range(len(time)):
+        phi = np.exp(-(time[k] - last) / field[1])
+        x[-1] *= phi
+        P[-1] *= phi
+        P[:, -1] *= phi
+        P[-1, -1] += field[0] ** 2 * (1.0 - phi * phi)
+        P[range(18), range(18)] += WALK**2 * (time[k] - last)
+        last = time[k]
+        out[k] = total[k] - A[k] @ x[:-1]
+        if use[k]:
+            h = np.r_[A[k], 1.0]
+            gain = P @ h / (h @ P @ h + noise**2)
+            x += gain * (total[k] - reference[k] - h @ x)
+            P -= np.outer(gain, h @ P)
+            P = 0.5 * (P + P.T)
+    return out
