@@ -156,7 +156,7 @@ def _read(path: Path | None) -> Tracks:
                     path, f"expected {cache_id}.cac, the list of its sensors, beside it or in a folder cac"
                 ) from None
             raise FormatError(path, f"expected a Slocum file: {error}") from None
-        except (ValueError, KeyError, IndexError, UnicodeDecodeError, RuntimeError) as error:
+        except (ValueError, KeyError, IndexError, UnicodeDecodeError, RuntimeError, OverflowError) as error:
             raise FormatError(path, f"expected a whole Slocum file: {error}") from None
     tracks = tracks if len(wanted) > 1 else [tracks]
     return {name: (np.asarray(t), np.asarray(v)) for name, (t, v) in zip(wanted, tracks, strict=True)}

@@ -138,6 +138,7 @@ class Table:
 
     def _whole(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
         """Return the lines that have as many fields as there are headings, and their numbers."""
+        lines, numbers = self._closed(lines, numbers)
         separator, width = self._layout.separator, len(self._layout.headings)
         counts = [
             len(cells(line, separator)) if separator == BLANKS or '"' in line else line.count(separator) + 1
@@ -150,6 +151,17 @@ class Table:
         if not wrong.any():
             return lines, list(numbers)
         self.faults.note("", wrong, numbers, f"expected {width} fields, not {counts[int(wrong.argmax())]}")
+        rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong.tolist(), strict=True) if not bad]
+        return [line for line, _ in rows], [number for _, number in rows]
+
+    def _closed(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], Sequence[int]]:
+        """Return the lines without those in which a quotation mark is left open, and their numbers."""
+        if not any('"' in line for line in lines):
+            return lines, numbers
+        wrong = np.array([line.count('"') % 2 == 1 for line in lines])
+        if not wrong.any():
+            return lines, numbers
+        self.faults.note("", wrong, numbers, "expected every quote to be closed in its line")
         rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong.tolist(), strict=True) if not bad]
         return [line for line, _ in rows], [number for _, number in rows]
 

@@ -58,3 +58,16 @@ def test_files_that_once_failed(cases: Path, name: str) -> None:
     assert said.startswith(f"{path}: ")
     assert "\n" not in said
     assert "cannot be read, damaged?" not in said, "nobody foresaw it"
+
+
+def test_a_quotation_mark_that_is_never_closed_costs_its_row(tmp_path: Path) -> None:
+    """It once took all that follows for one cell: pandas' ParserError."""
+    path = tmp_path / "log.csv"
+    rows = [f"{1_700_000_000 + 4 * k},20000.0,{k}.0,40000.0\n" for k in range(20)]
+    rows[7] = '1700000028,20000.0,"7.0,40000.0\n'
+    path.write_text("time,mag_x,mag_y,mag_z\n" + "".join(rows))
+    got = read(path)
+    assert got["mag_y"].to_numpy().tolist() == [*range(7), *range(8, 20)]
+    rows[7] = '1700000028,20000.0,"7.0",40000.0\n'
+    path.write_text("time,mag_x,mag_y,mag_z\n" + "".join(rows))
+    assert read(path)["mag_y"].to_numpy().tolist() == list(range(20))
