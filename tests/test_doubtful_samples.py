@@ -1,0 +1,44 @@
+"""Each fault of the sensor, the telemetry and the computer, in a survey's bytes: what is wrong is flagged."""
+
+from __future__ import annotations
+
+import pytest
+from faults import FAULTS, Flight, prepare, score, stalls
+
+HALF_A_PERCENT = 4
+"""Samples of 900 that may be wrong without a flag: 0.3 % are 2.7 of them, as chance has it."""
+UNSEEN = {"gain of x +2 %"}
+"""On a steady course it is a constant, as rock is."""
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    return prepare(tmp_path_factory.mktemp("flight"), 1, 1.0)
+
+
+@pytest.mark.parametrize("fault", sorted(FAULTS.keys() - UNSEEN))
+def test_what_is_wrong_is_flagged_or_its_sigma_grows(flight: Flight, fault: str) -> None:
+    found = score(flight, FAULTS[fault](flight.survey))
+    assert found.wrong <= HALF_A_PERCENT
+    assert found.samples == 900
+    if fault in ("none", "telemetry 2 s late"):
+        assert found.flagged < 0.05 * found.samples
+        assert found.sigma < 3.0
+
+
+@pytest.mark.parametrize("seconds", [1.5, 8.0])
+def test_what_waited_while_the_process_stood_still(flight: Flight, seconds: float) -> None:
+    found = score(flight, flight.survey, stalls(round(seconds * 1e6), 100_000_000))
+    assert found.wrong <= HALF_A_PERCENT
+    assert found.flagged < 0.15 * found.samples
+
+
+def test_another_glider_s_calibration(tmp_path_factory: pytest.TempPathFactory) -> None:
+    other = prepare(tmp_path_factory.mktemp("other"), 1, 0.5, calibrated_by=101)
+    assert score(other, other.survey).wrong <= HALF_A_PERCENT
+
+
+def test_a_gain_of_one_axis_is_seen_when_the_dive_becomes_a_climb(flight: Flight) -> None:
+    found = score(flight, FAULTS["gain of x +2 %"](flight.survey))
+    assert found.worst < 60.0
+    assert found.flagged > 0.7 * found.samples
