@@ -25,12 +25,13 @@ Row = dict[str, Any]
 FORMAT = 1
 """Of the catalogues that are written; newer ones are refused."""
 SERVERS = ("postgresql://", "postgres://")
-TEXT, NUMBER, COUNT, TEXTS, NUMBERS = (
+TEXT, NUMBER, COUNT, TEXTS, NUMBERS, PACKED = (
     pl.String(),
     pl.Float64(),
     pl.Int64(),
     pl.List(pl.String()),
     pl.List(pl.Float64()),
+    pl.Binary(),
 )
 TABLES: dict[str, dict[str, pl.DataType]] = {
     "vehicles": {
@@ -49,8 +50,8 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
     "calibrations": {
         "job": TEXT, "attempt": COUNT, "vehicle": TEXT, "deployment": TEXT, "refit": TEXT, "start": NUMBER,
         "sensor": TEXT, "method": TEXT, "rms": NUMBER, "noise": NUMBER, "expected": NUMBER,
-        "supported": pl.Boolean(), "warnings": TEXTS, "calibration": TEXT, "precision": NUMBERS,
-        "vector": NUMBERS,
+        "supported": pl.Boolean(), "warnings": TEXTS, "calibration": TEXT, "precision": PACKED,
+        "vector": PACKED,
     },
     "corrected": {
         "job": TEXT, "attempt": COUNT, "sha256": TEXT, "path": TEXT, "samples": COUNT, "flagged": COUNT,
@@ -66,8 +67,8 @@ TABLES: dict[str, dict[str, pl.DataType]] = {
     "failures": {"job": TEXT, "attempt": COUNT, "vehicle": TEXT, "deployment": TEXT, "line": TEXT},
 }  # fmt: skip
 """Table -> columns and their types, in nT, deg and s since 1970. `calibration` is a whole cal.json,
-`precision` and `vector` what the data alone say of its coefficients; `job` names what a result is made of,
-and its last `attempt` is the one that counts."""
+`precision` and `vector` what the data alone say of its coefficients (:func:`.packed`); `job` names what a
+result is made of, and its last `attempt` is the one that counts."""
 
 
 class Catalogue(ABC):

@@ -18,6 +18,7 @@ from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import WrongUse
 from magbridge.fleet.job import GIVEN
+from magbridge.fleet.learn import packed
 from magbridge.fleet.register import Deployment, vehicle_named
 
 if TYPE_CHECKING:
@@ -78,7 +79,6 @@ def add_calibration(
 def _row(
     vehicle: str, deployment: Deployment, sensor: str, start: float, calibration: Calibration, order: int
 ) -> Row:
-    told = _information(calibration, order)
     samples = sum(run.samples for run in calibration.runs)
     squares = sum(run.samples * run.rms**2 for run in calibration.runs)
     return {
@@ -87,8 +87,7 @@ def _row(
         "method": calibration.method, "rms": float(np.sqrt(squares / max(samples, 1))),
         "noise": calibration.noise.sensor, "expected": None, "supported": not calibration.doubts,
         "warnings": list(calibration.doubts), "calibration": encode_calibration(calibration).decode(),
-        "precision": told.precision.ravel().tolist() if told else [],
-        "vector": told.vector.tolist() if told else [],
+        **packed(_information(calibration, order)),
     }  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from magbridge.fleet.hierarchy import Observed, Population, learn
 from magbridge.fleet.shapes import shape_groups, shapes_of
 from magbridge.fleet.variances import NONE, Shapes, Variances
 
-__all__ = ["Fleet", "Lesson", "learn_fleet"]
+__all__ = ["Fleet", "Lesson", "learn_fleet", "packed", "unpacked"]
 
 REST = 0.01
 """Share of the physical widths that a refit of a mounted mass moves besides what a dipole does."""
@@ -61,6 +61,19 @@ class Lesson(NamedTuple):
         """
         B = rescaling(self.exponents, parameters, self.parameters, FIELD, self.field) @ basis
         return Information(B.T @ self.information.precision @ B, B.T @ self.information.vector)
+
+
+def packed(told: Information | None) -> dict[str, bytes]:
+    """Return information as columns of the catalogue: little-endian doubles, row by row; empty: none."""
+    if told is None:
+        return {"precision": b"", "vector": b""}
+    return {name: np.asarray(part, "<f8").tobytes() for name, part in told._asdict().items()}
+
+
+def unpacked(row: Mapping[str, bytes]) -> Information:
+    """Return what :func:`packed` has packed."""
+    vector = np.frombuffer(row["vector"], "<f8")
+    return Information(np.frombuffer(row["precision"], "<f8").reshape(len(vector), -1), vector)
 
 
 @dataclass(frozen=True, eq=False)

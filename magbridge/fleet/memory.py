@@ -10,13 +10,12 @@ import msgspec
 import numpy as np
 
 from magbridge.calibration.file import decode_calibration
-from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import DataError, WrongUse
 from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.fleet.job import GIVEN, jobs, last_attempts
-from magbridge.fleet.learn import Fleet, Lesson, learn_fleet
+from magbridge.fleet.learn import Fleet, Lesson, learn_fleet, unpacked
 from magbridge.fleet.register import current_files, masses, vehicle_named, vehicles
 from magbridge.fleet.variances import LEVELS, Variances
 
@@ -174,10 +173,8 @@ def _taught(row: Row) -> _Taught:
     calibration = decode_calibration(row["calibration"].encode(), f"calibration of {row['deployment']}")
     term = calibration.terms[0]
     assert isinstance(term, Polynomial)
-    size = len(row["vector"])
-    told = Information(np.reshape(row["precision"], (size, size)), np.array(row["vector"]))
     lesson = Lesson(
         row["vehicle"], row["refit"], row["deployment"], row["start"], calibration.parameters,
-        term.exponents, calibration.reference.field, told,
+        term.exponents, calibration.reference.field, unpacked(row),
     )  # fmt: skip
     return _Taught(lesson, frozenset(calibration.inputs.values()), row["sensor"], row["job"] == GIVEN)

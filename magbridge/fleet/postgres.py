@@ -33,6 +33,7 @@ TYPES: dict[pl.DataType, str] = {
     pl.Boolean(): "boolean",
     pl.List(pl.String()): "text[]",
     pl.List(pl.Float64()): "double precision[]",
+    pl.Binary(): "bytea",
 }
 
 

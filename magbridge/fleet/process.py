@@ -65,7 +65,7 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=memory,
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",  # any free port: a second command is no reason to warn
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster) as client,

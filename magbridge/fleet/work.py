@@ -24,6 +24,7 @@ from magbridge.correction import Correction, correct_rows
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, FormatError, MagbridgeError, WriteError
 from magbridge.files import digest
+from magbridge.fleet.learn import packed
 from magbridge.logs import Writer, read
 from magbridge.logs.deployment import join, passed_over, sliced
 from magbridge.logs.info import GAP
@@ -139,7 +140,7 @@ def _log(log: xr.Dataset, sha: str) -> Row:
 
 
 def _calibration(job: Job, found: Fit, start: float) -> Row:
-    calibration, told = found.calibration, found.information
+    calibration = found.calibration
     return {
         **job.mark, "vehicle": job.vehicle["vehicle"], "deployment": job.deployment, "refit": job.refit,
         "start": start, "sensor": calibration.sensor.name or job.sensor, "method": calibration.method,
@@ -147,8 +148,7 @@ def _calibration(job: Job, found: Fit, start: float) -> Row:
         "expected": found.details["expected_over_noise"] * calibration.noise.sensor,
         "supported": found.supported, "warnings": list(found.warnings),
         "calibration": encode_calibration(calibration).decode(),
-        "precision": told.precision.ravel().tolist() if told else [],
-        "vector": told.vector.tolist() if told else [],
+        **packed(found.information),
     }  # fmt: skip
 
 

@@ -151,3 +151,6 @@ def test_a_fleet_toml_names_what_is_wrong(tmp_path: Path) -> None:
     path.write_text('[vehicle.comet]\nparameter = ["battpos"]\n')
     with pytest.raises(ConfigError, match=r"vehicle\.comet\.parameter: unknown key"):
         read_fleet(path)
+    path.write_text("[vehicle.comet.mass.battpos]\nat = [-0.5, 0.0]\ntravel = [0.0254, 0.0, 0.0]\n")
+    with pytest.raises(ConfigError, match=r"vehicle\.comet\.mass.*\.at: expected `array` of length 3"):
+        read_fleet(path)

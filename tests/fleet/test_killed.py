@@ -1,4 +1,4 @@
-"""The scheduler is killed, then the command itself; run again, it ends in the same catalogue."""
+"""The scheduler is killed, then the command; run again by two at once, it ends in the same catalogue."""
 
 from __future__ import annotations
 
@@ -72,8 +72,10 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
         until(finished(2), command)
         command.send_signal(signal.SIGKILL)
         command.communicate()
-    with start("fleet", "process", "--catalogue", folder, "--workers", "1") as last:
-        assert last.wait() == 0
+    two = [start("fleet", "process", "--catalogue", folder, "--workers", "1") for _ in range(2)]
+    for one in two:  # two people at once
+        out, said = one.communicate(timeout=PATIENCE)
+        assert (one.returncode, said) == (0, ""), out
     # but for what the fixture's run did not learn at its end
     mine, theirs = content(catalogue), content(done)
     assert len(mine.pop("populations")) == 1
