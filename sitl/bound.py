@@ -41,6 +41,9 @@ class BestFit:
         nT of a channel's noise, and samples over which its correlation falls by e.
     at_sigma : float
         m, how well the masses' positions are known beforehand.
+    widths : (k,) array, optional
+        1-sigma of what is known beforehand instead: soft iron (9), hard iron (3, nT), and of each mass moment
+        (3, A m²), volume (3, m³) and place (3, m).
 
     Attributes
     ----------
@@ -67,10 +70,12 @@ class BestFit:
         sigma: float,
         memory: float = 0.0,
         at_sigma: float = 0.05,
+        widths: FloatArray | None = None,
     ) -> None:
         self._vehicle, self._calibration, self._survey = vehicle, calibration, survey
         self._phi = np.exp(-1 / memory) if memory else 0.0
-        scale = _widths(vehicle, at_sigma)  # θ in units of its prior: the information is then well scaled
+        # θ in units of its prior: the information is then well scaled
+        scale = _widths(vehicle, at_sigma) if widths is None else widths
         g, self._learned_floor = _sensitivity(vehicle, calibration, sigma)
         self._g = self._whitened(g) * scale
         self._covariance = np.linalg.inv(self._g.T @ self._g + np.eye(len(scale)))

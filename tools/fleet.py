@@ -4,7 +4,8 @@ Each vehicle of a simulated fleet is drawn at random and flies several deploymen
 another day. From one refit to the next its fixed iron, its masses' places and moments change (`--refit
 battery`: the battery pack is another one, with a moment of its own), from one power-up to the next the
 sensor's offsets. The fleet learns from all deployments but each vehicle's last. That one is calibrated with
-some of its runs, with the fleet's prior and without, and scored on its survey as tools/accuracy.py does.
+some of its runs, with the fleet's prior and without, and scored on its survey as tools/accuracy.py does. The
+bound is that of who knew the vehicle exactly as it was before, and the sizes of all changes.
 
     python tools/fleet.py --vehicles 12 --deployments 8 --runs 0 2 10
 """
@@ -33,9 +34,9 @@ from magbridge.errors import CalibrationError
 from magbridge.fleet.learn import Lesson, learn_fleet
 from magbridge.fleet.variances import LEVELS
 from sitl import Twin, load, segments, simulate
-from sitl.bound import oracle
+from sitl.bound import BestFit, oracle
 from sitl.dataset import at_rest, corrected
-from sitl.platform import MOUNTINGS, Matrix, Vehicle, draw_vehicle
+from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle
 
 MASSES = ("battpos", "ballast")
 REFITTED = {"fixed iron": 50.0, "soft iron": 1e-3, "place": 0.005, "moment": 0.1}
@@ -84,6 +85,19 @@ class Flight(NamedTuple):
         parts = segments(simulate(scenario, seed))
         assert isinstance(Twin.draw(scenario, seed).vehicle, Vehicle)
         return at_rest(parts["calibration"], MASSES), at_rest(parts["survey"], MASSES), vehicle
+
+    def widths(self) -> FloatArray:
+        """Return how far its vehicle may be from what it was before: after a refit, or a power-up alone."""
+        refitted = self.number % self.every == 0
+        nothing = 1e-9  # the bound divides by it
+        widths = [*[REFITTED["soft iron"] if refitted else nothing] * 9]
+        widths += [np.hypot(REFITTED["fixed iron"] * refitted, POWERED_UP)] * 3
+        for name in MASSES:
+            new = self.refit == "battery" and name == "battpos"
+            moment = np.sqrt(2.0) * MOMENT if new else REFITTED["moment"]
+            widths += [moment if refitted else nothing] * 3 + [nothing] * 3
+            widths += [REFITTED["place"] if refitted else nothing] * 3
+        return np.array(widths)
 
 
 class Row(NamedTuple):
@@ -139,6 +153,10 @@ def score(flight: Flight, counts: list[int], known: Known) -> list[Row]:
         after = corrected(survey, calibration)
         off = after.total - truth
         rows.append(Row(count, name, rms(off) / floor, float(np.std(off / after.sigma))))
+    for count in filter(None, counts):
+        part = runs.isel(time=np.isin(runs["run"], labels[:count]))
+        best = BestFit(vehicle, part, survey, 1.0, widths=flight.widths())
+        rows.append(Row(count, "bound", rms(best.bound) / rms(best.floor), 1.0))
     return rows
 
 
