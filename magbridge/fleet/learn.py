@@ -182,7 +182,7 @@ def _shapes(
         past = [one for one in observed if one.vehicle == vehicle]
         if not past:
             continue
-        mean, P = first.expected(vehicle, past, "")
+        mean, P = first.expected(vehicle, past, past[-1].refit)
         D = shapes_of(where, exponents, parameters, FIELD, basis @ mean, basis @ P @ basis.T)
         found[vehicle] = np.asarray(np.linalg.solve(basis, D))
     moves = np.repeat([sum(powers) > 0 for powers in exponents], 9)

@@ -50,7 +50,8 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
     PortError
         Nothing answers there.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is raised
+    for name in ("distributed", "distributed.client"):  # what matters is raised
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler:
         try:
             client = Client(scheduler, timeout=PATIENCE)
@@ -84,6 +85,7 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
         The scheduler was lost.
     """
     folder = catalogue.results.resolve()
+    address = str(client.scheduler.address) if client.scheduler else "dask"
     futures = {client.submit(work, job, folder, pure=False): job for job in todo}
     for future in as_completed(futures):
         job = futures[future]
@@ -93,7 +95,6 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
             line = f"{job.vehicle['vehicle']} {job.deployment}: its workers were killed (out of memory?)"
             done = Done({}, line)
         except CancelledError as error:
-            address = client.scheduler_info()["address"] if client.scheduler else str(client)
             raise PortError(address, "the dask scheduler was lost: run again to do what is left") from error
         future.release()
         yield _kept(catalogue, job, done)
