@@ -71,7 +71,7 @@ def test_another_encoding(tmp_path: Path) -> None:
         ("[log]", "[calibration]\nfile = 'cal.json'\n[log]", "calibration.file: no such file"),
         ("[log]", "[log", "not TOML"),
         ("[telemetry", "signing_key = 'key.bin'\n[telemetry", "link.signing_key: no such file"),
-        ("[log]", "[navigation]\nmap = 'grid.nc'\nfix = 'ODOMETRY'\n[log]", "navigation.map: no such file"),
+        ("[log]", "[navigation]\nmap = 'grid.nc'\n[log]", "navigation.map: no such file"),
         ('unit = "in"', "max_age = inf", "telemetry.battpos.max_age: expected `float` <= 1000000000"),
         ('unit = "in"', "scale = 0.0", "telemetry.battpos: scale: a number other than 0"),
         ('unit = "in"', "offset = nan", "telemetry.battpos: offset: a number, not nan"),
