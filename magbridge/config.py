@@ -202,8 +202,8 @@ class Navigation(Table, frozen=True):
     map : str
         The anomaly grid.
     fix : str
-        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4; unless
-        set), ``ODOMETRY`` (ArduPilot) or ``GLOBAL_POSITION_SENSOR`` (PX4).
+        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4, the
+        default), ``ODOMETRY`` (ArduPilot) or ``GLOBAL_POSITION_SENSOR`` (PX4).
     rate : float
         Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for
         ``ODOMETRY``, else 0.

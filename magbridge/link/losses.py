@@ -89,7 +89,9 @@ class Losses:
             self._before[component] = numbers.heard, numbers.lost
             heard, lost = numbers.heard - heard, numbers.lost - lost
             if lost >= LEAST and lost > MANY * (heard + lost):
-                text = f"more than {MANY:.0%} of the frames of {self._system}:{component} are lost"
+                # a router keeps back what is for others alone
+                who = f"{self._system}:{component}"
+                text = f"{who}: over {MANY:.0%} of its frames missing, or for others"
                 self._announcer.state(f"losses {component}", text, MAV_SEVERITY.WARNING)
             elif heard and not lost:
                 self._announcer.forget(f"losses {component}")

@@ -131,9 +131,9 @@ def test_whose_frames_are_lost_is_told(link: Line) -> None:
             frame = payload.pack("NAMED_VALUE_FLOAT", name="battpos", value=k)
             said += link.texts(link.give(link.autopilot.pack("ATTITUDE") + (frame if k >= lost else b"")))
             said += link.texts(link.to(0.1 * next(tenths)))
-        return [text for text in said if "are lost" in text]
+        return [text for text in said if "frames missing" in text]
 
-    told = ["more than 1% of the frames of 1:25 are lost"]
+    told = ["1:25: over 1% of its frames missing, or for others"]
     assert [ten_seconds(lost) for lost in (0, 2, 3, 20, 1, 0, 5, 0)] == [[], [], told, [], [], [], told, []]
     assert link.component.vehicle.frames_lost == 0, "the autopilot's"
 
