@@ -21,6 +21,7 @@ from magbridge.errors import CalibrationError
 __all__ = [
     "ClockEffect",
     "LegendreEffect",
+    "PathEffect",
     "PlayEffect",
     "PowersEffect",
     "SourcesEffect",

@@ -63,21 +63,24 @@ class HeldOut(NamedTuple):
     score: float
 
 
-def held_out(problem: Problem, columns: Sequence[Columns], fit: Joint) -> HeldOut:
+def held_out(
+    problem: Problem, columns: Sequence[Columns], fit: Joint, *, interleaved: bool = False
+) -> HeldOut:
     """Leave out dives, fold by fold.
 
     Nonlinear parameters and noise are those of the fit to all dives; every coefficient is fitted anew without
-    the fold.
+    the fold. Folds are stretches of dives, so that a slow change must be foretold; or, `interleaved`, every
+    eighth dive, so that it need only be filled in.
     """
     X, noise, prior = Design(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
     c = np.append(fit.z, fit.coefficients)
     y = noise.response(problem.residual - X.times(c))
-    dives = np.unique(problem.survey.dive)
-    folds = np.array_split(dives, min(FOLDS, dives.size))
-    ends = [int(fold[-1]) for fold in folds]
-    of = np.searchsorted(ends, problem.survey.dive)
-    P, b = np.zeros((len(folds), c.size, c.size)), np.zeros((len(folds), c.size))
+    dive = np.unique(problem.survey.dive, return_inverse=True)[1]
+    count, dives = min(FOLDS, int(dive.max()) + 1), int(dive.max()) + 1
+    ends = np.cumsum([len(some) for some in np.array_split(np.arange(dives), count)])
+    of = dive % count if interleaved else np.searchsorted(ends, dive, side="right")
+    P, b = np.zeros((count, c.size, c.size)), np.zeros((count, c.size))
     for rows in X.pieces:
         A = noise.whitened(X.rows, rows)
         for k in np.unique(of[rows]):

@@ -15,8 +15,9 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.accept import accept
-from magbridge.diagnose.causes import CAUSES, Cause, known
+from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
+from magbridge.diagnose.causes.time_dependent import interference_tone
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
@@ -117,7 +118,7 @@ def _examine(
     progress("searching")
     outcome = search(problem, candidates, len(causes))
     progress("what is left")
-    tone = _strongest_tone(problem, causes)
+    tone = _strongest_tone(problem, candidates)
     stand, rest = accept(problem, outcome, tone)
     named, rivals, fit = (outcome.chosen, outcome.rivals, outcome.fit) if stand else ((), (), outcome.null)
     model = [h.candidate for h in named]
@@ -145,8 +146,8 @@ def _examine(
     return Diagnosis(
         problem=problem, outcome=outcome,
         findings=_findings(problem, named, rivals, fit, after, counts, chances),
-        wrong=wrong, unexplained=rest, calibration=extended, fit=fit, before=before, after=after,
-        total=total,
+        wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
+        before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.trials, len(causes), untestable),
         verdict=_verdict(named, wrong, rest, total), causes=causes,
     )  # fmt: skip
@@ -188,10 +189,10 @@ def _whenever(candidates: Sequence[Candidate], learned: BoolArray) -> list[Candi
     return [*candidates, *(since(candidate, learned) for candidate in lasting)]
 
 
-def _strongest_tone(problem: Problem, causes: Mapping[str, Cause]) -> Candidate | None:
-    """Return the strongest tone, to describe what is left, where tones are not among the causes."""
-    tones = [] if "interference_tone" in causes else CAUSES["interference_tone"].candidates(problem)
-    return tones[0] if tones else None
+def _strongest_tone(problem: Problem, candidates: Sequence[Candidate]) -> Candidate | None:
+    """Return the strongest tone, to describe what is left, where tones are not among the candidates."""
+    known = any(isinstance(e, TimeEffect) and e.shape == "tone" for c in candidates for e in c.effects)
+    return None if known else next(iter(interference_tone(problem)), None)
 
 
 def _off(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | None:

@@ -54,6 +54,16 @@ def test_a_name_is_asserted_possible_or_ruled_out() -> None:
     assert {"asserted", "ruled out"} < set(said)
 
 
+def test_dives_left_out_overrule_a_name_that_fits() -> None:
+    """However likely it was beforehand: what only resembles the truth foretells less than a description."""
+    problem, rng = right(ROWS), np.random.default_rng(10)
+    bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
+    problem = replace(problem, residual=bent + rng.normal(size=ROWS))
+    for share, named in ((0.0, True), (0.5, False)):
+        alike = candidate("a", bent + share * bent.std() * rng.normal(size=ROWS), likelier=300.0)
+        assert accept(problem, search(problem, [alike], 1), None)[0] == named
+
+
 @pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])
 def test_a_name_whose_size_follows_something_else_is_not_asserted(follows: float, named: bool) -> None:
     """A payload's current at S/N 14 or more, its leads drawn apart by a moving mass."""

@@ -170,7 +170,7 @@ def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
         CAUSES[name].candidates(problem) for name in ("nonlinearity", "offset_step")
     )
     bent = np.hstack([bend.columns(rows), more.columns(rows)])
-    held = [one for one in listed if "nonlinearity" in one.holds]
+    held = [one for one in listed if one.holds(bend)]
     assert len(held) == 2
 
     def left(X: np.ndarray) -> float:

@@ -11,9 +11,11 @@ from posed import right
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.map_error import map_error
-from magbridge.diagnose.causes.reference import reference_bias
+from magbridge.diagnose.causes.reference import diurnal_variation, reference_bias
+from magbridge.diagnose.causes.time_dependent import offset_drift, offset_step
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.inference.search import search
 
 N = 1500
 NORTH = 2000.0 * (1.0 - np.abs(np.linspace(-1.0, 1.0, N)))
@@ -71,3 +73,15 @@ def test_what_is_drawn_wrong_is_the_same_at_every_depth() -> None:
     assert np.std(fit.left) < 0.1 * np.std(wrong)
     error = chart.columns(slice(None)) @ fit.coefficients / problem.gain
     np.testing.assert_allclose(error, error[::-1], atol=1e-6)  # there and back
+
+
+def test_a_gradient_over_the_whole_region_is_the_maps_error_alone() -> None:
+    """A line there and back tells place from time: no second, slow cause is named beside it."""
+    rng = np.random.default_rng(5)
+    whole = right(N)
+    survey = replace(whole.survey, time=whole.survey.time[0] + 16.0 * np.arange(N))
+    wrong = 0.01 * (NORTH - 1000.0) + rng.normal(size=N)
+    problem = drawn(replace(whole, survey=survey), wrong, DOWN)
+    slow = [c for cause in (diurnal_variation, offset_drift, offset_step) for c in cause(problem)]
+    found = search(problem, [*map_error(problem), *slow], 4)
+    assert [h.candidate.cause for h in found.chosen] == ["map_error"]

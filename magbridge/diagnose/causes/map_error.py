@@ -20,7 +20,7 @@ CELLS = 300
 """Most cells at which a map's error is described."""
 FINEST = 125.0
 """m, the smallest cell."""
-SCALES = np.array([1.0, 2.0, 4.0, 8.0])
+SCALES = np.array([1.0, 2.0, 4.0, 8.0, 32.0])
 """Depths of the rock below the deepest place of the track, and half the correlation lengths of what is the
 same at every depth, in cells."""
 ALTITUDE = 100.0

@@ -95,7 +95,7 @@ def _shortened(problem: Problem) -> Candidate:
 
 def clock_offset(problem: Problem) -> list[Candidate]:
     """Telemetry stamped by another clock: ``T += tau dT/dp dp/dt``, and A alike."""
-    return _delay(problem, ClockEffect(), 5.0)
+    return _delay(problem, ClockEffect(cause="clock_offset"), 5.0)
 
 
 def _delay(problem: Problem, effect: ClockEffect, width: float, *, positive: bool = False) -> list[Candidate]:

@@ -39,8 +39,10 @@ from magbridge.diagnose.inference.statistic import Statistic
 __all__ = [
     "IDEAL",
     "LEVEL",
+    "MOST_LEFT",
     "ODDS",
     "REMNANT",
+    "SMOOTH",
     "Score",
     "evidence_of",
     "log_bayes",
@@ -65,6 +67,9 @@ not another cause.
 
 The price: a second cause that weak is not named beside it.
 """
+SMOOTH, MOST_LEFT = 0.1, 8.0
+"""The same of a Gaussian process, and the most that it leaves: it takes any shape, but not any equally, and
+what a map's error leaves of itself is slow in time, too."""
 SIMULATIONS = 400
 
 

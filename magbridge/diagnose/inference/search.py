@@ -24,9 +24,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, evidence_of, regressor_error
+from magbridge.diagnose.gain import held_out
+from magbridge.diagnose.inference.evidence import (
+    LEVEL,
+    MOST_LEFT,
+    REMNANT,
+    SMOOTH,
+    evidence_of,
+    regressor_error,
+)
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import BRIEFEST, autoregressive_order
 from magbridge.diagnose.inference.information import Information
@@ -128,23 +137,28 @@ def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Cand
             break
         best = sharpen(state, model, best, base)
         cause = best.candidate.cause
-        size = 0.0 if best.candidate.shapeless else best.signal_to_noise
-        strengths[cause] = max(strengths.get(cause, 0.0), size)
+        strengths[cause] = max(strengths.get(cause, 0.0), _remnant(best))
         model, base = _added(state, model, best)
         found = state.round(model, base)
     return model, base
 
 
+def _remnant(found: Hypothesis) -> float:
+    """Return the signal-to-noise of what a cause's idealised regressor may leave of it."""
+    size = found.signal_to_noise
+    return min(SMOOTH * size, MOST_LEFT) if found.candidate.shapeless else REMNANT * size
+
+
 def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float) -> Hypothesis | None:
     """Pick the best that passes, unless it is so weak that other causes' idealised regressors may leave it.
 
-    `strengths` holds the signal-to-noise of the causes that are in the model, `ratio` is the likelihood ratio
-    of those that have a shape. Among candidates whose evidence differs by less than the regressors' errors
+    `strengths` holds what the causes that are in the model may leave, `ratio` is the likelihood ratio of
+    those that have a shape. Among candidates whose evidence differs by less than the regressors' errors
     may account for, the one with the fewest coefficients is preferred.
     """
 
     def remnant(cause: str) -> float:
-        return REMNANT * max((size for other, size in strengths.items() if other != cause), default=0.0)
+        return max((size for other, size in strengths.items() if other != cause), default=0.0)
 
     significant = [h for h in found if h.p_value < LEVEL and h.signal_to_noise >= remnant(h.candidate.cause)]
     as_likely = [h for h in significant if h.evidence >= significant[0].evidence - regressor_error(ratio)]
@@ -167,7 +181,10 @@ def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list
 def _backward_elimination(
     state: State, model: list[Candidate], base: Joint
 ) -> tuple[list[Hypothesis], Joint]:
-    """Drop causes without which the model is likelier, or which fail their test beside the others."""
+    """Drop causes without which the model is likelier, or which fail their test beside the others.
+
+    Of what then stays, drop what a Gaussian process may have left of itself, or dives left out speak against.
+    """
     chosen: list[Hypothesis] = []
     k = 0
     while k < len(model):
@@ -183,4 +200,27 @@ def _backward_elimination(
         fit = state.fit([*others, own], np.append(base.z, last), plain=False, like=base, rounds=1)
         chosen.append(Hypothesis(own, ratio, evidence_of(own, ratio, own.freedom), p_value, fit))
         k += 1
+        if k == len(model) > 1 and (surplus := _surplus(state, chosen, base)) is not None:
+            model = model[:surplus] + model[surplus + 1 :]
+            base, chosen, k = state.fit(model), [], 0
     return chosen, base
+
+
+def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | None:
+    """Return the place of the weakest cause if it need not be there, beside a Gaussian process.
+
+    That takes part in every slow shape, and what it leaves of a map's error passes for a second one.
+    """
+    smooth = max((_remnant(h) for h in chosen if h.candidate.shapeless), default=0.0)
+    k = min(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
+    if not smooth or chosen[k].candidate.shapeless:
+        return None
+    model = [h.candidate for h in chosen]
+    others = model[:k] + model[k + 1 :]
+    if chosen[k].signal_to_noise < smooth:
+        return k
+    left = [
+        held_out(state.problem, [candidate.columns for candidate in some], fit).left
+        for some, fit in ((others, state.fit(others)), (model, base))
+    ]
+    return k if rms(left[0]) < rms(left[1]) else None

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.effects import powers
-from magbridge.calibration.mass_effects import ClockEffect
+from magbridge.calibration.effects import ChannelEffect, powers
+from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect
+from magbridge.calibration.mass_effects import ClockEffect, LegendreEffect, PathEffect, PlayEffect
+from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.design_columns import Columns, size_of
@@ -25,9 +27,11 @@ __all__ = ["Description", "descriptions"]
 
 BODY, EARTH = 24, 48
 """Half waves per log of slow curves along the axes of the body, and along the field."""
-SCALES = {"temperature_offset": False, "temperature_scale": True}
-"""Whether it is the sensitivity that follows a temperature. Of other channels the table has one cause, which
-either description says with more numbers."""
+
+
+def _is(*kinds: type[Effect]) -> Callable[[Candidate], bool]:
+    """Return the question whether a candidate has an effect of these kinds."""
+    return lambda candidate: any(isinstance(effect, kinds) for effect in candidate.effects)
 
 
 class Description(NamedTuple):
@@ -45,14 +49,15 @@ class Description(NamedTuple):
         Number of independent descriptions that it was chosen from.
     period : float or None
         s, of a tone.
-    holds : tuple of str
-        Causes whose own regressors are among the columns.
+    holds : callable
+        Whether a candidate's own regressors are among the columns, beside those of the same channel.
     turned : bool
         The columns are the same functions along each of the body's axes.
     remembers : bool
         It follows the channel's past (from which side it came), not its value.
     scales : bool
-        The effect is in proportion to each reading: a change of sensitivity, not of offset.
+        The effect is in proportion to each reading: a change of sensitivity, not of offset. Only of heat is
+        that told apart: of other channels either description says what a cause does with more numbers.
     wider : bool
         It is much more general than a cause that it holds: what it finds beside that cause is no remnant, and
         it is an alternative to that cause together with another.
@@ -63,7 +68,7 @@ class Description(NamedTuple):
     channel: str | None = None
     trials: float = 1.0
     period: float | None = None
-    holds: tuple[str, ...] = ()
+    holds: Callable[[Candidate], bool] = _is()
     turned: bool = False
     remembers: bool = False
     scales: bool = False
@@ -71,17 +76,44 @@ class Description(NamedTuple):
 
     def covers(self, model: Sequence[Candidate]) -> bool:
         """Say whether it contains a cause of `model`, with more coefficients; a wider one, whether all."""
+        heat = "scale" if self.scales else "offset"
         same = [
-            candidate.cause in self.holds
+            self.holds(candidate)
             or (
                 candidate.channel is not None
                 and candidate.channel == self.channel
-                and (candidate.cause == "hysteresis") == self.remembers
-                and SCALES.get(candidate.cause, self.scales) == self.scales
+                and _is(PlayEffect)(candidate) == self.remembers
+                and _heat(candidate) in (heat, None)
             )
             for candidate in model
         ]
         return any(same) and (all(same) or not self.wider)
+
+
+def _heat(candidate: Candidate) -> Literal["offset", "scale"] | None:
+    """Return what a candidate changes with heat that soaks through a hull; None where it is no such one."""
+    soaked = (e for e in candidate.effects if isinstance(e, ChannelEffect) and e.stages > 1)
+    return next((effect.on for effect in soaked), None)
+
+
+def _soaks(*, scales: bool) -> Callable[[Candidate], bool]:
+    return lambda candidate: _heat(candidate) == ("scale" if scales else "offset")
+
+
+def _moves(own: set[str]) -> Callable[[Candidate], bool]:
+    """Return the question whether a candidate adds to what the calibration's `own` masses do."""
+    return lambda candidate: any(
+        isinstance(effect, LegendreEffect) or (isinstance(effect, PathEffect) and effect.channel in own)
+        for effect in candidate.effects
+    )
+
+
+def _is_constant(candidate: Candidate) -> bool:
+    return candidate.about == "constant"
+
+
+def _bends(candidate: Candidate) -> bool:
+    return any(isinstance(effect, ResponseEffect) and effect.power for effect in candidate.effects)
 
 
 def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) -> list[Description]:
@@ -123,7 +155,7 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
             lambda rows: problem.gain[rows, None] * waves(EARTH)(rows),
             (*shapes.spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
-        _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1.0, holds=("reference_bias",)),
+        _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1.0, holds=_is_constant),
         _of("transient", passing, trials=times),
     ]
 
@@ -132,19 +164,19 @@ def _of_reading(problem: Problem) -> list[Description]:
     """Functions of the field's direction, its rates of change, each channel's reading; one common delay."""
     body, rates = _body(problem), field_rates(problem)
     listed = [
-        _of("broadband", shapes.direction(body), holds=("nonlinearity",), wider=True),
+        _of("broadband", shapes.direction(body), holds=_bends, wider=True),
         _of(
             "broadband", _along_axes(problem, lambda rows: rates[:, rows].T), 1.0,
-            holds=("eddy_current", "channel_skew"), turned=True,
+            holds=_is(RateEffect), turned=True,
         ),
         Description(
-            shapes.response(problem.reading, body), shapes.bends(), holds=("nonlinearity",), wider=True
+            shapes.response(problem.reading, body), shapes.bends(), holds=_bends, wider=True
         ),
         _of("broadband", shapes.crossing(problem.reading, body)),
     ]  # fmt: skip
     if problem.calibration.parameters:
         late = effect_columns(problem, ClockEffect(), mass_rates(problem))
-        listed.append(_of("broadband", late, 1.0, holds=("clock_offset", "filter_lag")))
+        listed.append(_of("broadband", late, 1.0, holds=_is(ClockEffect)))
     return listed
 
 
@@ -154,7 +186,7 @@ def _of_channels(problem: Problem) -> list[Description]:
     listed = []
     for name, channel in problem.survey.channels.items():
         if name not in problem.survey.still:
-            held = ("actuator_order",) if name in own else ()
+            held = _moves(own) if name in own else _is()
             now, before = shapes.curve(channel.values), shapes.hysteresis(channel.values)
             listed += [
                 _of("broadband", _along_axes(problem, now), channel=name, turned=True, holds=held),
@@ -167,9 +199,9 @@ def _of_channels(problem: Problem) -> list[Description]:
 def _late(problem: Problem, name: str, channel: Channel) -> list[Description]:
     """Return what follows a channel late, as heat soaks into a hull: an offset, or a sensitivity."""
     late, listed = shapes.delayed(problem.survey.time, channel.values), []
-    for cause, scales in SCALES.items():
+    for scales in (False, True):
         columns = _along_axes(problem, late, scales=scales)
-        held = (cause,) if "temperature" in channel.kinds else ()
+        held = _soaks(scales=scales) if "temperature" in channel.kinds else _is()
         listed.append(_of("broadband", columns, channel=name, turned=True, scales=scales, holds=held))
     return listed
 

@@ -55,6 +55,15 @@ class Scored(NamedTuple):
     shift: FloatArray
 
 
+class Fitted(NamedTuple):
+    """A description fitted with its noise: the log evidence, its columns, the fit, and its trials."""
+
+    evidence: float
+    columns: Columns
+    fit: Joint
+    trials: float
+
+
 class Leftover(NamedTuple):
     """Unexplained structure: its kind, its size, and the channel it correlates with.
 
@@ -76,6 +85,8 @@ class Leftover(NamedTuple):
     within : tuple of Rival
         The causes that remain possible: it is likelier than they are, but by less
         than their margin.
+    fitted : tuple of Fitted
+        The likeliest descriptions.
     """
 
     kind: str
@@ -87,6 +98,7 @@ class Leftover(NamedTuple):
     description: Description | None = None
     choice: int = 1
     within: tuple[Rival, ...] = ()
+    fitted: tuple[Fitted, ...] = ()
 
     @property
     def among(self) -> float:
@@ -133,31 +145,36 @@ def leftover(
     tone : Candidate, optional
         The strongest tone, where tones are not among the causes.
     but : sequence of Candidate
-        Causes whose own regressors no description may contain.
+        Causes whose own regressors the description may not contain. Those that do are fitted all the same.
     also : sequence of Description
         Further descriptions.
     """
-    listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]
+    listed = [*descriptions(problem, fit, tone), *also]
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
-    found: list[tuple[float, Scored]] = []
+    found: list[tuple[Fitted, Scored]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
-        tried = sorted(scored, key=lambda one: -one.evidence)[:SHORT_LIST]
+        order = sorted(scored, key=lambda one: -one.evidence)
+        sides = ([s for s in order if s.description.covers(but) == covers] for covers in (False, True))
+        tried = [one for side in sides for one in side[:SHORT_LIST]]
         weighed = in_threads(len(problem), lambda one: _weighed(problem, columns, fit, one), tried)
-        # no more than the description itself can gain: the rest is of a noise that found another optimum
-        found += [(min(one.evidence, gained), one) for one, gained in zip(tried, weighed, strict=True)]
-    evidence, (_, kind, one, best, _) = max(found, key=lambda entry: entry[0])
+        found += zip(weighed, tried, strict=True)
+    others = (entry for entry in found if not entry[1].description.covers(but))
+    (evidence, *_), (_, kind, one, best, _) = max(others, key=lambda entry: entry[0].evidence)
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
-    count = sum(len(one.widths) for one in listed)
+    count = sum(len(one.widths) for one in listed if not one.covers(but))
     p_value = min(1.0, count * tail)
     # stricter where no cause was found: the distribution is only asymptotic
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
     channel = one.channel or _best_channel(problem, fit)
-    return Leftover(kind, best.signal_to_noise, p_value, evidence, one.period, channel, one, count)
+    fitted = tuple(entry for entry, _ in found)
+    return Leftover(
+        kind, best.signal_to_noise, p_value, evidence, one.period, channel, one, count, fitted=fitted
+    )
 
 
 def _scored(
@@ -190,17 +207,34 @@ def _calm(problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence
     return noise
 
 
-def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Scored) -> float:
-    """Log evidence of a description against the model, its noise fitted anew (Laplace's approximation)."""
-    one, c = scored.description, scored.best.estimate
+def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Scored) -> Fitted:
+    """Fit a description beside the model, its noise anew; its log evidence by Laplace's approximation."""
+    one, best, q = scored.description, scored.best, len(fit.z)
+    c, columns = best.estimate, one.columns
     moved = -scored.shift @ c
-    left = fit.left - Design(problem, [*model, one.columns]).times(np.append(moved, c))
+    left = fit.left - Design(problem, [*model, columns]).times(np.append(moved, c))
     noise = fit_noise(left, fit.noise.past, blocks=fit.noise.uneven, like=fit.noise)
-    before = fit.z - problem.centre
-    after = before + moved[: len(fit.z)]
-    pull = float(fit.prior[: len(fit.z)] @ (after**2 - before**2))
+    z = fit.z + moved[:q]
+    pull = float(fit.prior[:q] @ ((z - problem.centre) ** 2 - (fit.z - problem.centre) ** 2))
     gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
-    return gained - scored.best.price - float(np.log(one.trials))
+    if len(best.variance) < len(c):  # along one direction
+        curves = c.reshape(len(best.variance), -1)
+        direction = np.linalg.svd(curves, full_matrices=False)[2][0]
+        c, columns = curves @ direction, lambda rows: _along(one.columns(rows), direction)
+    coefficients = np.append(fit.coefficients + moved[q:], c)
+    prior = np.append(fit.prior, 1.0 / best.variance)
+    likelihood = fit.log_likelihood + gained
+    # no more than the description itself can gain: the rest is of a noise that found another optimum
+    evidence = min(scored.evidence, gained - best.price - float(np.log(one.trials)))
+    made = replace(
+        fit, log_likelihood=likelihood, z=z, coefficients=coefficients, prior=prior, noise=noise, left=left
+    )
+    return Fitted(evidence, columns, made, one.trials)
+
+
+def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
+    """(m, k) columns along one direction of (m, 3 k) along each axis."""
+    return np.asarray(part.reshape(len(part), -1, 3) @ direction)
 
 
 def _best_channel(problem: Problem, fit: Joint) -> str | None:

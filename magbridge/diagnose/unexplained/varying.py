@@ -52,7 +52,7 @@ def varying(problem: Problem, candidate: Candidate, trials: Mapping[str, float])
     width = np.full((1 + len(values)) * candidate.size, 30.0)
     return Description(
         columns, (("broadband", width),), candidate.channel, trials[candidate.cause],
-        holds=(candidate.cause,), turned=candidate.size == 3, wider=True,
+        holds=lambda other: other.cause == candidate.cause, turned=candidate.size == 3, wider=True,
     )  # fmt: skip
 
 

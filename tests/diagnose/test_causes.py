@@ -1,0 +1,55 @@
+"""The table of causes: a cause is one row, and nothing else in the package asks for one by its name."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import magbridge
+from magbridge.diagnose import causes
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.compare.problem import Problem
+
+ROOM = Path(causes.__file__).parent
+ELSEWHERE = {"magbridge/learning"}
+"""A learning bridge has a filter of its own, with states that are named after what they stand for."""
+
+
+def strings(path: Path) -> set[str]:
+    tree = ast.parse(path.read_text("utf-8"))
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+
+
+def test_a_cause_is_named_in_its_own_room_alone() -> None:
+    package = Path(magbridge.__file__).parent
+    unlike_words = set(CAUSES) - {
+        "hysteresis",
+        "map_error",
+    }  # a shape's name; a column that navigation writes
+    asked = {
+        path.relative_to(package.parent).as_posix(): sorted(unlike_words & strings(path))
+        for path in package.rglob("*.py")
+        if ROOM not in path.parents and unlike_words & strings(path)
+    }
+    assert {path for path in asked if Path(path).parent.as_posix() not in ELSEWHERE} == set()
+
+
+def test_a_cause_takes_one_row_and_one_function() -> None:
+    """Its name stands once in the table, and otherwise only in the module of its function."""
+    table = ROOM / "__init__.py"
+    for name, row in CAUSES.items():
+        places = [path for path in ROOM.glob("*.py") if path != table and name in strings(path)]
+        assert len(places) <= 1, (name, places)
+        assert row.candidates.__module__.startswith("magbridge.diagnose.causes.")
+        assert all((row.needs, row.separated_by, row.meaning))
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_what_a_row_puts_forward_has_its_name(name: str, problem: Problem) -> None:
+    assert {one.cause for one in CAUSES[name].candidates(problem)} <= {name}
