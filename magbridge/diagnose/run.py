@@ -45,9 +45,10 @@ __all__ = ["diagnose"]
 
 LOUD = 2.0
 """Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
-SLOW, NEGLIGIBLE = 0.4, 1e-5
-"""Share of a residual's power that is left in means over 64 samples from which it is far from white, and its
-RMS, as a share of the field, below which that does not matter."""
+SLOW, SMOOTH, NEGLIGIBLE = 0.4, 5.0, 1e-5
+"""A residual is far from white if so much of its power is left in means over 64 samples, or if its RMS is so
+many times what changes from one sample to the next (autoregressive noise of 0.96); and its RMS, as a share of
+the field, below which that does not matter."""
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 
@@ -248,7 +249,8 @@ def _slow(problem: Problem, fit: Joint) -> Leftover | None:
     """
     left = fit.left / problem.gain
     found = memory(problem, left)
-    if found.slow < SLOW or found.rms < NEGLIGIBLE * float(np.median(problem.survey.reference)):
+    far = found.slow >= SLOW or found.rms >= SMOOTH * found.white
+    if not far or found.rms < NEGLIGIBLE * float(np.median(problem.survey.reference)):
         return None
     power = found.means * found.samples * found.slow
     ratio = power * (found.rms / max(found.white, 1e-9)) ** 2
