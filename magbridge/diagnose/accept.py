@@ -10,9 +10,9 @@ import numpy as np
 from magbridge.diagnose.causes.candidates import Candidate, Group
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.gain import held_out
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds, margin
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.inference.state import Hypothesis, shaped_ratio

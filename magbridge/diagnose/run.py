@@ -23,10 +23,11 @@ from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis, Finding, counted
 from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
-from magbridge.diagnose.gain import Gain, held_out, paired
+from magbridge.diagnose.gain import Gain, paired
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers

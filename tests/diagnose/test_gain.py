@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal
 
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.gain import held_out
 from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.inference.left_out import held_out
 
 DIVES = 5
 

@@ -27,7 +27,6 @@ import numpy as np
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.gain import held_out
 from magbridge.diagnose.inference.evidence import (
     LEVEL,
     MOST_LEFT,
@@ -40,6 +39,7 @@ from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import BRIEFEST, autoregressive_order
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.rivals import Rival, sets_of
 from magbridge.diagnose.inference.state import Hypothesis, State, shaped_ratio

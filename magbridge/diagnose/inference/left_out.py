@@ -1,0 +1,77 @@
+r"""Dives that a fit has not seen: what it leaves of them, and how well it foretells them.
+
+Notes
+-----
+The *score* of a model is the log predictive density of every fold of dives, given the others. With l the log
+likelihood of the noise at the fit c to all dives, c_-f the fit without fold f, ``A_f^T A_f`` the information
+of that fold and P that of all folds and the prior, Laplace's approximation (exact for Gaussian noise, by
+Woodbury's identity) is
+
+.. math:: S = l - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
+              + \log\det P - \log\det (P - A_f^T A_f) \right]
+
+the log likelihood less the price of predicting each fold with coefficients learned from the others. The
+difference of two models' scores is the log of the odds that the left-out dives give one against the other:
+the pseudo-Bayes factor (Geisser & Eddy 1979, JASA 74:153).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.diagnose.compare.design_columns import Columns
+from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.design import Design, precomputed
+from magbridge.diagnose.inference.joint import Joint
+
+__all__ = ["HeldOut", "held_out"]
+
+FOLDS = 8
+"""Folds at most: each costs one solution of the normal equations."""
+
+
+class HeldOut(NamedTuple):
+    """(n,) residual, nT, of every sample under a fit that never saw its dive; and the model's score."""
+
+    left: FloatArray
+    score: float
+
+
+def held_out(
+    problem: Problem, columns: Sequence[Columns], fit: Joint, *, interleaved: bool = False
+) -> HeldOut:
+    """Leave out dives, fold by fold.
+
+    Nonlinear parameters and noise are those of the fit to all dives; every coefficient is fitted anew without
+    the fold. Folds are stretches of dives, so that a slow change must be foretold; or, `interleaved`, every
+    eighth dive, so that it need only be filled in.
+    """
+    X, noise, prior = Design(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
+    centre = np.append(problem.centre, np.zeros(X.effects))
+    c = np.append(fit.z, fit.coefficients)
+    y = noise.response(problem.residual - X.times(c))
+    dive = np.unique(problem.survey.dive, return_inverse=True)[1]
+    count, dives = min(FOLDS, int(dive.max()) + 1), int(dive.max()) + 1
+    ends = np.cumsum([len(some) for some in np.array_split(np.arange(dives), count)])
+    of = dive % count if interleaved else np.searchsorted(ends, dive, side="right")
+    P, b = np.zeros((count, c.size, c.size)), np.zeros((count, c.size))
+    for rows in X.pieces:
+        A = noise.whitened(X.rows, rows)
+        for k in np.unique(of[rows]):
+            fold_rows = A[of[rows] == k]
+            P[k] += fold_rows.T @ fold_rows
+            b[k] += fold_rows.T @ (y[rows][of[rows] == k] + fold_rows @ c)
+    whole_P, whole_b = P.sum(axis=0) + np.diag(prior), b.sum(axis=0) + prior * centre
+    others = whole_P - P
+    without = np.linalg.solve(others, (whole_b - b)[:, :, None])[:, :, 0]
+    left = np.empty(len(problem))
+    for rows in X.pieces:
+        left[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), without[of[rows]])
+    away = c - without
+    learned = np.einsum("fi,fij,fj->", away, others, away)
+    learned += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
+    return HeldOut(left, noise.log_likelihood - 0.5 * float(learned))
