@@ -30,8 +30,8 @@ from magbridge.fleet.catalogue import FORMAT, TABLES, TEXT, Catalogue, Row
 __all__ = ["FolderCatalogue"]
 
 MARK = "catalogue.json"
-MANY = 64
-"""Files of a table from which on they are made one."""
+MANY, SMALL = 64, 1000
+"""Files of a table, of fewer rows than that, from which on they are made one."""
 
 
 class FolderCatalogue(Catalogue):
@@ -39,6 +39,7 @@ class FolderCatalogue(Catalogue):
 
     def __init__(self, folder: Path, results: Path | None = None, *, create: bool = False) -> None:
         self.folder, self.name, self.results = folder, str(folder), results or folder / "results"
+        self._keys_of: dict[Path, frozenset[str]] = {}  # a file's content never changes
         mark = folder / MARK
         if create and not mark.exists():
             with atomic_path(mark) as beside:
@@ -55,26 +56,34 @@ class FolderCatalogue(Catalogue):
         return self._read(table, columns or tuple(TABLES[table])).drop("key").to_dicts()
 
     def compact(self) -> None:
-        """Make one file of each table's many.
+        """Make one file of each table's many small ones.
 
         What is removed is what is in the file just written, so rows are never lost, whoever else does so.
         """
         for table in TABLES:
-            files = self._files(table)
-            if len(files) < MANY:
-                continue
             with suppress(FileNotFoundError):  # another writer does the same
+                files = [path for path in self._files(table) if len(self._keys(path)) < SMALL]
+                if len(files) < MANY:
+                    continue
                 written = self._write(table, self._joined(table, files, tuple(TABLES[table])))
                 for path in files:
                     if path != written:
                         path.unlink(missing_ok=True)
 
     def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
-        known = set(self._read(table, ())["key"])
+        known = set[str]()
+        for path in self._files(table):
+            with suppress(FileNotFoundError):  # its rows are in another one now, or are written again
+                known |= keyed.keys() & self._keys(path)
         fresh = [{"key": key, **row} for key, row in keyed.items() if key not in known]
         if fresh:
             self._write(table, pl.DataFrame(fresh, schema={"key": TEXT, **TABLES[table]}))
         return len(fresh)
+
+    def _keys(self, path: Path) -> frozenset[str]:
+        if path not in self._keys_of:
+            self._keys_of[path] = frozenset(self._joined(path.parent.name, [path], ())["key"])
+        return self._keys_of[path]
 
     def _read(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
         while True:

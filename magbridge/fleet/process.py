@@ -20,6 +20,8 @@ __all__ = ["Outcome", "client_of", "process"]
 
 START = "120s"
 """Until processes of this machine are up: they import much, and it may be busy."""
+PACE = 64
+"""Deployments after which the catalogue is rearranged."""
 PATIENCE = "20s"
 """Until a scheduler that does not answer is given up."""
 
@@ -87,7 +89,7 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
     folder = catalogue.results.resolve()
     address = str(client.scheduler.address) if client.scheduler else "dask"
     futures = {client.submit(work, job, folder, pure=False): job for job in todo}
-    for future in as_completed(futures):
+    for number, future in enumerate(as_completed(futures), 1):
         job = futures[future]
         try:
             done = future.result()
@@ -98,7 +100,8 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
             raise PortError(address, "the dask scheduler was lost: run again to do what is left") from error
         future.release()
         yield _kept(catalogue, job, done)
-    catalogue.compact()
+        if number % PACE == 0 or number == len(futures):
+            catalogue.compact()
 
 
 def _kept(catalogue: Catalogue, job: Job, done: Done) -> Outcome:
