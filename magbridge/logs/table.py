@@ -138,7 +138,10 @@ class Table:
 
     def _whole(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
         """Return the lines that have as many fields as there are headings, and their numbers."""
-        lines, numbers = self._closed(lines, numbers)
+        open_quotes = [line.count('"') % 2 == 1 for line in lines]
+        lines, numbers = self._without(
+            open_quotes, lines, numbers, "expected every quote to be closed in its line"
+        )
         separator, width = self._layout.separator, len(self._layout.headings)
         counts = [
             len(cells(line, separator)) if separator == BLANKS or '"' in line else line.count(separator) + 1
@@ -147,22 +150,18 @@ class Table:
         if self._layout.open_ended:
             lines = [separator.join(line.split(separator, width)[:width]) + "\n" for line in lines]
             counts = [min(count, width) for count in counts]
-        wrong = np.array([count != width for count in counts])
-        if not wrong.any():
-            return lines, list(numbers)
-        self.faults.note("", wrong, numbers, f"expected {width} fields, not {counts[int(wrong.argmax())]}")
-        rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong.tolist(), strict=True) if not bad]
-        return [line for line, _ in rows], [number for _, number in rows]
+        wrong = [count != width for count in counts]
+        other = next((count for count in counts if count != width), width)
+        return self._without(wrong, lines, numbers, f"expected {width} fields, not {other}")
 
-    def _closed(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], Sequence[int]]:
-        """Return the lines without those in which a quotation mark is left open, and their numbers."""
-        if not any('"' in line for line in lines):
-            return lines, numbers
-        wrong = np.array([line.count('"') % 2 == 1 for line in lines])
-        if not wrong.any():
-            return lines, numbers
-        self.faults.note("", wrong, numbers, "expected every quote to be closed in its line")
-        rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong.tolist(), strict=True) if not bad]
+    def _without(
+        self, wrong: list[bool], lines: list[str], numbers: Sequence[int], text: str
+    ) -> tuple[list[str], list[int]]:
+        """Return the lines that are not wrong, and their numbers; the others are noted."""
+        if not any(wrong):
+            return lines, list(numbers)
+        self.faults.note("", np.array(wrong), numbers, text)
+        rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong, strict=True) if not bad]
         return [line for line, _ in rows], [number for _, number in rows]
 
     def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
