@@ -4,7 +4,7 @@ Random gliders survey rock of 60 nT in a criss-cross, with the IGRF as the only 
 run. Printed and drawn: the RMS error about its mean of the published field over the noise floor, in each
 stretch of the survey, and its claimed sigma, with and without the error of the level, which nobody sees.
 
-    python tools/live_nothing.py --seeds 4 --hours 24 -o docs/learning-from-nothing.svg
+    python tools/live_nothing.py --seeds 4 --hours 24 -o docs/figures/learning.png
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def draw(results: np.ndarray, file: Path) -> None:
     """Draw error and sigma (seeds, stretches, 3) against hours."""
     import matplotlib.pyplot as plt  # noqa: PLC0415 - only here
 
-    middle = np.sqrt(np.array(EDGES[:-1]) * np.array(EDGES[1:]))
+    flown = np.isfinite(results[:, :, 0]).any(0)
+    results, middle = results[:, flown], np.sqrt(np.array(EDGES[:-1]) * np.array(EDGES[1:]))[flown]
     figure, axes = plt.subplots(figsize=(7.0, 4.2), constrained_layout=True)
     for one in results:
         axes.plot(middle, one[:, 0], color="tab:blue", alpha=0.35, lw=1)
