@@ -25,6 +25,7 @@ from magbridge.cli import (
     fleet,
     info,
     navigate,
+    plan,
     survey,
 )
 from magbridge.cli.common import app, complain
@@ -43,6 +44,7 @@ __all__ = [
     "info",
     "main",
     "navigate",
+    "plan",
     "survey",
 ]
 

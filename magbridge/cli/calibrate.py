@@ -1,4 +1,4 @@
-"""Calibrate, and plan the runs to calibrate with."""
+"""Calibrate."""
 
 from __future__ import annotations
 
@@ -338,47 +338,3 @@ def _digests(files: tuple[Path, ...]) -> dict[str, str]:
             complain(f"{file}: identical to {first}; its samples are counted once")
     names = [file.name for file in seen.values()]
     return {str(file) if names.count(file.name) > 1 else file.name: key for key, file in seen.items()}
-
-
-@command("plan --calibration cal.json --mission FILE [OPTIONS]")
-def plan(
-    *,
-    calibration: Path,
-    mission: Path,
-    runs: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=100))] = 10,
-    roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
-    heading_reference: Heading = None,
-    reading: Reading = AS_THEY_SAY,
-    json: Json = False,
-) -> None:
-    """Choose the calibration runs to fly next: those that make the mission's worst error smallest.
-
-    Parameters
-    ----------
-    calibration
-        The calibration so far (cal.json).
-    mission
-        A log, real or simulated, that flies as the mission will: attitude, position, moving masses.
-    runs
-        Number of spirals.
-    roll
-        Largest bank angle in deg that the vehicle can fly in a spiral, either way.
-    heading_reference
-        What headings refer to. If not given: what the log says, else true north.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
-    """
-    from magbridge.calibration.file import load
-    from magbridge.calibration.planning import flight_plan
-    from magbridge.field.declination import with_true_heading
-    from magbridge.logs import read
-
-    with waiting("reading"):
-        deployment = with_true_heading(read(mission, options=reading.options), heading_reference)
-    note_losses(deployment.attrs)
-    known = load(calibration)
-    with waiting("planning"):
-        found = flight_plan.flight_plan(known, deployment, runs=runs, roll=roll)
-    print_result(flight_plan.facts(found, known), flight_plan.summary(found, known), json)

@@ -114,7 +114,13 @@ def navigate(
 
 
 def samples_of(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArray, RealArray]:
-    """Return time, total field and its sigma; NaN where a sample must not be used."""
+    """Return time (n,), s, total field and its sigma (n,), nT; NaN where a sample must not be used.
+
+    Raises
+    ------
+    FormatError
+        There is no total field, or time does not increase.
+    """
     if "total_field" not in deployment:
         raise FormatError(source, "expected total_field: correct the log with a calibration first")
     time = deployment["time"].to_numpy().astype(float)
@@ -146,7 +152,7 @@ def _glides(deployment: xr.Dataset) -> bool:
 
 
 def columns_of(deployment: xr.Dataset, names: Mapping[str, str]) -> dict[str, RealArray]:
-    """Return the columns that the log has, under their other names."""
+    """Return the columns (n,) that the log has, under their other names."""
     return {
         name: deployment[column].to_numpy().astype(float)
         for column, name in names.items()

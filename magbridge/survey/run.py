@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.crossings import far_off, jumped
+from magbridge.calibration.fitting.crossings import far_off
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
@@ -100,7 +100,8 @@ def survey(samples: Samples) -> Result:
     """
     warnings: list[str] = []
     far = far_off(samples.place)
-    warnings += jumped(int(far.sum()))
+    if far.any():
+        warnings.append(f"{int(far.sum())} samples far from all others (a jump in position): left out")
     samples = samples.part(~far)
     with threadpool_limits(1, "blas"):
         try:

@@ -123,6 +123,37 @@ def test_a_jump_in_position_is_left_out_and_told() -> None:
     assert sum(run.samples for run in found.calibration.runs) == len(data) - 3
 
 
+def test_samples_without_a_position_are_told_apart_from_a_jump() -> None:
+    """A hole in the positions is no jump; a fix that moves the rest of the track is one."""
+    data, _ = flown(legs=8)
+    assert data.place is not None
+    hole, moved = data.place.copy(), data.place.copy()
+    hole[300:350] = np.nan
+    moved[500:, 0] += 600.0
+    assert "50 samples without a position: left out" in fit(replace(data, place=hole), "survey").warnings
+    lines = fit(replace(data, place=moved), "survey").warnings
+    assert any("the position jumps by 60" in line and "--position-sigma" in line for line in lines)
+
+
+def test_two_vehicles_in_one_log_are_not_supported() -> None:
+    """Half of the log has another hard iron (300 nT): the fit must not pass for one that holds."""
+    data, _ = flown()
+    field = data.field.copy()
+    field[880:] += [300.0, -200.0, 150.0]
+    found = fit(replace(data, field=field), "survey")
+    assert not found.supported
+    assert any("two vehicles in one log" in line for line in found.calibration.doubts)
+
+
+def test_an_hour_is_fitted_with_an_honest_sigma() -> None:
+    data, true = flown(legs=8)
+    data, true = data.part(np.arange(len(data)) < 880), true[:880]
+    found = fit(data, "survey")
+    got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
+    apart = got.sigma**2 - level_of(found.calibration, data.field, np.empty((len(data), 0)), data.time) ** 2
+    assert 0.5 < np.std(got.total - true) / np.sqrt(np.median(apart)) < 1.25
+
+
 def test_a_track_that_drifts_is_bent_to_where_the_rock_repeats() -> None:
     """Positions that are slowly off by 150 m: as exact ones, where the fit knows that they may be."""
     data, true = flown(legs=20)

@@ -15,6 +15,7 @@ from magbridge.calibration.fitting.mission import Mission, expected_error
 from magbridge.calibration.model import identity
 from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
 from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
+from magbridge.calibration.planning.survey_patterns import propose
 from magbridge.errors import CalibrationError
 from sitl.mission import TABLE_1
 
@@ -58,3 +59,20 @@ def test_an_extended_calibration_is_not_planned_with() -> None:
     met = np.tile((20_000.0, 0.0, 45_000.0), (10, 1))
     with pytest.raises(CalibrationError, match="not one that diagnose extended"):
         plan(extended, Mission(met, np.empty((10, 0))), met[0], Limits(), runs=1)
+
+
+def test_a_survey_is_proposed_that_comes_back_to_its_places_on_other_courses(glider: Gliders) -> None:
+    """Criss-cross before lines, lines before a straight track, which says what it leaves open."""
+    flown = glider(1, 2).survey
+    ahead = 0.35 * (flown.time - flown.time[0])
+    survey = replace(flown, place=np.stack([ahead, 0.0 * ahead, 0.0 * ahead], axis=1))
+    before = expected_calibration(survey.ranges(), 52_000.0)
+    found = {one.name: one for one in propose(before, survey, hours=6.0)}
+    names = list(found)
+    assert names[0].startswith("criss-cross")
+    assert names[-1] == "straight ahead"
+    assert found[names[0]].worst < 0.1 * found["straight ahead"].worst
+    assert found["lines and ties"].rms < found["parallel lines"].rms
+    assert "never crossed your own track" in found["straight ahead"].open[0]
+    assert not found["criss-cross on all courses"].open
+    assert propose(before, survey, hours=12.0)[0].rms < found[names[0]].rms

@@ -260,6 +260,14 @@ def test_plan_for_a_mission_that_moves_one_of_two_masses(deployment: Path, comma
     assert command.refuses(*asked, "flat.nc").startswith("the mission has no sample with all of roll, pitch")
 
 
+def test_plan_of_a_survey_needs_no_calibration(deployment: Path, command: Command) -> None:
+    asked = "plan", "--mission", deployment
+    found = json.loads(command(*asked, "--survey", "3", "--parameter", "battpos", "--json").out)["surveys"]
+    assert found[0]["expected_worst_nT"] < found[-1]["expected_worst_nT"]
+    assert found[-1]["open"]
+    assert "expected --calibration, or --survey HOURS" in command(*asked, code=2).err
+
+
 def test_help_names_every_command(command: Command) -> None:
     text = command("--help").out
     assert re.findall(r"^│ ([a-z]+) ", text, re.MULTILINE) == sorted(name for name in app if name[0] != "-")

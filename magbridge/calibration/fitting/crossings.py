@@ -10,7 +10,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.observations import Observations
 
-__all__ = ["courses", "crossed", "crosses_itself", "far_off", "jumped", "left_open"]
+__all__ = ["courses", "crossed", "crosses_itself", "far_off", "jumped", "left_open", "left_open_by"]
 
 TURNED = 30.0
 """deg between two courses that cross."""
@@ -27,6 +27,8 @@ PLACES = (125.0, 250.0, 500.0)
 OFTEN, TWICE = 0.08, 2
 """Share of the places, and how many at least, that a survey meets again on another course if it tells its own
 rock: six hours of a glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
+LEAP = 100.0
+"""m beyond what the vehicle can have moved: a jump in position."""
 STILL = 5.0
 """m between samples, below which a course is not one."""
 
@@ -49,7 +51,12 @@ def left_open(data: Observations, length: float) -> Iterator[str]:
     """Say, in a pilot's words, what keeps rock of a `length`, m, from being told from the vehicle's field."""
     if data.place is None or data.unmapped is None or not data.unmapped.all():
         return
-    place, course = courses(data.place[:, :2])
+    yield from left_open_by(data.place[:, :2], length)
+
+
+def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
+    """Say what a track (n, 2), m, leaves open over rock of a `length`, m, that nobody has mapped."""
+    place, course = courses(track)
     if not len(place) or np.ptp(place, axis=0).max() < SHARE * length:
         return  # all at one place: the rock is a constant
     cells, reversed_cells = crossed(place, course, SHARE * length)
@@ -73,10 +80,25 @@ def far_off(place: FloatArray) -> BoolArray:
     return np.asarray(~(distance <= FARTHEST * usual))
 
 
-def jumped(count: int) -> Iterator[str]:
-    """Say that so many samples were left out for their position."""
-    if count:
-        yield f"{count} sample{'s' * (count > 1)} far from all others (a jump in position): left out"
+def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
+    """Say what was left out of places (n, 2), m, at times (n,), s, and whether the track jumps."""
+    without = ~np.isfinite(place).all(axis=1)
+    far = far_off(place) & ~without
+    for left_out, why in ((without, "without a position"), (far, "far from all others (a jump in position)")):
+        if count := int(left_out.sum()):
+            yield f"{count} sample{'s' * (count > 1)} {why}: left out"
+    kept = ~without & ~far
+    if kept.sum() < FEW:
+        return
+    step = np.linalg.norm(np.diff(place[kept], axis=0), axis=1)
+    usual = float(np.median(step / np.maximum(np.diff(time[kept]), 1e-3)))
+    beyond = step - FARTHEST * usual * np.diff(time[kept])
+    jumps = np.flatnonzero(beyond > LEAP)
+    if len(jumps) and usual > 0.0:
+        yield (
+            f"the position jumps by {step[jumps].max():.0f} m ({len(jumps)} jump{'s' * (len(jumps) > 1)} of "
+            f"more than {LEAP:.0f} m): a fix after dead reckoning? --position-sigma bends the track between"
+        )
 
 
 def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, int]:

@@ -56,6 +56,8 @@ shrinks all scales, and a real flight was off by as much that had met rock (0.88
 LEVEL = 145.0
 """nT, 1-sigma by which the total field at a site differs from a main-field model's: what its degrees do not
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
+LASTING = 0.98
+"""Autocorrelation of neighbours that no sensor's noise has beside a field in place."""
 UNSEEN = 270.0
 """deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
@@ -169,13 +171,14 @@ def fit(
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
-        far = np.zeros(len(data), bool)
+        away: tuple[str, ...] = ()
         if method == "auto" and data.place is not None:
-            far = far_off(data.place[:, :2]) & np.isfinite(data.place).all(axis=1)
-            data = data.part(~far)
+            known = np.isfinite(data.place[:, :2]).all(axis=1)
+            away = tuple(jumped(data.place[known, :2], data.time[known]))
+            data = data.part(~(far_off(data.place[:, :2]) & known))
         found = chosen(data, order, **options)
         if method == "auto":
-            found = replace(found, open=(*jumped(int(far.sum())), *left_open(data, UNKNOWN_LENGTH)))
+            found = replace(found, open=(*away, *left_open(data, UNKNOWN_LENGTH)))
         if (kept := found.details.pop("flown", None)) is not None:
             data = data.part(kept)
             found.details["ends"] = int((~kept).sum())
@@ -228,7 +231,8 @@ def _judged(found: Fit, data: Observations) -> Fit:
         if magnetic := magnetic_headings(calibration, data):
             mismatch.append(magnetic)
     ratio = expected_ratio(apart_from_level(calibration), data)
-    doubts = tuple(_doubts(ratio, calibration.noise.sensor, heading_gap(data)))
+    lasting = found.details.get("autocorrelation", 0.0)
+    doubts = tuple(_doubts(ratio, calibration.noise.sensor, heading_gap(data), lasting))
     if ratio > UNSUPPORTED:
         doubts = (*doubts, *found.open)
     unsupported = [f"the data do not support this fit: {'; '.join(doubts)}"] if doubts else []
@@ -252,8 +256,16 @@ def _judged(found: Fit, data: Observations) -> Fit:
     )
 
 
-def _doubts(ratio: float, noise: float, gap: float) -> Iterator[str]:
-    """Say why data do not support a fit: error over `noise` (nT), and widest gap of the headings (deg)."""
+def _doubts(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[str]:
+    """Say why data do not support a fit: error over `noise` (nT), widest gap of the headings (deg), memory.
+
+    `lasting` is the residual's autocorrelation where rock has been taken out of it.
+    """
+    if lasting > LASTING:
+        yield (
+            f"residuals of {noise:.0f} nT last for many samples (autocorrelation {lasting:.3f}) though the "
+            "rock is taken out: two vehicles in one log, an offset that jumped, or wrong positions"
+        )
     if ratio > UNSUPPORTED:
         yield (
             "at these pitches and positions, on any heading and with 10 degrees more roll, expect "

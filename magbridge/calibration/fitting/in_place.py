@@ -158,6 +158,7 @@ def fit_survey(
         raise CalibrationError(
             "method survey: expected latitude and longitude, and a field that is not known"
         )
+    away = tuple(jumped(data.place[:, :2], data.time))
     far = far_off(data.place[:, :2])
     if far.any():
         data = data.part(~far)
@@ -182,7 +183,7 @@ def fit_survey(
     fit = replace(
         fit,
         calibration=stated,
-        open=(*jumped(int(far.sum())), *left_open(data, choice.field.length)),
+        open=(*away, *left_open(data, choice.field.length)),
     )
     slow = survey.steady[:, 1:] @ found.z[q + 1 : q + survey.steady.shape[1]]
     return fit, InPlace(
@@ -211,6 +212,7 @@ def _details(found: _Answer, survey: SurveySamples) -> dict[str, Any]:
     return {
         "log_evidence": found.score,
         "determined": found.widths.determined,
+        "autocorrelation": choice.rho,
         "outliers": int((~survey.kept).sum()),
         "widths_nT": dict(zip(names, np.exp(found.widths.eta).tolist(), strict=True)),
         "rock": {

@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.planning.limits import Limits, settled, trim_of
-from magbridge.calibration.planning.plan import Plan, plan
+from magbridge.calibration.planning.plan import Plan, expected_calibration, plan
+from magbridge.calibration.planning.survey_patterns import Proposal, propose
 from magbridge.columns import require_units
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["facts", "flight_plan", "summary"]
+__all__ = ["facts", "flight_plan", "summary", "survey_plan"]
 
 
 def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
@@ -41,15 +43,46 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
     FormatError
         It lacks a parameter of the calibration, or has it in another unit.
     """
-    some = ("time", np.ones(mission.sizes["time"]))  # placeholder readings; zeros would count as missing
     require_units(mission, calibration.units)
     names = tuple(calibration.units)
-    data = observations(mission.assign({f"mag_{axis}": some for axis in "xyz"}), names)
+    data = _to_be_flown(mission, names)
     if data.reference_ned is None:
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
     flown = settled(data, calibration.parameters) if names else None
     limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
     return plan(calibration, Mission.of(data), np.nanmean(data.reference_ned, axis=0), limits, runs=runs)
+
+
+def survey_plan(
+    calibration: Calibration | None,
+    mission: xr.Dataset,
+    parameters: tuple[str, ...] = (),
+    *,
+    hours: float,
+    roll: float = 10.0,
+) -> list[Proposal]:
+    """Propose surveys that calibrate themselves, of so many `hours`; arguments as for :func:`flight_plan`.
+
+    Without a calibration they are for a vehicle nobody knows, whose masses' positions are `parameters`.
+
+    Raises
+    ------
+    CalibrationError, FormatError
+        As :func:`flight_plan`.
+    """
+    if calibration is not None:
+        require_units(mission, calibration.units)
+        parameters = tuple(calibration.units)
+    data = _to_be_flown(mission.drop_vars("reference_field", errors="ignore"), parameters)
+    if calibration is None:
+        calibration = expected_calibration(data.ranges(), float(np.median(data.reference)))
+    return propose(calibration, data, hours=hours, roll=roll)
+
+
+def _to_be_flown(mission: xr.Dataset, names: tuple[str, ...]) -> Observations:
+    """Return a mission's samples; what the magnetometer will read is of no account."""
+    some = ("time", np.ones(mission.sizes["time"]))  # zeros would count as missing
+    return observations(mission.assign({f"mag_{axis}": some for axis in "xyz"}), names)
 
 
 def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from magbridge.calibration.residual import Samples, independent, jacobian, resid
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError
 
-__all__ = ["Plan", "evaluate_runs", "expected_calibration", "plan"]
+__all__ = ["Design", "Plan", "evaluate_runs", "expected_calibration", "plan"]
 
 HEADINGS = 24
 SAMPLES = 225
@@ -87,7 +87,7 @@ def expected_calibration(
     )
 
 
-class _Design:
+class Design:
     """The linear algebra of candidate runs, linearised about one calibration."""
 
     def __init__(self, calibration: Calibration, mission: Mission, field_ned: FloatArray) -> None:
@@ -106,7 +106,7 @@ class _Design:
         self.points = jacobian(phi, g)
 
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return monomials and the residual's derivative at true fields in body axes."""
+        """Return monomials (n, m) and the residual's derivative (n, 9) at true fields (n, 3), nT, body axes."""
         calibration = self.calibration
         phi = monomials(positions, calibration.parameters, self.exponents)
         reading = forward(calibration, truth, positions, np.zeros(len(truth)))
@@ -131,12 +131,12 @@ class _Design:
         return np.asarray(np.einsum("ij,jk,ik->i", self.points, C, self.points))
 
     def after(self, C: FloatArray, F: FloatArray) -> FloatArray:
-        """Return C', the covariance after one more run."""
+        """Return C' (K, K), the covariance after one more run."""
         CF = C @ F
         return np.asarray(C - CF @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ CF, CF.T))
 
     def scores(self, C: FloatArray, factors: Sequence[FloatArray]) -> FloatArray:
-        """Return the mean power of the variance over the mission after each of the candidates."""
+        """Return the mean power of the variance over the mission after each of the candidates: (m,)."""
         PC, before = self.points @ C, self.variances(C)
         found = []
         for F in factors:
@@ -150,7 +150,7 @@ def evaluate_runs(
     calibration: Calibration, mission: Mission, field_ned: FloatArray, runs: Sequence[PlannedRun]
 ) -> Plan:
     """Return what given runs are expected to bring, one after the other; `field_ned` is (3,), nT."""
-    design = _Design(calibration, mission, field_ned)
+    design = Design(calibration, mission, field_ned)
     C = calibration.covariance
     course = [design.variances(C)]
     for run in runs:
@@ -187,7 +187,7 @@ def plan(
         The limits leave nothing to fly.
     """
     with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
-        design = _Design(calibration, mission, field_ned)
+        design = Design(calibration, mission, field_ned)
         candidates = candidate_runs(limits, calibration.parameters, LEVELS)
         if not candidates:
             raise CalibrationError("plan: no pitch, roll and position lie within the vehicle's limits")

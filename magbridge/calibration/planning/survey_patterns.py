@@ -1,0 +1,190 @@
+"""Which survey to fly so that it calibrates itself: what each pattern of legs would leave open.
+
+The vehicle trims, rolls and moves its masses as in the mission; a pattern gives each leg its course, and may
+bank every other leg. With the jacobians of the samples it would take and a Gaussian field in place
+(:mod:`~magbridge.calibration.fitting.joint`), the coefficients' covariance follows before it is flown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.boresight import field_body
+from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
+from magbridge.calibration.fitting.field_search import nodes_for
+from magbridge.calibration.fitting.joint import Linear, add_up, eliminate
+from magbridge.calibration.fitting.mission import Mission
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.prior import polynomial_prior
+from magbridge.calibration.fitting.solve import covariance_of
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.planning.plan import Design
+from magbridge.calibration.residual import jacobian
+from magbridge.errors import CalibrationError
+from magbridge.field.place.matern import Matern
+
+__all__ = ["Proposal", "facts", "propose", "summary"]
+
+ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
+"""nT, m and Matern's power of the rock that is expected, as nobody has been there."""
+LEVEL = 145.0
+"""nT, 1-sigma of the main field's level."""
+SAMPLES = 1_500
+"""Of a pattern: more are averaged."""
+SPIRAL = 1_800.0
+"""s of a spiral at the end."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A pattern, what is expected after it, and what it leaves open.
+
+    Attributes
+    ----------
+    name : str
+    rms, worst : float
+        nT, 1-sigma of the corrected field over the mission, about its mean.
+    crossings : int
+        Places met again on another course.
+    open : tuple of str
+    """
+
+    name: str
+    rms: float
+    worst: float
+    crossings: int
+    open: tuple[str, ...]
+
+
+def propose(
+    calibration: Calibration, data: Observations, *, hours: float, roll: float = 10.0
+) -> list[Proposal]:
+    """Return patterns of a survey that lasts so many hours, the best first.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Where to linearise, with the noise of a sample: the one so far, or what is expected of any vehicle.
+    data : Observations
+        The mission: attitude, position and masses as they will be.
+    hours : float
+        How long it may take.
+    roll : float
+        deg, by which the vehicle can bank either way.
+
+    Raises
+    ------
+    CalibrationError
+        The mission has no attitude or position, or does not move.
+    """
+    known, attitude, ned = data.directed()
+    if not known.any() or data.place is None:
+        raise CalibrationError("the mission needs roll, pitch, heading, latitude and longitude")
+    time, place = data.time[known], data.place[known, :2]
+    speed = float(np.median(np.hypot(*np.diff(place, axis=0).T) / np.maximum(np.diff(time), 1e-3)))
+    if not speed > 0.0:
+        raise CalibrationError("the mission does not move: no survey can be flown like it")
+    mission = Mission.of(data)
+    field = np.asarray(ned.mean(axis=0))
+    count = int(hours * 3600.0 / float(np.median(np.diff(time))))
+    rows = np.arange(0, count, max(count // SAMPLES, 1))
+    interval, as_flown = hours * 3600.0 / len(rows), rows % len(attitude)
+    noise = calibration.noise.sensor * max(len(rows) / count, 1e-9) ** 0.5
+    found = []
+    with threadpool_limits(1, "blas"):
+        design = Design(calibration, mission, field)
+        for name, course, bank in _patterns(len(rows), interval, speed, roll):
+            flown = np.column_stack([attitude[as_flown, 0] + bank, attitude[as_flown, 1], course])
+            step = speed * interval * np.stack([np.cos(course), np.sin(course)], axis=1)
+            where = np.cumsum(step, axis=0)
+            positions = data.parameters[known][as_flown]
+            rms, worst = _expected(design, flown, where, positions, noise)
+            met = sum(crossed(*courses(where), 0.25 * LENGTH))
+            found.append(Proposal(name, rms, worst, met, tuple(left_open_by(where, LENGTH))))
+    return sorted(found, key=lambda one: one.worst)
+
+
+def _patterns(
+    n: int, interval: float, speed: float, roll: float
+) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Yield name, course and bank (n,), rad, of every pattern of n samples, `interval` s apart."""
+    share, level = (np.arange(n) + 0.5) / n, np.zeros(n)
+    bank = np.radians(roll) * np.where(np.arange(n) * 24 // n % 2, 1.0, -1.0)
+    yield "straight ahead", np.zeros(n), level
+    yield "there and back", np.where(share < 0.5, 0.0, np.pi), level
+    lines = _lines(share, 8, speed * interval * n)
+    yield "parallel lines", lines, level
+    crossing = np.where(share < 0.5, _lines(2.0 * share, 5, speed * interval * n / 2.0), 0.0)
+    later = share >= 0.5
+    crossing[later] = 0.5 * np.pi - _lines(2.0 * share[later] - 1.0, 5, speed * interval * n / 2.0)
+    yield "lines and ties", crossing, level
+    leg = np.minimum((share * 24).astype(int), 23)
+    star = np.radians(125.0) * leg
+    yield "criss-cross on all courses", star, level
+    yield f"criss-cross, legs banked {roll:.0f} deg either way in turn", star, bank
+    turning = np.arange(n) * interval > (n * interval - SPIRAL)
+    circles = np.where(turning, 8.0 * np.pi * np.linspace(0.0, 1.0, n) * n * interval / SPIRAL, star)
+    yield "criss-cross, half an hour of spiral at the end", circles, np.where(turning, np.radians(roll), 0.0)
+
+
+def _lines(share: FloatArray, count: int, length: float) -> FloatArray:
+    """Return the course (n,), rad, over `count` parallel lines of `length` m, at shares (n,) of the way."""
+    aside = min(0.1, 0.5 * LENGTH * count / max(length, 1.0))  # of a line's part, from each to the next
+    part = share * count
+    line, within = part.astype(int), part % 1.0
+    return np.where(within > 1.0 - aside, 0.5 * np.pi, np.where(line % 2, np.pi, 0.0))
+
+
+def _expected(
+    design: Design, attitude: FloatArray, place: FloatArray, positions: FloatArray, noise: float
+) -> tuple[float, float]:
+    """Return RMS and worst 1-sigma over the mission, about its mean, nT, after a survey's samples."""
+    calibration = design.calibration
+    truth = field_body(attitude, np.tile(design.field_ned, (len(attitude), 1)))
+    phi, g = design.derivative(truth, positions)
+    names = tuple(one.name for one in calibration.parameters)
+    family = polynomial_prior(design.exponents, names, calibration.reference.field)
+    D = np.column_stack([np.zeros(len(phi)), jacobian(phi, g) @ family.E, -np.ones(len(phi))])
+    field = Matern(nodes_for(place, LENGTH), LENGTH, SMOOTH)
+    sums = add_up([Linear(D, -field.basis(place), np.zeros(len(phi), bool))])
+    H = eliminate(sums, field, ROCK / noise, 0.0).quadratic.H / noise**2
+    prior = np.append(family.widths(family.centre), LEVEL) ** -2.0
+    P = covariance_of(H + np.diag(prior))[:-1, :-1]
+    points = (design.points - design.points.mean(axis=0)) @ family.E
+    variance = np.einsum("ij,jk,ik->i", points, P, points)
+    return float(np.sqrt(variance.mean())), float(np.sqrt(variance.max()))
+
+
+def facts(found: list[Proposal]) -> dict[str, Any]:
+    """Return the proposals as plain values."""
+    return {
+        "surveys": [
+            {
+                "pattern": one.name,
+                "expected_rms_nT": one.rms,
+                "expected_worst_nT": one.worst,
+                "places_met_again": one.crossings,
+                "open": one.open,
+            }
+            for one in found
+        ]
+    }
+
+
+def summary(found: list[Proposal]) -> str:
+    """Return the proposals as a table."""
+    head = (
+        f"{'survey':52} {'met again':>9} {'error about the mean over the mission, nT: RMS':>48} {'worst':>7}"
+    )
+    lines = [f"{one.name:52} {one.crossings:9} {one.rms:48.2f} {one.worst:7.2f}" for one in found]
+    note = (
+        f"over rock of {ROCK:.0f} nT and {LENGTH:.0f} m, nothing known of the vehicle, no calibration run, "
+        "no map; the level stays as uncertain as the main field's"
+    )
+    return "\n".join([head, *lines, note])
