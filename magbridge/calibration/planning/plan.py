@@ -106,7 +106,7 @@ class Design:
         self.points = jacobian(phi, g)
 
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return monomials (n, m) and the residual's derivative (n, 9) at true fields (n, 3), nT, body axes."""
+        """Return monomials (n, m) and the residual's derivative (n, 9) at fields (n, 3), nT, body axes."""
         calibration = self.calibration
         phi = monomials(positions, calibration.parameters, self.exponents)
         reading = forward(calibration, truth, positions, np.zeros(len(truth)))
