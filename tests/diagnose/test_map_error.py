@@ -30,7 +30,7 @@ def drawn(whole: Problem, error: NDArray[np.float64], down: NDArray[np.float64])
 
 
 def fitted(problem: Problem, chart: Candidate) -> Joint:
-    assert chart.shapeless
+    assert chart.nonparametric
     return fit_joint(problem, [chart.columns], 1, spectra=[chart.spectra])
 
 

@@ -157,12 +157,12 @@ def test_a_candidate_profiled_again_stays_its_own_channels(problem: Problem) -> 
     seen = 0
     for cause in CAUSES.values():
         for candidate in cause.candidates(pose(survey, problem.calibration)):
-            if candidate.again is None:
+            if candidate.rebuild is None:
                 continue
             shape = [value for value, _ in candidate.shape.values()]
-            once = candidate.again(*shape)
-            assert once.again is not None
-            twice = once.again(*shape)
+            once = candidate.rebuild(*shape)
+            assert once.rebuild is not None
+            twice = once.rebuild(*shape)
             assert (twice.channel, twice.effects) == (candidate.channel, candidate.effects)
             np.testing.assert_array_equal(twice.columns(slice(0, 100)), candidate.columns(slice(0, 100)))
             seen += 1
@@ -177,8 +177,8 @@ def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Pro
     odds = {candidate.shape["onset"][0]: np.exp(candidate.likelier) for candidate in grid}
     assert odds[t[100] - 1.0] + odds[t[300]] == pytest.approx(0.5 * len(grid))
     assert sum(odds.values()) == pytest.approx(len(grid))
-    assert grid[0].again is not None
-    assert [grid[0].again(t[at]).likelier > 0.0 for at in (99, 101, 300)] == [True, False, True]
+    assert grid[0].rebuild is not None
+    assert [grid[0].rebuild(t[at]).likelier > 0.0 for at in (99, 101, 300)] == [True, False, True]
     assert {candidate.likelier for candidate in offset_step(problem)} == {0.0}
 
 

@@ -41,7 +41,7 @@ class Candidate:
         What it adds to the calibration; none where the reference is wrong, or what it was fitted to.
     shape : dict
         Nonlinear parameters: name -> (value, unit).
-    again : callable or None
+    rebuild : callable or None
         Shape's values -> the same candidate with those: for profiling.
     trials : float
         Number of independent hypotheses that this one was picked from (frequencies searched).
@@ -72,7 +72,7 @@ class Candidate:
     units: tuple[str, ...]
     effects: tuple[Effect, ...] = ()
     shape: dict[str, tuple[float, str]] = field(default_factory=dict)
-    again: Callable[..., Candidate] | None = None
+    rebuild: Callable[..., Candidate] | None = None
     trials: float = 1.0
     positive: bool = False
     likelier: float = 0.0
@@ -104,7 +104,7 @@ class Candidate:
         return 0.5 if self.positive or self.spectra is not None else 1.0
 
     @property
-    def shapeless(self) -> bool:
+    def nonparametric(self) -> bool:
         """Whether it is a Gaussian process: it takes any shape, and leaves no remnant of an idealised one."""
         return self.spectra is not None and not self.effects
 
@@ -127,7 +127,7 @@ class Candidate:
             units=self.units + other.units,
             effects=self.effects + other.effects,
             shape=self.shape | {name + mark: value for name, value in other.shape.items()},
-            again=None,
+            rebuild=None,
             likelier=self.likelier + other.likelier,
             narrow=self.narrow + other.narrow,
             parts=(*self.pieces, *other.pieces),
@@ -141,11 +141,11 @@ def slices(candidates: Sequence[Candidate], first: int = 0) -> list[slice]:
 
 def since(candidate: Candidate, learned: BoolArray) -> Candidate:
     """Return the same cause, absent from the samples (n,) that the calibration has `learned` from."""
-    again, fresh = candidate.again, ~learned
+    rebuild, fresh = candidate.rebuild, ~learned
     return replace(
         candidate,
         columns=Mixture(tuple((Since(X, fresh), M) for X, M in parts(candidate.columns))),
-        again=again and (lambda *shape: since(again(*shape), learned)),
+        rebuild=rebuild and (lambda *shape: since(rebuild(*shape), learned)),
         since=True,
     )
 

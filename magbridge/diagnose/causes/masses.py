@@ -129,9 +129,9 @@ def _plays(problem: Problem, name: str, shapes: Sequence[tuple[float, float, flo
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     unit = problem.survey.channels[name].unit
 
-    def again(width: float, centre: float, scale: float) -> Candidate:
+    def rebuild(width: float, centre: float, scale: float) -> Candidate:
         effect = PlayEffect(cause="hysteresis", channel=name, width=width, centre=centre, scale=scale)
         shape = {"width": (width, unit), "centre": (centre, unit), "scale": (scale, unit)}
-        return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, again=again)
+        return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, rebuild=rebuild)
 
-    return [again(2.0 * half * w, middle + half * c, half * s) for w, c, s in shapes]
+    return [rebuild(2.0 * half * w, middle + half * c, half * s) for w, c, s in shapes]

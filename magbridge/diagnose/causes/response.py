@@ -58,11 +58,11 @@ def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candid
     unit = problem.calibration.reference.field
     names = (f"{AXES[axis]} jump", f"{AXES[axis]} slope")
 
-    def again(knee: float) -> Candidate:
+    def rebuild(knee: float) -> Candidate:
         effect = ResponseEffect(cause="saturation", unit=unit, axis=axis, knee=knee)
         return of_effect(
             problem, effect, np.array([100.0, 0.1 * unit]), ("nT", per(f"{unit:.0f} nT")), names=names,
-            shape={"knee": (knee, "nT")}, again=again,
+            shape={"knee": (knee, "nT")}, rebuild=rebuild,
         )  # fmt: skip
 
-    return [again(knee) for knee in knees]
+    return [rebuild(knee) for knee in knees]

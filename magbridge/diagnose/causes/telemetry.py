@@ -61,17 +61,17 @@ def _warmed(
     field = problem.calibration.reference.field
     unit = "nT/degC" if on == "offset" else f"nT/degC per {field:.0f} nT"
 
-    def again(origin: float, lag: float) -> Candidate:
+    def rebuild(origin: float, lag: float) -> Candidate:
         lag = max(lag, 0.0)
         effect = ChannelEffect(
             cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, stages=STAGES, on=on
         )
         return of_effect(
             problem, effect, 5.0, unit, channel=name, shape={"origin": (origin, "degC"), "lag": (lag, "s")},
-            again=again, phi=_levels(problem)(name, lag), origin=origin,
+            rebuild=rebuild, phi=_levels(problem)(name, lag), origin=origin,
         )  # fmt: skip
 
-    return [again(origin, lag) for origin in _origins(problem, name) for lag in lags]
+    return [rebuild(origin, lag) for origin in _origins(problem, name) for lag in lags]
 
 
 def temperature_offset(problem: Problem) -> list[Candidate]:

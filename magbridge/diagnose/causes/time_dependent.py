@@ -29,15 +29,15 @@ def offset_step(problem: Problem) -> list[Candidate]:
     cycles = {*survey.cycles, *([first] if survey.learned.any() else [])}
     grid = np.unique([first, *onsets, *cycles])
 
-    def again(onset: float) -> Candidate:
+    def rebuild(onset: float) -> Candidate:
         effect = TimeEffect(cause="offset_step", shape="step", start=onset)
         alike = len(cycles) if max(onset, first) in cycles else len(grid) - len(cycles)
         return of_effect(
-            problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, again=again,
+            problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, rebuild=rebuild,
             likelier=float(np.log(0.5 * len(grid) / alike)) if cycles else 0.0,
         )  # fmt: skip
 
-    return [again(float(onset)) for onset in grid]
+    return [rebuild(float(onset)) for onset in grid]
 
 
 def offset_drift(problem: Problem) -> list[Candidate]:
@@ -81,11 +81,11 @@ def interference_tone(problem: Problem) -> list[Candidate]:
     ratio = np.where(frequency * float(np.ptp(t)) > 20.0, power / smooth, 0.0)
     made: list[Candidate] = []
 
-    def again(period: float) -> Candidate:
+    def rebuild(period: float) -> Candidate:
         effect = TimeEffect(cause="interference_tone", shape="tone", start=float(t[0]), period=period)
         names = tuple(f"{f} {axis}" for f in ("cos", "sin") for axis in AXES)
         return of_effect(
-            problem, effect, 10.0, "nT", names=names, shape={"period": (period, "s")}, again=again,
+            problem, effect, 10.0, "nT", names=names, shape={"period": (period, "s")}, rebuild=rebuild,
             trials=0.5 * len(t),
         )  # fmt: skip
 
@@ -93,7 +93,7 @@ def interference_tone(problem: Problem) -> list[Candidate]:
         peak = int(np.argmax(ratio))
         if ratio[peak] <= 0.0:
             break
-        made.append(again(1.0 / (_top(power, peak) * frequency[1])))
+        made.append(rebuild(1.0 / (_top(power, peak) * frequency[1])))
         ratio[max(peak - 4, 0) : peak + 5] = 0.0
     return made
 

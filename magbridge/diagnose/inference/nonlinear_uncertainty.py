@@ -66,7 +66,7 @@ def loosened(
         All candidates that were searched.
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
-    if all(piece.again is None for piece in pieces):
+    if all(piece.rebuild is None for piece in pieces):
         return fit
     more = _within(problem, pieces, columns, fit) + _beyond(problem, pieces, columns, fit, grid)
     return replace(fit, covariance=fit.covariance + 0.5 * (more + more.T))
@@ -90,12 +90,12 @@ def _within(
 
 def _slopes(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
     """Yield the derivative of the residual by each nonlinear parameter, in units of its cell."""
-    if piece.again is None:
+    if piece.rebuild is None:
         return
     values = [value for value, _ in piece.shape.values()]
     for k, cell in enumerate(piece.cells):
         near = [value + SHARE * cell * (n == k) for n, value in enumerate(values)]
-        moved = piece.again(*near)
+        moved = piece.rebuild(*near)
 
         def columns(rows: slice, moved: Candidate = moved) -> FloatArray:
             return np.asarray((moved.columns(rows) - piece.columns(rows)) @ b / SHARE)[:, None]
@@ -113,7 +113,7 @@ def _beyond(
     """(q + k, q + k) covariance added by all other cells."""
     more = np.zeros_like(fit.covariance)
     points = [
-        [c for c in grid if piece.again and (c.group, c.names) == (piece.group, piece.names)]
+        [c for c in grid if piece.rebuild and (c.group, c.names) == (piece.group, piece.names)]
         for piece in pieces
     ]
     every = [candidate for some in points for candidate in some]

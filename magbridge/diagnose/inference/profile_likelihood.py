@@ -27,7 +27,7 @@ def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: 
     peaks. The evidence pays for the choice: the average over the bracket counts, not the peak.
     """
     best, narrow = hypothesis, 0.0
-    if best.candidate.again is None:
+    if best.candidate.rebuild is None:
         return best
     for position, name in enumerate(best.candidate.shape):
         candidate, start, narrower = _profiled(state, model, best, base, position, name)
@@ -46,8 +46,8 @@ def _profiled(
     state: State, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
 ) -> tuple[Candidate, FloatArray, float]:
     """Return the best value's candidate, coefficients to begin from, and its share of the bracket."""
-    again = best.candidate.again
-    assert again is not None
+    rebuild = best.candidate.rebuild
+    assert rebuild is not None
     columns = [candidate.columns for candidate in model]
     low, high = _bracket(state, best.candidate, name)
     narrower = 0.0
@@ -57,7 +57,7 @@ def _profiled(
         for value in values[1:-1]:
             shape = [v for v, _ in best.candidate.shape.values()]
             shape[position] = float(value)
-            made.append(again(*shape))
+            made.append(rebuild(*shape))
         info = information(
             state.problem, best.fit.noise, base, [*(c.columns for c in made), *columns]
         ).fitted(base)
@@ -98,7 +98,7 @@ def refined(
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
         base = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
         model = [*others, own]
-        if own.again is not None:
+        if own.rebuild is not None:
             rest = state.fit(others, plain=False)
             ratio = 2.0 * (base.log_likelihood - rest.log_likelihood)
             best = sharpen(state, others, Hypothesis(own, ratio, 0.0, 0.0, base), rest)

@@ -146,7 +146,7 @@ def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Cand
 def _remnant(found: Hypothesis) -> float:
     """Return the signal-to-noise of what a cause's idealised regressor may leave of it."""
     size = found.signal_to_noise
-    return min(SMOOTH * size, MOST_LEFT) if found.candidate.shapeless else REMNANT * size
+    return min(SMOOTH * size, MOST_LEFT) if found.candidate.nonparametric else REMNANT * size
 
 
 def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float) -> Hypothesis | None:
@@ -211,9 +211,9 @@ def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | N
 
     That takes part in every slow shape, and what it leaves of a map's error passes for a second one.
     """
-    smooth = max((_remnant(h) for h in chosen if h.candidate.shapeless), default=0.0)
+    smooth = max((_remnant(h) for h in chosen if h.candidate.nonparametric), default=0.0)
     k = min(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
-    if not smooth or chosen[k].candidate.shapeless:
+    if not smooth or chosen[k].candidate.nonparametric:
         return None
     model = [h.candidate for h in chosen]
     others = model[:k] + model[k + 1 :]

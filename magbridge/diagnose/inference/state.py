@@ -78,7 +78,7 @@ def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint) -> float:
 
     `ratio` is that of the whole model.
     """
-    free = np.repeat([candidate.shapeless for candidate in model], [candidate.size for candidate in model])
+    free = np.repeat([one.nonparametric for one in model], [one.size for one in model])
     return min(ratio, fit.wald(np.flatnonzero(~free))) if free.any() else ratio
 
 
