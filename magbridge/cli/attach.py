@@ -68,7 +68,7 @@ def init(
     port = port or _ask("2. On which port?", _ports_told(), "/dev/ttyUSB*", asks, "--port")
     default = "udpout:127.0.0.1:14550"
     link = link or _ask("3. Where is the autopilot or the ground station?", "", default, asks, "--link")
-    number = system or int(_ask("4. The vehicle's system id?", "", "1", asks, "--system"))
+    number = system or _system(_ask("4. The vehicle's system id?", "", "1", asks, "--system"))
     names = parameter
     if not names and known is None and asks:
         told = "as: battpos [in], ballast [cm3]; none: press Enter"
@@ -117,8 +117,17 @@ def _ask(question: str, told: str, default: str, asks: bool, flag: str) -> str:
         return default
     if told:
         print(told)
-    answer = input(f"{question} [{default}] " if default else f"{question} ").strip()
+    try:
+        answer = input(f"{question} [{default}] " if default else f"{question} ").strip()
+    except EOFError:
+        raise WrongUse("no answer: nothing is written") from None
     return answer or default
+
+
+def _system(answer: str) -> int:
+    if not (answer.isdecimal() and 1 <= int(answer) <= 255):
+        raise WrongUse(f"expected a system id from 1 to 255, not {answer!r}: nothing is written")
+    return int(answer)
 
 
 def _drivers_told() -> str:

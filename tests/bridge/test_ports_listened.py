@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import pty
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import reduce
 from operator import xor
 from pathlib import Path
@@ -142,3 +144,37 @@ def test_init_says_what_is_left_to_fill_in(command: Command) -> None:
 def test_what_is_wrong_is_one_line(arguments: str, words: str, command: Command) -> None:
     code = 1 if "calibration" in arguments else 2
     assert words in command(*arguments.split(), code=code).err
+
+
+@pytest.mark.parametrize(
+    ("typed", "words"),
+    [
+        (b"hmr2300\nloop://\n\n7\nbattpos [in]\n", "bridge.toml: written; next: magbridge run --check"),
+        (
+            b"hmr2300\nloop://\n\nseven\n",
+            "expected a system id from 1 to 255, not 'seven': nothing is written",
+        ),
+        (b"hmr2300\nloop://\n\x04", "no answer: nothing is written"),
+    ],
+    ids=["answered", "no number", "Ctrl-D"],
+)
+def test_init_asks_five_questions_on_a_terminal(typed: bytes, words: str, here: Path) -> None:
+    master, slave = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "magbridge", "init"], stdin=slave, stdout=slave, stderr=slave, cwd=here
+    ) as process:
+        os.close(slave)
+        os.write(master, typed)
+        said = b""
+        with suppress(OSError):  # the terminal ends with its last program
+            while piece := os.read(master, 4096):
+                said += piece
+    os.close(master)
+    text = said.decode()
+    assert words in text
+    assert "Traceback" not in text
+    written = (here / "bridge.toml").exists()
+    assert written == (process.returncode == 0)
+    if written:
+        assert load("bridge.toml").link.system == 7
+        assert load("bridge.toml").telemetry["battpos"].unit == "in"
