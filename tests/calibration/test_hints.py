@@ -11,13 +11,16 @@ from magbridge.calibration.fitting.observe import observations
 from sitl import load, simulate
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 5])
 @pytest.mark.parametrize("declared", [("battpos",), ("battpos", "ballast")])
-def test_a_mass_that_was_left_out_is_named(declared: tuple[str, ...]) -> None:
-    log = simulate(load("demo"), 5)
+def test_a_mass_that_was_left_out_is_named(declared: tuple[str, ...], seed: int) -> None:
+    """Also one that nearly always moves with the declared one, as a glider's ballast with its battery."""
+    log = simulate(load("demo"), seed)
     data = observations(log, declared)
     rows = np.searchsorted(log["time"].to_numpy(), data.time)
     noise = np.random.default_rng(2).normal(size=len(data))
-    columns = {"noise": noise, "clock": data.time, "ballast": log["ballast"].to_numpy()[rows]}
+    others = {name: log[name].to_numpy()[rows] for name in ("ballast", "sensor_temperature")}
+    columns = {"noise": noise, "walk": np.cumsum(noise), "clock": data.time, **others}
     others = {name: column for name, column in columns.items() if name not in declared}
     said = undeclared(fit(data, "auto").calibration, data, others)
     if "ballast" in declared:

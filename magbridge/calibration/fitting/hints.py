@@ -13,12 +13,17 @@ from magbridge.calibration.model import Calibration
 
 __all__ = ["undeclared", "worths"]
 
-PARTS = 8
-"""Parts of a log, of which each is left out in turn."""
+PARTS, BLOCKS = 8, 32
+"""Parts of a log, of which each is left out in turn; and the blocks of neighbours that they are dealt. A mass
+that nearly always moves with a declared one is known only by a few: no part may have them all."""
 BETTER = 0.8
 """Share of the residual that must be left on the parts left out, for a column to be named."""
 LEAST = 2.0
 """nT, below which nothing is said."""
+NAMED = 3
+"""Columns that are named at most, each beside those before it: what only resembles a mass is not a second."""
+WORTHY = 0.5
+"""Share of the first one's worth that another must have: a mass's higher powers leave what anything fits."""
 
 
 def undeclared(calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray]) -> list[str]:
@@ -39,21 +44,33 @@ def undeclared(calibration: Calibration, data: Observations, columns: Mapping[st
     residual is regressed on ``u, c u, c^2 u`` beside the same of each declared parameter, which without c
     may have taken some of its part; what c adds is measured on parts left out.
     """
-    found = worths(calibration, data, columns)
-    strongest = sorted(found, key=lambda name: -found[name])[:3]
-    return [
-        f"column {name!r} is not declared and moves the field, by about {found[name]:.0f} nT here: "
-        f"--parameter {name}"
-        for name in strongest
-    ]
+    lines: list[str] = []
+    beside: tuple[str, ...] = ()
+    first = 0.0
+    while len(beside) < NAMED and (found := worths(calibration, data, columns, beside=beside)):
+        name = max(found, key=lambda one: found[one])
+        if found[name] < WORTHY * first:
+            break
+        first = first or found[name]
+        beside = (*beside, name)
+        lines.append(
+            f"column {name!r} is not declared and moves the field, by about {found[name]:.0f} nT here: "
+            f"--parameter {name}"
+        )
+    return lines
 
 
 def worths(
-    calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray], better: float = BETTER
+    calibration: Calibration,
+    data: Observations,
+    columns: Mapping[str, FloatArray],
+    better: float = BETTER,
+    beside: tuple[str, ...] = (),
 ) -> dict[str, float]:
     """Return what each column explains of a fit's residual on parts left out, nT; see :func:`undeclared`.
 
-    Columns that leave more than the share `better` of it are left out.
+    Columns that leave more than the share `better` of it are left out, and so are those `beside` which the
+    others are looked at.
     """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
         return {}
@@ -64,12 +81,15 @@ def worths(
     for name, column in columns.items():
         known = np.isfinite(column) & np.isfinite(residual)
         c = column[known]
-        if known.sum() < 10 * PARTS or not np.ptp(c) > 0.0:
+        if name in beside or known.sum() < 10 * PARTS or not np.ptp(c) > 0.0:
             continue
         declared = [_moved(one, direction[known], 3) for one in data.parameters[known].T]
-        plain = np.column_stack([direction[known], np.ones(len(c)), *declared])
+        given = [_moved(np.nan_to_num(columns[one][known]), direction[known], 2) for one in beside]
+        plain = np.column_stack([direction[known], np.ones(len(c)), *declared, *given])
         without = _left_out(plain, residual[known])
-        left = _left_out(np.column_stack([plain, _moved(c, direction[known], 2)]), residual[known])
+        # a mass that was in two places has no second power to tell
+        powers = (np.column_stack([plain, _moved(c, direction[known], order)]) for order in (1, 2))
+        left = min(_left_out(design, residual[known]) for design in powers)
         worth = float(np.sqrt(max(without**2 - left**2, 0.0)))
         if left < better * without and worth > LEAST:
             found[name] = worth
@@ -84,7 +104,7 @@ def _moved(c: FloatArray, direction: FloatArray, order: int) -> FloatArray:
 
 def _left_out(design: FloatArray, residual: FloatArray) -> float:
     """Return the RMS of (n,) `residual` less what (n, m) `design` explains of it, on parts left out."""
-    part = np.arange(len(residual)) * PARTS // len(residual)
+    part = np.arange(len(residual)) * BLOCKS // len(residual) % PARTS
     rest = residual.copy()
     for k in range(PARTS):
         out = part == k
