@@ -42,7 +42,7 @@ class Kind(NamedTuple):
         Returns the values of a message by name.
     columns : callable
         Returns column, unit and values of the topic's name, its number among those of this type (from 0), and
-        the values of all messages.
+        the values of all messages. Of several topics that have a column, the first is taken.
     header : bool
         It begins with a ``std_msgs/Header``.
     doubles : int
@@ -65,10 +65,12 @@ def _numbered(number: int) -> str:
 
 
 def _angles(v: Values) -> Columns:
-    """Yield roll, pitch and heading (deg) of the quaternion that turns FLU into ENU."""
+    """Yield roll, pitch and heading (deg) of the quaternion that turns FLU into ENU, if it is ever known."""
     x, y, z, w = (v[f"q{axis}"] for axis in "xyzw")
     norm = x * x + y * y + z * z + w * w
     known = (np.abs(norm - 1) < 0.1) & (v["unknown"] != -1)  # the first covariance is -1: no orientation
+    if not known.any():
+        return
     x, y, z, w = (np.where(known, one, np.nan) for one in (x, y, z, w))
     # of the rotation from FLU to ENU; FRD has the opposite y and z, NED swaps x and y and has the opposite z
     down_x, down_y, down_z = -2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
@@ -83,11 +85,6 @@ def _imu_row(m: Any) -> dict[str, float]:
     return {"qx": q.x, "qy": q.y, "qz": q.z, "qw": q.w, "unknown": float(m.orientation_covariance[0])}
 
 
-def _imu(_: str, number: int, v: Values) -> Columns:
-    if not number:
-        yield from _angles(v)
-
-
 def _fix_row(m: Any) -> dict[str, float]:
     fixed = m.status.status >= 0
     return (
@@ -95,8 +92,8 @@ def _fix_row(m: Any) -> dict[str, float]:
     )
 
 
-def _fix(_: str, number: int, v: Values) -> Columns:
-    if not number and v:
+def _fix(_: str, __: int, v: Values) -> Columns:
+    if v:
         yield "latitude", "deg", v["lat"]
         yield "longitude", "deg", v["lon"]
         yield "altitude", "m", v["alt"]
@@ -182,7 +179,7 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind(MAGNETIC, _vector, _nothing, doubles=12),
-        Kind("sensor_msgs/Imu", _imu_row, _imu, doubles=37),
+        Kind("sensor_msgs/Imu", _imu_row, lambda _, __, v: _angles(v), doubles=37),
         Kind("sensor_msgs/NavSatFix", _fix_row, _fix),
         Kind("nav_msgs/Odometry", _odometry_row, _odometry),
         Kind(

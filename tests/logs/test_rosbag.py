@@ -20,12 +20,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 T0 = 1_700_000_000
 ANGLES = np.random.default_rng(0).uniform([-180, -89, 0], [180, 89, 360], (40, 3))
 FIELD = np.random.default_rng(1).normal(0, 3e-5, (40, 3))
 """T, in ROS' axes."""
+RC_OUT = "std_msgs/Header header\nuint16[] channels\n"
 
 
 def bag(
@@ -38,6 +39,7 @@ def bag(
     """Write a bag: ``ros1``, ``sqlite3`` or ``mcap``."""
     one = kind == "ros1"
     store = get_typestore(Stores.ROS1_NOETIC if one else Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(RC_OUT, "mavros_msgs/msg/RCOut"))
     types: Any = store.types
     writer: Any = (
         Writer1(path)
@@ -59,10 +61,14 @@ def bag(
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, message, typestore=store)
             writer.write(
-                topics[topic], (T0 * 10 + k) * 100_000_000 + 7, serialize(types[message](**fields), message)
+                topics[topic],
+                (T0 * 10 + k) * 100_000_000 + 10**6,
+                serialize(types[message](**fields), message),
             )
 
         for k, (angles, field) in enumerate(zip(ANGLES, FIELD, strict=True)):
+            if more is not None:
+                more(say, types, header, k, frame)
             # from FRD to NED, turned to FLU and ENU
             turned = Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix()
             enu = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]) @ turned @ np.diag([1, -1, -1.0])
@@ -77,8 +83,6 @@ def bag(
                 "/joints", "sensor_msgs/msg/JointState", k, header=header(k, ""), name=["arm lift", "grip"],
                 position=np.array([0.01 * k, 1.0]), velocity=np.array([]), effort=np.array([]),
             )  # fmt: skip
-            if more is not None:
-                more(say, types, header, k, frame)
             say(
                 "/imu/mag", "sensor_msgs/msg/MagneticField", k, header=header(k, "mag" * (1 + k % 2)),
                 magnetic_field=vector(*(scale * field)), magnetic_field_covariance=nine,
@@ -167,6 +171,84 @@ def test_an_odometry_of_its_own_frame_is_no_position(tmp_path: Path) -> None:
     back = logs.read(bag(tmp_path / "log", frame="odom", more=_odometry))
     assert "local_east" not in back
     np.testing.assert_allclose(back["odom_x"], 0.2 * np.arange(40))
+
+
+def _robot(say: Any, types: Any, header: Any, k: int, _: str) -> None:
+    """Say all that a robot with mavros does: a fix that is lost at times, a battery, servos, sensors."""
+    status = types["sensor_msgs/msg/NavSatStatus"](status=-1 if k % 4 == 3 else 0, service=1)
+    say(
+        "/mavros/global_position/global", "sensor_msgs/msg/NavSatFix", k, header=header(k, ""), status=status,
+        latitude=47.0 + 1e-4 * k, longitude=8.0 - 1e-4 * k, altitude=400.0 + k,
+        position_covariance=np.zeros(9), position_covariance_type=0,
+    )  # fmt: skip
+    battery = {
+        field: np.array([], np.float32) if field.startswith("cell_") else
+        "" if field in {"location", "serial_number"} else False if field == "present" else 0
+        for field in types["sensor_msgs/msg/BatteryState"].__dataclass_fields__
+        if field not in {"header", "__msgtype__"} and not field.isupper() and "SUPPLY_" not in field
+    }  # fmt: skip
+    for number in range(2):
+        known = battery | {"voltage": 16.0 - number, "current": -0.5 * k - number}
+        say(f"/battery{number}", "sensor_msgs/msg/BatteryState", k, header=header(k, ""), **known)
+    channels = np.array([1500 + k, 0, 1100], np.uint16)
+    say("/mavros/rc/out", "mavros_msgs/msg/RCOut", k, header=header(k, ""), channels=channels)
+    say("/board", "sensor_msgs/msg/Temperature", k, header=header(k, ""), temperature=20.0 + k, variance=0.0)
+    say(
+        "/air", "sensor_msgs/msg/FluidPressure", k, header=header(k, ""), fluid_pressure=1e5 + k, variance=0.0
+    )
+    say("/keel/angle", "std_msgs/msg/Float64", k, data=0.1 * k)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3"])
+def test_whatever_a_robot_says_is_as_rosbags_reads_it(kind: str, tmp_path: Path) -> None:
+    path = bag(tmp_path / ("log.bag" if kind == "ros1" else "log"), kind, more=_robot)
+    theirs: dict[str, list[Any]] = {}
+    with AnyReader([path]) as reader:
+        for connection, _, raw in reader.messages():
+            theirs.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+    back = logs.read(path)
+    fixes = theirs["/mavros/global_position/global"]
+    # the last fix before a row: of every fourth there is none
+    last = [fixes[k - (k % 4 == 3)] for k in range(40)]
+    expected = {
+        "latitude": [one.latitude for one in last],
+        "longitude": [one.longitude for one in last],
+        "altitude": [one.altitude for one in last],
+        "battery_current": [-one.current for one in theirs["/battery0"]],
+        "battery_voltage": [one.voltage for one in theirs["/battery0"]],
+        "battery2_current": [-one.current for one in theirs["/battery1"]],
+        "battery2_voltage": [one.voltage for one in theirs["/battery1"]],
+        "servo1": [one.channels[0] for one in theirs["/mavros/rc/out"]],
+        "servo3": [one.channels[2] for one in theirs["/mavros/rc/out"]],
+        "board_temperature": [one.temperature for one in theirs["/board"]],
+        "pressure": [0.01 * one.fluid_pressure for one in theirs["/air"]],
+        "arm_lift": [one.position[0] for one in theirs["/joints"]],
+        "grip": [one.position[1] for one in theirs["/joints"]],
+    }
+    for name, values in expected.items():
+        np.testing.assert_allclose(back[name], values, rtol=1e-12, err_msg=name)
+    # it has no header, and is stamped by the recorder 1 ms later than the row
+    np.testing.assert_allclose(back["keel_angle"][1:], 0.1 * np.arange(39), err_msg="keel_angle")
+    assert back["battery_current"].attrs["units"] == "A"
+    known = {"mag_x", "mag_y", "mag_z", "roll", "pitch", "heading", "keel_angle", *expected}
+    assert set(back.data_vars) == known
+
+
+def test_an_imu_that_knows_no_orientation_gives_none(tmp_path: Path) -> None:
+    """Its first covariance is -1; the quaternion says nothing."""
+
+    def other(say: Any, types: Any, header: Any, k: int, _: str) -> None:
+        vector, nine = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 9.8), np.zeros(9)
+        say(
+            "/a_raw", "sensor_msgs/msg/Imu", k, header=header(k, "imu"),
+            orientation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            orientation_covariance=np.array([-1.0, *[0.0] * 8]), angular_velocity=vector,
+            angular_velocity_covariance=nine, linear_acceleration=vector, linear_acceleration_covariance=nine,
+        )  # fmt: skip
+
+    back = logs.read(bag(tmp_path / "log", more=other))
+    for name, values in zip(("roll", "pitch", "heading"), ANGLES.T, strict=True):
+        np.testing.assert_allclose(back[name], values, atol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize("kept", [0.3, 0.9])

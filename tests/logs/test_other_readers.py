@@ -1,0 +1,225 @@
+"""Every column beside another reader's: xarray, pyulog, pymavlink, on made files and on measured data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import degrees
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+from flash import Log
+from ulogs import Said, ulog_of
+
+from magbridge import logs
+from magbridge.logs.resample import MAX_AGE
+
+Series = tuple[list[float], list[float]]
+"""Times, s, and values."""
+
+
+def carried(at: np.ndarray, series: Series) -> list[float]:
+    """Return, one by one, the last value at or before each time: what :func:`.resample.latest` is to do."""
+    found = []
+    for now in at.tolist():
+        known = [(t, v) for t, v in zip(*series, strict=True) if t <= now and np.isfinite(v)]
+        found.append(known[-1][1] if known and now - known[-1][0] <= MAX_AGE else np.nan)
+    return found
+
+
+def test_a_trajectory_is_as_xarray_reads_it(tmp_path: Path) -> None:
+    """Packed integers, a fill value, days since a date, a record dimension: xarray decodes all of them."""
+    rng = np.random.default_rng(4)
+    path = tmp_path / "other.nc"
+    with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as file:
+        file.createDimension("obs", None)
+        time = file.createVariable("time", "f8", ("obs",))
+        time.setncatts({"units": "days since 2020-02-28", "standard_name": "time"})
+        time[:] = np.arange(50) / 86_400.0
+        for name, kind, more in (
+            ("mag_x", "i2", {"scale_factor": 3.5, "add_offset": 100.0, "units": "nT"}),
+            ("mag_y", "f4", {"units": "nT"}),
+            ("mag_z", "i4", {"units": "nT"}),
+            ("pump", "f8", {"units": "A"}),
+        ):
+            variable = file.createVariable(name, kind, ("obs",), fill_value=-99)
+            variable.setncatts(more)
+            variable.set_auto_maskandscale(False)
+            variable[:] = rng.integers(-3000, 3000, 50)
+            variable[[3, 7]] = -99
+    theirs = xr.open_dataset(path)
+    back = logs.read(path)
+    np.testing.assert_allclose(
+        back["time"],
+        theirs["time"].to_numpy().astype("datetime64[us]").astype(float) * 1e-6,
+        rtol=0,
+        atol=1e-5,
+    )
+    assert set(back.data_vars) == set(theirs.data_vars) - {"time"}
+    for name in back.data_vars:
+        np.testing.assert_allclose(back[name], theirs[name], rtol=1e-6, err_msg=str(name))
+        assert np.flatnonzero(np.isnan(back[name])).tolist() == [3, 7]
+
+
+@pytest.mark.real
+def test_a_seaglider_is_as_xarray_reads_it(real_data: Path) -> None:
+    path = sorted((real_data / "seaglider_sg167").glob("*.nc"))[0]
+    back, theirs = logs.read(path), xr.open_dataset(path, decode_times=False)
+    np.testing.assert_allclose(back["time"], theirs["time"], rtol=0, atol=1e-6)
+    for ours, name, scale in (
+        *((f"mag_{axis}", f"eng_mag_{axis}", 100.0) for axis in "xyz"),
+        ("roll", "eng_rollAng", 1.0), ("pitch", "eng_pitchAng", 1.0), ("heading", "eng_head", 1.0),
+        ("pitchCtl", "eng_pitchCtl", 1.0), ("rollCtl", "eng_rollCtl", 1.0), ("vbdCC", "eng_vbdCC", 1.0),
+        ("depth", "depth", 1.0),
+    ):  # fmt: skip
+        np.testing.assert_allclose(back[ours], scale * theirs[name], rtol=1e-7, err_msg=ours)
+    inside = (back["time"] > float(theirs["ctd_time"][0])) & (back["time"] < float(theirs["ctd_time"][-1]))
+    for ours, name in (("latitude",) * 2, ("longitude",) * 2, ("water_temperature", "temperature")):
+        between = np.interp(back["time"], theirs["ctd_time"], theirs[name])
+        np.testing.assert_allclose(back[ours][inside], between[inside], rtol=1e-9, err_msg=ours)
+
+
+def _px4() -> bytes:
+    """Return a log of all that is read of PX4, each topic at its own rate."""
+    axes = "float x;float y;float z;"
+    topics = {
+        "sensor_mag": (f"uint64_t timestamp;uint32_t device_id;{axes}", "<QI3f"),
+        "vehicle_attitude": ("uint64_t timestamp;float[4] q;", "<Q4f"),
+        "vehicle_global_position": ("uint64_t timestamp;double lat;double lon;", "<Q2d"),
+        "vehicle_local_position": (f"uint64_t timestamp;{axes}", "<Q3f"),
+        "battery_status": ("uint64_t timestamp;float voltage_v;float current_a;", "<Q2f"),
+        "vehicle_air_data": ("uint64_t timestamp;float baro_pressure_pa;", "<Qf"),
+        "actuator_outputs": ("uint64_t timestamp;float[4] output;", "<Q4f"),
+        "actuator_motors": ("uint64_t timestamp;float[4] control;", "<Q4f"),
+    }
+    said: Said = []
+    for k in range(30):
+        us = 2_000_000 + 100_000 * k
+        said.append(("sensor_mag", 0, (us, 11, 0.2 + 0.01 * k, 0.1, -0.4)))
+        if k % 2:
+            said.append(("actuator_outputs", 0, (us + 7, 1100.0 + k, 0.0, 1200.0, 0.0)))
+            said.append(("actuator_motors", 0, (us + 9, 0.01 * k, 0.0, 0.5, 0.0)))
+        if k % 3 == 0:
+            said.append(("vehicle_local_position", 0, (us - 5, 1.0, 2.0, -0.1 * k)))
+            said += [("battery_status", n, (us + 3, 16.0 - n, -1.0 if k == 6 else k + n)) for n in range(2)]
+        if k % 5 == 1:
+            said.append(("vehicle_global_position", 0, (us, 47.0 + 1e-5 * k, 8.0)))
+            said.append(("vehicle_air_data", 0, (us, 1e5 + k)))
+            said.append(("vehicle_attitude", 0, (us, 1.0, 0.0, 0.0, 0.0)))
+    return ulog_of(topics, {"CAL_MAG0_ID": 11}, said)
+
+
+def test_every_column_of_px4_is_as_pyulog_reads_it(tmp_path: Path) -> None:
+    pyulog = pytest.importorskip("pyulog")
+    path = tmp_path / "log.ulg"
+    path.write_bytes(_px4())
+    theirs = pyulog.ULog(str(path))
+
+    def series(topic: str, field: str, number: int = 0, scale: float = 1.0) -> Series:
+        (one,) = [one for one in theirs.data_list if (one.name, one.multi_id) == (topic, number)]
+        values = one.data[field].astype(float) * scale
+        if field == "current_a":
+            values[values == -1.0] = np.nan  # not measured
+        return (one.data["timestamp"] * 1e-6).tolist(), values.tolist()
+
+    back = logs.read(path)
+    expected = {
+        **{f"mag_{axis}": series("sensor_mag", axis, scale=1e5) for axis in "xyz"},
+        "latitude": series("vehicle_global_position", "lat"),
+        "longitude": series("vehicle_global_position", "lon"),
+        "depth": series("vehicle_local_position", "z"),
+        "pressure": series("vehicle_air_data", "baro_pressure_pa", scale=0.01),
+        "battery_voltage": series("battery_status", "voltage_v"),
+        "battery_current": series("battery_status", "current_a"),
+        "battery2_voltage": series("battery_status", "voltage_v", 1),
+        "battery2_current": series("battery_status", "current_a", 1),
+        **{f"servo{k + 1}": series("actuator_outputs", f"output[{k}]") for k in (0, 2)},
+        **{f"motor{k + 1}": series("actuator_motors", f"control[{k}]") for k in (0, 2)},
+    }
+    for name, one in expected.items():
+        np.testing.assert_allclose(back[name], carried(back["time"].to_numpy(), one), err_msg=name)
+    assert set(back.data_vars) == {*expected, "roll", "pitch", "heading"}
+
+
+def _pymavlink(path: Path) -> Iterator[tuple[float, Any]]:
+    from pymavlink import mavutil  # noqa: PLC0415 - beside the project's own dialect, only here
+
+    connection: Any = mavutil.mavlink_connection(str(path), dialect="ardupilotmega")
+    while (message := connection.recv_match()) is not None:
+        yield float(message._timestamp), message
+
+
+@pytest.mark.real
+def test_every_column_of_a_telemetry_log_is_as_pymavlink_reads_it(real_data: Path) -> None:
+    path = real_data / "ardusub" / "small.tlog"
+    known: dict[str, tuple[float, float]] = {}
+    rows: list[dict[str, float]] = []
+    for when, message in _pymavlink(path):
+        kind = message.get_type()
+        if kind == "BAD_DATA" or message.get_srcComponent() != 1:
+            continue
+        said: dict[str, float] = {}
+        if kind == "ATTITUDE":
+            said = {"roll": degrees(message.roll), "pitch": degrees(message.pitch),
+                    "heading": degrees(message.yaw) % 360.0}  # fmt: skip
+        elif kind == "GLOBAL_POSITION_INT":
+            said = {"latitude": message.lat * 1e-7, "longitude": message.lon * 1e-7,
+                    "depth": -message.relative_alt * 1e-3}  # fmt: skip
+        elif kind == "SYS_STATUS":
+            said = {"battery_current": message.current_battery * 1e-2,
+                    "battery_voltage": message.voltage_battery * 1e-3}  # fmt: skip
+        elif kind == "SCALED_PRESSURE2":
+            said = {"pressure2": message.press_abs, "pressure2_temperature": message.temperature * 1e-2}
+        elif kind == "SERVO_OUTPUT_RAW":
+            said = {f"servo{k}": float(getattr(message, f"servo{k}_raw")) for k in (1, 2, 3, 4, 5, 6)}
+        elif kind == "SCALED_IMU2":
+            said = {f"mag2_{axis}": 100.0 * getattr(message, f"{axis}mag") for axis in "xyz"}
+        elif kind == "NAMED_VALUE_FLOAT":
+            said = {message.name: message.value}
+        known |= {name: (when, value) for name, value in said.items()}
+        if kind == "RAW_IMU":
+            own = {f"mag_{axis}": 100.0 * getattr(message, f"{axis}mag") for axis in "xyz"}
+            rows.append(
+                {"time": when, **own, **{name: v for name, (t, v) in known.items() if when - t <= MAX_AGE}}
+            )
+    back = logs.read(path)
+    assert len(rows) == back.sizes["time"]
+    for name in {name for row in rows for name in row}:
+        theirs = [row.get(name, np.nan) for row in rows]
+        np.testing.assert_allclose(back[name], theirs, rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+def test_every_column_of_ardupilot_is_carried_as_it_was_logged(tmp_path: Path) -> None:
+    """That each record is as pymavlink reads it has its own test; here columns are brought to rows."""
+    log, said = (
+        Log(),
+        {name: ([], []) for name in ("roll", "heading", "battery_current", "battery2_current", "depth")},
+    )
+
+    def say(name: str, us: int, value: float) -> None:
+        said[name][0].append(us * 1e-6)
+        said[name][1].append(value)
+
+    for k in range(40):
+        us = 1_000_000 + 100_000 * k
+        if k % 3 == 0:
+            log.say("ATT", us + 5, 0, 0.5 * k, 0, 2.0, 0, 3.0 * k, 0, 0, 3)
+            say("roll", us + 5, 0.5 * k)
+            say("heading", us + 5, 3.0 * k)
+        if k % 4 == 1:
+            for number, name in enumerate(("battery_current", "battery2_current")):
+                log.say("BAT", us - 5, number, 16.0, 2.0 * k + number)
+                say(name, us - 5, 2.0 * k + number)
+        if k % 7 == 2:
+            log.say("BARO", us, 0, -0.25 * k, 1e5)
+            say("depth", us, 0.25 * k)
+        log.mag(us, 0, (100 + k, 200, -300), 1, [7, 0, 0, 0, 0, 50])
+    (tmp_path / "log.bin").write_bytes(log.data)
+    back = logs.read(tmp_path / "log.bin")
+    for name, (times, values) in said.items():
+        np.testing.assert_allclose(
+            back[name], carried(back["time"].to_numpy(), (times, values)), err_msg=name
+        )
