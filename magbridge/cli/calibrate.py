@@ -55,6 +55,7 @@ def calibrate(
     vehicle: Path | None = None,
     grid: Path | None = None,
     base: Base = None,
+    about_mean: bool = False,
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
@@ -97,6 +98,9 @@ def calibrate(
     base
         A base station's log (total_field, or a vector): by how much the Earth's field varied, to add to the
         reference. So is that of an observatory (IAGA-2002) among the logs.
+    about_mean
+        Fit about the mean length of the log's own readings, where neither it nor --date tell what the Earth's
+        field was. The total field then has the sensor's own scale, which site_bias counts: by default 2 %.
     site_bias
         1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
         the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
@@ -135,7 +139,8 @@ def calibrate(
             reading,
             lambda one, name, of: calibrate(
                 *files, output=name, picture=picture and _of(picture, of), reading=one, parameter=parameter,
-                order=order, method=method, vehicle=vehicle, grid=grid, base=base, site_bias=site_bias,
+                order=order, method=method, vehicle=vehicle, grid=grid, base=base, about_mean=about_mean,
+                site_bias=site_bias,
                 filter_corner=filter_corner, fleet=fleet, member=member, refit=refit,
                 heading_reference=heading_reference, json=json,
             ),
@@ -163,6 +168,8 @@ def calibrate(
     require(deployment, CHANNELS)
     deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
+    if about_mean:
+        deployment, site_bias = _about_mean(deployment, site_bias)
     note_unused_grid(grid, deployment)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     with _naming(deployment), waiting("fitting"):
@@ -207,6 +214,27 @@ def _refuse_together(parameter: tuple[str, ...], method: str, vehicle: Path | No
         raise WrongUse("--parameter auto: goes with method auto, and without --vehicle and --fleet")
     if fleet and (vehicle or method != "auto"):
         raise WrongUse("--fleet: goes with method auto, and without --vehicle")
+
+
+def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:
+    """Return a log with a reference that is its own mean, and how well that is known, nT.
+
+    WrongUse: the log tells the true field.
+    """
+    from magbridge.calibration.fitting.nominal import GAIN_SIGMA
+    from magbridge.columns import counts_from_boot
+    from magbridge.field.reference import about_mean
+
+    source = deployment.attrs["source"]
+    placed = {"latitude", "longitude"} <= set(deployment.data_vars) and not counts_from_boot(deployment)
+    if placed or "reference_field" in deployment:
+        raise WrongUse(f"--about-mean: {source} tells what the field was")
+    deployment = about_mean(deployment)
+    mean = float(deployment["reference_field"][0])
+    complain(
+        f"{source}: fitted about a mean of {mean:.0f} nT, since nothing tells what the Earth's field was"
+    )
+    return deployment, GAIN_SIGMA * mean if site_bias is None else site_bias
 
 
 def _of(path: Path, compass: int) -> Path:

@@ -19,12 +19,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EARTHS",
+    "about_mean",
     "earth_field",
     "main_field",
     "other_units",
     "positions",
     "reference_field",
     "require_date",
+    "sphere_radius",
 ]
 
 EARTHS = 20_000.0, 70_000.0
@@ -74,7 +76,9 @@ def reference_field(
             return given
         source = deployment.attrs.get("source", "deployment")
         raise FormatError(
-            source, "expected latitude and longitude, or reference_field: the true field is unknown"
+            source,
+            "expected latitude and longitude, or reference_field: the true field is unknown "
+            "(calibrate --about-mean does without)",
         )
     require_date(deployment)
     longitude, latitude, depth = positions(deployment)
@@ -87,6 +91,33 @@ def reference_field(
         there = continued(grid, depth[unknown]).grid
         reference[unknown] += there.at(longitude[unknown], latitude[unknown], depth[unknown])
     return reference
+
+
+def about_mean(deployment: xr.Dataset) -> xr.Dataset:
+    """Return a deployment with the mean length of its own readings as ``reference_field``, nT.
+
+    For a log that tells neither date nor place. The mean is the radius of the sphere through the raw field,
+    so that hard iron does not count; a gain that all axes share does.
+
+    Raises
+    ------
+    FormatError
+        The readings are on no sphere of the size of the Earth's field: too few attitudes, or another unit.
+    """
+    raw = np.column_stack([deployment[f"mag_{axis}"].to_numpy() for axis in "xyz"])
+    radius = sphere_radius(raw[np.isfinite(raw).all(axis=1)])
+    if not EARTHS[0] < radius < EARTHS[1]:
+        source = deployment.attrs.get("source", "deployment")
+        told = f"a sphere of {radius:.0f} nT through its readings: too few attitudes, or another unit"
+        raise FormatError(source, f"expected a field of the Earth's size, not {told}")
+    return deployment.assign(reference_field=("time", np.full(len(raw), radius), {"units": "nT"}))
+
+
+def sphere_radius(points: FloatArray) -> float:
+    """Return the radius of the sphere that fits points (n, 3) best: ``|m|² = 2 m·c + d`` is linear."""
+    squared = np.einsum("ij,ij->i", points, points)
+    (*centre, d), *_ = np.linalg.lstsq(np.column_stack([2 * points, np.ones(len(points))]), squared)
+    return float(np.sqrt(max(d + np.dot(centre, centre), 1.0)))
 
 
 def earth_field(
@@ -150,7 +181,7 @@ def require_date(deployment: xr.Dataset) -> None:
         raise FormatError(
             deployment.attrs.get("source", "deployment"),
             "its times count from the boot, so the Earth's field is not known: expected the day, by "
-            "--date YYYY-MM-DD, or a column reference_field",
+            "--date YYYY-MM-DD, or a column reference_field; calibrate also takes --about-mean",
         )
 
 

@@ -33,6 +33,7 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNELS
 from magbridge.errors import FormatError
 from magbridge.field.igrf import total_field
+from magbridge.field.reference import sphere_radius
 from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, with_losses
 from magbridge.logs.resample import CIRCLES, linear
@@ -163,16 +164,13 @@ def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[
 
 
 def _by_length(time: FloatArray, columns: Mapping[str, FloatArray]) -> float:
-    """Return the IGRF over the radius of the sphere ``|m|² = 2 m·c + d`` through the counts m, nT."""
+    """Return the IGRF over the radius of the sphere through the counts, nT."""
     counts = np.column_stack([columns[f"mag_{axis}"] for axis in "xyz"])
     counts = counts[np.isfinite(counts).all(axis=1)]
     place = [columns[name][np.isfinite(columns[name])][:1] for name in PLACE if name in columns]
     if len(counts) < 4 or sum(map(len, place)) < 2:
         return NT_PER_COUNT[2]
-    squared = np.einsum("ij,ij->i", counts, counts)
-    (*centre, d), *_ = np.linalg.lstsq(np.column_stack([2 * counts, np.ones(len(counts))]), squared)
-    radius = np.sqrt(max(d + np.dot(centre, centre), 1.0))
-    return float(total_field(place[0], place[1], 0.0, time[0])[0] / radius)
+    return float(total_field(place[0], place[1], 0.0, time[0])[0]) / sphere_radius(counts)
 
 
 def _position(known: Dive, column: str) -> FloatArray | None:
