@@ -9,7 +9,7 @@ from magbridge.columns import COLUMNS, NT_PER_UNIT, usual
 
 __all__ = ["aliases", "is_unit", "split"]
 
-HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
+HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
 UNITS = {
     *NT_PER_UNIT,
     *(column.units for column in COLUMNS.values() if column.units != "1"),
@@ -53,7 +53,7 @@ ALIASES = {
 def split(heading: str) -> tuple[str, str]:
     """Return the name and the unit of a heading: ``Bx [uT]``, ``Bx (uT)``, ``Bx/uT``, ``Bx_uT``.
 
-    Where there is no unit it is empty.
+    Where there is no unit it is empty; a number in brackets, as in ``magADC[0]``, is an index.
     """
     match = HEADING.fullmatch(heading.strip())
     assert match is not None

@@ -167,6 +167,20 @@ def test_columns_are_declared_one_by_one(tmp_path: Path) -> None:
     assert float(log["mag_x"][0]) == 5_000.0
 
 
+def test_a_blackbox_as_csv(tmp_path: Path) -> None:
+    """What blackbox_decode writes: an index in brackets is no unit."""
+    head = "loopIteration,time (us),magADC[0],magADC[1],magADC[2],amperageLatest (A),motor[0]\n"
+    rows = "".join(
+        f"{k},{1_000_000 + 2000 * k}, {200 + k}, -100, 350, {0.1 * k}, {1100 + k}\n" for k in range(9)
+    )
+    log = read(tmp_path, head + rows, column=[f"mag_{axis}=magADC[{k}] [mG]" for k, axis in enumerate("xyz")])
+    np.testing.assert_allclose(log["time"], 1.0 + 0.002 * np.arange(9))
+    np.testing.assert_allclose(log["mag_x"], 20_000.0 + 100.0 * np.arange(9))
+    np.testing.assert_allclose(log["motor[0]"], 1100.0 + np.arange(9))
+    assert log["amperageLatest"].attrs["units"] == "A"
+    assert log.attrs["time_reference"] == "boot"
+
+
 def test_a_mapping_file_renames_scales_and_declares(tmp_path: Path) -> None:
     mapping = tmp_path / "columns.toml"
     mapping.write_text(
