@@ -8,7 +8,6 @@ or in another order, and is refused.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
@@ -20,6 +19,7 @@ from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import CHANNEL_TIMES, usual
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
+from magbridge.logs.faults import Faults
 from magbridge.logs.order import in_order
 
 __all__ = ["checked", "increasing"]
@@ -52,8 +52,6 @@ MANY = 10
 """Rows from which on some can be called alone."""
 AHEAD = 64
 """Rows looked at beyond the end of a piece: whether its last was stamped too late, they tell."""
-REFUSED = 0.5
-"""Share of the rows, or of a column's values, that are wrong in a file that is refused."""
 
 
 def increasing(file: str | Path, time: FloatArray, *, after: float = -np.inf) -> None:
@@ -114,15 +112,9 @@ class _Checks:
     """What was wrong in a file so far."""
 
     def __init__(self, file: str | Path, strict: bool) -> None:
-        self._file, self._strict = file, strict
+        self._faults = Faults(file, strict=strict)
         self._last = -np.inf
-        # by column, of time: rows; of the others: values
-        self._wrong: Counter[str] = Counter()
-        self._total: Counter[str] = Counter()
-        self._first: dict[str, FormatError] = {}
-        # not yet in the attributes of a piece
-        self._counts: Counter[str] = Counter()
-        self._lines: list[str] = []
+        self.finish = self._faults.finish
 
     def sound(self, dataset: xr.Dataset, rows: Sequence[int], ahead: FloatArray) -> xr.Dataset:
         """Return the piece without what cannot be. `ahead` are the times of the next."""
@@ -135,24 +127,16 @@ class _Checks:
             dataset = merged(dataset)
         if dataset.sizes["time"]:
             self._last = float(dataset["time"].values[-1])
-        self._counts.update(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
+        self._faults.lost(rows_dropped=dropped, duplicate_rows=duplicates, values_dropped=values)
         return dataset
 
     def counted(self, dataset: xr.Dataset) -> xr.Dataset:
         """Return a piece with what was lost since the last one was returned."""
-        counts, lines = self._counts, self._lines
-        self._counts, self._lines = Counter(), []
-        return with_losses(dataset, counts, lines)
-
-    def finish(self) -> None:
-        """FormatError: half of the file's rows, or of a column's values, are wrong."""
-        for column, error in self._first.items():
-            if self._wrong[column] >= REFUSED * self._total[column]:
-                raise error
+        return with_losses(dataset, *self._faults.since_last())
 
     def _times(self, time: FloatArray, rows: Sequence[int], ahead: FloatArray) -> tuple[IndexArray, int]:
         """Return the indices of the rows to keep, and how many of these have the time of the one before."""
-        self._total["time"] += len(time)
+        self._faults.count("time", len(time))
         whole = np.concatenate([time, ahead[:AHEAD]])
         if not len(_wrong(whole, self._last)) and not (np.diff(whole) > FAR).any():
             return np.arange(len(time)), 0
@@ -165,7 +149,7 @@ class _Checks:
             k = int(wrong[0])
             place = int(np.searchsorted(index, k))
             before = float(time[index[place - 1]]) if place else self._last
-            self._note("time", len(wrong), rows[k], _expected(float(time[k]), before, then[place]))
+            self._faults.note("time", len(wrong), rows[k], _expected(float(time[k]), before, then[place]))
         return index, len(repeated)
 
     def _plausible(self, dataset: xr.Dataset, rows: Sequence[int]) -> tuple[xr.Dataset, int]:
@@ -174,23 +158,16 @@ class _Checks:
         for name, column in dataset.data_vars.items():
             values = column.values
             wrong, expected = _impossible(str(name), column.attrs.get("units", ""), values, time)
-            self._total[str(name)] += int(np.isfinite(values).sum()) if expected else 0
+            if expected:
+                self._faults.count(str(name), int(np.isfinite(values).sum()))
             if expected and wrong.any():
                 k = int(wrong.argmax())
-                self._note(str(name), int(wrong.sum()), rows[k], f"{expected}, not {float(values[k])!r}")
+                self._faults.note(
+                    str(name), int(wrong.sum()), rows[k], f"{expected}, not {float(values[k])!r}"
+                )
                 count += int(wrong.sum())
                 dataset = dataset.assign({name: column.copy(data=np.where(wrong, np.nan, values))})
         return dataset, count
-
-    def _note(self, column: str, count: int, row: int, expected: str) -> None:
-        """Count what is wrong, and remember the first; FormatError: `strict`."""
-        error = FormatError(self._file, expected, row=row, column=column)
-        if self._strict:
-            raise error
-        self._wrong[column] += count
-        if column not in self._first:
-            self._first[column] = error
-            self._lines.append(str(error))
 
 
 def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,66 +14,14 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import clock_of, seconds
+from magbridge.logs.faults import Faults
 from magbridge.logs.layout import BLANKS, Layout, cells
 from magbridge.records import Quality
 
-__all__ = ["Faults", "Table"]
+__all__ = ["Table"]
 
 NOTHING = "-", "--", "*", "---"
 """What means 'no value', beside what pandas knows (an empty field, NaN, NA, null ...)."""
-REFUSED = 0.5
-"""Share of the rows, or of a column's values, that are wrong in a file that is refused."""
-
-
-class Faults:
-    """What was wrong in a file so far.
-
-    Attributes
-    ----------
-    rows : int
-        Rows seen, also the wrong ones.
-    """
-
-    def __init__(self, path: Path, *, strict: bool) -> None:
-        self._path, self._strict = path, strict
-        self.rows = 0
-        self._wrong: Counter[str] = Counter()
-        self._known: Counter[str] = Counter()
-        self._first: dict[str, FormatError] = {}
-        self._counts: Counter[str] = Counter()
-        self._lines: list[str] = []
-
-    def note(self, column: str, wrong: BoolArray, numbers: Sequence[int], expected: str) -> None:
-        """Count the `wrong` (n,) values of a column ("" and ``time``: rows); `expected` is of the first.
-
-        FormatError: `strict`.
-        """
-        first = numbers[int(wrong.argmax())]
-        error = FormatError(self._path, expected, row=first, column=column or None)
-        if self._strict:
-            raise error
-        count = int(wrong.sum())
-        self._wrong[column] += count
-        self._counts["rows_dropped" if column in {"", "time"} else "values_dropped"] += count
-        if column not in self._first:
-            self._first[column] = error
-            self._lines.append(str(error))
-
-    def count(self, column: str, known: int) -> None:
-        """Count the values that a column has."""
-        self._known[column] += known
-
-    def since_last(self) -> tuple[Counter[str], list[str]]:
-        """Return what was dropped since the last call: how much, and the lines that name it."""
-        last = self._counts, self._lines
-        self._counts, self._lines = Counter(), []
-        return last
-
-    def finish(self) -> None:
-        """FormatError: half of the rows, or of a column's values, are wrong."""
-        for column, error in self._first.items():
-            if self._wrong[column] >= REFUSED * (self._known[column] or self.rows):
-                raise error
 
 
 class Table:
@@ -160,9 +107,14 @@ class Table:
         """Return the lines that are not wrong, and their numbers; the others are noted."""
         if not any(wrong):
             return lines, list(numbers)
-        self.faults.note("", np.array(wrong), numbers, text)
+        self._note("", np.array(wrong), numbers, text)
         rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong, strict=True) if not bad]
         return [line for line, _ in rows], [number for _, number in rows]
+
+    def _note(self, column: str, wrong: BoolArray, numbers: Sequence[int], expected: str) -> None:
+        """Count the `wrong` (n,) values of a column ("" and ``time``: rows); `expected` is of the first."""
+        counter = "rows_dropped" if column in {"", "time"} else "values_dropped"
+        self.faults.note(column, int(wrong.sum()), numbers[int(wrong.argmax())], expected, counter)
 
     def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
         layout = self._layout
@@ -200,7 +152,7 @@ class Table:
         self.faults.count("time", len(times))
         if wrong.any():
             text = str(column.iloc[int(wrong.argmax())]).strip()
-            self.faults.note("time", wrong, numbers, f"expected {self._clock.expected}, not {text!r}")
+            self._note("time", wrong, numbers, f"expected {self._clock.expected}, not {text!r}")
         return times, wrong
 
     def _floats(self, name: str, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
@@ -215,7 +167,7 @@ class Table:
             wrong = np.isnan(values) & column.notna().to_numpy() & (texts.str.lower() != "nan").to_numpy()
             if wrong.any():
                 text = str(column.iloc[int(wrong.argmax())]).strip()
-                self.faults.note(name, wrong, numbers, f"expected a number, not {text!r}")
+                self._note(name, wrong, numbers, f"expected a number, not {text!r}")
         self.faults.count(name, int(column.notna().sum()))
         values[values == self._fill] = np.nan
         source = self._declared.columns.get(name)

@@ -59,9 +59,9 @@ def test_a_trajectory_is_as_xarray_reads_it(tmp_path: Path) -> None:
         atol=1e-5,
     )
     assert set(back.data_vars) == set(theirs.data_vars) - {"time"}
-    for name in back.data_vars:
-        np.testing.assert_allclose(back[name], theirs[name], rtol=1e-6, err_msg=str(name))
-        assert np.flatnonzero(np.isnan(back[name])).tolist() == [3, 7]
+    for column in back.data_vars:
+        np.testing.assert_allclose(back[column], theirs[column], rtol=1e-6, err_msg=str(column))
+        assert np.flatnonzero(np.isnan(back[column])).tolist() == [3, 7]
 
 
 @pytest.mark.real
@@ -78,7 +78,7 @@ def test_a_seaglider_is_as_xarray_reads_it(real_data: Path) -> None:
         np.testing.assert_allclose(back[ours], scale * theirs[name], rtol=1e-7, err_msg=ours)
     inside = (back["time"] > float(theirs["ctd_time"][0])) & (back["time"] < float(theirs["ctd_time"][-1]))
     for ours, name in (("latitude",) * 2, ("longitude",) * 2, ("water_temperature", "temperature")):
-        between = np.interp(back["time"], theirs["ctd_time"], theirs[name])
+        between = np.asarray(np.interp(back["time"], theirs["ctd_time"], theirs[name]))
         np.testing.assert_allclose(back[ours][inside], between[inside], rtol=1e-9, err_msg=ours)
 
 
@@ -194,10 +194,9 @@ def test_every_column_of_a_telemetry_log_is_as_pymavlink_reads_it(real_data: Pat
 
 def test_every_column_of_ardupilot_is_carried_as_it_was_logged(tmp_path: Path) -> None:
     """That each record is as pymavlink reads it has its own test; here columns are brought to rows."""
-    log, said = (
-        Log(),
-        {name: ([], []) for name in ("roll", "heading", "battery_current", "battery2_current", "depth")},
-    )
+    log = Log()
+    names = "roll", "heading", "battery_current", "battery2_current", "depth"
+    said: dict[str, Series] = {name: ([], []) for name in names}
 
     def say(name: str, us: int, value: float) -> None:
         said[name][0].append(us * 1e-6)
