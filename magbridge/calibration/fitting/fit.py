@@ -22,7 +22,7 @@ from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
-from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
+from magbridge.calibration.residual import Samples, residuals_of, rms, robust_scale, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 from magbridge.field.reference import other_units
@@ -58,6 +58,8 @@ LEVEL = 145.0
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
 LASTING = 0.98
 """Autocorrelation of neighbours that no sensor's noise has beside a field in place."""
+ROCK, JUDGED = 3.0 * LEVEL, 3000
+"""nT, more than which no rock leaves over a whole track; and samples that are enough to see that."""
 UNSEEN = 270.0
 """deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
@@ -160,12 +162,11 @@ def fit(
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
     bias = _default_bias(data) if site_bias is None else site_bias
-    if method == "auto" and data.lacks_rock and crosses_itself(data):
+    if method == "auto" and data.lacks_rock and crosses_itself(data) and _rock_may_show(data, order):
         method = "survey"
     if method == "survey":
         options["level"] = bias
-    module, _, name = METHODS[method].partition(":")
-    chosen: Callable[..., Fit] = getattr(import_module(module), name)
+    chosen = _function(method)
     # one thread: for matrices this small threads cost more than they gain, and the order of sums is fixed
     with threadpool_limits(1, "blas"):
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
@@ -183,6 +184,29 @@ def fit(
             data = data.part(kept)
             found.details["ends"] = int((~kept).sum())
         return _judged(found if method == "survey" else _biased(found, bias), data)
+
+
+def _function(method: str) -> Callable[..., Fit]:
+    module, _, name = METHODS[method].partition(":")
+    function: Callable[..., Fit] = getattr(import_module(module), name)
+    return function
+
+
+def _rock_may_show(data: Observations, order: int) -> bool:
+    """Tell whether a fit without rock leaves as little as rock can be.
+
+    A compass among a drone's motors leaves more; a field in place would be fitted to these.
+    """
+    few = data.part(np.arange(len(data)) % max(len(data) // JUDGED, 1) == 0)
+    for method in ("nominal", "auto"):
+        try:
+            with threadpool_limits(1, "blas"):
+                left = robust_scale(_function(method)(few, order).residual)
+        except CalibrationError:
+            return True
+        if left <= ROCK:
+            return True
+    return False
 
 
 def _default_bias(data: Observations) -> float:
