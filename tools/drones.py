@@ -149,11 +149,9 @@ def magfits(deployment: xr.Dataset, early: Observations, late: Observations, pee
     if early.attitude is None or early.reference_ned is None:
         return
     at = deployment["time"].to_numpy()
-    current = (
-        deployment["battery_current"].to_numpy()
-        if "battery_current" in deployment
-        else np.full(len(at), np.nan)
-    )
+    current = np.zeros(len(at))
+    if "battery_current" in deployment:
+        current = np.nan_to_num(deployment["battery_current"].to_numpy())
     known, attitude, earth = early.directed()
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "half.npz"
