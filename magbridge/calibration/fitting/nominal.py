@@ -25,6 +25,7 @@ from magbridge.calibration.residual import Samples, independent, residuals_of, s
 from magbridge.errors import CalibrationError
 
 __all__ = [
+    "GAIN_SIGMA",
     "HARD_IRON_SIGMA",
     "SCALE_SIGMA",
     "check_scales",
