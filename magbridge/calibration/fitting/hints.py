@@ -67,7 +67,7 @@ def worths(
     better: float = BETTER,
     beside: tuple[str, ...] = (),
 ) -> dict[str, float]:
-    """Return what each column explains of a fit's residual on parts left out, nT; see :func:`undeclared`.
+    """Return what each column (n,) explains of a residual on parts left out, nT; see :func:`undeclared`.
 
     Columns that leave more than the share `better` of it are left out, and so are those `beside` which the
     others are looked at.
