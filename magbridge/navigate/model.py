@@ -77,7 +77,7 @@ class Block(NamedTuple):
 
 
 def repeated(grid: AnomalyGrid, metres: float | FloatArray) -> FloatArray:
-    """Return how often measurements that lie `metres` apart meet one and the same error of the map.
+    """Return how often measurements `metres` (n,) apart meet one and the same error of the map.
 
     Notes
     -----
