@@ -193,18 +193,14 @@ def _function(method: str) -> Callable[..., Fit]:
 
 
 def _rock_may_show(data: Observations, order: int) -> bool:
-    """Tell whether a fit without rock leaves as little as rock can be.
-
-    A compass among a drone's motors leaves more; a field in place would be fitted to these.
-    """
+    """Tell whether a fit without rock leaves no more than rock can be: among a drone's motors it does."""
     few = data.part(np.arange(len(data)) % max(len(data) // JUDGED, 1) == 0)
     for method in ("nominal", "auto"):
         try:
             with threadpool_limits(1, "blas"):
-                left = robust_scale(_function(method)(few, order).residual)
+                if robust_scale(_function(method)(few, order).residual) <= ROCK:
+                    return True
         except CalibrationError:
-            return True
-        if left <= ROCK:
             return True
     return False
 

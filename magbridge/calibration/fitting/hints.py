@@ -69,8 +69,8 @@ def worths(
 ) -> dict[str, float]:
     """Return what each column (n,) explains of a residual on parts left out, nT; see :func:`undeclared`.
 
-    Columns that leave more than the share `better` of it are left out, and so are those `beside` which the
-    others are looked at.
+    `columns` are (n,), at the n samples. Those that leave more than the share `better` of it are left out,
+    and so are those `beside` which the others are looked at.
     """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
         return {}
