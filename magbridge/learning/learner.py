@@ -1,9 +1,11 @@
-"""A bridge's learning: what it takes from each sample, what it publishes, and when it says that it doubts."""
+"""A bridge's learning: what it takes from each sample.
+
+What is published of it is :mod:`.publication`'s, how a doubt stands :mod:`.standing`'s.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import isnan
 from typing import TYPE_CHECKING, Final
 
@@ -11,16 +13,17 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.field.geodesy import separation
-from magbridge.learning.doubt import Alarm, Doubt, Signs
+from magbridge.learning.doubt import Doubt, Signs
 from magbridge.learning.estimator import Estimator
-from magbridge.learning.judge import FIRST, LEARNED, Judge
+from magbridge.learning.judge import FIRST, LEARNED
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
 from magbridge.learning.observation import Observation, observe
+from magbridge.learning.publication import NONE, Publication
 from magbridge.learning.report import Notice, State
+from magbridge.learning.standing import Standing
 from magbridge.learning.start import Start
 from magbridge.records import Quality, Vector
 
@@ -31,29 +34,15 @@ __all__ = ["Learner"]
 
 UNFIT: Final = int(Quality.STALE_TELEMETRY | Quality.MOVING | Quality.SATURATED | Quality.LATE_JOIN)
 """Samples that nothing is learned from."""
-NONE: Final = "none"
-"""The method of a calibration that is none."""
 LINEAR: Final = 300.0
 """nT, 1-sigma of an axis's offset: from here on it is fitted anew as a whole."""
 CREEP: Final = 3.0 / 86_400.0**0.5
 """nT per square root of a second: an offset walks by 3 nT a day."""
-SURE: Final = 6.0
-"""By which a doubt's log-likelihood ratio has to grow until it is learned what is behind it."""
-PATIENCE: Final = 128
-"""Telling samples after which that is decided at the latest."""
-MORE: Final = 2.0
-"""By which an alarm's log-likelihood ratio has to grow to be news."""
 GONE: Final = 9.0
 """Log-likelihood ratio below which it is not learned any more, but gone."""
-QUIET: Final = 300
-"""Telling samples without an alarm after which its cause is gone."""
 OUTLIER: Final = 5.0
 AGREE: Final = 3
 """An innovation beyond so many sigmas is not learned from, unless it is the third in a row."""
-APART: Final = 0.3
-"""Of the noise: the published total field is renewed when it is so far from what is learned."""
-RENEW: Final = 32, 256
-"""Samples after which it may be, and is in any case."""
 SHORT_US: Final = 3_600_000_000
 """µs without a sample to learn from after which that is told."""
 
@@ -78,18 +67,12 @@ class Learner:
 
     Attributes
     ----------
-    calibration : Calibration
-        The one to publish.
     watched : tuple of str
         Telemetry that :meth:`sample` wants: the temperature, and the currents.
-    flags : int
-        Of the last sample: ``unexplained``, or 0.
-    variance : float
-        nT², to add to that of the total field while the data are not explained.
-    renewed : bool
-        The calibration to publish has changed last by what was learned since, for no reason of its own.
     notices : list of Notice
         What has changed since the caller last emptied it.
+    samples : int
+        That coefficients were learned from.
     enabled, frozen : bool
         Not enabled, nothing happens; frozen, it judges and doubts, but learns nothing.
 
@@ -109,27 +92,51 @@ class Learner:
         max_rate: float = 1.0,
         currents: tuple[str, ...] = (),
     ) -> None:
-        self.first = self.calibration = calibration
         self._model = Model(calibration, currents)
         self.watched = self._model.watched
         self._turn_on = turn_on
         self._unfit = UNFIT if calibration.method == NONE else UNFIT | int(Quality.UNCALIBRATED)
-        self._start: Start | None
         self._grid, self._spread = grid, spread
         self._nuisance = Nuisance(calibration.noise, spread)
         self._period_us = round(1e6 / max_rate)
         self.enabled, self.frozen = True, False
-        self.flags, self.variance, self.renewed = 0, 0.0, False
         self.notices: list[Notice] = []
-        self.samples = 0
-        self._alarm: Alarm | None = None
-        self._forget()
+        self._now_us = 0
+        self._publication = Publication(self._model, calibration, self._nuisance)
+        self._standing = Standing()
+        self._begin()
+
+    @property
+    def first(self) -> Calibration:
+        """The calibration that it began with, or that was accepted."""
+        return self._publication.first
+
+    @property
+    def calibration(self) -> Calibration:
+        """The one to publish."""
+        return self._publication.calibration
+
+    @property
+    def renewed(self) -> bool:
+        """Whether that has changed last by what was learned since, for no reason of its own."""
+        return self._publication.renewed
+
+    @property
+    def flags(self) -> int:
+        """Of the last sample: ``unexplained``, or 0."""
+        return self._standing.flags
+
+    @property
+    def variance(self) -> float:
+        """nT², to add to that of the total field while the data are not explained."""
+        return self._standing.variance
 
     @property
     def state(self) -> State:
         """How learning stands."""
-        rms = np.sqrt(self._judge.mean_square).tolist()
-        alarm, judge, published = self._alarm, self._judge, self.calibration is not self.first
+        publication, alarm = self._publication, self._standing.alarm
+        judge, published = publication.judge, publication.learned
+        rms = np.sqrt(judge.mean_square).tolist()
         causes = alarm.causes if alarm else ()
         since, size = (round(alarm.since * 1e6), alarm.size) if alarm else (0, 0.0)
         better = -judge.worse if published else judge.better
@@ -137,54 +144,40 @@ class Learner:
 
     def learned(self) -> Calibration:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
-        origin = f"{calibration_id(self.first):08x}"
-        method = self.first.method if "learned" in self.first.method else f"{self.first.method}, learned"
-        estimator = self._estimator
-        coefficients = estimator.coefficients
-        if self.first.method == NONE and self.calibration is not self.first:
-            coefficients = estimator.at_level_of(self._coefficients)
-        made = self._model.calibration(coefficients, estimator.covariance)
-        if self.first.method == NONE:
-            method = "learned"
-        inputs = self.first.inputs | {f"calibration {origin}": f"{self.samples} samples later"}
-        return replace(made, method=method, inputs=inputs, noise=self._noise)
+        return self._publication.made(self._estimator, self.samples, self._noise)
 
     def accept(self) -> None:
         """Let what is learned be the calibration that nothing rolls back, and the doubt be known."""
         if self.samples:
             self._publish("accepted: what was learned")
-            self.first = self.calibration
-            self._weights[FIRST] = self._weights[LEARNED]
-            self._judge.restart()
+            self._publication.accept()
         self._settle("acknowledged")
 
     def forget(self) -> None:
         """Go back to the calibration that it began with, and learn anew from there."""
         self._settle("forgotten")
-        self._forget()
-        self.calibration = self.first
+        self._publication.forget(self._nuisance)
+        self._begin()
         self._notify("learning: all forgotten")
 
-    def _forget(self) -> None:
-        self._judge = Judge(self._nuisance)
+    def _begin(self) -> None:
         self._restart()
-        self._weights = [self._model.weights(self._model.coefficients(self.first)[0])] * 2
-        self.samples = self._quiet = self._doubted = 0
-        self._sure = 0.0
+        self.samples = 0
         self._last_us = self._told_us = 0
         self._where: tuple[float, float] | None = None
         self._before: FloatArray | None = None
 
     def _restart(self) -> None:
         """Begin to learn from the first calibration, whose offsets may have changed at this power-on."""
-        coefficients, covariance = self._model.coefficients(self.first)
-        self._estimator = Estimator(coefficients, covariance, self._model.offsets, self._nuisance, CREEP)
+        first, offsets = self.first, self._model.offsets
+        coefficients, covariance = self._model.coefficients(first)
+        self._estimator = Estimator(coefficients, covariance, offsets, self._nuisance, CREEP)
         self._estimator.open(self._turn_on**2)
         self._doubt = Doubt(self._model, self._estimator)
-        self._outliers = self._since_renewed = 0
-        self._noise, self._start = self.first.noise, None
-        if np.trace(covariance[np.ix_(self._model.offsets, self._model.offsets)]) > 3.0 * LINEAR**2:
-            self._start = Start(self._model, coefficients, covariance, self.first.reference.field)
+        self._outliers, self._noise = 0, first.noise
+        self._start: Start | None = None
+        if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * LINEAR**2:
+            self._start = Start(self._model, coefficients, covariance, first.reference.field)
 
     def _notify(self, text: str, *, grave: bool = False) -> None:
         self.notices.append(Notice(text, self._now_us * 1e-6, grave))
@@ -258,16 +251,17 @@ class Learner:
         positions = tuple(self._model.scaled(values))
         signs = Signs(time_us * 1e-6, live.by_nine[6:], positions, tuple(watched), clock, -1.0 / live.s)
         estimator.predict(live.e, live.s, self._model.derivative(phi, live.by_nine))
-        first = self._observe(field, phi @ self._weights[FIRST], reference)
-        self._judge.judge(
+        by_first, by_published = self._publication.nine(phi)
+        first = self._observe(field, by_first, reference)
+        self._publication.judge.judge(
             *self._nuisance.over(metres, seconds), first.e, first.s, estimator.residual, estimator.variance
         )
         if self._start is not None:
             if not self.frozen:
-                self._begin(self._start, due=self._start.add(field, phi, reference, metres, seconds))
+                self._fit(self._start, due=self._start.add(field, phi, reference, metres, seconds))
         else:
             self._learn(signs)
-        published = self._observe(field, phi @ self._weights[LEARNED], reference)
+        published = self._observe(field, by_published, reference)
         estimator.follow(live.s)
         self._decide((published.e - live.e) * live.s)
 
@@ -295,56 +289,39 @@ class Learner:
         far = abs(estimator.residual) > OUTLIER * estimator.sigma
         self._outliers = self._outliers + 1 if far else 0
         alarm = self._doubt.test(estimator, signs)
-        if alarm is not None:
-            self._raise(alarm)
-        if far and self._outliers < AGREE and self._alarm is None:
+        if alarm is not None and (news := self._standing.raised(alarm)):
+            self._notify(news, grave=True)
+        if far and self._outliers < AGREE and self._standing.alarm is None:
             return
         learn = estimator.telling and not self.frozen
         self._doubt.updated(estimator.update(learn=learn))
         self.samples += learn
-        self._quiet += estimator.telling
-        self._doubted += estimator.telling
-        self._since_renewed += 1
+        self._standing.count(estimator.telling)
+        self._publication.age += 1
 
-    def _begin(self, start: Start, *, due: bool) -> None:
+    def _fit(self, start: Start, *, due: bool) -> None:
         """Learn from a sample while next to nothing is known; fit all so far where that is due."""
         estimator = self._estimator
         if not due:
             estimator.update(learn=True)
             self.samples += 1
-            self._since_renewed += 1
+            self._publication.age += 1
             return
         fitted = start.fit(estimator.coefficients, self._nuisance)
         self._noise = msgspec.structs.replace(self._noise, sensor=fitted.noise)
         self._nuisance = Nuisance(self._noise, self._spread)
         estimator.know(fitted.coefficients, fitted.beside, fitted.covariance, self._nuisance)
-        self._judge.restart(self._nuisance)
-        if self.calibration is not self.first:
-            self._renew()
+        self._publication.judge.restart(self._nuisance)
+        if self._publication.learned:
+            self._publication.renew(self.learned())
         if start.over:
             self._start = None
 
-    def _raise(self, alarm: Alarm) -> None:
-        """Begin to doubt, or know better what is doubted."""
-        standing = self._alarm
-        if standing is not None and alarm.strength < standing.strength + MORE:
-            return
-        self._quiet = 0
-        self._alarm = alarm
-        self.flags, self.variance = int(Quality.UNEXPLAINED), alarm.size**2
-        if standing is None:
-            self._doubted, self._sure = 0, alarm.strength + SURE
-            names = " or ".join(alarm.causes[:2]).replace("_", " ")
-            self._notify(f"unexplained: {alarm.size:.0f} nT, {names}", grave=True)
-        elif standing.causes != alarm.causes and len(alarm.causes) == 1:
-            self._notify(f"unexplained: it is {alarm.causes[0].replace('_', ' ')}", grave=True)
-
     def _settle(self, how: str) -> None:
         """End the doubt."""
-        if self._alarm is None:
+        if self._standing.alarm is None:
             return
-        self._alarm = None
-        self.flags, self.variance = 0, 0.0
+        self._standing.end()
         self._doubt.restart()
         self._notify(f"explained again: {how}")
 
@@ -356,24 +333,21 @@ class Learner:
         apart : float
             nT, of the published total field from what is learned.
         """
-        judge, alarm = self._judge, self._alarm
-        if alarm is not None and not self.frozen:
-            if self._quiet > QUIET:
-                self._settle("gone")
-            elif alarm.strength > self._sure or self._doubted > PATIENCE:
-                self._take_up()
-        published = self.calibration is not self.first
-        if published and judge.roll_back:
-            self._roll_back()
-        elif self.frozen or self._alarm is not None:
+        publication, standing = self._publication, self._standing
+        if standing.gone and not self.frozen:
+            self._settle("gone")
+        elif standing.ripe and not self.frozen:
+            self._take_up()
+        if publication.learned and publication.judge.roll_back:
+            change = publication.roll_back()
+            self._restart()
+            self._notify(change)
+        elif self.frozen or standing.alarm is not None:
             return
-        elif not published and judge.adopt:
+        elif not publication.learned and publication.judge.adopt:
             self._publish("learned")
-        elif published:
-            least, most = RENEW
-            due = abs(apart) > APART * self._noise.sensor and self._since_renewed >= least
-            if due or self._since_renewed >= most:
-                self._renew()
+        elif publication.stale(apart):
+            publication.renew(self.learned())
 
     def _take_up(self) -> None:
         """Learn what is behind the doubt, if coefficients can take it up."""
@@ -387,28 +361,5 @@ class Learner:
         self._publish("learned")
         self._settle("learned")
 
-    def _roll_back(self) -> None:
-        self.calibration = self.first
-        self._weights[LEARNED] = self._weights[FIRST]
-        self._judge.restart()
-        self._restart()
-        self._tell_change("rolled back: the first calibration predicts better", LEARNED, FIRST)
-
-    def _renew(self) -> None:
-        """Publish what is learned so far."""
-        self.calibration = self.learned()
-        self._coefficients = self._model.coefficients(self.calibration)[0]
-        self._weights[LEARNED] = self._model.weights(self._coefficients)
-        self._since_renewed, self.renewed = 0, True
-
     def _publish(self, how: str) -> None:
-        before = LEARNED if self.calibration is not self.first else FIRST
-        self._renew()
-        self._judge.worse = 0.0
-        self._tell_change(how, before, LEARNED)
-
-    def _tell_change(self, how: str, before: int, after: int) -> None:
-        self.renewed = False
-        rms = np.sqrt(self._judge.mean_square)
-        name = calibration_id(self.calibration)
-        self._notify(f"{how} {name:08x}: {rms[before]:.1f} to {rms[after]:.1f} nT")
+        self._notify(self._publication.publish(self.learned(), how))

@@ -146,6 +146,16 @@ def test_forgetting_goes_back_to_the_first() -> None:
     assert learner.first is not known
 
 
+def test_forgetting_and_accepting_come_before_any_sample_too() -> None:
+    """An operator may ask for both as soon as the bridge is up."""
+    known = calibration()
+    learner = Learner(known)
+    learner.accept()
+    learner.forget()
+    assert learner.calibration is known
+    assert [notice.text for notice in learner.notices] == ["learning: all forgotten"]
+
+
 def test_a_worse_calibration_is_rolled_back() -> None:
     """What was published is taken back when the offset goes back to what it was."""
     known = calibration()

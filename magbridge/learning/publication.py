@@ -1,0 +1,117 @@
+"""What is published: the first calibration, or what was learned since, while that predicts better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.file import calibration_id
+from magbridge.calibration.model import Calibration, Noise
+from magbridge.learning.estimator import Estimator
+from magbridge.learning.judge import FIRST, LEARNED, Judge
+from magbridge.learning.model import Model
+from magbridge.learning.nuisance import Nuisance
+
+__all__ = ["NONE", "Publication"]
+
+NONE: Final = "none"
+"""The method of a calibration that is none."""
+APART: Final = 0.3
+"""Of the noise: the published total field is renewed when it is so far from what is learned."""
+RENEW: Final = 32, 256
+"""Samples after which it may be, and is in any case."""
+
+
+class Publication:
+    """Holds the first calibration and the published one, and judges between them.
+
+    Parameters
+    ----------
+    model : Model
+    first : Calibration
+        The one to begin with.
+    nuisance : Nuisance
+
+    Attributes
+    ----------
+    first, calibration : Calibration
+        The one that it began with, or that was accepted; the one to publish.
+    judge : Judge
+    renewed : bool
+        The one to publish has changed last by what was learned since, for no reason of its own.
+    age : int
+        Samples learned from since it did.
+    """
+
+    def __init__(self, model: Model, first: Calibration, nuisance: Nuisance) -> None:
+        self._model, self.first, self.renewed = model, first, False
+        self.forget(nuisance)
+
+    def forget(self, nuisance: Nuisance) -> None:
+        """Go back to the first, as if nothing had been judged."""
+        self.calibration, self.judge, self.age = self.first, Judge(nuisance), 0
+        self._coefficients = self._model.coefficients(self.first)[0]
+        self._weights = [self._model.weights(self._coefficients)] * 2
+
+    @property
+    def learned(self) -> bool:
+        """Whether what was learned is published."""
+        return self.calibration is not self.first
+
+    def nine(self, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the nine coefficients (9,) of the first and of the published one at regressors (m,)."""
+        return phi @ self._weights[FIRST], phi @ self._weights[LEARNED]
+
+    def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
+        """Return the calibration that an estimator has learned from so many samples, with its origin."""
+        first, coefficients, method = self.first, estimator.coefficients, self.first.method
+        if first.method == NONE:
+            method = "learned"
+            if self.learned:
+                coefficients = estimator.at_level_of(self._coefficients)
+        elif "learned" not in method:
+            method += ", learned"
+        inputs = first.inputs | {f"calibration {calibration_id(first):08x}": f"{samples} samples later"}
+        made = self._model.calibration(coefficients, estimator.covariance)
+        return replace(made, method=method, inputs=inputs, noise=noise)
+
+    def stale(self, apart: float) -> bool:
+        """Whether what is learned is `apart` (nT, of the total field) from what is published of it."""
+        least, most = RENEW
+        far = abs(apart) > APART * self.calibration.noise.sensor
+        return self.learned and ((far and self.age >= least) or self.age >= most)
+
+    def renew(self, calibration: Calibration) -> None:
+        """Publish what is learned so far."""
+        self.calibration = calibration
+        self._coefficients = self._model.coefficients(calibration)[0]
+        self._weights[LEARNED] = self._model.weights(self._coefficients)
+        self.age, self.renewed = 0, True
+
+    def publish(self, calibration: Calibration, how: str) -> str:
+        """Publish it for a reason of its own; return what to say of that."""
+        before = LEARNED if self.learned else FIRST
+        self.renew(calibration)
+        self.judge.worse = 0.0
+        return self._change(how, before, LEARNED)
+
+    def accept(self) -> None:
+        """Let what is published be the first, so that nothing takes it back."""
+        self.first = self.calibration
+        self._weights[FIRST] = self._weights[LEARNED]
+        self.judge.restart()
+
+    def roll_back(self) -> str:
+        """Publish the first again; return what to say of that."""
+        self.calibration, self.age = self.first, 0
+        self._weights[LEARNED] = self._weights[FIRST]
+        self.judge.restart()
+        return self._change("rolled back: the first calibration predicts better", LEARNED, FIRST)
+
+    def _change(self, how: str, before: int, after: int) -> str:
+        self.renewed = False
+        rms = np.sqrt(self.judge.mean_square)
+        return f"{how} {calibration_id(self.calibration):08x}: {rms[before]:.1f} to {rms[after]:.1f} nT"
