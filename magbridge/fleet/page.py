@@ -99,7 +99,7 @@ def _write(path: Path, title: str, body: Sequence[str]) -> None:
 
 def _table(headings: str, rows: Sequence[str]) -> str:
     named = "".join(f"<th>{heading}</th>" for heading in headings.split(", "))
-    return f"<div class=wide><table><tr>{named}</tr>{''.join(rows)}</table></div>"
+    return f"<div class=wide tabindex=0><table><tr>{named}</tr>{''.join(rows)}</table></div>"
 
 
 def _overview(histories: Mapping[str, History], links: Mapping[str, str]) -> Iterator[str]:

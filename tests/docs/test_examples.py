@@ -136,6 +136,13 @@ def test_a_block_of_python_runs(block: Block, survey_and_runs: Path) -> None:
     assert not done.returncode, f"{block}\n{done.stderr}"
 
 
+@pytest.mark.parametrize("block", blocks("py"), ids=str)
+def test_a_block_for_a_cluster_is_python(block: Block) -> None:
+    """What needs a machine that is not here is marked ``py``, and only read."""
+    assert "Cluster" in block.text
+    compile(block.text, str(block), "exec")
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_an_address_of_ours_leads_somewhere(page: Path) -> None:
     """Links that survive on a package index are absolute: what they name is in the repository."""

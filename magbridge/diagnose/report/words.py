@@ -81,7 +81,7 @@ def row(name: str, value: float, sigma: float | None, unit: str) -> str:
 def table(heads: Sequence[str], rows: Iterable[str]) -> str:
     """Return a table of rows under their heads; nothing where there are no rows."""
     head, body = "".join(f"<th>{one}</th>" for one in heads), "".join(rows)
-    return f"<table><tr>{head}</tr>{body}</table>" * bool(body)
+    return f'<div class="wide" tabindex="0"><table><tr>{head}</tr>{body}</table></div>' * bool(body)
 
 
 def chance(p_value: float) -> str:
@@ -109,7 +109,5 @@ def figure(png: str | None, caption: str) -> str:
     """Return a picture (base64 of a PNG) below its caption, as HTML; nothing if there is none."""
     if png is None:
         return ""
-    return (
-        f"<figure><figcaption>{caption}</figcaption>"
-        f'<div><img alt="{escape(caption)}" src="data:image/png;base64,{png}"></div></figure>'
-    )
+    image = f'<img alt="{escape(caption)}" src="data:image/png;base64,{png}">'
+    return f'<figure><figcaption>{caption}</figcaption><div class="wide" tabindex="0">{image}</div></figure>'
