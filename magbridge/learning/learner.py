@@ -296,7 +296,7 @@ class Learner:
         learn = estimator.telling and not self.frozen
         self._doubt.updated(estimator.update(learn=learn))
         self.samples += learn
-        self._standing.count(estimator.telling)
+        self._standing.count(telling=estimator.telling)
         self._publication.age += 1
 
     def _fit(self, start: Start, *, due: bool) -> None:

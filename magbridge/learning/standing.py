@@ -11,8 +11,11 @@ __all__ = ["Standing"]
 
 SURE: Final = 6.0
 """By which a doubt's log-likelihood ratio has to grow until it is learned what is behind it."""
+RIVAL: Final = 3.0
+"""And by which more for each further cause that fits: a bit more evidence often leaves fewer of them, where
+sorting out what was learned of all takes hours."""
 PATIENCE: Final = 128
-"""Telling samples after which that is decided at the latest."""
+"""Telling samples for each cause that fits, after which that is decided at the latest."""
 MORE: Final = 2.0
 """By which an alarm's log-likelihood ratio has to grow to be news."""
 QUIET: Final = 300
@@ -57,7 +60,7 @@ class Standing:
             return f"unexplained: it is {alarm.causes[0].replace('_', ' ')}"
         return ""
 
-    def count(self, telling: bool) -> None:
+    def count(self, *, telling: bool) -> None:
         """Take note of a sample that tells something of the coefficients, or does not."""
         self._quiet += telling
         self._doubted += telling
@@ -70,4 +73,7 @@ class Standing:
     @property
     def ripe(self) -> bool:
         """Whether it is time to learn what is behind the alarm."""
-        return self.alarm is not None and (self.alarm.strength > self._sure or self._doubted > PATIENCE)
+        if self.alarm is None:
+            return False
+        fit = len(self.alarm.channels)
+        return self.alarm.strength > self._sure + RIVAL * (fit - 1) or self._doubted > PATIENCE * fit
