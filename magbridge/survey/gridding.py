@@ -34,7 +34,8 @@ from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
 from magbridge.field.place.blocks import near_inverse
-from magbridge.field.place.matern import Matern
+from magbridge.field.place.matern import SMOOTHNESS, Matern
+from magbridge.field.place.nodes import Nodes
 from magbridge.survey.gridded import Gridded, Posterior
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.samples import Samples
@@ -53,6 +54,8 @@ LARGE, LIKELIER = 100.0, 5.0
 """Areas of a length's square, and nats, from which on the field's size may vary from place to place."""
 FINE, ENOUGH = 4.0, 8_000
 """Nodes a length, as long as there are no more than enough: a map shows what coarser ones leave out."""
+MOST = 40_000
+"""Nodes of a rough field at most; their variances take 0.5 GB."""
 CHUNK = 16_384
 """Rows at a time."""
 
@@ -107,9 +110,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     """
     sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1)
     choice, roughness = _searched(samples, sigma, local=local)
-    nodes = nodes_for(samples.place, choice.field.length, FINE)
-    if nodes.size > ENOUGH:
-        nodes = nodes_for(samples.place, choice.field.length)
+    nodes = _nodes(samples.place, choice.field)
     choice = replace(choice, field=replace(choice.field, nodes=nodes))
     groups = _groups(samples)
     problem, family = _Problem(samples, groups, roughness), with_groups(NOTHING, groups)
@@ -141,6 +142,22 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     return Gridded(
         tuple(posteriors), roughness, choice.rho, problem.middle, problem.mean, problem.kept, widths
     )
+
+
+def _nodes(place: FloatArray, found: Matern) -> Nodes:
+    """Return the nodes of the map about places (n, 2), m.
+
+    The roughest field changes within a small part of its length: its evidence holds for nodes as fine as
+    those it was found with, and on coarser ones such rock would be taken for noise and for outliers.
+    """
+    if found.alpha == SMOOTHNESS[0]:
+        fine = found.length / found.nodes.spacing
+        while fine > FINE and (nodes := nodes_for(place, found.length, fine)).size > MOST:
+            fine *= 0.98 * (MOST / nodes.size) ** 0.5
+        if fine > FINE:
+            return nodes
+    nodes = nodes_for(place, found.length, FINE)
+    return nodes if nodes.size <= ENOUGH else nodes_for(place, found.length)
 
 
 def _left_open(
