@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.crossings import far_off
+from magbridge.calibration.fitting.crossings import far_off, too_rough
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
@@ -117,6 +117,8 @@ def survey(samples: Samples) -> Result:
         warnings.append(
             "no line crosses another: what is level of a line and what is rock rests on its smoothness"
         )
+    if found.size > found.sigma:
+        warnings += too_rough(samples.place, found.field.length)
     if (out := int((~found.kept).sum())) > 0.02 * len(residual):
         warnings.append(f"{out} of {len(residual)} samples are outliers and were left out of the map")
     return Result(samples, found, crossed, before, after, residual, tuple(warnings))

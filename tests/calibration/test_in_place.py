@@ -11,6 +11,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting.boresight import field_body
+from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observations import Observations
@@ -143,6 +144,35 @@ def test_two_vehicles_in_one_log_are_not_supported() -> None:
     found = fit(replace(data, field=field), "survey")
     assert not found.supported
     assert any("two vehicles in one log" in line for line in found.calibration.doubts)
+
+
+def over(data: Observations, length: float) -> Observations:
+    """Return the data with further rock of 30 nT that changes over a `length`, m."""
+    rng = np.random.default_rng(0)
+    assert data.place is not None
+    k, phase = rng.normal(0, 1 / length, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
+    rock = 30.0 * np.sqrt(2 / 400) * np.cos(data.place[:, :2] @ k.T + phase).sum(axis=1)
+    return replace(data, field=data.field * (1.0 + rock / np.linalg.norm(data.field, axis=1))[:, None])
+
+
+def test_rock_rougher_than_the_tracks_is_not_supported(survey: Survey) -> None:
+    """Rock that changes over 35 m, tracks 90 m apart: the fit is off by 25 nT, and one line says so."""
+    data = over(flown(legs=3)[0], 35.0)
+    found = fit(data.part(np.arange(len(data)) % 2 == 0), "survey")
+    assert not found.supported
+    assert sum("half the distance between your tracks" in line for line in found.calibration.doubts) == 1
+    assert survey[2].supported
+
+
+def test_rock_is_rough_beside_the_distance_of_tracks_or_at_the_shortest_length() -> None:
+    """Lines 400 m apart; a straight line has no distance between tracks."""
+    along = np.arange(0.0, 4_000.0, 20.0)
+    turned = [along[:: 1 if line % 2 else -1] for line in range(11)]
+    lines = np.concatenate([np.stack([x, np.full(len(x), 400.0 * i)], axis=1) for i, x in enumerate(turned)])
+    assert "(about 3" in next(too_rough(lines, 100.0))
+    assert "shortest length that these samples can tell being 300 m" in next(too_rough(lines, 290.0, 300.0))
+    assert not list(too_rough(lines, 290.0))
+    assert not list(too_rough(lines[:200], 10.0))
 
 
 def test_an_hour_is_fitted_with_an_honest_sigma() -> None:

@@ -6,11 +6,21 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.observations import Observations
 
-__all__ = ["courses", "crossed", "crosses_itself", "far_off", "jumped", "left_open", "left_open_by"]
+__all__ = [
+    "courses",
+    "crossed",
+    "crosses_itself",
+    "far_off",
+    "jumped",
+    "left_open",
+    "left_open_by",
+    "too_rough",
+]
 
 TURNED = 30.0
 """deg between two courses that cross."""
@@ -29,6 +39,8 @@ OFTEN, TWICE = 0.08, 2
 rock: six hours of a glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
 LEAP = 100.0
 """m beyond what the vehicle can have moved: a jump in position."""
+BETWEEN = 0.5
+"""Of the distance between tracks: rock that changes over less is not the same on any two of them."""
 STILL = 5.0
 """m between samples, below which a course is not one."""
 
@@ -71,6 +83,28 @@ def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
             f"you crossed your own track at {places} only: rock and heading are told apart by how smooth the "
             "rock is; fly more legs that cross earlier ones"
         )
+
+
+def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[str]:
+    """Say whether rock of a `length`, m, changes faster than a track (n, 2), m, can follow.
+
+    `shortest` is the least length, m, that was tried: a fit that ends there has found a limit, not the rock.
+    """
+    place = courses(track)[0]
+    if len(place) < FEW:
+        return
+    way = float(np.linalg.norm(np.diff(place, axis=0), axis=1).sum())
+    apart = float(ConvexHull(place, qhull_options="QJ").volume) / way  # in a plane its volume is an area
+    if length < BETWEEN * apart:
+        than = f"less than half the distance between your tracks (about {apart:.0f} m)"
+    elif length <= shortest:
+        than = f"the shortest length that these samples can tell being {shortest:.0f} m"
+    else:
+        return
+    yield (
+        f"the rock changes over {length:.0f} m, {than}: rock, vehicle and noise are hardly told apart, nor "
+        "does the map know what lies between; fly tracks closer together"
+    )
 
 
 def far_off(place: FloatArray) -> BoolArray:

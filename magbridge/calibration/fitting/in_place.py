@@ -219,6 +219,7 @@ def _details(found: _Answer, survey: SurveySamples) -> dict[str, Any]:
             "size_nT": choice.ratio * found.widths.sigma,
             "length_m": field.length,
             "smoothness": field.alpha - 1,
+            "shortest_m": float(ladder(survey.place)[0]),
             "falls_off_upwards": field.harmonic,
             "nodes": field.nodes.size,
         },
