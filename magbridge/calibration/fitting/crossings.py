@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -19,6 +20,7 @@ __all__ = [
     "jumped",
     "left_open",
     "left_open_by",
+    "rough_rock",
     "too_rough",
 ]
 
@@ -83,6 +85,12 @@ def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
             f"you crossed your own track at {places} only: rock and heading are told apart by how smooth the "
             "rock is; fly more legs that cross earlier ones"
         )
+
+
+def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float) -> Iterator[str]:
+    """Say whether a fit's `rock`, where it is larger than the `noise`, nT, is too rough for the track."""
+    if rock and data.place is not None and rock["size_nT"] > noise:
+        yield from too_rough(data.place[:, :2], rock["length_m"], rock["shortest_m"])
 
 
 def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[str]:

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import find_boresight, magnetic_headings
-from magbridge.calibration.fitting.crossings import crosses_itself, far_off, jumped, left_open, too_rough
+from magbridge.calibration.fitting.crossings import crosses_itself, far_off, jumped, left_open, rough_rock
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.left_out import LeftOut
@@ -252,12 +252,15 @@ def _judged(found: Fit, data: Observations) -> Fit:
             mismatch.append(magnetic)
     ratio = expected_ratio(apart_from_level(calibration), data)
     lasting = found.details.get("autocorrelation", 0.0)
-    doubts = tuple(_doubts(ratio, calibration.noise.sensor, heading_gap(data), lasting))
-    doubts = (*doubts, *_rough(found, data))
+    noise = calibration.noise.sensor
+    doubts = (
+        *_doubts(ratio, noise, heading_gap(data), lasting),
+        *rough_rock(data, found.details.get("rock"), noise),
+    )
     if ratio > UNSUPPORTED:
         doubts = (*doubts, *found.open)
     unsupported = [f"the data do not support this fit: {'; '.join(doubts)}"] if doubts else []
-    seen = combinations(found.samples, calibration.coefficients, max(calibration.noise.sensor, 1e-9))
+    seen = combinations(found.samples, calibration.coefficients, max(noise, 1e-9))
     return replace(
         found,
         calibration=replace(calibration, doubts=doubts),
@@ -275,13 +278,6 @@ def _judged(found: Fit, data: Observations) -> Fit:
             "combinations_nT": seen.sigma.tolist(),
         },
     )
-
-
-def _rough(found: Fit, data: Observations) -> Iterator[str]:
-    """Say whether rock that is larger than the noise changes faster than the track can follow."""
-    rock = found.details.get("rock")
-    if rock and data.place is not None and rock["size_nT"] > found.calibration.noise.sensor:
-        yield from too_rough(data.place[:, :2], rock["length_m"], rock["shortest_m"])
 
 
 def _doubts(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[str]:
