@@ -25,9 +25,9 @@ from magbridge.calibration.fitting.ends import flown
 from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.known import Known
-from magbridge.calibration.fitting.left_out import LeftOut, leave_out
+from magbridge.calibration.fitting.left_out import leave_out, refitted
 from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise, memory
-from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, starts
+from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, nominal, nominal_samples, starts
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import Vehicle, pose
 from magbridge.calibration.fitting.prior import Prior, PriorFamily
@@ -42,6 +42,8 @@ ENOUGH, BLOCK = 6000, 50
 """Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
 ROUNDS = 16
 """Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
+SHRUNK = 0.15
+"""Departure of the middle scale from 1 that no magnetometer has."""
 USUAL = 3
 """The order that is usually enough: below it, the evidence is asked for one more."""
 
@@ -93,10 +95,8 @@ def fit_auto(
     coefficients = prior.coefficients(best.solution.z)
     check_scales(samples, coefficients)
     left = leave_out(samples, prior, best.solution.z, best.noise, data.runs)
-    if left.ratio > 1.0 and known is None and (simpler := _simpler(data, left)) is not None:
-        return simpler
     covariance = prior.E @ covariance_of(precision) @ prior.E.T
-    return assemble(
+    found = assemble(
         data, samples, posed.ranges, posed.exponents, coefficients, covariance, best.noise, "auto", left,
         prior=prior, details={
             "log_evidence": best.score,
@@ -106,15 +106,34 @@ def fit_auto(
             "widths_nT": dict(zip(family.names, np.exp(best.widths.eta).tolist(), strict=True)),
         },
     )  # fmt: skip
+    doubtful = known is None and (left.ratio > 1.0 or not data.names)
+    return (_simpler(data, found, best) if doubtful else None) or found
 
 
-def _simpler(data: Observations, left: LeftOut) -> Fit | None:
-    """Return the fit of one ellipsoid, if it predicts the parts left out better than this one does."""
+def _simpler(data: Observations, found: Fit, best: _Answer) -> Fit | None:
+    """Return the fit of one ellipsoid, if it predicts the parts left out better.
+
+    Where both are one ellipsoid each is fitted again without the part; with parameters the first order tells
+    enough. Beside a reference that is nearly constant such errors reward a collapse: so not if its scales are
+    those of no sensor, and further from 1 than those of `found`.
+    """
     try:
-        one = fit_nominal(data)
+        one, simpler = nominal(data), fit_nominal(data)
     except CalibrationError:
         return None
-    return one if one.details["left_out_nT"] < left.rms else None
+    if data.names:
+        return simpler if simpler.details["left_out_nT"] < found.details["left_out_nT"] else None
+    white = replace(one.noise, autocorrelation=0.0, white=0.0)  # as it was fitted
+    prior = best.family.at(best.widths.eta)
+    better = refitted(nominal_samples(data), one.prior, one.z, white, data.runs) < refitted(
+        found.samples, prior, best.solution.z, best.noise, data.runs
+    )
+    return simpler if better and _shrinks(simpler) <= max(_shrinks(found), SHRUNK) else None
+
+
+def _shrinks(found: Fit) -> float:
+    """Departure of the middle scale from 1."""
+    return abs(0.5 * sum(found.scales) - 1.0)
 
 
 def _may_gain(data: Observations, order: int, known: Known | None) -> bool:

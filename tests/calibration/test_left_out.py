@@ -1,0 +1,74 @@
+"""Parts left out: which they are, what a fit without them predicts, and which fit they prefer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.left_out import refitted
+from magbridge.calibration.fitting.nominal import nominal, nominal_samples
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.validate import in_sensor_units
+
+FIELD = np.array([21_000.0, 2_000.0, 42_000.0])
+BOOTS = np.repeat([0, 1, 2], [400, 100, 100])
+
+
+def copter(seed: int, n: int = 600, size: float = 800.0, memory: float = 0.97) -> Observations:
+    """All headings, tilted by 12 deg; disturbed for long, and three times as much in the first third."""
+    rng = np.random.default_rng(seed)
+    angles = np.column_stack([lfilter([0.2], [1.0, -0.98], rng.normal(size=n)) * 3.0 for _ in range(2)])
+    heading = np.cumsum(rng.normal(0.0, 6.0, n)) + np.linspace(0.0, 1500.0, n)
+    turned = Rotation.from_euler("ZYX", np.column_stack([heading, 12.0 * np.tanh(angles)]), degrees=True)
+    field = turned.inv().apply(FIELD) @ (np.eye(3) + rng.normal(0.0, 0.005, (3, 3)))
+    lasting = lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], rng.normal(0.0, size, (n, 3)), axis=0)
+    lasting[: n // 3] = 3.0 * lasting[: n // 3] + rng.normal(0.0, 3.0 * size, 3)
+    return Observations(
+        field + rng.normal(0.0, 500.0, 3) + lasting,
+        np.full(n, np.linalg.norm(FIELD)),
+        np.empty((n, 0)),
+        time=np.arange(n, dtype=float) * 0.1,
+    )
+
+
+def predicted(data: Observations, runs: np.ndarray) -> float:
+    one = nominal(data)
+    fitted = replace(one.noise, autocorrelation=0.0, white=0.0)
+    return refitted(nominal_samples(data), one.prior, one.z, fitted, runs)
+
+
+def test_a_run_that_is_most_of_the_log_is_no_part() -> None:
+    """What the rest says of it would judge how far a fit can be carried, not how well it fits."""
+    data = copter(1)
+    quarters = np.zeros(600)
+    assert predicted(data, BOOTS) == predicted(data, quarters)
+    assert predicted(data, np.repeat([0, 1, 2], 200)) != predicted(data, quarters)
+
+
+def test_parts_are_predicted_by_fits_without_them() -> None:
+    data = copter(2, size=50.0, memory=0.0)
+    runs = np.repeat([0, 1, 2], 200)
+    errors = [
+        in_sensor_units(fit(data.part(runs != k), "nominal").calibration, data.part(runs == k))[0]
+        for k in range(3)
+    ]
+    assert predicted(data, runs) == pytest.approx(np.sqrt(np.mean(np.concatenate(errors) ** 2)), rel=0.1)
+
+
+def test_auto_is_better_than_one_ellipsoid_where_the_first_part_differs() -> None:
+    """Fitted to the first half, tested on the second, of six logs."""
+    squares = {"nominal": 0.0, "auto": 0.0}
+    for seed in range(6):
+        data = copter(seed, 1200)
+        late = data.part(data.time >= 60.0)
+        first = data.part(data.time < 60.0)
+        first = Observations(first.field, first.reference, first.parameters, runs=BOOTS, time=first.time)
+        for method in squares:
+            error, _ = in_sensor_units(fit(first, method).calibration, late)
+            squares[method] += float(np.mean(error**2))
+    assert squares["auto"] < 0.84**2 * squares["nominal"]
