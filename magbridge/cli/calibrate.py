@@ -151,6 +151,7 @@ def calibrate(
     from magbridge.calibration.fitting.lowpass import unfiltered
     from magbridge.calibration.fitting.mounted_masses import read_vehicle
     from magbridge.calibration.fitting.observe import observations
+    from magbridge.calibration.fitting.offered import AUTO
     from magbridge.calibration.fitting.sources import idle
     from magbridge.columns import CHANNELS, require
     from magbridge.field.declination import with_true_heading
@@ -165,7 +166,7 @@ def calibrate(
     with waiting("reading"):
         logs = by_base_station(read_each(files, options=reading.options), base)
         deployment = join(logs)
-    require(deployment, CHANNELS)
+    require(deployment, (*CHANNELS, *(name for name in parameter if name != AUTO)))
     deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
     if about_mean:
@@ -174,7 +175,6 @@ def calibrate(
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
     with _naming(deployment), waiting("fitting"):
         parameter = chosen_parameters(parameter, deployment, grid=anomalies, order=order, site_bias=site_bias)
-        require(deployment, parameter)
         data = replace(
             observations(deployment, parameter, grid=anomalies),
             inputs=_digests((*files, *([base] if base else []))),

@@ -90,7 +90,7 @@ def chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Seque
         raise FormatError(path, "expected rows, there are none")
     start, scale = epoch(path, clock)
     columns, left_out = _columns(path, file, dimension, clock)
-    units = {one.name: str(getattr(one.variable, "units", "1")) for one in columns}
+    units = {one.name: _unit(one.variable) for one in columns}
     meanings = {one.name: str(getattr(one.variable, "long_name", "")) for one in columns}
     try:
         attrs = {key: _plain(value) for key, value in file.__dict__.items() if key not in GENERATED}
@@ -240,3 +240,9 @@ def _bad(flags: Any, rows: slice) -> BoolArray:
 
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
+
+
+def _unit(variable: Any) -> str:
+    """Return the unit, which a file of ours spells as UDUNITS does where it is an angle's."""
+    unit = str(getattr(variable, "units", "1"))
+    return "deg" if unit == "degree" else unit
