@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from html import escape
 from importlib import import_module
@@ -12,12 +12,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.boresight import find_boresight, magnetic_headings
-from magbridge.calibration.fitting.crossings import crosses_itself, far_off, jumped, left_open, rough_rock
-from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
+from magbridge.calibration.fitting.crossings import crosses_itself, far_off, jumped, left_open
+from magbridge.calibration.fitting.judged import judged
 from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.left_out import LeftOut
-from magbridge.calibration.fitting.level import apart_from_level, with_level
+from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.prior import Prior
@@ -42,26 +41,13 @@ METHODS: dict[str, str] = {
 
 ONE_ATTITUDE = 5.0
 """deg: all samples within that of their mean direction are one attitude."""
-UNSUPPORTED = 5.0
-"""Expected error over noise, above which the data do not support the fit."""
-LIKELIER = 3.0
-"""Nats by which one more order is likelier (20:1) where the one that was asked for is too low."""
 UNKNOWN_LENGTH = 500.0
 """m, taken for the rock's where no field in place was fitted."""
-WORSE = 1.25
-"""Errors of parts left out over what a fit claims for them, from which on a pilot should know."""
-GAIN = 0.08
-"""Departure of the middle scale from 1 that few sensors have, four sigmas of the prior: a wrong reference
-shrinks all scales, and a real flight was off by as much that had met rock (0.88 to 0.94)."""
 LEVEL = 145.0
 """nT, 1-sigma by which the total field at a site differs from a main-field model's: what its degrees do not
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
-LASTING = 0.98
-"""Autocorrelation of neighbours that no sensor's noise has beside a field in place."""
 ROCK, JUDGED = 3.0 * LEVEL, 3000
 """nT, more than which no rock leaves over a whole track; and samples that are enough to see that."""
-UNSEEN = 270.0
-"""deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +169,7 @@ def fit(
         if (kept := found.details.pop("flown", None)) is not None:
             data = data.part(kept)
             found.details["ends"] = int((~kept).sum())
-        return _judged(found if method == "survey" else _biased(found, bias), data)
+        return judged(found if method == "survey" else _biased(found, bias), data)
 
 
 def _function(method: str) -> Callable[..., Fit]:
@@ -236,98 +222,6 @@ def _refuse_one_attitude(data: Observations) -> None:
         raise CalibrationError(
             f"all samples lie within {np.quantile(off, 0.95):.1f} degrees of one attitude: "
             "fly turns (full circles, dives and climbs)"
-        )
-
-
-def _judged(found: Fit, data: Observations) -> Fit:
-    """Add the boresight, and warnings of what the data could not determine."""
-    calibration, mismatch = found.calibration, []
-    if calibration.boresight is None:
-        try:
-            calibration = replace(calibration, boresight=find_boresight(calibration, data))
-        except CalibrationError as error:
-            mismatch.append(str(error))
-            data = replace(data, attitude=None)
-        if magnetic := magnetic_headings(calibration, data):
-            mismatch.append(magnetic)
-    ratio = expected_ratio(apart_from_level(calibration), data)
-    lasting = found.details.get("autocorrelation", 0.0)
-    noise = calibration.noise.sensor
-    doubts = (
-        *_doubts(ratio, noise, heading_gap(data), lasting),
-        *rough_rock(data, found.details.get("rock"), noise),
-    )
-    if ratio > UNSUPPORTED:
-        doubts = (*doubts, *found.open)
-    unsupported = [f"the data do not support this fit: {'; '.join(doubts)}"] if doubts else []
-    seen = combinations(found.samples, calibration.coefficients, max(noise, 1e-9))
-    return replace(
-        found,
-        calibration=replace(calibration, doubts=doubts),
-        warnings=(
-            *unsupported,
-            *(found.open if ratio <= UNSUPPORTED else ()),
-            *warnings_for(calibration, data),
-            *mismatch,
-            *_suspicions(found),
-        ),
-        details={
-            **found.details,
-            "expected_over_noise": ratio,
-            "rank": seen.rank,
-            "combinations_nT": seen.sigma.tolist(),
-        },
-    )
-
-
-def _doubts(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[str]:
-    """Say why data do not support a fit: error over `noise` (nT), widest gap of the headings (deg), memory.
-
-    `lasting` is the residual's autocorrelation where rock has been taken out of it.
-    """
-    if lasting > LASTING:
-        yield (
-            f"residuals of {noise:.0f} nT last for many samples (autocorrelation {lasting:.3f}) though the "
-            "rock is taken out: two vehicles in one log, an offset that jumped, or wrong positions"
-        )
-    if ratio > UNSUPPORTED:
-        yield (
-            "at these pitches and positions, on any heading and with 10 degrees more roll, expect "
-            f"{ratio * noise:.0f} nT of error"
-        )
-    if gap > UNSEEN:
-        yield (
-            f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
-            "cannot be told from the Earth's"
-        )
-
-
-def _suspicions(found: Fit) -> Iterator[str]:
-    """Say what the fit itself shows to be wrong with the samples or with their reference."""
-    samples, outliers = len(found.residual), found.details.get("outliers", 0)
-    if outliers > 0.02 * samples:
-        yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
-    if ends := found.details.get("ends", 0):
-        yield (
-            f"{ends} samples at the ends of the log do not fit the others (a crash, handling?), "
-            "and were left out"
-        )
-    if (ratio := found.details.get("left_out_ratio", 1.0)) > WORSE:
-        yield (
-            f"parts left out of the fit are off by {ratio:.1f} times what it claimed, so its sigmas were "
-            "raised by that: the model lacks something (magbridge diagnose), or the reference does"
-        )
-    if (gained := found.details.get("next_order", 0.0)) > LIKELIER:
-        yield (
-            f"--order is too low: one more is likelier by {gained:.0f} nats, and the sigmas do not know what "
-            "is missing"
-        )
-    smallest, largest = found.scales
-    if abs(0.5 * (smallest + largest) - 1.0) > GAIN:
-        yield (
-            f"the fit multiplies the readings by {smallest:.2f} to {largest:.2f}, and anomalies with them: "
-            "unless the sensor is that far off, the reference is; fit to runs at one place, or with a better "
-            "map (--grid)"
         )
 
 

@@ -33,8 +33,8 @@ __all__ = ["OWN", "Assessment", "Fitness", "assess", "unsettled", "useful"]
 
 Fitness = Literal["yes", "once_settled", "no", "nothing_added", "reference_only"]
 OWN = (
-    "The calibration was fitted to this very log, so nothing was left out of its fit: the improvement is no "
-    "test."
+    "The calibration was fitted to this very log and has absorbed part of what is wrong: the improvement is "
+    "no test."
 )
 REPEATS = (
     "What was left out of the fit are parts of the same log. Compare one more log, of another day, before "
