@@ -102,7 +102,7 @@ def test_true_field_is_fitted_as_before() -> None:
     data, true = flown(legs=6)
     known = Observations(field=data.field, reference=true, parameters=data.parameters, time=data.time)
     found = fit(known)
-    assert found.calibration.method == "auto"
+    assert found.calibration.method in {"auto", "nominal"}  # which of both predicts parts left out better
     assert found.calibration.reference.level_sigma == 0.0
 
 
