@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from html import escape
 from io import StringIO
 from pathlib import Path
@@ -181,7 +181,8 @@ def _panel(one: History, k: int) -> str:
                 middle = datetime.fromtimestamp((before.time + after.time) / 2.0, UTC)
                 ax.axvline(middle, color=REFIT, lw=0.8, ls=":")  # type: ignore[arg-type]
         ax.set_title(f"{one.names[k]}, nT", fontsize=9, loc="left")
-        ax.margins(x=0.08)
+        aside = max(0.08 * (when[-1] - when[0]), timedelta(days=10))  # one deployment alone has no span
+        ax.set_xlim(when[0] - aside, when[-1] + aside)
         ax.spines[["top", "right"]].set_visible(False)
         ax.xaxis.set_major_formatter(ConciseDateFormatter(ax.xaxis.get_major_locator()))  # type: ignore[no-untyped-call]
         literal(figure)
