@@ -35,6 +35,7 @@ BENCHMARKS: dict[str, tuple[str, int]] = {
     "files": ("benchmarks.files:files", 2),
     "replay": ("benchmarks.replay:replay", 5),
     "start": ("benchmarks.start:start", 5),
+    "learning": ("benchmarks.learning:learning", 5),
     "commands": ("benchmarks.commands:commands", 7),
     "fitting": ("benchmarks.calibration:fitting", 3),
     "correcting": ("benchmarks.calibration:correcting", 5),

@@ -193,5 +193,5 @@ def keep(learning: Learning, path: Path) -> str:
     try:
         save(newest, path)
     except WriteError as error:
-        return f"learned calibration not kept: {error}"
+        return f"learned, but not kept: {error.reason}"
     return ""

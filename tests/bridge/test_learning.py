@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from small import CONFIG, START
+from turning import bridge, events, heard, named
 
 from magbridge import logs
-from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, Start
-from magbridge.bridge.learning import keep, kept_path
+from magbridge.bridge.events import Event
+from magbridge.bridge.learning import kept_path
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.calibration.file import calibration_id, load, save
-from magbridge.calibration.model import Calibration, Noise, Reference
-from magbridge.calibration.terms import Polynomial
+from magbridge.calibration.file import calibration_id, load
 from magbridge.cli import main
 from magbridge.config import load as load_config
 from magbridge.errors import ConfigError
@@ -24,72 +24,6 @@ from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.mavlink.dialect import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
 from magbridge.records import Channel, Quality
-
-PLACE = (49.52, -57.87)
-SAMPLES = 700
-COUNT = 1.0 / 64.0
-"""nT."""
-SHIFT = np.array([14.0, -11.0, 13.0])
-LEARNING = "[learning]\nenabled = true\n"
-
-
-def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pipeline:
-    """Set up a bridge with a nominal calibration that is known to a nanotesla, or with none."""
-    cal = Calibration(
-        parameters=(),
-        terms=(Polynomial(exponents=((),)),),
-        coefficients=np.random.default_rng(1).normal(size=9) * 100.0,
-        covariance=np.eye(9),
-        noise=Noise(1.0),
-        reference=Reference(51_900.0),
-        method="nominal",
-    )
-    save(cal, folder / "cal.json")
-    config = folder / "bridge.toml"
-    source = CONFIG if known else CONFIG.replace('[calibration]\nfile = "cal.json"\n', "")
-    head, _, _ = source.partition("[telemetry")
-    head = head.replace("options = {", f'options = {{unit = "counts", scale = {COUNT}, ')
-    config.write_text(
-        f'{head}[log]\ndirectory = "logs"\n[publish]\nMAG_FIELD = 0\n{learning}', encoding="utf-8"
-    )
-    return set_up(load_config(config), Start(START))
-
-
-def events(folder: Path) -> list[Event]:
-    """A vehicle turns and pitches in a field as strong as the IGRF; its offset has changed."""
-    rng, autopilot = np.random.default_rng(2), Codec(1, 1)
-    cal = load(folder / "cal.json")
-    A, T = (one[0] for one in cal.matrices(np.empty((1, 0))))
-    made = []
-    for k in range(SAMPLES):
-        time_us = START + k * 4_000_000
-        frame = autopilot.pack(
-            "GLOBAL_POSITION_INT",
-            time_boot_ms=k * 4000,
-            lat=round(PLACE[0] * 1e7) + k * 120,
-            lon=round(PLACE[1] * 1e7),
-        )
-        made.append(Event(time_us - 400_000, Channel.LINK, frame))
-        yaw, pitch = (
-            0.7 * (k // 40) + 0.1 * rng.normal(),
-            (0.45 if k // 40 % 2 else -0.4) + 0.05 * rng.normal(),
-        )
-        unit = np.array([0.4 * np.cos(yaw) - 0.9 * pitch, 0.4 * np.sin(yaw), 0.9 + 0.4 * pitch * np.cos(yaw)])
-        total = 51_900.0 + 40.0 * np.sin(k / 400.0)
-        x, y, z = np.linalg.solve(A, total * unit / np.linalg.norm(unit)) + T + SHIFT + rng.normal(size=3)
-        counts = (round(x / COUNT), round(y / COUNT), round(z / COUNT))
-        made.append(Event(time_us, Channel.SENSOR, b"%d %d %d 4.0 %d 7\r\n" % (*counts, k)))
-    return made
-
-
-def heard(frames: list[tuple[int, bytes]]) -> list[Message]:
-    """Return the messages of frames."""
-    return [message for _, frame in frames for message in Codec(255, 190).parse(frame)]
-
-
-def named(messages: list[Message], name: str) -> list[Message]:
-    """Return those of one name."""
-    return [message for message in messages if message.name == name]
 
 
 @pytest.fixture(scope="module")
@@ -150,23 +84,6 @@ def test_ashore_it_learns_what_it_learned_live(
     assert pipeline.learning is not None
     kept = load(learned)
     np.testing.assert_array_equal(kept.coefficients, pipeline.learning.learner.calibration.coefficients)
-
-
-def test_it_is_kept_beside_the_first(flight: tuple[Path, Pipeline, list[tuple[int, bytes]]]) -> None:
-    """A calibration like any other, with where it comes from; only what is new is written."""
-    folder, pipeline, _ = flight
-    path = kept_path(load_config(folder / "bridge.toml"))
-    assert pipeline.learning is not None
-    assert path == folder / "cal-learned.json"
-    assert keep(pipeline.learning, path) == ""
-    kept = load(path)
-    assert calibration_id(kept) == calibration_id(pipeline.learning.learner.calibration)
-    assert any(name.startswith("calibration ") for name in kept.inputs)
-    path.unlink()
-    assert keep(pipeline.learning, path) == ""
-    assert not path.exists()
-    pipeline.learning.to_keep.append(kept)
-    assert "not kept" in keep(pipeline.learning, folder / "nowhere" / "cal-learned.json")
 
 
 def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
@@ -259,6 +176,25 @@ def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     live = np.array([one["total_field"] for one in fields])
     np.testing.assert_array_equal(logs.read(out)["total_field"].to_numpy(), live)
     assert kept_path(load_config(tmp_path / "bridge.toml")) == tmp_path / "cal-learned.json"
+
+
+THREADS = """
+import sys
+from threadpoolctl import threadpool_info
+from magbridge.__main__ import main
+main(sys.argv[1:])
+import numpy
+print({one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"})
+"""
+
+
+@pytest.mark.parametrize("name", ["run", "replay", "correct"])
+def test_the_same_bytes_on_another_number_of_cores(name: str) -> None:
+    """Linear algebra has one thread where samples are learned from: several round otherwise."""
+    free = {key: value for key, value in os.environ.items() if "NUM_THREADS" not in key}
+    command = [sys.executable, "-c", THREADS, name, "nowhere.toml"]
+    told = subprocess.run(command, env=free, capture_output=True, text=True, check=True).stdout
+    assert told.splitlines()[-1] == "{1}"
 
 
 def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

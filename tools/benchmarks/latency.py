@@ -94,11 +94,11 @@ def started(command: Callable[[str, int], list[str]]) -> Iterator[Running]:
         os.close(slave)
 
 
-def bridge_command(folder: Path) -> Callable[[str, int], list[str]]:
-    """Return the command that starts the bridge of the workload."""
+def bridge_command(folder: Path, more: str = "") -> Callable[[str, int], list[str]]:
+    """Return the command that starts the bridge of the workload, with `more` tables in its configuration."""
 
     def command(device: str, port: int) -> list[str]:
-        config = write_config(folder, device, f"udpout:127.0.0.1:{port}")
+        config = write_config(folder, device, f"udpout:127.0.0.1:{port}", more)
         return [str(BIN / "magbridge"), "run", "--config", str(config)]
 
     return command

@@ -86,11 +86,13 @@ def calibration() -> Calibration:
     )
 
 
-def write_config(folder: Path, port: str = "/dev/null", url: str = "udpout:127.0.0.1:14550") -> Path:
-    """Write ``bridge.toml`` and ``cal.json`` to `folder`; return the first."""
+def write_config(
+    folder: Path, port: str = "/dev/null", url: str = "udpout:127.0.0.1:14550", more: str = ""
+) -> Path:
+    """Write ``bridge.toml``, with `more` tables, and ``cal.json`` to `folder`; return the first."""
     save(calibration(), folder / "cal.json")
     path = folder / "bridge.toml"
-    path.write_text(CONFIG.format(port=port, url=url), encoding="utf-8")
+    path.write_text(CONFIG.format(port=port, url=url) + more, encoding="utf-8")
     return path
 
 

@@ -1,0 +1,86 @@
+"""A bridge that learns, without ports: line protocol, no masses; events are fed by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from small import CONFIG, START
+
+from magbridge.bridge.drive import set_up
+from magbridge.bridge.events import Event, Start
+from magbridge.bridge.pipeline import Pipeline
+from magbridge.calibration.file import load, save
+from magbridge.calibration.model import Calibration, Noise, Reference
+from magbridge.calibration.terms import Polynomial
+from magbridge.config import load as load_config
+from magbridge.mavlink import Codec, Message
+from magbridge.records import Channel
+
+__all__ = ["bridge", "events", "heard", "named"]
+
+PLACE = (49.52, -57.87)
+SAMPLES = 700
+COUNT = 1.0 / 64.0
+"""nT."""
+SHIFT = np.array([14.0, -11.0, 13.0])
+LEARNING = "[learning]\nenabled = true\n"
+
+
+def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pipeline:
+    """Set up a bridge with a nominal calibration that is known to a nanotesla, or with none."""
+    cal = Calibration(
+        parameters=(),
+        terms=(Polynomial(exponents=((),)),),
+        coefficients=np.random.default_rng(1).normal(size=9) * 100.0,
+        covariance=np.eye(9),
+        noise=Noise(1.0),
+        reference=Reference(51_900.0),
+        method="nominal",
+    )
+    save(cal, folder / "cal.json")
+    config = folder / "bridge.toml"
+    source = CONFIG if known else CONFIG.replace('[calibration]\nfile = "cal.json"\n', "")
+    head, _, _ = source.partition("[telemetry")
+    head = head.replace("options = {", f'options = {{unit = "counts", scale = {COUNT}, ')
+    config.write_text(
+        f'{head}[log]\ndirectory = "logs"\n[publish]\nMAG_FIELD = 0\n{learning}', encoding="utf-8"
+    )
+    return set_up(load_config(config), Start(START))
+
+
+def events(folder: Path) -> list[Event]:
+    """A vehicle turns and pitches in a field as strong as the IGRF; its offset has changed."""
+    rng, autopilot = np.random.default_rng(2), Codec(1, 1)
+    cal = load(folder / "cal.json")
+    A, T = (one[0] for one in cal.matrices(np.empty((1, 0))))
+    made = []
+    for k in range(SAMPLES):
+        time_us = START + k * 4_000_000
+        frame = autopilot.pack(
+            "GLOBAL_POSITION_INT",
+            time_boot_ms=k * 4000,
+            lat=round(PLACE[0] * 1e7) + k * 120,
+            lon=round(PLACE[1] * 1e7),
+        )
+        made.append(Event(time_us - 400_000, Channel.LINK, frame))
+        yaw, pitch = (
+            0.7 * (k // 40) + 0.1 * rng.normal(),
+            (0.45 if k // 40 % 2 else -0.4) + 0.05 * rng.normal(),
+        )
+        unit = np.array([0.4 * np.cos(yaw) - 0.9 * pitch, 0.4 * np.sin(yaw), 0.9 + 0.4 * pitch * np.cos(yaw)])
+        total = 51_900.0 + 40.0 * np.sin(k / 400.0)
+        x, y, z = np.linalg.solve(A, total * unit / np.linalg.norm(unit)) + T + SHIFT + rng.normal(size=3)
+        counts = (round(x / COUNT), round(y / COUNT), round(z / COUNT))
+        made.append(Event(time_us, Channel.SENSOR, b"%d %d %d 4.0 %d 7\r\n" % (*counts, k)))
+    return made
+
+
+def heard(frames: list[tuple[int, bytes]]) -> list[Message]:
+    """Return the messages of frames."""
+    return [message for _, frame in frames for message in Codec(255, 190).parse(frame)]
+
+
+def named(messages: list[Message], name: str) -> list[Message]:
+    """Return those of one name."""
+    return [message for message in messages if message.name == name]
