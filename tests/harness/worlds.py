@@ -9,9 +9,10 @@ import numpy as np
 from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.field.grid import AnomalyGrid
 from magbridge.learning import Learner
 
-__all__ = ["FIELD", "MASS", "World", "calibration", "error_of", "learn"]
+__all__ = ["FIELD", "MASS", "World", "calibration", "error_of", "grid_of", "learn"]
 
 MASS = Parameter("battpos", "in", -1.0, 1.0, 0.0, 1.0)
 ORDER = full_order(1, 2)
@@ -55,9 +56,8 @@ class World:
         A, T = truth.matrices(self.mass[:, None])
         self.field = np.linalg.solve(A, (unit * self.total[:, None])[:, :, None])[:, :, 0] + T
         self.field += rng.normal(size=(samples, 3))
-        self.where: list[tuple[float, float] | None] = [
-            (49.0 + n * 1.4 / 111_000.0, -57.0) for n in range(samples)
-        ]
+        self.track = [(49.0 + n * 1.4 / 111_000.0, -57.0) for n in range(samples)]
+        self.where: list[tuple[float, float] | None] = [*self.track]
 
 
 def learn(
@@ -95,3 +95,12 @@ def error_of(learned: Calibration, world: World) -> float:
     A, T = learned.matrices(world.mass[:, None])
     total = np.linalg.norm(np.matmul(A, (world.field - T)[:, :, None])[:, :, 0], axis=1)
     return float(np.std(total - world.total))
+
+
+def grid_of(scale: float, shift: float = 0.0) -> AnomalyGrid:
+    """Return a map of the world's rock, which runs north; `scale` and `shift` (m) make it a wrong one."""
+    metres = np.arange(-3_000.0, 5_000.0, 100.0)
+    rock = scale * 60.0 * np.sin((metres + shift) / 900.0)
+    latitude = 49.0 + metres / 111_000.0
+    longitude = np.linspace(-57.1, -56.9, 5)
+    return AnomalyGrid(longitude, latitude, np.repeat(rock[:, None], 5, axis=1), altitude=0.0)

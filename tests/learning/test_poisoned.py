@@ -1,0 +1,96 @@
+"""Poisoned references: what is published stays as good as it was, and what is seen is told."""
+
+from __future__ import annotations
+
+from math import nan
+
+import numpy as np
+import pytest
+from worlds import World, calibration, error_of, grid_of, learn
+
+from magbridge.learning import Learner
+
+
+def told(learner: Learner) -> list[str]:
+    """Return the texts of its notices."""
+    return [notice.text for notice in learner.notices]
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(-1.0, 0.0), (1.0, 1000.0)])
+def test_a_wrong_map_teaches_nothing_wrong(scale: float, shift: float) -> None:
+    """Upside down, or off by a kilometre as a false GPS: what is published stays as good as it was."""
+    known = calibration()
+    world = World(known, 1500)
+    learner = Learner(known, grid=grid_of(scale, shift), spread=20.0)
+    learn(learner, world)
+    assert error_of(learner.calibration, world) < 1.3
+
+
+def test_a_month_without_a_fix_changes_nothing() -> None:
+    """It is reported once, and what was published stays."""
+    known = calibration()
+    learner, world = Learner(known), World(known, 600)
+    learn(learner, world)
+    before = learner.calibration
+    field = tuple(world.field[0].tolist())
+    for hour in range(24 * 30):
+        learner.sample(
+            2_400_000_000 + hour * 3_600_000_000, field, [1.0, 0.5, 0.25], (0.5,), 0,
+            faulty=False, reference=nan, where=None, watched=(nan,),
+        )  # fmt: skip
+    assert learner.calibration is before
+    told = [notice.text for notice in learner.notices if "hour" in notice.text]
+    assert told == ["learning: an hour without a sample to learn from"]
+
+
+def test_a_spoofed_current_is_not_learned_from() -> None:
+    """Telemetry that jumps at random has nothing to do with the field: no term of it is published."""
+    known, rng = calibration(), np.random.default_rng(4)
+    learner = Learner(known, currents=("pump_current",))
+    learn(
+        learner,
+        World(known, 1200),
+        watched=np.column_stack([np.full(1200, nan), 50.0 * rng.normal(size=1200)]),
+    )
+    assert learner.calibration.effects == ()
+    assert learner.flags == 0
+
+
+def test_a_map_in_other_units_is_told() -> None:
+    """Ten times too strong: the map is named, the first calibration is published, and sigma grows."""
+    known, n = calibration(), 600
+    world, learner = World(known, n), Learner(known, grid=grid_of(10.0, 1000.0), spread=20.0)
+    doubted = learn(learner, world)
+    assert len(doubted) > n // 2
+    assert learner.state.causes == ("map_error",)
+    assert learner.variance > 100.0**2
+    assert learner.calibration is known
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_a_gps_that_jumps_by_a_kilometre_teaches_nothing(*, mapped: bool) -> None:
+    """To and fro, with a map and without one."""
+    known, n = calibration(), 1200
+    world = World(known, n)
+    world.where = [
+        (latitude + 1000.0 / 111_000.0 * (400 <= k < 800), longitude)
+        for k, (latitude, longitude) in enumerate(world.track)
+    ]
+    learner = Learner(known, grid=grid_of(1.0) if mapped else None, spread=20.0 if mapped else 145.0)
+    learn(learner, world)
+    assert learner.calibration is known
+    assert error_of(known, world) < 1.1
+
+
+def test_a_mass_whose_telemetry_lies_is_told_and_what_it_taught_is_taken_back() -> None:
+    """Positions at random for 20 minutes: the flag stands, and an hour later the first one is back."""
+    known, n = calibration(), 1800
+    world, rng = World(known, n), np.random.default_rng(5)
+    truth = world.mass.copy()
+    world.mass[600:900] = rng.uniform(-1.0, 1.0, 300)
+    learner = Learner(known)
+    doubted = learn(learner, world)
+    assert doubted[0] <= 605
+    assert sum(600 <= k < 900 for k in doubted) > 250
+    world.mass = truth
+    assert error_of(learner.calibration, world) < 1.3
