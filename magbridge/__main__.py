@@ -12,8 +12,8 @@ LIVE = ("run", "replay", "correct")
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; return its exit code. Ctrl-C prints one line, even while libraries are being loaded."""
     if (sys.argv[1:] if arguments is None else arguments)[:1] in [[name] for name in LIVE]:
-        # numpy reads it as it is loaded: threads round otherwise, which no replay on another computer would
-        # repeat, and on a busy one they wait for each other 400 times as long as one takes alone
+        # read as numpy is loaded. Two threads round otherwise, which no replay on one core would repeat;
+        # and on a busy computer they wait for each other for up to 0.4 s, where one alone takes 1 ms
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         from magbridge.cli import main as command  # noqa: PLC0415 - inside the try: importing takes time

@@ -2,18 +2,52 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 from nicegui import ui
 
+from magbridge.monitor.alarms import Alarm
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import State
-from magbridge.monitor.widgets import AMBER, MUTED, RED, Changes, card, clock, nothing
+from magbridge.monitor.widgets import AMBER, MUTED, RED, Changes, button, card, clock, nothing
 
 __all__ = ["AlarmPanel"]
 
 REPEAT = 5.0
 """s between two sounds while an alarm is not acknowledged."""
+
+
+class Row:
+    """One alarm. Its elements stay as long as it does, so that a click finds the button that it aims at."""
+
+    def __init__(self, acknowledge: Callable[[], None]) -> None:
+        self._acknowledge = acknowledge
+        with ui.row().classes("w-full items-center justify-between flex-nowrap border-l-4 pl-3") as self.box:
+            with ui.column().classes("gap-0"):
+                self._text = ui.label().classes("leading-tight text-sm")
+                self._times = ui.label().classes(f"text-xs {MUTED}")
+            self._seen: ui.button | None = None
+
+    def show(self, alarm: Alarm) -> None:
+        """Show how it stands; the button is there until somebody has seen it."""
+        color = RED if alarm.active else AMBER
+        self.box.style(f"border-color: {'transparent' if alarm.acknowledged else color}")
+        self._text.set_text(alarm.text)
+        times = f", {alarm.count} times" if alarm.count > 1 else ""
+        over = "since" if alarm.active else "over; at"
+        self._times.set_text(f"{over} {clock(alarm.since)} UTC{times}")
+        if alarm.acknowledged and self._seen is not None:
+            self._seen.delete()
+            self._seen = None
+        elif not alarm.acknowledged:
+            if self._seen is None:
+                with self.box:
+                    self._seen = button("Seen", self._acknowledge)
+            label = f"Seen: {alarm.text}"
+            if self._seen.props.get("aria-label") != label:
+                self._seen.props["aria-label"] = label
+                self._seen.update()
 
 
 class AlarmPanel:
@@ -25,11 +59,11 @@ class AlarmPanel:
         with card("Alarms"):
             with ui.row().classes("w-full items-center gap-x-4"):
                 self._sound = ui.switch("Sound", value=sound, on_change=self._switched)
-                ui.button("Acknowledge all", on_click=partial(self._acknowledge, None)).props(
-                    "dense no-caps outline size=sm padding='4px 10px'"
-                ).classes("!text-slate-700 dark:!text-slate-200")
+                button("Acknowledge all", partial(self._acknowledge, None))
             self._box = ui.column().classes("w-full max-h-60 gap-2 overflow-auto flex-nowrap")
             self._box.props('tabindex=0 role=group aria-label="Alarms"')
+            self._none = nothing("None")
+        self._rows: dict[str, Row] = {}
         self._spoken = ui.label().classes("sr-only").props("role=alert")
 
     @property
@@ -44,32 +78,22 @@ class AlarmPanel:
             self._sounded = now
             ui.run_javascript("magbridge.beep()")
         if not self._changes.new(
-            "alarms", [(a.key, a.text, a.active, a.acknowledged, a.count) for a in alarms], self._box
+            "alarms", [(a.key, a.text, a.active, a.acknowledged, a.count) for a in alarms]
         ):
             return
         unseen = [alarm.text for alarm in alarms if not alarm.acknowledged]
         self._spoken.set_text(f"Alarm: {unseen[0]}" if unseen else "")
-        with self._box:
-            if not alarms:
-                nothing("None")
-            for alarm in alarms:
-                color = RED if alarm.active else AMBER
-                edge = color if not alarm.acknowledged else "transparent"
-                with (
-                    ui.row()
-                    .classes("w-full items-center justify-between flex-nowrap border-l-4 pl-3")
-                    .style(f"border-color: {edge}")
-                ):
-                    with ui.column().classes("gap-0"):
-                        ui.label(alarm.text).classes("leading-tight text-sm")
-                        times = f", {alarm.count} times" if alarm.count > 1 else ""
-                        over = "since" if alarm.active else "over; at"
-                        ui.label(f"{over} {clock(alarm.since)} UTC{times}").classes(f"text-xs {MUTED}")
-                    if not alarm.acknowledged:
-                        button = ui.button("Seen", on_click=partial(self._acknowledge, alarm.key))
-                        button.props("dense no-caps outline size=sm padding='4px 10px'")
-                        button.classes("!text-slate-700 dark:!text-slate-200")
-                        button.props["aria-label"] = f"Seen: {alarm.text}"
+        self._none.set_visibility(not alarms)
+        for key in self._rows.keys() - {alarm.key for alarm in alarms}:
+            self._rows.pop(key).box.delete()
+        for place, alarm in enumerate(alarms):
+            if alarm.key not in self._rows:
+                with self._box:
+                    self._rows[alarm.key] = Row(partial(self._acknowledge, alarm.key))
+            row = self._rows[alarm.key]
+            row.show(alarm)
+            if self._box.default_slot.children[place] is not row.box:
+                row.box.move(target_index=place)
 
     def _acknowledge(self, key: str | None) -> None:
         with self._station.lock:

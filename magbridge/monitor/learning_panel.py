@@ -8,11 +8,12 @@ from nicegui import ui
 
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import State
-from magbridge.monitor.widgets import GRID, INK, RED, card, fact
+from magbridge.monitor.widgets import GRID, INK, RED, button, card, fact
 from magbridge.monitor.words import learnt
 
 __all__ = ["LearningPanel"]
 
+TITLE = "Learning in flight"
 DO = "MB_LEARN_DO"
 ORDERS = {
     "Accept": (1.0, "What was learned is the calibration from now on, and the doubt is acknowledged"),
@@ -25,15 +26,13 @@ class LearningPanel:
 
     def __init__(self, station: StationLink, state: State) -> None:
         self._station, self._state = station, state
-        with ui.element().classes("w-full") as self._box, card("Learning in flight"):
-            with ui.element().classes(f"{GRID} md:grid-cols-2 gap-y-1"):
+        self._box = ui.element().classes("w-full").props(f'role=region aria-label="{TITLE}"')
+        with self._box, card(TITLE):
+            with ui.element().classes(f"{GRID} md:grid-cols-2 gap-x-12 gap-y-1"):
                 self._labels = [fact(name) for name in learnt(state)]
             with ui.row().classes("gap-x-4"):
                 self._buttons = [
-                    ui.button(name, on_click=partial(self._order, value))
-                    .props("dense no-caps outline size=sm padding='4px 10px'")
-                    .classes("!text-slate-700 dark:!text-slate-200")
-                    .tooltip(meaning)
+                    button(name, partial(self._order, value)).tooltip(meaning)
                     for name, (value, meaning) in ORDERS.items()
                 ]
             self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
@@ -44,8 +43,8 @@ class LearningPanel:
         for label, (text, well) in zip(self._labels, learnt(state).values(), strict=True):
             label.set_text(text)
             label.style(f"color: {INK if well else RED}")
-        for button in self._buttons:
-            button.set_enabled(DO in state.parameters)
+        for one in self._buttons:
+            one.set_enabled(DO in state.parameters)
         self._answer.set_text(state.parameters[DO].error if DO in state.parameters else "")
 
     def _order(self, value: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -21,6 +21,7 @@ __all__ = [
     "RED",
     "STYLE",
     "Changes",
+    "button",
     "card",
     "clock",
     "fact",
@@ -82,9 +83,15 @@ def slanted(old: bool) -> str:
     return f"font-style: {'italic' if old else 'normal'}; color: {FADED if old else INK}"
 
 
-def nothing(text: str = "None yet") -> None:
+def nothing(text: str = "None yet") -> ui.label:
     """Say that there is nothing to show."""
-    ui.label(text).classes(f"text-sm {MUTED}")
+    return ui.label(text).classes(f"text-sm {MUTED}")
+
+
+def button(text: str, order: Callable[[], None]) -> ui.button:
+    """Make a small button that gives an order."""
+    made = ui.button(text, on_click=order).classes("!text-slate-700 dark:!text-slate-200")
+    return made.props("dense no-caps outline size=sm padding='4px 10px'")
 
 
 def clock(when: float) -> str:

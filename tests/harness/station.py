@@ -26,11 +26,11 @@ def free(kind: socket.SocketKind) -> int:
 
 
 @contextmanager
-def served(clock: Path, *options: str, warned: bool = False) -> Iterator[Station]:
-    """Run the page; `clock` holds by how many µs its computer's clock is set forward."""
+def served(clock: Path, *options: str, warned: bool = False, url: str = "") -> Iterator[Station]:
+    """Run the page; `clock` holds by how many µs its computer's clock is set forward, `url` is its link."""
     link, port = free(socket.SOCK_DGRAM), free(socket.SOCK_STREAM)
     launch = [sys.executable, str(Path(__file__).parent / "stepped.py"), str(clock)]
-    command = [*launch, "monitor", f"udpin:127.0.0.1:{link}", "--port", str(port), *options]
+    command = [*launch, "monitor", url or f"udpin:127.0.0.1:{link}", "--port", str(port), *options]
     # NiceGUI looks at them
     alone = {name: value for name, value in os.environ.items() if "PYTEST" not in name}
     with subprocess.Popen(command, stderr=subprocess.PIPE, env=alone) as process:

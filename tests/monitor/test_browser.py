@@ -18,12 +18,14 @@ import pytest
 from station import get, served
 
 from magbridge.mavlink import Codec
+from magbridge.records import Quality
 
 pytest.importorskip("nicegui")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
+FLAGS = int(Quality.STALE_TELEMETRY | Quality.GAP)
 PATIENCE = 20_000
 """ms that a loaded computer may take to show something."""
 
@@ -39,7 +41,7 @@ def feed(link: tuple[str, int], stop: threading.Event) -> None:
             total = 52_000.0 + 5.0 * math.sin(k / 20.0) + (9_000.0 if k == 150 else 0.0)
             field = {"time_usec": us, "total_field": total, "total_field_sigma": 1.0}
             frames = [
-                bridges[0].pack("MAG_FIELD", flags=1, **field),
+                bridges[0].pack("MAG_FIELD", flags=FLAGS, **field),
                 bridges[1].pack("MAG_FIELD", **{**field, "total_field": 41_000.0}),
                 bridges[0].pack("MAG_RAW", time_usec=us, temperature=7.0),
                 autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=k // 40 % 2),
@@ -143,8 +145,10 @@ def test_a_spike_is_marked_and_does_not_flatten_the_axis(browser: Any, url: str)
 def test_alarms_vehicles_and_texts(browser: Any, url: str) -> None:
     page = visit(browser, url)
     seen = page.get_by_role("button", name=re.compile("Seen: A parameter of the calibration"))
+    other = page.get_by_role("button", name=re.compile("Seen: Samples are missing")).element_handle()
     seen.click()
     seen.wait_for(state="detached")
+    assert other.evaluate("button => button.isConnected")  # a click on it would not have been lost
     assert page.get_by_text("<b>bold</b> ballast is stale").count()  # as text, not as HTML
     page.get_by_role("button", name=re.compile("Vehicle 2, component 191")).click()
     page.get_by_text("41\u202f000.00").wait_for()

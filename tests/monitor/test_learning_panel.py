@@ -1,0 +1,115 @@
+"""The panel of learning in a browser, of a real bridge over a real socket: what it shows, and its buttons."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from itertools import count, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig import Rig
+from station import get, served
+
+from magbridge.mavlink.dialect import MAV_PARAM_TYPE
+
+pytest.importorskip("nicegui")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this computer")
+PATIENCE = 30_000
+"""ms that a loaded computer may take to show something."""
+HZ = 20
+LAT, LON, FIELD = 49.52, -57.87, 51_900.0
+"""deg, deg, nT: a place, and how strong the Earth's field is there."""
+SHIFT = np.array([14.0, -11.0, 13.0])
+"""nT, by which the offset has changed since the calibration."""
+
+
+class Turning:
+    """The field that a vehicle reads which turns and pitches, nT; the Earth's can be made stronger."""
+
+    def __init__(self) -> None:
+        self.level, self._samples, self._rng = 0.0, count(), np.random.default_rng(2)
+
+    def __call__(self, _: float) -> tuple[float, float, float]:
+        """Read the next sample."""
+        leg = next(self._samples) // 20
+        yaw = 0.7 * leg + 0.1 * self._rng.normal()
+        pitch = (0.45 if leg % 2 else -0.4) + 0.05 * self._rng.normal()
+        level = np.array(
+            [0.4 * np.cos(yaw) - 0.9 * pitch, 0.4 * np.sin(yaw), 0.9 + 0.4 * pitch * np.cos(yaw)]
+        )
+        x, y, z = (FIELD + self.level) * level / np.linalg.norm(level) + SHIFT + self._rng.normal(size=3)
+        return float(x), float(y), float(z)
+
+
+@pytest.fixture
+def flying(tmp_path: Path) -> Iterator[tuple[Rig, Turning]]:
+    """Fly a bridge that learns, until the test ends."""
+    more = f"[learning]\nenabled = true\nmax_rate = {HZ}.0\n"
+    (folder := tmp_path / "rig").mkdir()
+    rig, field, ended = Rig(folder, "udpin", more=more, hz=HZ), Turning(), threading.Event()
+    autopilot, rig.fluxgate.field = rig.autopilot, field
+    rig.config.write_text(rig.config.read_text().replace("[publish]", "[publish]\nMAG_LEARNING = 2"))
+
+    def with_position(frame: bytes) -> list[bytes]:
+        place = {"lat": round(LAT * 1e7), "lon": round(LON * 1e7)}
+        return [frame, autopilot.pack("GLOBAL_POSITION_INT", time_boot_ms=autopilot.boot_us // 1000, **place)]
+
+    with autopilot.retelling(with_position):
+        rig.start()
+        player = threading.Thread(target=rig.until, args=(ended.is_set, 300.0))
+        player.start()
+        try:
+            yield rig, field
+        finally:
+            ended.set()
+            player.join()
+            rig.close()
+
+
+def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], clock: Path) -> None:
+    """Since when, how large, its causes and both predictions; each button does in the bridge what it says."""
+    rig, field = flying
+    with (
+        served(clock, url=rig.url.replace("udpin", "udpout")) as (address, _),
+        playwright.sync_playwright() as player,
+    ):
+        get(address)
+        browser = player.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.set_default_timeout(PATIENCE)
+        page.goto(address)
+        panel = page.get_by_role("region", name="Learning in flight")
+        panel.get_by_text("learned", exact=True).wait_for()  # the state
+        to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
+        # nothing more is learned, so that a doubt stands
+        rig.autopilot.say("PARAM_SET", param_id="MB_LEARN_FREEZE", param_value=1.0, **to)
+        panel.get_by_text("frozen", exact=True).wait_for()
+        field.level = 60.0
+        panel.get_by_text("map error").wait_for()
+        shown = dict(pairwise(panel.inner_text().splitlines()))
+        since = time.strftime("%d %b", time.gmtime())
+        assert re.fullmatch(rf"\d+ nT since {since} \d\d:\d\d UTC", shown["Not explained"])
+        for which in ("first", "published"):
+            assert float(shown[f"Error of prediction, {which}"].removesuffix(" nT")) > 1.0
+        panel.get_by_role("button", name="Accept").click()
+        page.get_by_text("explained again: acknowledged").first.wait_for()
+        panel.get_by_role("button", name="Forget").click()
+        page.get_by_text("learning: all forgotten").first.wait_for()
+        panel.get_by_text(re.compile("the first$")).wait_for()
+        browser.close()
+    said = [text.partition(" what")[0] for text in rig.said()]
+    order = (
+        "MB_LEARN_DO = 1, set by 255:190",
+        "accepted:",
+        "explained again: acknowledged",
+        "MB_LEARN_DO = 2, set by 255:190",
+        "learning: all forgotten",
+    )
+    assert [text for text in said if text in order] == [*order]
