@@ -28,6 +28,7 @@ from magbridge.learning.model import TEMPERATURE
 from magbridge.plausibility import Plausibility
 from magbridge.records import BEYOND, Corrected, Quality, Reading
 from magbridge.toml import convert
+from magbridge.turns import Turns
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -70,6 +71,7 @@ class Correction:
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
         # what has no calibration is not expected to be the Earth's field
         self.plausibility = None if calibration.method == "none" else Plausibility(calibration.noise.sensor)
+        self.turns = Turns()
         self.direction = None if calibration.boresight is None else Direction()
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
@@ -126,7 +128,6 @@ class Correction:
             judged = self.plausibility.check(
                 sample.time_us,
                 reading.field,
-                sample.values,
                 F,
                 sigma,
                 quality,
@@ -134,6 +135,7 @@ class Correction:
                 self.aligner.settings.reference_sigma,
             )
             quality |= self.plausibility.flags
+            judged += self.turns.check(sample.time_us, x, y, z, F, sigma * sigma + judged, quality)
         turned = 0.0
         if self.direction is not None:
             turned = self.direction.check(sample.time_us, x, y, z)
@@ -185,6 +187,7 @@ class Correction:
             self.plausibility = Plausibility(calibration.noise.sensor)
         elif self.learner is not None:
             self.plausibility.explain(by, jumps=not self.learner.renewed)
+            self.turns.explain(by)
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
         """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""
@@ -204,7 +207,11 @@ class Correction:
 
 
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
-    """Correct the rows of a deployment, or of its pieces in order, exactly as the live bridge would.
+    """Correct the rows of a deployment, or of its pieces in order, as the live bridge would.
+
+    One flag is added that live cannot be known yet: ``moving`` of the last sample before telemetry tells of
+    a motion, where that sample's own telemetry is older than it. A motion that begins with a piece's first
+    row does not reach back into the piece before.
 
     Parameters
     ----------
@@ -235,7 +242,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     require(deployment, CHANNELS)
     correction.as_declared(deployment.attrs)
     results = np.full((deployment.sizes["time"], len(CORRECTED)), nan)
-    level = np.full(len(results), nan)
+    level, age = np.full((2, len(results)), nan)
     results[:, CORRECTED.index("quality")] = Quality.GAP
     vectors, places, attitudes = main_field(deployment), _places(deployment), _attitudes(deployment)
     if correction.learner is None:
@@ -248,9 +255,10 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
             correction.direction.expect(*vectors[row].tolist())
             correction.direction.attitude(stamp, *attitudes[row])
         sample, one = correction.reading(reading, stamp, main_field=known[row], where=places[row])
-        level[row] = correction.level(sample, one)
+        level[row], age[row] = correction.level(sample, one), sample.age
         results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
     _keep_late_joins(results, deployment)
+    _flag_onsets(results, age)
     columns = dict(zip(CORRECTED, results.T, strict=True))
     if np.isfinite(level).any():
         columns["level_sigma"] = level
@@ -301,6 +309,15 @@ def _keep_late_joins(results: FloatArray, deployment: xr.Dataset) -> None:
     sigma, quality = CORRECTED.index("total_field_sigma"), CORRECTED.index("quality")
     results[late, quality] = results[late, quality].astype(int) | Quality.LATE_JOIN
     results[late, sigma] = np.fmax(results[late, sigma], deployment["total_field_sigma"].to_numpy()[late])
+
+
+def _flag_onsets(results: FloatArray, age: FloatArray) -> None:
+    """Flag samples as moving after whose telemetry, `age` (n,) s old, a mass began to move."""
+    quality = CORRECTED.index("quality")
+    sampled = np.flatnonzero(np.isfinite(age))
+    moving = results[sampled, quality].astype(int) & Quality.MOVING != 0
+    onset = sampled[:-1][moving[1:] & ~moving[:-1] & (age[sampled[:-1]] > 0.0)]
+    results[onset, quality] += Quality.MOVING
 
 
 def _readings(correction: Correction, deployment: xr.Dataset) -> Iterator[tuple[int, Reading, int]]:

@@ -6,7 +6,9 @@ level
     The Earth's total field is the main field and the rock's; the main field alone is off by 145 nT (1-sigma
     over the Earth, rock and disturbances included: the error model of Chulliat et al. 2020, *The US/UK World
     Magnetic Model for 2020-2025*), or by ``align.reference_sigma``. More than :data:`LEVEL` sigmas are none
-    of it. Without a position, the total field is compared with the extremes on Earth.
+    of it. Without a position, the total field is compared with the extremes on Earth. Rock is come upon
+    little by little. Where the field is more than :data:`FAR` sigmas off before it was ever within
+    :data:`NEAR`, a gain may be wrong, and sigma spans what it is off until it is.
 axis
     A channel that repeats its number while the others change is stuck, or stands at a limit. How often it may
     is learned: a coarse instrument repeats itself, `n` times in a row with the probability ``p^n``.
@@ -14,7 +16,7 @@ jump
     The total field does not change with the attitude, and changes slowly with the place. The innovation
     ``e = F - L`` from a level L that follows it has the variance ``S = s^2 + (slope dt)^2 + sigma^2 +
     sigma_L^2``: s and the slope are learned, and the sigmas are those of the correction, only where
-    parameters have changed. Where ``e^2 > GATE^2 S``, a Kalman filter's gate (Bar-Shalom et al. 2001,
+    a mass may have moved. Where ``e^2 > GATE^2 S``, a Kalman filter's gate (Bar-Shalom et al. 2001,
     *Estimation with Applications to Tracking and Navigation*, section 5.4), the sample is an outlier.
     Outliers that agree with each other are another level, which nothing explains: what follows is
     doubtful by the sum of such jumps, until it is nothing, and is remembered for some time.
@@ -32,6 +34,8 @@ from magbridge.records import Quality, Vector
 __all__ = ["Plausibility"]
 
 LEVEL: Final = 5.0
+FAR: Final = 3.0
+NEAR: Final = 2.0
 """Sigmas of the level."""
 LEAST: Final = 17_000.0
 MOST: Final = 72_000.0
@@ -55,6 +59,8 @@ PATIENCE: Final = 6
 FASTEST: Final = 12
 """Samples in a row that lie on one side of the median before its steps grow, and by how many times at most:
 twenty times the noise is learned in half the samples, and white noise passes for more no oftener."""
+RARE: Final = 4.0
+"""Times the median that counts as three samples: of white noise one in 140 is as large."""
 SWIFT: Final = 60
 """The n-th step is at least SWIFT/n such factors: at the start the noise is learned in a few samples."""
 ENOUGH: Final = 5
@@ -134,8 +140,10 @@ class Plausibility:
         self._known = noise > 0.0
         self._floor = 1.5 * max(noise, QUIETEST) ** 2
         self._variance = 0.0  # of innovations, nT^2
+        self._near = self._far = False  # the main field, once
         self._level = nan
         self._level_variance = 0.0
+        self._unsteady = False  # since the last sample that was judged, so a mass may have moved
         self._before = nan  # the level before a sample that only the time or a mass's move made acceptable
         self._level_us = 0
         self._slope = SLOPE * SLOPE
@@ -144,7 +152,6 @@ class Plausibility:
         self._decay, self._quiet = UNREST, BURST
         self._last = self._last_but_one = nan
         self._moved_us = 0
-        self._values: tuple[float, ...] = ()
         self._candidate, self._agreed = nan, 0
         self._bends = self._accepted = 0
         self._noisy = False
@@ -157,7 +164,6 @@ class Plausibility:
         self,
         time_us: int,
         raw: Vector,
-        values: tuple[float, ...],
         total: float,
         sigma: float,
         quality: int,
@@ -172,8 +178,6 @@ class Plausibility:
             µs.
         raw : tuple of 3 float
             nT, the channels as the instrument sent them.
-        values : tuple of float
-            The parameters.
         total, sigma : float
             nT, the corrected total field and its 1-sigma.
         quality : int
@@ -186,10 +190,14 @@ class Plausibility:
         self.fault = True
         if not 0.0 <= total < inf:
             return 0.0
-        wrong = self._is_wrong(time_us, total, sigma, reference, reference_sigma)
-        more = 0.0
-        if not quality & UNSTEADY:
-            more = self._jump(time_us, values, total, sigma, learn=not (stuck or wrong))
+        off = 0.0 if isnan(reference) else total - reference
+        sigmas2 = off * off / (reference_sigma * reference_sigma + sigma * sigma)
+        wrong = self._is_wrong(time_us, total, reference, sigmas2)
+        more = self._span(total, reference, sigmas2, steady=not quality & UNSTEADY)
+        if quality & UNSTEADY:
+            self._unsteady = True
+        else:
+            more += self._jump(time_us, total, sigma, learn=not (stuck or wrong))
         if stuck or wrong or time_us < self._wrong_until_us:
             self.flags = IMPLAUSIBLE
         self.fault = self.flags != 0
@@ -240,15 +248,21 @@ class Plausibility:
         self._notify("axis", f"axis {AXES[number]} stuck at {value:.0f} nT, or clipped there")
         return True
 
-    def _is_wrong(
-        self, time_us: int, total: float, sigma: float, reference: float, reference_sigma: float
-    ) -> bool:
+    def _span(self, total: float, reference: float, sigmas2: float, *, steady: bool) -> float:
+        """Return the variance (nT²) of a field that is far off the main field from the first sample on."""
+        if isnan(reference) or self._near:
+            return 0.0
+        self._near = steady and sigmas2 <= NEAR * NEAR
+        self._far = not self._near and (self._far or sigmas2 > FAR * FAR)
+        if not self._far:
+            return 0.0
+        off = total - reference
+        self._notify("far", f"field of {total:.0f} nT, expected {reference:.0f}: sigma is widened")
+        return off * off
+
+    def _is_wrong(self, time_us: int, total: float, reference: float, sigmas2: float) -> bool:
         """Say whether the total field is none that the Earth has here, or anywhere."""
-        if isnan(reference):
-            wrong = not LEAST < total < MOST
-        else:
-            off = total - reference
-            wrong = off * off > LEVEL * LEVEL * (reference_sigma * reference_sigma + sigma * sigma)
+        wrong = not LEAST < total < MOST if isnan(reference) else sigmas2 > LEVEL * LEVEL
         if not wrong:
             self._wrong = 0
             return False
@@ -261,19 +275,17 @@ class Plausibility:
             self._notify("level", f"field of {total:.0f} nT, expected {expected}: sensor or calibration")
         return True
 
-    def _jump(
-        self, time_us: int, values: tuple[float, ...], total: float, sigma: float, *, learn: bool
-    ) -> float:
+    def _jump(self, time_us: int, total: float, sigma: float, *, learn: bool) -> float:
         """Follow the level; return the variance (nT²) to add to that of a sample which is an outlier."""
         variance = max(self._variance, self._floor)
         if isnan(self._level):
             if learn:
-                self._begin(time_us, values, total, sigma)
+                self._begin(time_us, total, sigma)
                 self._variance = 9.0 * max(sigma * sigma, self._floor)
                 self._median = (self._variance / INNOVATION) ** 0.5
             return 0.0
         seconds = 1e-6 * (time_us - self._level_us)
-        moved = values != self._values
+        moved = self._unsteady
         spread = variance + self._slope * seconds * seconds
         if moved:
             spread += sigma * sigma + self._level_variance
@@ -282,14 +294,14 @@ class Plausibility:
         if e * e > GATE * GATE * spread and self._accepted < AGREE:
             if moved and learn:
                 self._move(time_us, e, moved)
-            self._begin(time_us, values, total, sigma)  # which of the first is the outlier is not known
+            self._begin(time_us, total, sigma)  # which of the first is the outlier is not known
             self._accepted = 0
             return 0.0
         if e * e <= GATE * GATE * spread:
             self._accepted += 1
             self._agreed = 0
             self._before = self._level if e * e > GATE * GATE * variance else nan
-            self._begin(time_us, values, self._level + 0.5 * e, sigma)
+            self._begin(time_us, self._level + 0.5 * e, sigma)
             if time_us - self._mark_us >= SLOPE_US:
                 self._learn_slope(time_us)
             self._unrest = self._unrest * self._decay if self._unrest > variance else 0.0
@@ -311,12 +323,12 @@ class Plausibility:
             back = self._candidate - self._before
             if not back * back <= GATE * GATE * spread:  # else the last that was accepted was the outlier
                 self._move(time_us, self._candidate - self._level, moved)
-            self._begin(time_us, values, self._candidate, sigma)
+            self._begin(time_us, self._candidate, sigma)
             self._agreed = 0
         return e * e
 
-    def _begin(self, time_us: int, values: tuple[float, ...], level: float, sigma: float) -> None:
-        self._level, self._level_us, self._values = level, time_us, values
+    def _begin(self, time_us: int, level: float, sigma: float) -> None:
+        self._level, self._level_us, self._unsteady = level, time_us, False
         self._level_variance = sigma * sigma
 
     def _learn_noise(self, total: float) -> None:
@@ -325,7 +337,7 @@ class Plausibility:
         self._last_but_one, self._last = self._last, total
         if bend == bend:  # noqa: PLR0124 - compiled, quicker than a call
             rising = bend > self._median
-            self._run = self._run + 1 if rising == self._rising else 0
+            self._run = self._run + (3 if bend > RARE * self._median else 1) if rising == self._rising else 0
             self._rising = rising
             step = STEP ** max(min(max(self._run - PATIENCE, 1), FASTEST), SWIFT // (self._bends + 1))
             self._median *= step if rising else 1.0 / step

@@ -7,8 +7,8 @@ from faults import FAULTS, Flight, prepare, score, stalls
 
 HALF_A_PERCENT = 4
 """Samples of 900 that may be wrong without a flag: 0.3 % are 2.7 of them, as chance has it."""
-UNSEEN = {"gain of x +2 %"}
-"""On a steady course it is a constant, as rock is."""
+UNSEEN = {"gain of x +2 %", "offset of x +100 nT with a motion", "drift of z, 20 nT/h"}
+"""On a steady course it is a constant, or a slope, as rock is."""
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,6 @@ class Flight:
         direction = turn / np.linalg.norm(turn, axis=1)[:, None]
         self.raw: FloatArray = (FIELD + rock)[:, None] * direction + rng.normal(0.0, 1.0, (n, 3))
         self.raw = np.rint(self.raw / steps) * steps
-        self.values = np.zeros(n)
         self.quality = np.zeros(n, int)
 
     def judge(self, reference: float = FIELD) -> tuple[IntArray, FloatArray, list[str]]:
@@ -38,9 +37,8 @@ class Flight:
         total = np.linalg.norm(self.raw, axis=1).tolist()
         for k, raw in enumerate(self.raw.tolist()):
             quality = int(self.quality[k])
-            values = (float(self.values[k]),)
             more = judge.check(
-                k * PERIOD_US, tuple(raw), values, total[k], SIGMA, quality, reference, 145.0
+                k * PERIOD_US, tuple(raw), total[k], SIGMA, quality, reference, 145.0
             )  # fmt: skip
             flags.append(judge.flags)
             sigma.append((SIGMA**2 + more) ** 0.5)
@@ -122,7 +120,6 @@ def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() ->
 
 def test_a_mass_that_moves_is_no_jump_if_the_field_stays_and_one_if_it_does_not() -> None:
     flight = Flight()
-    flight.values[700:] = 1.0
     flight.quality[695:705] = MOVING
     flight.raw[695:700] += along(flight.raw[695:700], 300.0)  # while it moves, nothing is known
     flags, _, told = flight.judge()
@@ -135,7 +132,6 @@ def test_a_mass_that_moves_is_no_jump_if_the_field_stays_and_one_if_it_does_not(
 
 def test_a_wrong_mass_is_seen_if_it_moves_with_the_very_second_sample() -> None:
     flight = Flight()
-    flight.values[1:] = 1.0
     flight.quality[1:5] = MOVING
     flight.raw[5:] += along(flight.raw[5:], -460.0)
     flags, sigma, told = flight.judge()
@@ -146,7 +142,6 @@ def test_a_wrong_mass_is_seen_if_it_moves_with_the_very_second_sample() -> None:
 def test_a_spike_that_a_mass_s_move_makes_acceptable_is_no_new_level() -> None:
     """After 40 s of motion the rock may be another by 80 nT; if the next samples are as before, it is not."""
     flight = Flight()
-    flight.values[700:] = 1.0
     flight.quality[690:700] = MOVING
     flight.raw[700] += along(flight.raw[700:701], 60.0)[0]
     flags, _, told = flight.judge()
@@ -198,6 +193,34 @@ def test_noise_from_the_start_on_widens_sigma_within_ten_samples(times: float) -
     assert told == []
 
 
+@pytest.mark.parametrize("sigmas", [3.2, -3.2, 4.2])
+def test_a_field_that_is_far_off_from_the_first_on_has_that_as_its_sigma(sigmas: float) -> None:
+    """A gain wrong by 1 % is 500 nT; it is not flagged, since rock may be as much."""
+    flight = Flight()
+    off = 145.0 * sigmas
+    flags, sigma, told = flight.judge(reference=FIELD - off)
+    error = np.abs(np.linalg.norm(flight.raw, axis=1) - FIELD + off)
+    far = error > 3.0 * np.hypot(145.0, SIGMA)
+    assert far.mean() > 0.5
+    assert sigma[far] == pytest.approx(np.hypot(error[far], SIGMA))
+    assert not flags.any()
+    assert [line for line in told if "sigma is widened" in line] == told[:1]
+
+
+def test_rock_that_is_come_upon_little_by_little_is_no_fault() -> None:
+    flight = Flight(n=3000)
+    rise = np.interp(np.arange(3000), [200, 2000], [200.0, 600.0])
+    flight.raw += rise[:, None] * flight.raw / np.linalg.norm(flight.raw, axis=1)[:, None]
+    flags, sigma, told = flight.judge()
+    assert not flags.any()
+    assert (sigma == SIGMA).all()
+    assert told == []
+    for off, span in ((350.0, True), (100.0, False)):  # 3.4 sigmas or more at first, then 2.4 or 0.7
+        flags, sigma, _ = flight.judge(reference=FIELD + 600.0 + off)
+        assert (sigma[:100] > 400.0).all()
+        assert (sigma[-100:] > 250.0).all() if span else (sigma[-100:] == SIGMA).all()
+
+
 def test_without_a_position_only_what_is_nowhere_on_earth_is_wrong() -> None:
     flight = Flight(n=50)
     assert not flight.judge(reference=nan)[0].any()
@@ -212,5 +235,5 @@ def test_memory_and_state_do_not_grow() -> None:
     rng = np.random.default_rng(3)
     for k in range(3000):
         raw = tuple(rng.normal(0.0, 4e4, 3).tolist())
-        judge.check(k * PERIOD_US, raw, (0.0,), float(np.linalg.norm(raw)), SIGMA, 0, FIELD, 145.0)
+        judge.check(k * PERIOD_US, raw, float(np.linalg.norm(raw)), SIGMA, 0, FIELD, 145.0)
     assert len(judge.notices) <= 5

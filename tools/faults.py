@@ -168,6 +168,15 @@ def late(rows: Rows) -> Rows:
     return rows.assign({n: ("time", np.interp(time - 2.0, time, rows[n]), rows[n].attrs) for n in MASSES})
 
 
+def with_motion(rows: Rows) -> Rows:
+    """The offset of x changes by 100 nT in the very moment that a mass and the course change."""
+    moves = np.abs(np.diff(rows["battpos"].to_numpy())) > 0.01 * np.ptp(rows["battpos"].to_numpy())
+    late = np.arange(len(moves)) > FAULT_AT * len(moves)
+    begin = int(np.argmax(moves & late)) + 1
+    values = rows["mag_x"].to_numpy() + np.where(np.arange(len(moves) + 1) >= begin, 100.0, 0.0)
+    return rows.assign({"mag_x": ("time", values, rows["mag_x"].attrs)})
+
+
 def noise(values: FloatArray, _: FloatArray) -> FloatArray:
     """Twenty times the noise."""
     seed = int(abs(values[0]))  # each channel's own
@@ -192,12 +201,18 @@ FAULTS: dict[str, Callable[[Rows], Rows]] = {
     "ballast's sign": fault_of("ballast", by=lambda v, _: -v),
     "ballast's unit": fault_of("ballast", by=lambda v, _: v / 1000),
     "gain +2 %": fault_of(*CHANNELS, by=lambda v, _: v * 1.02),
+    "gain +1 %": fault_of(*CHANNELS, by=lambda v, _: v * 1.01),
     "gain of x +2 %": fault_of("mag_x", by=lambda v, _: v * 1.02),
     "gain +2 % on the way": fault_of(*CHANNELS, by=lambda v, _: v * 1.02, late=True),
     "spikes of 500 nT": fault_of("mag_x", by=spikes),
     "telemetry 2 s late": late,
     "offset of x +100 nT": fault_of("mag_x", by=lambda v, _: v + 100.0, late=True),
     "offset of z +100 nT": fault_of("mag_z", by=lambda v, _: v + 100.0, late=True),
+    "offset of x +100 nT with a motion": with_motion,
+    "drift of z, 20 nT/h": fault_of(
+        "mag_z", by=lambda v, t: v + 20.0 * (t - FAULT_AT * t[-1]) / 3600.0, late=True
+    ),
+    "steps of 100 nT": fault_of(*CHANNELS, by=lambda v, _: 100.0 * np.round(v / 100.0), late=True),
     "noise times 20": fault_of(*CHANNELS, by=noise, late=True),
 }
 

@@ -104,6 +104,7 @@ class Pipeline:
         learner = open_learner(config, used)
         self._correction = Correction(used, config.align, learner)
         self._plausibility, self._direction = self._correction.plausibility, self._correction.direction
+        self._turns = self._correction.turns
         self._calibration_id = calibration_id(used) if used else 0
         autopilot = config.link.system, config.link.autopilot
         stamps = start.signing_timestamp, start.signing_streams
@@ -222,6 +223,8 @@ class Pipeline:
         )
         if self._plausibility is not None and self._plausibility.notices:
             self._tell_implausible(self._plausibility.notices)
+        if self._turns.notices:
+            self._tell_implausible(self._turns.notices)
         if self._direction is not None and self._direction.notices:
             self._tell_implausible(self._direction.notices)
         doubts = corrected.quality & DOUBTS

@@ -71,8 +71,15 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
     again = correct_rows(Correction(load_calibration(tmp_path / "cal.json")), converted)
     seen = {flag for flag in Quality for quality in rows["quality"].to_numpy() if int(quality) & flag}
     assert {Quality.STALE_TELEMETRY, Quality.MOVING} <= seen
-    for name in set(CORRECTED) - {"anomaly"}:
+    for name in set(CORRECTED) - {"anomaly", "quality"}:
         np.testing.assert_allclose(again[name], rows[name], rtol=precision, err_msg=name)
+    before, after = (one["quality"].to_numpy().astype(int) for one in (rows, again))
+    more = before != after
+    assert (after[more] == before[more] + Quality.MOVING).all()
+    assert (before[np.flatnonzero(more) + 1] & Quality.MOVING != 0).all()
+    assert 3 <= more.sum() <= 7, (
+        "the last sample before each of seven motions, but where both are of one time"
+    )
 
 
 def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
