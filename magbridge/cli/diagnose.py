@@ -137,6 +137,8 @@ def summary(facts: dict[str, Any], parts: str) -> str:
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
     """Return a line for each cause found, with the alternatives to it, and for what is left unexplained."""
+    from magbridge.diagnose.report.words import number
+
     causes = []
     for one in facts["findings"]:
         others = " or ".join(map(_plain, one["alternatives"]))
@@ -144,6 +146,8 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
         causes.append(said + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:
         said = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"
+        size = number(facts["assessment"]["residual"]["rms_nT"])
+        said += f", {size} nT RMS that lasts {rest['correlation_time_s']:.3g} s"
         within = ", ".join(map(_plain, rest["alternatives"]))
         causes.append(f"{said}{_followed(rest['follows'])}" + f"; resembles {within}" * bool(within))
     return causes or ["no cause"]
@@ -151,10 +155,11 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
 
 def _followed(what: dict[str, Any] | None) -> str:
     """Return what is seen, apart from what it may be: the series that an effect follows, lag and axis."""
-    if not what or not what["channel"]:
+    if not what:
         return ""
     late = f" {what['lag_s']:g} s late" * bool(what["lag_s"])
-    return f", follows {what['channel']}{late}" + f" along {what['axis']}" * bool(what["axis"])
+    along = f" along {what['axis']}" * bool(what["axis"])
+    return f", follows {what['channel']}{late}{along}" if what["channel"] else f",{along}" * bool(along)
 
 
 def _plain(one: dict[str, Any]) -> str:

@@ -7,8 +7,9 @@ A signal y is explained by a series q, late by a lag, along the axes of the body
 .. math:: y = c_0 + \sum_i b_i u_i + q\,\bigl(d_0 + \sum_i d_i u_i\bigr)
 
 u the direction of the field in the body: what an offset of one nanotesla along each axis adds to the total
-field. The share of y's power that the terms in q add is what the series explains. That is a description: a
-cause is a claim about physics, and is tested elsewhere.
+field. The share of y's power that the terms in q add is what the series explains. Where no series is
+followed, q are slow waves in time, which find the axis of a slow signal. That is a description: a cause is a
+claim about physics, and is tested elsewhere.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import fdtrc
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import lagged
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.evidence import LEVEL
 
 __all__ = ["Memory", "Seen", "memory", "seen"]
 
@@ -32,7 +35,11 @@ LEAST = 0.1
 MOSTLY = 0.8
 """Share of what all axes together explain that one must explain alone, to be said to be the one."""
 WORTH = 0.02
-"""Share of the signal's power that a lag must add over none."""
+"""Share of the signal's power that a lag must add over none, and the one axis over the next."""
+WAVES, SLOW = 48, 0.5
+"""Half waves per log by which the axis of a slow signal that follows no series is found, and the share of its
+power, constants aside, that they must explain."""
+EVERY = slice(None)
 AXES = ("field", "x", "y", "z")
 ROWS = 20_000
 """Rows that are looked at."""
@@ -45,11 +52,12 @@ class Seen(NamedTuple):
     ----------
     channel : str or None
         The series that explains most of it: telemetry, ``time``, ``roll``, ``pitch`` or ``heading``; None
-        if none explains a tenth.
+        if none explains a tenth, or as much as that may be chance: what is slow goes with anything slow.
     lag : float
         s, by which it follows.
     axis : str or None
-        ``x y z`` of the body, ``field`` along the field; None where several take part.
+        ``x y z`` of the body, ``field`` along the field; None where several take part, or the signal neither
+        follows a series nor is slow.
     size : float
         RMS of the signal in the total field.
     share : float
@@ -99,20 +107,55 @@ def seen(problem: Problem, signal: FloatArray) -> Seen:
     base = np.linalg.qr(axes)[0]
     y = y - base @ (base.T @ y)
 
-    def explained(q: FloatArray, some: slice) -> float:
+    def fitted(q: FloatArray, some: slice) -> FloatArray:
         X = (q[:, :, None] * axes[:, None, some]).reshape(len(q), -1)
         X -= base @ (base.T @ X)
-        G, b = X.T @ X, X.T @ y
+        G = X.T @ X
         G += 1e-9 * np.trace(G) / len(G) * np.eye(len(G)) + 1e-300 * np.eye(len(G))
-        return float(b @ np.linalg.solve(G, b)) / total
+        return np.asarray(X @ np.linalg.solve(G, X.T @ y))
 
-    found = [(explained(q, slice(None)), name, lag, q) for name, lag, q in _series(problem, part)]
+    def explained(q: FloatArray, some: slice = EVERY) -> float:
+        return float(y @ fitted(q, some)) / total
+
+    def axis(q: FloatArray, whole: float) -> str | None:
+        alone = [explained(q, slice(k, k + 1)) for k in range(len(AXES))]
+        *_, second, k = np.argsort(alone)
+        clear = alone[k] >= MOSTLY * whole and alone[k] - alone[second] >= WORTH
+        return AXES[k] if clear else None
+
+    found = [(explained(q), name, lag, q) for name, lag, q in _series(problem, part)]
     share, name, lag, q = max(found, key=lambda one: one[0] - WORTH * (one[2] > 0.0))
-    if share < LEAST:
-        return Seen(None, 0.0, None, size, share)
-    alone = [explained(q, slice(k, k + 1)) for k in range(len(AXES))]
-    k = int(np.argmax(alone))
-    return Seen(name, lag, AXES[k] if alone[k] >= MOSTLY * share else None, size, share)
+    chance = _by_chance(share, q.shape[1] * len(AXES), (y - fitted(q, EVERY))[:, None] * axes)
+    if share >= LEAST and len(found) * chance < LEVEL:
+        return Seen(name, lag, axis(q, share), size, share)
+    waves = _waves(problem.survey.time[part])
+    slow = explained(waves)
+    return Seen(None, 0.0, axis(waves, slow) if slow * total >= SLOW * float(y @ y) else None, size, share)
+
+
+def _by_chance(share: float, terms: int, left: FloatArray) -> float:
+    """Return the chance that a series explains such a share of something that has nothing to do with it.
+
+    Fisher's F; of what is `left` (n, 4), seen along each axis, only so many samples are independent as its
+    memory allows (Bartlett 1946).
+    """
+    n = len(left)
+    freedom = max(n / (1.0 + 2.0 * max(map(_remembered, left.T))) - terms - len(AXES), 1.0)
+    return float(fdtrc(terms, freedom, share / terms / max((1.0 - share) / freedom, 1e-300)))
+
+
+def _remembered(e: FloatArray) -> int:
+    """Return the samples after which the autocorrelation of e (n,) has fallen to 1/e."""
+    spectrum = np.abs(np.fft.rfft(e, 2 * len(e))) ** 2
+    correlation = np.fft.irfft(spectrum)[: len(e)]
+    below = np.flatnonzero(correlation <= correlation[0] / np.e)
+    return int(below[0]) if below.size else len(e)
+
+
+def _waves(time: FloatArray) -> FloatArray:
+    """(n, k) cosines of 1 to :data:`WAVES` half waves over the log."""
+    phase = np.pi * (time - time[0]) / max(float(time[-1] - time[0]), 1e-300)
+    return np.asarray(np.cos(phase[:, None] * np.arange(1, WAVES + 1)))
 
 
 def _series(problem: Problem, part: slice) -> Iterator[tuple[str, float, FloatArray]]:
@@ -147,8 +190,5 @@ def memory(problem: Problem, residual: FloatArray) -> Memory:
     white = rms(np.diff(e)[joined]) / 2.0**0.5 if joined.any() else size
     samples = int(np.clip(len(e) // 16, 2, 64))
     means = e[: len(e) // samples * samples].reshape(-1, samples).mean(axis=1)
-    spectrum = np.abs(np.fft.rfft(e, 2 * len(e))) ** 2
-    correlation = np.fft.irfft(spectrum)[: len(e)]
-    below = np.flatnonzero(correlation < correlation[0] / np.e)
-    time = float(below[0] if below.size else len(e)) * survey.interval
+    time = _remembered(e) * survey.interval
     return Memory(size, white, time, float(np.mean(means**2)) / size**2, samples, means.size)

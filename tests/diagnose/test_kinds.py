@@ -6,12 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from posed import calibrated, surveyed, walk
+import xarray as xr
+from posed import FIELD, T0, calibrated, surveyed, walk
 
+from magbridge.calibration.effects import lagged
+from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.kinds import ANY, kinds_of
 from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.compare.survey import Channel
+from magbridge.diagnose.report.findings import findings
+from magbridge.diagnose.run import diagnose
 
 
 @pytest.mark.parametrize(
@@ -58,3 +63,46 @@ def test_no_cause_is_put_forward_for_a_series_whose_kind_contradicts_it() -> Non
     assert together.size == 6
     assert together.freedom == 1
     assert {name for effect in together.effects for name in effect.channels()} == set(motors)
+
+
+def rotor(hidden: str) -> xr.Dataset:
+    """A multirotor's log at 2 Hz with a throttle without a unit, four motors' outputs and a current.
+
+    Its field follows the throttle 2 s late, along z; or each motor, along an axis of its own.
+    """
+    rng, n = np.random.default_rng(2), 1600
+    time, u = T0 + 0.5 * np.arange(float(n)), walk(n, rng)
+    throttle = np.clip(
+        0.45 + 0.25 * rng.normal(size=n // 20).repeat(20) + 0.02 * rng.normal(size=n), 0.0, 1.0
+    )
+    apart = 0.1 * rng.normal(size=(4, n // 10)).repeat(10, axis=1)
+    motors = {f"esc{k}": 1000.0 + 800.0 * np.clip(throttle + one, 0.0, 1.0) for k, one in enumerate(apart, 1)}
+    field = FIELD * u / np.linalg.norm(u, axis=1)[:, None] + rng.normal(size=(n, 3))
+    if hidden == "late":
+        field += np.outer(60.0 * lagged(time, throttle, 2.0), [0.1, 0.0, 1.0])
+    else:
+        field += sum(np.outer(0.05 * (one - 1000.0), rng.normal(size=3)) for one in motors.values())
+    columns = dict(zip(("mag_x", "mag_y", "mag_z"), field.T, strict=True)) | motors
+    columns |= {"throttle": throttle, "current": 5.0 + 30.0 * throttle**1.5 + 0.3 * rng.normal(size=n)}
+    columns["reference_field"] = np.full(n, FIELD)
+    ds = xr.Dataset({k: ("time", v) for k, v in columns.items()}, {"time": time}, {"source": "rotor"})
+    units = dict.fromkeys(("mag_x", "mag_y", "mag_z", "reference_field"), "nT") | {"current": "A"}
+    for name, unit in units.items():
+        ds[name].attrs["units"] = unit
+    return ds
+
+
+@pytest.mark.parametrize("hidden", ["late", "several"])
+def test_on_a_multirotors_log_what_is_seen_stands_apart_from_what_it_may_be(hidden: str) -> None:
+    known = replace(calibrated(np.zeros(9)), parameters=(), terms=(Polynomial(exponents=((),)),))
+    found = diagnose([rotor(hidden)], known)
+    facts = findings(found, CAUSES)
+    named = {(one["cause"], one["channel"]) for one in facts["findings"]}
+    every = named | {(o["cause"], o["channel"]) for one in facts["findings"] for o in one["alternatives"]}
+    assert not [one for one in every if one[0].startswith(("temperature", "pressure"))]
+    if hidden == "several":
+        assert named == {("current_field", None)}
+    else:
+        assert {one for one, _ in named} <= {"current_field", "unmodelled_actuator"}
+        seen = facts["assessment"]["residual"]["follows"] if not named else facts["findings"][0]["follows"]
+        assert (seen["channel"], seen["lag_s"], seen["axis"]) == ("throttle", 2.0, "z")

@@ -21,6 +21,7 @@ from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.canvas import ends, rolling
 from magbridge.diagnose.report.details import remaining, visible
 from magbridge.diagnose.report.page import report_html
+from magbridge.diagnose.report.words import number
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.unexplained.leftover import Leftover
 
@@ -149,6 +150,9 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
     first, below = page.split("<h2", 1)
     assert "<b>A tone</b> of period 33 s is left (signal-to-noise ratio 9.0; it follows" in first
     assert "amps&lt;b&gt;" in first
+    left = clear.assessment.residual
+    last = number(left.correlation_time, 2)
+    assert f"in all {number(left.rms)}\N{NO-BREAK SPACE}nT RMS, which last {last} s" in first
     assert f"None of {len(CAUSES)} causes is named." in below
 
 

@@ -6,15 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 from msgspec import structs
 from posed import calibrated, surveyed, walk
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import lagged
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration
+from magbridge.cli.diagnose import causes_of
+from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel
+from magbridge.diagnose.report.details import described
+from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.seen import memory, seen
 from sitl import load, simulate
@@ -62,16 +69,60 @@ def test_how_far_from_white_a_residual_is(flown: Problem, rho: float, slow: floa
         assert found.correlation_time == pytest.approx(-4.0 / np.log(rho), rel=0.5)
 
 
-def test_a_residual_far_from_white_is_never_nothing() -> None:
-    """Noise of a long memory describes anything slow; a calibration that states it makes it no less."""
+@pytest.mark.parametrize("axis", ["x", "z", "field"])
+def test_the_axis_of_what_is_slow_is_told_though_it_follows_nothing(axis: str) -> None:
+    """What is slow goes with anything slow by chance: not said. The axis shows as the vehicle turns."""
+    turned = np.random.default_rng(5).normal(size=(N // 30, 3)).repeat(30, axis=0)
+    survey = surveyed(turned, np.sin(np.arange(N) / 30.0))
+    hours = Channel(correlated(np.random.default_rng(4).normal(size=(N, 1)), 0.997)[:, 0], "h", ("position",))
+    problem = pose(replace(survey, channels=survey.channels | {"hours": hours}), calibrated(np.zeros(18)))
+    u = np.ones(N) if axis == "field" else -problem.slopes[:, 6 + "xyz".index(axis)] / problem.gain
+    slow = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
+    found = seen(problem, 34.0 * slow * u)
+    assert (found.channel, found.axis) == (None, axis)
+
+
+def test_a_slow_series_that_explains_all_is_followed(flown: Problem) -> None:
+    """However slow it is: what is left is not."""
+    warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
+    survey = replace(flown.survey, channels={"warmth": Channel(warmth, "degC", ("temperature",))})
+    signal = 20.0 * warmth + np.random.default_rng(6).normal(size=N)
+    assert seen(replace(flown, survey=survey), signal)[:2] == ("warmth", 0.0)
+
+
+def _slow_log() -> tuple[xr.Dataset, Calibration, FloatArray]:
+    """A survey beside whose reference something wanders, a calibration that states it, and what does, nT."""
     scenario = load("demo")
     parts = segments(simulate(scenario, 2))
     calibration = fit(
         unfiltered(observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner)
     ).calibration
     survey = parts["survey"]
-    n = survey.sizes["time"]
-    slow = 30.0 * correlated(np.random.default_rng(9).normal(size=(n, 1)), 0.99)[:, 0]
+    noise = np.random.default_rng(9).normal(size=(survey.sizes["time"], 1))
+    slow = 34.0 * correlated(noise, 0.99)[:, 0]
     loud = replace(calibration, noise=structs.replace(calibration.noise, sensor=34.0, autocorrelation=0.99))
-    found = diagnose([survey.assign(reference_field=survey["reference_field"] + slow)], loud)
-    assert found.verdict in ("unexplained", "partly_explained")
+    return survey.assign(reference_field=survey["reference_field"] + slow), loud, slow
+
+
+def test_a_residual_far_from_white_is_never_nothing() -> None:
+    """Noise of a long memory describes anything slow; a calibration that states it makes it no less.
+
+    How large it is, how long it lasts, and that nothing logged goes with it, are said.
+    """
+    survey, loud, slow = _slow_log()
+    found = diagnose([survey], loud)
+    assert found.verdict == "unexplained"
+    assert found.findings == ()
+    facts = findings(found, CAUSES)
+    rest, left = facts["unexplained"], facts["assessment"]["residual"]
+    assert rest["kind"] == "drift"
+    assert left["rms_nT"] == pytest.approx(np.std(slow), rel=0.1)
+    assert left["white_nT"] == pytest.approx(np.std(np.diff(slow)) / np.sqrt(2.0), rel=0.2)
+    assert 60.0 < rest["correlation_time_s"] < 250.0
+    assert rest["follows"]["channel"] is rest["best_channel"] is None
+    assert "does not describe all" in facts["assessment"]["answer"]
+    said = "\n".join(causes_of(facts))
+    assert f"{left['rms_nT']:.1f} nT RMS that lasts {rest['correlation_time_s']:.3g} s" in said
+    assert found.unexplained is not None
+    page = described(found.unexplained, found.assessment.residual)
+    assert f"in all {left['rms_nT']:.1f} nT RMS, which last" in page

@@ -33,6 +33,7 @@ __all__ = [
     "delays",
     "level",
     "motion",
+    "slow_share",
     "stays",
     "times_usual",
 ]
@@ -124,6 +125,14 @@ def motion(problem: Problem, finding: Finding) -> Motion | None:
     share, usual = float(power[moving].sum() / power.sum()), float(moving.mean())
     interval = float(np.median(np.diff(survey.time)))
     return None if usual > 0.5 or share < 0.8 else Motion(share, usual, interval)
+
+
+def slow_share(problem: Problem, finding: Finding) -> float:
+    """Return the share of a cause's power, about its mean, that a trend and a bend over the log explain."""
+    field, time = finding.field(problem), problem.survey.time
+    x = (time - time.mean()) / max(float(np.ptp(time)), 1e-300)
+    smooth = np.polynomial.Polynomial.fit(x, field, 2)(x)
+    return 1.0 - float(np.var(field - smooth) / max(np.var(field), 1e-300))
 
 
 def times_usual(candidate: Candidate, b: FloatArray) -> float:

@@ -17,11 +17,13 @@ from magbridge.diagnose.assessment.numbers import (
     cancelling,
     delays,
     level,
+    slow_share,
     stays,
     times_usual,
 )
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.returns import Returns, returns
 from magbridge.diagnose.seen import Memory, Seen, memory, seen
 from magbridge.diagnose.words import label, number
 
@@ -40,6 +42,8 @@ REPEATS = (
     "What was left out of the fit are parts of the same log. Compare one more log, of another day, before "
     "you rely on it."
 )
+SLOWLY = 0.9
+"""Share of its power that a trend and a bend over the log explain, of what is called slow."""
 ANSWERS: dict[Fitness, str] = {
     "yes": "Nothing in this log speaks against it.",
     "once_settled": "Only once these doubts are settled.",
@@ -74,6 +78,8 @@ class Assessment:
         How far from white it is, of what is left.
     follows : Seen
         What it follows.
+    returns : Returns or None
+        Whether the track tells place from time; None without positions.
     """
 
     fit_for_use: Fitness
@@ -87,13 +93,15 @@ class Assessment:
     budget: Budget
     residual: Memory
     follows: Seen
+    returns: Returns | None
 
 
 def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
     """Weigh a diagnosis; `causes` is the table that was asked about."""
     problem, left = diagnosis.problem, diagnosis.fit.left / diagnosis.problem.gain
     shift = level(problem, diagnosis.possible, diagnosis.calibration)
-    against = _against(diagnosis, causes, shift) if diagnosis.named else []
+    track = returns(problem.survey)
+    against = _against(diagnosis, causes, shift, track) if diagnosis.named else []
     use = useful(diagnosis)
     fitness = _fitness(diagnosis, use, against)
     good = [Note("use", use), *_alone(diagnosis)] if use else []
@@ -109,6 +117,7 @@ def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
         budget=budget(diagnosis),
         residual=memory(problem, left),
         follows=seen(problem, left),
+        returns=track,
     )
 
 
@@ -161,7 +170,9 @@ def _alone(diagnosis: Diagnosis) -> list[Note]:
     return [Note("by_itself", text, found._asdict())]
 
 
-def _against(diagnosis: Diagnosis, causes: Mapping[str, Cause], shift: Level | None) -> list[Note]:
+def _against(
+    diagnosis: Diagnosis, causes: Mapping[str, Cause], shift: Level | None, track: Returns | None
+) -> list[Note]:
     """List what a reviewer must see settled, a sentence or two each."""
     survey, rest, made = diagnosis.problem.survey, diagnosis.unexplained, diagnosis.findings
     found = [Note("own_log", OWN)] if (survey.fitted & ~survey.learned).any() else []
@@ -176,6 +187,7 @@ def _against(diagnosis: Diagnosis, causes: Mapping[str, Cause], shift: Level | N
             f"{'; '.join(tests)}."
         )
         found.append(Note("contested", text))
+    found += _place_or_time(diagnosis, track)
     for one, other, a, b, both in cancelling(diagnosis):
         text = (
             f"{_name(one)} and {_name(other)} largely cancel each other ({number(a)} and {number(b)} nT RMS, "
@@ -194,6 +206,16 @@ def _against(diagnosis: Diagnosis, causes: Mapping[str, Cause], shift: Level | N
         text = f"Something of S/N {rest.signal_to_noise:.1f} is left that has no name."
         found.append(Note("unexplained", text, {"signal_to_noise": rest.signal_to_noise}))
     return found
+
+
+def _place_or_time(diagnosis: Diagnosis, track: Returns | None) -> list[Note]:
+    """Say so where an error of the reference is slow, and the track does not tell place from time."""
+    if track is None or track.apart:
+        return []
+    about = [one for one in diagnosis.findings if one.candidate.about in ("place", "time")]
+    slow = [_name(one) for one in about if slow_share(diagnosis.problem, one) >= SLOWLY]
+    text = f"{track.text} Only their usual shapes speak for: {', '.join(slow)}."
+    return [Note("place_or_time", text, track._asdict())] if slow else []
 
 
 def _manoeuvres(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:

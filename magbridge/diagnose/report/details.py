@@ -30,6 +30,7 @@ from magbridge.diagnose.report.words import (
     sizes,
     table,
 )
+from magbridge.diagnose.seen import Memory, Seen
 from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["described", "found", "nameless", "remaining", "visible"]
@@ -117,15 +118,23 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     )
     how = (
         f"<p>It is {number(left.rms)} nT RMS, {number(left.white)} nT from one sample to the next, remembers "
-        f"{number(left.correlation_time, 2)} s, and follows "
-        f"{goes_with(diagnosis.assessment.follows, share=True) or 'nothing logged'}. {_noise(diagnosis)}</p>"
+        f"{number(left.correlation_time, 2)} s, {_goes(diagnosis.assessment.follows)}. "
+        f"{_noise(diagnosis)}</p>"
     )
     return [
-        f"<p>{described(rest)}. {nameless(rest, causes)}</p>" if rest else "",
+        f"<p>{described(rest, left)}. {nameless(rest, causes)}</p>" if rest else "",
         how,
         table(("difference between measured and reference", "RMS"), lines),
         worse * ((budget.after or 0.0) > WORSE * budget.fitted),
     ]
+
+
+def _goes(what: Seen) -> str:
+    """Say what the rest goes with, and along which axis it lies."""
+    said = goes_with(what, share=True)
+    if what.channel:
+        return f"and follows {said}"
+    return f"lies {said}, and follows nothing logged" if said else "and follows nothing logged"
 
 
 def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
@@ -138,12 +147,13 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
     )
 
 
-def described(rest: Leftover) -> str:
-    """Return what is left as a sentence without its full stop, as HTML."""
+def described(rest: Leftover, left: Memory) -> str:
+    """Return what is left, its size and how long it lasts, as a sentence without its full stop, as HTML."""
     goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     size = f"signal-to-noise ratio {rest.signal_to_noise:.1f}"
-    return f"<b>{KINDS[rest.kind]}</b>{period} is left ({size}{goes})"
+    all_of_it = f"in all {number(left.rms)} nT RMS, which last {number(left.correlation_time, 2)} s"
+    return f"<b>{KINDS[rest.kind]}</b>{period} is left ({size}{goes}; {all_of_it})"
 
 
 def _noise(diagnosis: Diagnosis) -> str:
@@ -181,8 +191,10 @@ def visible(diagnosis: Diagnosis) -> list[str]:
         f"ranges that were flown nothing was measured. Likeness above {100 * CONFOUNDED:.0f} %: such causes "
         "are easily taken for each other.</p>"
     )
+    track = diagnosis.assessment.returns
     return [
         basis,
+        f"<p>{track.text}</p>" if track else "",
         table(heads, rows),
         f"<p>Not to be found at any plausible size: {unseen}.</p>" if unseen else "",
         f"<p>Not testable here, with what it would take: {missing}.</p>" if missing else "",

@@ -139,7 +139,7 @@ def _adds_up(candidate: Candidate) -> bool:
 
 def assessment(found: Assessment) -> dict[str, Any]:
     """Return all that the report shows beside the findings, rounded."""
-    delays, budget, left = found.delays, found.budget, found.residual
+    delays, budget, left, track = found.delays, found.budget, found.residual, found.returns
     return {
         "fit_for_use": found.fit_for_use,
         "answer": found.answer,
@@ -160,6 +160,10 @@ def assessment(found: Assessment) -> dict[str, Any]:
             "rms_nT": _round(left.rms), "white_nT": _round(left.white),
             "correlation_time_s": _round(left.correlation_time), "slow_share": _round(left.slow),
             "follows": follows(found.follows),
+        },
+        "place_or_time": track and {
+            "told_apart": track.apart, "least_share": _round(track.told),
+            "returning_share": _round(track.share), "longest_s": _round(track.longest), "text": track.text,
         },
     }  # fmt: skip
 

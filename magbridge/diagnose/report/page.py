@@ -105,7 +105,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
         within = f"no name is asserted; it resembles {listed(rest.within)}"
         name = within if rest.within else "none of the known causes explains it"
         more = f"The difference of {number(total.before)} nT RMS is more than noise"
-        return f"{more}, but {name}. {described(rest)}."
+        return f"{more}, but {name}. {described(rest, left)}."
     names = [
         bold(one.candidate)
         + (f" <span class=faint>or {listed(one.rivals[:2], ' or ')}</span>" * bool(one.rivals))

@@ -49,10 +49,10 @@ def listed(rivals: Sequence[Rival], joint: str = ", ") -> str:
 
 
 def goes_with(seen: Seen, *, share: bool = False) -> str:
-    """Return what a signal is seen to follow, how late and along which axis; empty if none."""
-    if not seen.channel:
-        return ""
+    """Return what a signal is seen to follow, how late and along which axis; empty if neither."""
     axis = "along the field" if seen.axis == "field" else f"mostly along {seen.axis}" if seen.axis else ""
+    if not seen.channel:
+        return axis
     late = f"{seen.lag:g} s late" if seen.lag else ""
     much = f"in {100 * seen.share:.0f} % of its power" * share
     return ", ".join(part for part in (f"<code>{escape(seen.channel)}</code>", late, axis, much) if part)

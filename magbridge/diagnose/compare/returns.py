@@ -1,0 +1,92 @@
+r"""Whether a track tells what changes with the place from what changes with time.
+
+Notes
+-----
+A function of the place is the same on every pass. Of slow changes with time, a trend and a bend
+``f = (x, x^2)``, x the time over the log, it can imitate the means of f over the cells of the track. With T
+the covariance of f and W that within the cells, the smallest eigenvalue of ``T^-1 W`` is the least share of
+the power of such a change that no function of the place imitates: one less the largest squared canonical
+correlation (Hotelling 1936, Biometrika 28:321). It is 0 for a track that never returns, and for one that
+goes there and back: a change that bends about the turning point is the same on both ways.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import eigh
+
+from magbridge.diagnose.compare.survey import Survey
+
+__all__ = ["Returns", "returns"]
+
+CELL = 250.0
+"""m, side of the cells: rock is seldom nearer, and a map's own grid seldom finer."""
+AWAY = 900.0
+"""s after which passing a place again is a return."""
+TOLD = 0.1
+"""Least share from which place and time are told apart: at S/N 10 that is worth 5 nats, odds of 150:1."""
+
+
+class Returns(NamedTuple):
+    """The returns of a track.
+
+    Attributes
+    ----------
+    share : float
+        Of the samples, that lie where the track passes again.
+    longest : float
+        s, the longest time between two passes of one place.
+    told : float
+        Least share of the power of a slow change with time that no function of the place imitates.
+    """
+
+    share: float
+    longest: float
+    told: float
+
+    @property
+    def apart(self) -> bool:
+        """Whether the log tells place from time."""
+        return self.told >= TOLD
+
+    @property
+    def text(self) -> str:
+        """The same in words."""
+        told = "an error of the map and a slow change with time (a daily variation)"
+        if not self.share:
+            return f"The track never returns to a place: {told} cannot be told apart."
+        again = (
+            f"The track passes {100.0 * self.share:.0f} % of its places again, up to "
+            f"{self.longest / 3600.0:.1f} h later"
+        )
+        if self.apart:
+            return f"{again}: {told} can be told apart."
+        like = f"imitates {100.0 * (1.0 - self.told):.0f} % of the other's power"
+        return f"{again}, but at times at which one {like}: {told} cannot be told apart."
+
+
+def returns(survey: Survey) -> Returns | None:
+    """Return where and when the track of a survey returns; None for a log without positions."""
+    if survey.place is None:
+        return None
+    corner = np.floor(survey.place[:, :2] / CELL).astype(int)
+    cell = np.unique(corner, axis=0, return_inverse=True)[1].ravel()
+    order = np.lexsort((survey.time, cell))
+    of, time = cell[order], survey.time[order]
+    again = (np.diff(of) == 0) & (np.diff(time) > AWAY)
+    first, last = (
+        np.searchsorted(of, np.arange(of[-1] + 1)),
+        np.searchsorted(of, np.arange(of[-1] + 1), "right") - 1,
+    )
+    passed = np.bincount(of[1:], again, of[-1] + 1) > 0
+    x = (time - time.min()) / max(float(np.ptp(time)), 1.0)
+    f = np.stack([x, x * x], axis=1)
+    f -= f.mean(axis=0)
+    count = np.bincount(of)[:, None]
+    means = np.stack([np.bincount(of, column) for column in f.T], axis=1) / count
+    within = f - means[of]
+    told = float(eigh(within.T @ within, f.T @ f, eigvals_only=True)[0])
+    longest = float(np.max(np.where(passed, time[last] - time[first], 0.0)))
+    return Returns(float(np.mean(passed[of])), longest, float(np.clip(told, 0.0, 1.0)))
