@@ -7,6 +7,7 @@ accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency
 nominal       the same, with the remaining errors of a nominal calibration
 watch         how long a wrong position counts as valid
 misinformed   whether a position counts as valid when the level is wrong, or half of the map is
+unmapped      surveys without a map: a glider's of 6 and 12 h, an aircraft's of 100 minutes, beside the bound
 dived         gliders that dive under a map flown 90 m above the sea, without and with its continuation
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
@@ -39,6 +40,7 @@ import os
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from hashlib import sha256
 from multiprocessing import get_context
@@ -67,6 +69,8 @@ from voyages.simulated import (
     synthetic,
     voyage,
 )
+from voyages.unmapped import AIRCRAFT, Located, located
+from voyages.unmapped import GLIDER as UNMAPPED
 
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Block, prior, transition
@@ -86,14 +90,14 @@ class Runs(NamedTuple):
     number: int
     keep: Path | None
 
-    def __call__(self, run: partial[Any]) -> list[Any]:
-        """Return `run` of 0, 1, ...; from the folder if they were made before."""
-        row = f"{run.func.__name__} {run.args} {self.number}"
+    def __call__(self, run: partial[Any], first: int = 0) -> list[Any]:
+        """Return `run` of `first` and the numbers after it; from the folder if they were made before."""
+        row = f"{run.func.__name__} {run.args} {self.number} {first}"
         kept = self.keep / sha256(row.encode()).hexdigest()[:16] if self.keep else None
         if kept and kept.exists():
             made: list[Any] = loads(kept.read_bytes())
             return made
-        made = list(self.pool.map(run, range(self.number)))
+        made = list(self.pool.map(run, range(first, first + self.number)))
         if kept:
             kept.write_bytes(dumps(made))
         return made
@@ -236,6 +240,45 @@ def dives(runs: Runs, _asked: argparse.Namespace) -> None:
         show(table)
 
 
+def unmapped(runs: Runs, asked: argparse.Namespace) -> None:
+    """Localise surveys in their own field, beside the bound of localisation and mapping at once."""
+    print(
+        "\n"
+        f"## Without a map: {runs.number} surveys a row (aircraft: a quarter), RMS in m over track and runs;"
+        "\nworse: those farther off than dead reckoning alone, and those of them beyond twice their sigma\n"
+    )
+    head = "bound", "error", "alone", "sigma", "NEES/2", "worse", "beyond", "valid %", "s of CPU"
+    table: Table = [("map, vehicle", *head)]
+    long = replace(UNMAPPED, hours=12.0)
+    for name, vehicle, kinds in (
+        ("6 h", UNMAPPED, (Map(30, 500), Map(30, 1000), Map(60, 500), Map(60, 1000))),
+        ("6 h", UNMAPPED, (Map(30, 1000, rough=True),)),
+        ("12 h", long, (Map(30, 500),)),
+        ("aircraft", AIRCRAFT, (Map(30, 1000),)),
+    ):
+        number = max(runs.number // 4, 1) if vehicle is AIRCRAFT else runs.number
+        for kind in kinds:
+            made = runs._replace(number=number)(partial(located, vehicle, kind), asked.first)
+            table.append(unmapped_row(f"{kind}; {name}", made))
+            show(table)
+
+
+def unmapped_row(label: str, made: Sequence[Located]) -> list[str]:
+    """Return one line of the table of surveys without a map."""
+    found = np.array(made)
+    bound, error, alone, sigma = (np.sqrt(np.mean(found[:, k] ** 2)) for k in (3, 0, 1, 2))
+    worse = found[:, 0] > found[:, 1]
+    return [
+        label,
+        *(f"{value:.0f}" for value in (bound, error, alone, sigma)),
+        f"{found[:, 4].mean():.2f}",
+        f"{worse.sum()}",
+        f"{(worse & (found[:, 0] > 2.0 * found[:, 2])).sum()}",
+        f"{100 * found[:, 5].mean():.0f}",
+        f"{found[:, 6].mean():.0f}",
+    ]
+
+
 # ---- speed, peers ------------------------------------------------------------------------------------------
 
 
@@ -309,6 +352,7 @@ PARTS: dict[str, Callable[[Runs, argparse.Namespace], None]] = {
     "accuracy": accuracy,
     "watch": watch,
     "misinformed": misinformed,
+    "unmapped": unmapped,
     "dived": dives,
     "calibrations": calibrations,
     "nominal": partial(accuracy, left="nominal"),
@@ -320,6 +364,7 @@ PARTS: dict[str, Callable[[Runs, argparse.Namespace], None]] = {
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="the first survey's number, of unmapped")
     parser.add_argument("--part", choices=sorted(PARTS), action="append")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="folder in which rows that are done are kept")

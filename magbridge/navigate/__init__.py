@@ -14,6 +14,8 @@ reckoning is, on the states of :mod:`.model`: by one Kalman filter where the pos
 
 Ashore, :mod:`.batch` runs the same navigator over a log and smooths the track; :mod:`.reference_track`,
 :mod:`.findings` and :mod:`.draw` say how good it is. :mod:`.bound` says what a map is worth before the dive.
+Without a map :mod:`.own_survey` localises a whole log in the field that it met itself (:mod:`.own_field`), by
+:mod:`.particles`.
 """
 
 from magbridge.navigate.bound import Bound, position_bound
