@@ -105,11 +105,12 @@ AXES: Final = "xyz"
 class Axis:
     """One channel as the instrument sends it: whether it repeats itself."""
 
-    __slots__ = ("last", "rail", "run")
+    __slots__ = ("last", "rail", "run", "share")
 
     def __init__(self) -> None:
         self.last = self.rail = nan
         self.run = 0
+        self.share = 0.1  # of repeated numbers
 
 
 class Plausibility:
@@ -136,7 +137,7 @@ class Plausibility:
         self.notices: list[str] = []
         self._told: set[str] = set()
         self._axes = (Axis(), Axis(), Axis())
-        self._share, self._stood = 0.1, False  # of repeated numbers; whether an axis has a rail
+        self._stood = False  # whether an axis has a rail
         self._known = noise > 0.0
         self._floor = 1.5 * max(noise, QUIETEST) ** 2
         self._variance = 0.0  # of innovations, nT^2
@@ -224,7 +225,9 @@ class Plausibility:
         if not (same_x or same_y or same_z or self._stood):
             first.last, second.last, third.last = x, y, z
             first.run = second.run = third.run = 0
-            self._share += (1e-3 - self._share) / REPEATS
+            first.share += (1e-3 - first.share) / REPEATS
+            second.share += (1e-3 - second.share) / REPEATS
+            third.share += (1e-3 - third.share) / REPEATS
             return False
         if same_x and same_y and same_z:
             return False
@@ -235,14 +238,14 @@ class Plausibility:
     def _repeats(self, number: int, axis: Axis, value: float, same: bool) -> bool:
         if not same:
             axis.last, axis.run = value, 0
-            self._share += (1e-3 - self._share) / (3 * REPEATS)
+            axis.share += (1e-3 - axis.share) / REPEATS
             return abs(value) == axis.rail
         axis.run += 1
         if axis.run < 4 and abs(value) != axis.rail:
-            self._share += (1.0 - self._share) / (3 * REPEATS)
+            axis.share += (1.0 - axis.share) / REPEATS
             return False
-        if abs(value) != axis.rail and axis.run * log(self._share) > log(RARELY):
-            self._share += (1.0 - self._share) / (3 * REPEATS)
+        if abs(value) != axis.rail and axis.run * log(axis.share) > log(RARELY):
+            axis.share += (1.0 - axis.share) / REPEATS
             return False
         axis.rail, self._stood = abs(value), True
         self._notify("axis", f"axis {AXES[number]} stuck at {value:.0f} nT, or clipped there")

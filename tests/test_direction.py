@@ -89,3 +89,51 @@ def test_what_the_heading_of_a_vehicle_at_the_pole_is_does_not_matter() -> None:
         one.attitude(k * 1_000_000, 0.0, 0.0, 3.0)
         assert one.check(k * 1_000_000, *polar.tolist()) == 0.0
     assert one.notices == []
+
+
+def looks(tilts: list[float], every_us: int = 1_000_000, roll: float = 0.0) -> tuple[list[int], Direction]:
+    """Return the flags of looks at a vector that is tilted by so many degrees, of a banked vehicle."""
+    one, flags = Direction(), []
+    one.expect(*NED.tolist())
+    for k, tilt in enumerate(tilts):
+        attitude = np.radians([roll, 20.0, 30.0])
+        one.attitude(k * every_us, *attitude.tolist())
+        to_ned = Rotation.from_euler("ZYX", attitude[::-1])
+        wrong = Rotation.from_rotvec(np.radians(tilt) * np.array([NED[1], -NED[0], 0.0]) / np.hypot(*NED[:2]))
+        one.check(k * every_us, *to_ned.inv().apply(wrong.apply(NED)).tolist())
+        flags.append(one.flags)
+    return flags, one
+
+
+@pytest.mark.parametrize("roll", [-50.0, 0.0, 40.0])
+def test_the_inclination_may_be_ten_degrees_off_at_any_bank(roll: float) -> None:
+    for tilt in (9.7, -9.7):
+        assert not any(looks([tilt] * 30, roll=roll)[0])
+    for tilt in (10.3, -10.3):
+        flags, one = looks([tilt] * 30, roll=roll)
+        assert flags == [0] * 7 + [int(Quality.IMPLAUSIBLE)] * 23
+        assert one.notices == [f"inclination off by {tilt:+.0f} deg: axes or mounting wrong"]
+
+
+def test_eight_looks_in_a_row_have_to_differ_one_a_second() -> None:
+    assert not any(looks(([20.0] * 7 + [0.0]) * 5)[0])
+    assert not any(looks([20.0] * 60 + [0.0] * 60, every_us=100_000)[0]), "six seconds"
+    assert looks([20.0] * 90, every_us=100_000)[0][-1]
+
+
+def test_what_was_seen_is_remembered_for_an_hour() -> None:
+    flags, one = looks([20.0] * 10 + [0.0] * 3700)
+    assert sum(flag != 0 for flag in flags) == pytest.approx(3602, abs=2)
+    assert one.check(3710_000_000, *NED.tolist()) == 0.0
+    _, one = looks([20.0] * 10 + [0.0] * 3500)
+    tilted = 2.0 * np.linalg.norm(NED) * np.sin(np.radians(10.0))
+    assert one.check(3510_000_000, *NED.tolist()) ** 0.5 == pytest.approx(tilted, rel=1e-3)
+
+
+def test_attitudes_that_are_older_than_five_seconds_tell_nothing() -> None:
+    one = Direction()
+    one.expect(*NED.tolist())
+    one.attitude(0, 0.0, 0.0, 0.0)
+    for k in range(100):
+        assert one.check(k * 1_000_000, 0.0, 0.0, -50_000.0) == 0.0
+    assert one.flags == 0

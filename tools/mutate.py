@@ -43,7 +43,8 @@ TESTS = {
     "calibration/fitting/noise": "calibration/test_noise.py",
     "diagnose/inference/evidence": "diagnose/test_evidence.py",
     "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py",
-    "plausibility": "test_plausibility.py",
+    "plausibility": "test_plausibility.py test_plausibility_numbers.py",
+    "turns": "test_turns.py",
     "direction": "test_direction.py",
 }
 """The tests that have to see a change to each module."""

@@ -37,6 +37,20 @@ def test_white_noise_has_no_memory_and_few_samples_tell_of_none() -> None:
     assert estimate_noise(drawn(0.9)[enough], STEPS[enough], 0.0).autocorrelation > 0.4
 
 
+def test_memory_is_believed_from_three_standard_errors_on() -> None:
+    weak = drawn(0.07)
+    rho = float(weak[1:] @ weak[:-1] / (weak @ weak))
+    assert 3.0 < rho * np.sqrt(N) < 6.0
+    assert estimate_noise(weak, STEPS, 0.0).autocorrelation == pytest.approx(rho, abs=0.01)
+
+
+def test_a_few_pairs_of_wrong_samples_are_no_memory() -> None:
+    e = drawn(0.0)
+    for k in range(100, 100 + 200 * 10, 200):
+        e[k : k + 2] += 400.0
+    assert estimate_noise(e, STEPS, 0.0).autocorrelation == 0.0
+
+
 def test_neighbours_across_a_gap_are_no_neighbours() -> None:
     """Two interleaved halves, each of which turns its sign at every gap."""
     e = drawn(0.95)

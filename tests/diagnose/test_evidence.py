@@ -95,3 +95,26 @@ def test_the_same_hypothesis_counts_once_and_strangers_each() -> None:
     S = np.diag([4.0, 9.0, 1.0])
     assert counted(np.tile(S, (5, 5)), [3] * 5) == pytest.approx(1.0)
     assert counted(np.kron(np.eye(5), S), [3] * 5) == pytest.approx(5.0, rel=0.01)
+
+
+def test_a_score_is_the_ratio_its_evidence_and_the_shrunk_estimate() -> None:
+    S, b = np.array([[4.0, 1.0], [1.0, 9.0]]), np.array([6.0, -3.0])
+    info = Information(S, b, np.zeros((1, 2)))
+    one = sized("late", 2)
+    found = score(info, slice(0, 2), one)
+    assert found.ratio == pytest.approx(b @ np.linalg.solve(S, b))
+    assert found.evidence == pytest.approx(float(log_bayes(found.ratio, 2)))
+    np.testing.assert_allclose(found.estimate, np.linalg.solve(S + np.eye(2), b))
+    assert evidence_of(one, 12.0, 2) == float(log_bayes(12.0, 2)), "a size of either sign has two tails"
+    positive = score(info, slice(1, 2), sized("late", 1, positive=True))
+    assert (positive.ratio, positive.evidence, positive.freedom) == (0.0, 0.0, 1)
+    assert positive.estimate.tolist() == [0.0]
+
+
+def test_the_prior_of_coefficients_of_one_size_is_that_of_their_spectrum() -> None:
+    S, b = np.diag([5.0, 5.0]), np.array([20.0, -15.0])
+    spectrum = np.array([[2.0, 1.0]])
+    found = score(Information(S, b, np.zeros((1, 2))), slice(0, 2), sized("map_error", 2, spectra=spectrum))
+    prior = np.diag(found.prior)
+    np.testing.assert_allclose(found.estimate, np.linalg.solve(S + prior, b), rtol=1e-6)
+    assert found.prior[1] / found.prior[0] == pytest.approx(2.0, rel=1e-6)
