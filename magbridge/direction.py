@@ -51,7 +51,7 @@ class Direction:
     def __init__(self) -> None:
         self.flags = 0
         self.notices: list[str] = []
-        self._told = 0
+        self._reported = 0
         self._roll = self._pitch = self._yaw = nan
         self._attitude_us = -FRESH_US
         self._inclination = self._declination = nan
@@ -115,6 +115,6 @@ class Direction:
         self.flags = IMPLAUSIBLE if time_us < self._tilted_until_us else 0
 
     def _notify(self, which: int, text: str) -> None:
-        if not self._told & which:
-            self._told |= which
+        if not self._reported & which:
+            self._reported |= which
             self.notices.append(text)

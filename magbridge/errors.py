@@ -131,10 +131,10 @@ def _installed_from() -> str:
     from urllib.parse import unquote, urlsplit  # noqa: PLC0415 - as above
 
     try:
-        told = distribution("magbridge").read_text("direct_url.json")
+        recorded = distribution("magbridge").read_text("direct_url.json")
     except PackageNotFoundError:  # run from its sources
-        told = None
-    url = urlsplit(json.loads(told or "{}").get("url", ""))
+        recorded = None
+    url = urlsplit(json.loads(recorded or "{}").get("url", ""))
     return unquote(url.path) if url.scheme == "file" else "magbridge"
 
 

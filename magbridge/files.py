@@ -32,12 +32,12 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         The operating system does not let the file be written: no folder, no permission, no room.
     """
     target = Path(path)
-    beside = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
+    temporary = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
     with suppress(OSError):  # a folder that cannot be read, or is not there: the write itself will fail
         _clear(target)
     try:
-        yield beside
-        beside.replace(target)
+        yield temporary
+        temporary.replace(target)
     except MagbridgeError:
         raise
     except OSError as error:
@@ -45,7 +45,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise WriteError(target, reason) from error
     finally:
         with suppress(OSError):  # it was renamed, or never made
-            beside.unlink()
+            temporary.unlink()
 
 
 def existing(path: Path) -> Path:

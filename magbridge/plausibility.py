@@ -135,7 +135,7 @@ class Plausibility:
         self.flags = 0
         self.fault = False
         self.notices: list[str] = []
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._axes = (Axis(), Axis(), Axis())
         self._stood = False  # whether an axis has a rail
         self._known = noise > 0.0
@@ -398,6 +398,6 @@ class Plausibility:
         return more
 
     def _notify(self, key: str, text: str) -> None:
-        if key not in self._told:
-            self._told.add(key)
+        if key not in self._reported:
+            self._reported.add(key)
             self.notices.append(text)

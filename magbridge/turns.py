@@ -55,7 +55,7 @@ class Turns:
 
     def __init__(self) -> None:
         self.notices: list[str] = []
-        self._told = False
+        self._reported = False
         self._next_us = 0
         self._anchor_us = -LONGEST_US
         self._field, self._variance = 0.0, 0.0
@@ -116,7 +116,7 @@ class Turns:
         self._sum = min(max(self._sum + min(ratio, CLIP) - DRIFT, 0.0), MOST)
         self._largest = max(self._largest, e * e) if self._sum else 0.0
         self._wrong = self._sum > (0.0 if self._wrong else ALARM)
-        if self._wrong and not self._told:
-            self._told = True
+        if self._wrong and not self._reported:
+            self._reported = True
             size = self._largest**0.5
             self.notices.append(f"field changes by {size:.0f} nT in turns: offset, gain or a mass wrong")

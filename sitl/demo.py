@@ -34,7 +34,7 @@ __all__ = ["demo", "summary"]
 PARAMETERS = ("battpos", "ballast")
 
 
-def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dict[str, Any]:
+def demo(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> dict[str, Any]:
     """Run the demonstration; leave the deployment, the calibration, the log and a picture in `folder`.
 
     Returns
@@ -46,7 +46,7 @@ def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dic
     begun = time.monotonic()
 
     def step(text: str) -> None:
-        say(f"{time.monotonic() - begun:5.1f} s  {text}")
+        notify(f"{time.monotonic() - begun:5.1f} s  {text}")
 
     step("simulating a glider with a moving battery and a ballast pump: calibration spirals, then a survey")
     scenario = load("demo")
@@ -65,19 +65,19 @@ def demo(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> dic
 
     step("replaying the survey: the fluxgate through a pty, the autopilot through a socket, into the bridge")
     listener = Listener()
-    stage = Stage(config, listener.hear, folder / "logs")
+    stage = Stage(config, listener.receive, folder / "logs")
     stage.play(Start(start_us(survey)), emulate(survey, load_config(config)), inf)
     step(f"heard {sum(listener.counts.values())} messages as a ground station would")
 
-    heard = _align(listener.field(), survey)
-    result = _compare(survey, nominal, heard)
+    received = _align(listener.field(), survey)
+    result = _compare(survey, nominal, received)
     picture = folder / "demo.png"
     from sitl.demo_picture import draw  # noqa: PLC0415 - matplotlib takes a second, and comes last
 
-    draw(survey, corrected(survey, nominal.calibration).total, heard, picture)
+    draw(survey, corrected(survey, nominal.calibration).total, received, picture)
     step(f"drew {picture}")
     files = [str(folder / name) for name in ("deployment.nc", "cal.json", "bridge.toml", "logs", "demo.png")]
-    return {**result, "calibration_rms_nT": found.rms, "said": listener.said, "files": files}
+    return {**result, "calibration_rms_nT": found.rms, "said": listener.texts, "files": files}
 
 
 def _align(field: dict[str, FloatArray], survey: xr.Dataset) -> xr.Dataset:
@@ -92,18 +92,18 @@ def _align(field: dict[str, FloatArray], survey: xr.Dataset) -> xr.Dataset:
     return xr.Dataset({name: ("time", column) for name, column in columns.items()})
 
 
-def _compare(survey: xr.Dataset, nominal: Fit, heard: xr.Dataset) -> dict[str, Any]:
+def _compare(survey: xr.Dataset, nominal: Fit, received: xr.Dataset) -> dict[str, Any]:
     truth = survey["truth_total_field"].to_numpy()
     raw = np.linalg.norm(channels(survey), axis=1)
-    error = (heard["total_field"] - heard["truth"]).to_numpy()
-    good = ~heard["flagged"].to_numpy()
+    error = (received["total_field"] - received["truth"]).to_numpy()
+    good = ~received["flagged"].to_numpy()
     return {
-        "samples": heard.sizes["time"],
+        "samples": received.sizes["time"],
         "raw_rms_nT": rms(raw - truth),
         "nominal_rms_nT": rms(corrected(survey, nominal.calibration).total - truth),
         "corrected_rms_nT": rms(error),
         "unflagged_rms_nT": rms(error[good]),
-        "unflagged_sigma_nT": rms(heard["sigma"].to_numpy()[good]),
+        "unflagged_sigma_nT": rms(received["sigma"].to_numpy()[good]),
         "flagged": int((~good).sum()),
     }
 
@@ -118,5 +118,5 @@ def summary(result: dict[str, Any]) -> str:
         ("  the 1-sigma it claims for those", result["unflagged_sigma_nT"]),
     ]
     table = [f"  {name:44}{value:10.2f} nT" for name, value in rows]
-    head = f"\nerror of the total field over the survey, RMS of {result['samples']} samples:"
-    return "\n".join([head, *table, "", "  " + "\n  ".join(result["files"])])
+    header = f"\nerror of the total field over the survey, RMS of {result['samples']} samples:"
+    return "\n".join([header, *table, "", "  " + "\n  ".join(result["files"])])

@@ -23,14 +23,14 @@ __all__ = ["draw"]
 RAW, NOMINAL, CORRECTED, TRUE, FLAGGED = "#b0b0b0", "#d1793b", "#1f6fb4", "#111111", "#c0392b"
 
 
-def draw(survey: xr.Dataset, nominal: FloatArray, heard: xr.Dataset, path: Path) -> None:
+def draw(survey: xr.Dataset, nominal: FloatArray, samples: xr.Dataset, path: Path) -> None:
     """Draw the survey: masses, raw and true field, corrected and true field, errors.
 
-    `nominal` (n,) is the total field (nT) of the survey's samples as one ellipsoid corrects it; `heard` is
+    `nominal` (n,) is the total field (nT) of the survey's samples as one ellipsoid corrects it; `samples` is
     what came over the link.
     """
     hours = _hours(survey["time"], survey)
-    received = _hours(heard["time"], survey)
+    received = _hours(samples["time"], survey)
     truth = survey["truth_total_field"].to_numpy()
     raw = np.linalg.norm(channels(survey), axis=1)
     style: dict[Any, Any] = {
@@ -47,7 +47,7 @@ def draw(survey: xr.Dataset, nominal: FloatArray, heard: xr.Dataset, path: Path)
         _levels(
             panels[1], "What the fluxgate reads", (hours, raw, RAW, "raw |H|"), (hours, truth, TRUE, "true")
         )
-        total, sigma = heard["total_field"].to_numpy(), heard["sigma"].to_numpy()
+        total, sigma = samples["total_field"].to_numpy(), samples["sigma"].to_numpy()
         panels[2].fill_between(
             received,
             total - 2 * sigma,
@@ -63,10 +63,10 @@ def draw(survey: xr.Dataset, nominal: FloatArray, heard: xr.Dataset, path: Path)
             (received, total, CORRECTED, "corrected"),
             (hours, truth, TRUE, "true"),
         )
-        _errors(panels[3], hours, nominal - truth, received, heard)
+        _errors(panels[3], hours, nominal - truth, received, samples)
         panels[-1].set_xlabel("hours since the survey began")
-        with atomic_path(path) as beside:
-            figure.savefig(beside, dpi=130)
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary, dpi=130)
         plt.close(figure)
 
 
@@ -95,10 +95,10 @@ def _levels(axes: Axes, title: str, *lines: tuple[FloatArray, FloatArray, str, s
 
 
 def _errors(
-    axes: Axes, hours: FloatArray, nominal: FloatArray, received: FloatArray, heard: xr.Dataset
+    axes: Axes, hours: FloatArray, nominal: FloatArray, received: FloatArray, samples: xr.Dataset
 ) -> None:
-    error = (heard["total_field"] - heard["truth"]).to_numpy()
-    flagged = heard["flagged"].to_numpy()
+    error = (samples["total_field"] - samples["truth"]).to_numpy()
+    flagged = samples["flagged"].to_numpy()
     good = rms(error[~flagged])
     axes.set_title("Error")
     axes.plot(hours, nominal, color=NOMINAL, lw=1, label=f"one ellipsoid: {rms(nominal):.0f} nT RMS")

@@ -54,7 +54,7 @@ ENDING = 10.0
 
 
 @contextmanager
-def flying(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> Iterator[str]:
+def flying(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> Iterator[str]:
     """Fly the glider of a seed while the context lasts; give the link at which a ground station hears it.
 
     Parameters
@@ -63,10 +63,10 @@ def flying(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> I
         For the deployment, its calibration, its world's map, the bridge's configuration and its log.
     seed : int
         Which random glider.
-    say : callable
+    notify : callable
         Takes a line about what is being done.
     """
-    say("simulating a glider and fitting its calibration to the spirals")
+    notify("simulating a glider and fitting its calibration to the spirals")
     survey = _prepare(folder, seed)
     stop = Stop()
     with ExitStack() as opened:
@@ -80,7 +80,7 @@ def flying(folder: Path, seed: int = 1, say: Callable[[str], None] = print) -> I
         text = text.replace("/dev/null", os.ttyname(slave)).replace("14550", str(router.bridge_port))
         config = folder / "bridge.toml"
         config.write_text(text, encoding="utf-8")
-        say("starting the bridge")
+        notify("starting the bridge")
         command = [sys.executable, "-m", "magbridge", "run", "--config", str(config)]
         bridge = subprocess.Popen(  # noqa: S603 - our own
             command, stderr=subprocess.DEVNULL, start_new_session=True

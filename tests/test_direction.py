@@ -34,8 +34,8 @@ def judge(
     one.expect(*field.tolist())
     rng = np.random.default_rng(2)
     for time_us, attitude, body in flight():
-        told = attitude + rng.normal(0.0, np.radians(1.5), 3)
-        one.attitude(time_us, *(told + (0.0 if attitude_error is None else attitude_error)).tolist())
+        reported = attitude + rng.normal(0.0, np.radians(1.5), 3)
+        one.attitude(time_us, *(reported + (0.0 if attitude_error is None else attitude_error)).tolist())
         sigma.append(one.check(time_us, *(wrong @ body).tolist()) ** 0.5)
         flags.append(one.flags)
     return np.array(flags), np.array(sigma), one.notices
@@ -44,27 +44,27 @@ def judge(
 def test_a_right_vector_is_left_alone_and_so_is_one_without_position_or_attitude() -> None:
     compass = np.radians([0.0, 0.0, 15.0])
     for field, off in ((NED, None), (NED, compass), (NED * nan, None), (NED, compass * nan)):
-        flags, sigma, told = judge(np.eye(3), off, field)
+        flags, sigma, reported = judge(np.eye(3), off, field)
         assert not flags.any()
         assert not sigma.any()
-        assert told == []
+        assert reported == []
 
 
 @pytest.mark.parametrize("axes", [(0,), (1,), (2,), (0, 1), (0, 2), (1, 2), (0, 1, 2)])
 def test_reversed_axes_are_seen_though_the_total_field_is_right(axes: tuple[int, ...]) -> None:
     signs = np.ones(3)
     signs[list(axes)] = -1.0
-    flags, sigma, told = judge(np.diag(signs))
+    flags, sigma, reported = judge(np.diag(signs))
     assert np.mean((flags == Quality.IMPLAUSIBLE) | (sigma > 10_000.0)) > 0.5
-    assert told
+    assert reported
 
 
 def test_exchanged_axes_and_a_mounting_that_is_pitched_are_flagged() -> None:
     pitched = Rotation.from_euler("y", 20.0, degrees=True).as_matrix()
     for wrong in (np.eye(3)[[1, 0, 2]], np.eye(3)[[0, 2, 1]], pitched):
-        flags, sigma, told = judge(wrong)
+        flags, sigma, reported = judge(wrong)
         assert np.mean((flags != 0) | (sigma > 5_000.0)) > 0.5
-        assert len(told) <= 2
+        assert len(reported) <= 2
 
 
 def test_a_mounting_that_is_turned_is_reported_and_its_vector_s_sigma_spans_the_difference() -> None:

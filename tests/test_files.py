@@ -27,8 +27,8 @@ def writing(target: Path) -> tuple[subprocess.Popen[str], Path]:
     """Start a process that is in the middle of writing `target`; return it and what it writes to."""
     process = subprocess.Popen([sys.executable, "-c", WRITER, str(target)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    with process.stdout as said:
-        return process, target.with_name(said.readline().strip())
+    with process.stdout as output:
+        return process, target.with_name(output.readline().strip())
 
 
 def test_a_write_clears_what_a_killed_one_left_and_leaves_a_living_ones(tmp_path: Path) -> None:
@@ -43,8 +43,8 @@ def test_a_write_clears_what_a_killed_one_left_and_leaves_a_living_ones(tmp_path
         assert left.read_text() == "half"
         assert target.read_text() == "before"
         other.write_text("of another target")
-        with atomic_path(target) as beside:
-            beside.write_text("after")
+        with atomic_path(target) as temporary:
+            temporary.write_text("after")
         assert {path.name for path in tmp_path.iterdir()} == {target.name, still.name, other.name}
         assert target.read_text() == "after"
     finally:
@@ -55,14 +55,17 @@ def test_a_write_clears_what_a_killed_one_left_and_leaves_a_living_ones(tmp_path
 def test_a_block_that_raises_leaves_everything_as_it_was(tmp_path: Path) -> None:
     target = tmp_path / "a.json"
     target.write_text("before")
-    with pytest.raises(ZeroDivisionError), atomic_path(target) as beside:
-        beside.write_text(str(1 // (beside.write_text("half") - 4)))
+    with pytest.raises(ZeroDivisionError), atomic_path(target) as temporary:
+        temporary.write_text(str(1 // (temporary.write_text("half") - 4)))
     assert [path.read_text() for path in tmp_path.iterdir()] == ["before"]
 
 
 def test_no_folder_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(WriteError, match=os.strerror(2)), atomic_path(tmp_path / "no" / "a.json") as beside:
-        beside.write_text("")
+    with (
+        pytest.raises(WriteError, match=os.strerror(2)),
+        atomic_path(tmp_path / "no" / "a.json") as temporary,
+    ):
+        temporary.write_text("")
 
 
 @pytest.mark.parametrize(("name", "left"), [("new/doubt", []), (".", ["half"])])

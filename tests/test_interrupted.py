@@ -32,9 +32,9 @@ def test_stopped_in_the_middle_leaves_nothing(tmp_path: Path, number: signal.Sig
             assert process.poll() is None
             time.sleep(0.01)
         process.send_signal(number)
-        said = process.stderr.read()
+        output = process.stderr.read()
     assert process.returncode == code
-    assert said == ("magbridge: interrupted\n" if number == signal.SIGINT else "")
+    assert output == ("magbridge: interrupted\n" if number == signal.SIGINT else "")
     assert [path.name for path in tmp_path.iterdir()] == ["long.nc"]
 
 

@@ -30,13 +30,13 @@ def test_every_public_name_is_there() -> None:
 
 
 def test_help_has_a_line_for_each_name() -> None:
-    told = {
+    reported = {
         name
         for line in mb.__doc__.splitlines()
         if line.startswith("- ``")
         for name in WORD.findall(line.partition(":")[0])
     }
-    assert told == {name for name in mb.__all__ if not name.startswith("_")}
+    assert reported == {name for name in mb.__all__ if not name.startswith("_")}
     assert set(mb.__all__) <= set(dir(mb))
 
 

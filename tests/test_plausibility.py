@@ -57,11 +57,11 @@ def test_a_healthy_sensor_is_left_alone(steps: float, reference: float) -> None:
     flight = Flight(n=3000, steps=steps)
     if steps > 1.0:
         flight.raw[:, 2] = flight.raw[:, 2] + 0.0
-    flags, sigma, told = flight.judge(reference)
+    flags, sigma, reported = flight.judge(reference)
     assert np.mean(flags != 0) <= 0.001
     if steps < 1.0:
         assert not flags.any()
-        assert told == []
+        assert reported == []
         assert (sigma[200:] == SIGMA).all()
 
 
@@ -79,11 +79,11 @@ def test_a_fault_on_the_way_is_flagged_from_there_on(
 ) -> None:
     flight = Flight()
     flight.raw[700:] = fault(flight.raw[700:])
-    flags, sigma, told = flight.judge()
+    flags, sigma, reported = flight.judge()
     assert not flags[:700].any()
     assert (flags[710:] & IMPLAUSIBLE).all() or (sigma[710:][flags[710:] == 0] > 30.0).all()
     assert np.mean(flags[700:710] == 0) <= 0.9
-    assert len([line for line in told if text in line]) == 1
+    assert len([line for line in reported if text in line]) == 1
 
 
 def test_spikes_are_flagged_one_by_one() -> None:
@@ -91,20 +91,20 @@ def test_spikes_are_flagged_one_by_one() -> None:
     hit = np.random.default_rng(7).random(1500) < 0.03
     hit[:10] = False
     flight.raw[hit] += along(flight.raw[hit], 500.0)
-    flags, sigma, told = flight.judge()
+    flags, sigma, reported = flight.judge()
     assert (flags[hit] == IMPLAUSIBLE).all()
     assert np.mean(flags[~hit] != 0) < 0.005
     assert np.median(sigma[~hit]) == SIGMA
-    assert told == []
+    assert reported == []
 
 
 def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() -> None:
     flight = Flight()
     flight.raw[500:515] += along(flight.raw[500:515], 200.0)  # a ship passes: one minute
-    flags, _, told = flight.judge()
+    flags, _, reported = flight.judge()
     assert (flags[500:515] == IMPLAUSIBLE).all()
     assert not flags[540:].any()
-    assert len(told) == 1
+    assert len(reported) == 1
     flight.raw[515:1000] += along(flight.raw[515:1000], 200.0)
     flags, sigma, _ = flight.judge()
     assert (flags[500:1000] == IMPLAUSIBLE).all()
@@ -122,21 +122,21 @@ def test_a_mass_that_moves_is_no_jump_if_the_field_stays_and_one_if_it_does_not(
     flight = Flight()
     flight.quality[695:705] = MOVING
     flight.raw[695:700] += along(flight.raw[695:700], 300.0)  # while it moves, nothing is known
-    flags, _, told = flight.judge()
+    flags, _, reported = flight.judge()
     assert not flags.any()
     flight.raw[700:] += along(flight.raw[700:], 150.0)
-    flags, _, told = flight.judge()
+    flags, _, reported = flight.judge()
     assert (flags[705:] == IMPLAUSIBLE).all()
-    assert "as a mass moves: calibration or telemetry wrong" in told[0]
+    assert "as a mass moves: calibration or telemetry wrong" in reported[0]
 
 
 def test_a_wrong_mass_is_seen_if_it_moves_with_the_very_second_sample() -> None:
     flight = Flight()
     flight.quality[1:5] = MOVING
     flight.raw[5:] += along(flight.raw[5:], -460.0)
-    flags, sigma, told = flight.judge()
+    flags, sigma, reported = flight.judge()
     assert ((flags[5:] == IMPLAUSIBLE) | (sigma[5:] > 400.0)).all()
-    assert "as a mass moves" in told[0]
+    assert "as a mass moves" in reported[0]
 
 
 def test_a_spike_that_a_mass_s_move_makes_acceptable_is_no_new_level() -> None:
@@ -144,10 +144,10 @@ def test_a_spike_that_a_mass_s_move_makes_acceptable_is_no_new_level() -> None:
     flight = Flight()
     flight.quality[690:700] = MOVING
     flight.raw[700] += along(flight.raw[700:701], 60.0)[0]
-    flags, _, told = flight.judge()
+    flags, _, reported = flight.judge()
     assert not flags[:690].any()
     assert (flags[701:] == IMPLAUSIBLE).sum() <= 3
-    assert told == []
+    assert reported == []
 
 
 def test_clipping_is_remembered() -> None:
@@ -156,25 +156,25 @@ def test_clipping_is_remembered() -> None:
     limit = float(np.quantile(flight.raw[:, 2], 0.8))
     clipped = flight.raw[:, 2] > limit
     flight.raw[:, 2] = np.minimum(flight.raw[:, 2], limit)
-    flags, _, told = flight.judge()
+    flags, _, reported = flight.judge()
     missed = clipped & (flags == 0)
     assert missed.sum() <= 10
     assert missed[np.flatnonzero(clipped)[30] :].sum() == 0
-    assert any("axis z stuck" in line for line in told)
+    assert any("axis z stuck" in line for line in reported)
 
 
 def test_more_noise_than_the_calibration_s_widens_sigma_within_a_hundred_samples() -> None:
     flight = Flight(n=3000)
     before = np.linalg.norm(flight.raw, axis=1)
     flight.raw[700:] += np.random.default_rng(2).normal(0.0, 20.0, (2300, 3))
-    flags, sigma, told = flight.judge()
+    flags, sigma, reported = flight.judge()
     error = np.abs(np.linalg.norm(flight.raw, axis=1) - before)
     wrong = (flags == 0) & (error > 3.0 * sigma)
     assert np.median(sigma[1000:]) == pytest.approx(20.0 * (4 / 3) ** 0.5, rel=0.2)
     assert np.mean(wrong[800:]) < 0.004
     assert np.mean(wrong[700:800]) < 0.08
-    assert [line for line in told if "noise" in line]
-    assert len(told) == len(set(told))
+    assert [line for line in reported if "noise" in line]
+    assert len(reported) == len(set(reported))
 
 
 @pytest.mark.parametrize("times", [5.0, 20.0])
@@ -188,9 +188,9 @@ def test_noise_from_the_start_on_widens_sigma_within_ten_samples(times: float) -
         wrong.append((flags == 0) & (np.abs(np.linalg.norm(flight.raw, axis=1) - before) > 3.0 * sigma))
     assert np.mean(wrong) < 0.006
     assert np.mean(np.array(wrong)[:, 10:]) < 0.004
-    _, quiet, told = Flight(n=2000).judge()
+    _, quiet, reported = Flight(n=2000).judge()
     assert (quiet[50:] == SIGMA).all()
-    assert told == []
+    assert reported == []
 
 
 @pytest.mark.parametrize("sigmas", [3.2, -3.2, 4.2])
@@ -198,23 +198,23 @@ def test_a_field_that_is_far_off_from_the_first_on_has_that_as_its_sigma(sigmas:
     """A gain wrong by 1 % is 500 nT; it is not flagged, since rock may be as much."""
     flight = Flight()
     off = 145.0 * sigmas
-    flags, sigma, told = flight.judge(reference=FIELD - off)
+    flags, sigma, reported = flight.judge(reference=FIELD - off)
     error = np.abs(np.linalg.norm(flight.raw, axis=1) - FIELD + off)
     far = error > 3.0 * np.hypot(145.0, SIGMA)
     assert far.mean() > 0.5
     assert sigma[far] == pytest.approx(np.hypot(error[far], SIGMA))
     assert not flags.any()
-    assert [line for line in told if "sigma is widened" in line] == told[:1]
+    assert [line for line in reported if "sigma is widened" in line] == reported[:1]
 
 
 def test_rock_that_is_come_upon_little_by_little_is_no_fault() -> None:
     flight = Flight(n=3000)
     rise = np.interp(np.arange(3000), [200, 2000], [200.0, 600.0])
     flight.raw += rise[:, None] * flight.raw / np.linalg.norm(flight.raw, axis=1)[:, None]
-    flags, sigma, told = flight.judge()
+    flags, sigma, reported = flight.judge()
     assert not flags.any()
     assert (sigma == SIGMA).all()
-    assert told == []
+    assert reported == []
     for off, span in ((350.0, True), (100.0, False)):  # 3.4 sigmas or more at first, then 2.4 or 0.7
         flags, sigma, _ = flight.judge(reference=FIELD + 600.0 + off)
         assert (sigma[:100] > 400.0).all()
@@ -225,9 +225,9 @@ def test_without_a_position_only_what_is_nowhere_on_earth_is_wrong() -> None:
     flight = Flight(n=50)
     assert not flight.judge(reference=nan)[0].any()
     flight.raw *= 0.2
-    flags, _, told = flight.judge(reference=nan)
+    flags, _, reported = flight.judge(reference=nan)
     assert (flags == IMPLAUSIBLE).all()
-    assert "expected 17000 to 72000" in told[0]
+    assert "expected 17000 to 72000" in reported[0]
 
 
 def test_memory_and_state_do_not_grow() -> None:

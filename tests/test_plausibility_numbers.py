@@ -188,8 +188,8 @@ def test_a_wrong_level_is_remembered_for_an_hour_if_it_lasted_eight_seconds() ->
         for k in range(20, 20 + samples):
             assert judged(900.0, judge=judge, at=k)[0] == IMPLAUSIBLE
         flags = [judged(0.0, judge=judge, at=k)[0] for k in range(20 + samples, 2000)]
-        told = any(text.startswith("field of 50900 nT, expected 50000") for text in judge.notices)
-        assert told is (samples == 5)
+        reported = any(text.startswith("field of 50900 nT, expected 50000") for text in judge.notices)
+        assert reported is (samples == 5)
         assert sum(flag != 0 for flag in flags[3:]) == pytest.approx(remembered_for, abs=4)
 
 

@@ -48,7 +48,7 @@ class Attacker:
         for line in self.lines:
             line.setblocking(False)
 
-    def say(self, data: bytes, times: int = 1) -> None:
+    def emit(self, data: bytes, times: int = 1) -> None:
         """Send from each."""
         for line in self.lines:
             for _ in range(times):
@@ -72,7 +72,7 @@ class Attack(NamedTuple):
     link: str
     strangers: int
     act: Callable[[Attacker, int], None]
-    told: str = ""
+    reported: str = ""
     spoofs: bool = False
 
 
@@ -88,8 +88,8 @@ def to_us(**fields: Any) -> dict[str, Any]:
 
 def ftp(opcode: int, data: bytes, sequence: int, size: int = 0) -> bytes:
     """Return a request for a file."""
-    head = HEADER.pack(sequence & 0xFFFF, sequence & 0xFF, opcode, size or len(data), 0, 0, 0)
-    payload = (head + data).ljust(251, b"\0")
+    header = HEADER.pack(sequence & 0xFFFF, sequence & 0xFF, opcode, size or len(data), 0, 0, 0)
+    payload = (header + data).ljust(251, b"\0")
     return frame(255, 190, "FILE_TRANSFER_PROTOCOL", **to_us(payload=payload))
 
 
@@ -100,9 +100,9 @@ def signed(component: int, ahead_us: int) -> bytes:
     return codec.pack("NAMED_VALUE_FLOAT", name="x", value=1.0)
 
 
-def again(attacker: Attacker, _: int) -> None:
+def recorded_frames(attacker: Attacker, _: int) -> None:
     """Send again what the autopilot has just sent."""
-    attacker.say(RECORDED[0])
+    attacker.emit(RECORDED[0])
 
 
 def connect(attacker: Attacker, _: int, words: bytes = b"") -> None:
@@ -122,61 +122,62 @@ def connect(attacker: Attacker, _: int, words: bytes = b"") -> None:
 
 
 RECORDED = [b""]
-HEAD = bytes((0xFD, 60, 0, 0, 7, 9, 9, 0xF0, 0xE0, 0))
+HEADER_SIZE = bytes((0xFD, 60, 0, 0, 7, 9, 9, 0xF0, 0xE0, 0))
 BEAT = frame(255, 190, "HEARTBEAT", type=6, autopilot=8)
 BATTERY = frame(1, 99, "NAMED_VALUE_FLOAT", name="battpos", value=-9.0)
 AGE = frame(1, 99, "PARAM_SET", **to_us(param_id="MB_AGE_BATTPOS", param_value=1e6, param_type=9))
 OFF = frame(1, 99, "COMMAND_LONG", **to_us(command=511, param1=60101, param2=-1.0))
 ATTACKS = (
     Attack("nothing, signed", "signed", 0, lambda _a, _k: None),
-    Attack("header of an unknown message before each frame", "signed", 1, lambda a, _: a.say(HEAD)),
-    Attack("unsigned heartbeats of 40", "signed", 40, lambda a, _: a.say(BEAT), "not signed"),
+    Attack("header of an unknown message before each frame", "signed", 1, lambda a, _: a.emit(HEADER_SIZE)),
+    Attack("unsigned heartbeats of 40", "signed", 40, lambda a, _: a.emit(BEAT), "not signed"),
     Attack("an unsigned RADIO_STATUS, which needs no signature", "signed", 1,
-           lambda a, _: a.say(frame(51, 68, "RADIO_STATUS", rssi=80))),
+           lambda a, _: a.emit(frame(51, 68, "RADIO_STATUS", rssi=80))),
     Attack("frames signed with another key", "signed", 1,
-           lambda a, _: a.say(Codec(1, 1, Signing(bytes(32))).pack("HEARTBEAT", type=12)), "another key"),
-    Attack("genuine frames, recorded and sent again", "signed", 1, again, "an old time stamp"),
+           lambda a, _: a.emit(Codec(1, 1, Signing(bytes(32))).pack("HEARTBEAT", type=12)), "another key"),
+    Attack("genuine frames, recorded and sent again", "signed", 1, recorded_frames, "an old time stamp"),
     Attack("a liar with the key, ten years ahead, as 1:25", "signed", 1,
-           lambda a, _: a.say(signed(25, YEARS_US))),
+           lambda a, _: a.emit(signed(25, YEARS_US))),
     Attack("a liar with the key, ten years ahead, as the autopilot", "signed", 1,
-           lambda a, _: a.say(signed(1, YEARS_US)), "several addresses", spoofs=True),
+           lambda a, _: a.emit(signed(1, YEARS_US)), "several addresses", spoofs=True),
     Attack("a liar with the key, an hour behind, as 1:25", "signed", 1,
-           lambda a, _: a.say(signed(25, -3_600_000_000)), "a time stamp behind our clock"),
+           lambda a, _: a.emit(signed(25, -3_600_000_000)), "a time stamp behind our clock"),
     Attack("a new key, unasked (SETUP_SIGNING)", "signed", 1,
-           lambda a, _: a.say(frame(255, 190, "SETUP_SIGNING", **to_us(secret_key=KEY[::-1]))),
+           lambda a, _: a.emit(frame(255, 190, "SETUP_SIGNING", **to_us(secret_key=KEY[::-1]))),
            "keys come from a file"),
     Attack("nothing, unsigned", "udpin", 0, lambda _a, _k: None),
-    Attack("one byte from each of 40", "udpin", 40, lambda a, _: a.say(b"x")),
-    Attack("8,000 datagrams of garbage a second", "udpin", 1, lambda a, _: a.say(bytes(range(97)), 40)),
+    Attack("one byte from each of 40", "udpin", 40, lambda a, _: a.emit(b"x")),
+    Attack("8,000 datagrams of garbage a second", "udpin", 1, lambda a, _: a.emit(bytes(range(97)), 40)),
     Attack("empty datagrams and one of 60 kB", "udpin", 2,
-           lambda a, k: a.say(b"" if k % 20 else bytes(60_000))),
-    Attack("battpos of another component (1:99)", "udpin", 1, lambda a, _: a.say(BATTERY), "not used"),
-    Attack("MB_AGE_BATTPOS = 1e6 from 1:99", "udpin", 1, lambda a, _: a.say(AGE), "only a station"),
-    Attack("MAG_FIELD turned off by 1:99", "udpin", 1, lambda a, _: a.say(OFF), "may not set a rate"),
+           lambda a, k: a.emit(b"" if k % 20 else bytes(60_000))),
+    Attack("battpos of another component (1:99)", "udpin", 1, lambda a, _: a.emit(BATTERY), "not used"),
+    Attack("MB_AGE_BATTPOS = 1e6 from 1:99", "udpin", 1, lambda a, _: a.emit(AGE), "only a station"),
+    Attack("MAG_FIELD turned off by 1:99", "udpin", 1, lambda a, _: a.emit(OFF), "may not set a rate"),
     Attack("the list of parameters, asked for 1,000 times a second", "udpin", 1,
-           lambda a, _: a.say(frame(255, 190, "PARAM_REQUEST_LIST", **to_us()), 5)),
+           lambda a, _: a.emit(frame(255, 190, "PARAM_REQUEST_LIST", **to_us()), 5)),
     Attack("metadata, asked for 1,000 times a second", "udpin", 1,
-           lambda a, _: a.say(frame(255, 190, "COMMAND_LONG", **to_us(command=512, param1=397)), 5),
+           lambda a, _: a.emit(frame(255, 190, "COMMAND_LONG", **to_us(command=512, param1=397)), 5),
            "commands a second"),
     Attack("heartbeats of 200 new stations a second", "udpin", 1,
-           lambda a, k: a.say(frame(200 + k % 50, 1 + k % 200, "HEARTBEAT", type=6, autopilot=8))),
+           lambda a, k: a.emit(frame(200 + k % 50, 1 + k % 200, "HEARTBEAT", type=6, autopilot=8))),
     Attack("files opened without end, and one outside", "udpin", 1,
-           lambda a, k: a.say(ftp(Opcode.OPEN_READ, (b"general.json", b"../key.bin")[k % 2], k)), "refused"),
+           lambda a, k: a.emit(ftp(Opcode.OPEN_READ, (b"general.json", b"../key.bin")[k % 2], k)), "refused"),
     Attack("answers to TIMESYNC that nobody asked for", "udpin", 1,
-           lambda a, k: a.say(frame(1, 1, "TIMESYNC", tc1=1 + k, ts1=k)), "several addresses", spoofs=True),
+           lambda a, k: a.emit(frame(1, 1, "TIMESYNC", tc1=1 + k, ts1=k)), "several addresses", spoofs=True),
     Attack("bursts of a file by 7 at once", "udpin, others", 7,
-           lambda a, k: a.say(ftp(Opcode.OPEN_READ if k < 2 else Opcode.BURST, b"parameter.json", k, 239))),
+           lambda a, k: a.emit(ftp(Opcode.OPEN_READ if k < 2 else Opcode.BURST, b"parameter.json", k, 239))),
     Attack("valid heartbeats of 40 stations", "udpin, others", 40,
-           lambda a, _: a.say(BEAT), "more than 8 peers"),
+           lambda a, _: a.emit(BEAT), "more than 8 peers"),
     Attack("reboots of the autopilot that never were", "udpin", 1,
-           lambda a, k: a.say(frame(1, 1, "ATTITUDE", time_boot_ms=k % 4)), "several addresses", spoofs=True),
+           lambda a, k: a.emit(frame(1, 1, "ATTITUDE", time_boot_ms=k % 4)),
+           "several addresses", spoofs=True),
     Attack("1,000 texts a second, to all", "udpin", 1,
-           lambda a, k: a.say(frame(1, 99, "STATUSTEXT", text=f"nothing {k}", severity=2), 5)),
+           lambda a, k: a.emit(frame(1, 99, "STATUSTEXT", text=f"nothing {k}", severity=2), 5)),
     Attack("commands without end", "udpin", 1,
-           lambda a, k: a.say(frame(255, 190, "COMMAND_LONG", **to_us(command=k % 1000)), 5),
+           lambda a, k: a.emit(frame(255, 190, "COMMAND_LONG", **to_us(command=k % 1000)), 5),
            "commands a second"),
     Attack("our own heartbeat, sent back", "udpin", 1,
-           lambda a, _: a.say(frame(1, 191, "HEARTBEAT", type=18, autopilot=8)), "another program speaks"),
+           lambda a, _: a.emit(frame(1, 191, "HEARTBEAT", type=18, autopilot=8)), "another program speaks"),
     Attack("nothing, by TCP", "tcpin", 0, lambda _a, _k: None),
     Attack("1,000 connections a second", "tcpin", 0, connect),
     Attack("1,000 connections a second, each with half a frame", "tcpin", 0,
@@ -187,7 +188,7 @@ ATTACKS = (
 def run(rig: Rig, attack: Attack, seconds: float = SECONDS) -> tuple[float, float, int, str]:
     """Attack; return the shares lost in and out, bytes that the strangers got, and what was told."""
     rig.until_well()
-    before, mark, sent, said = rig.fresh_status(), rig.mark, [0], set(rig.said())
+    before, mark, sent, texts = rig.fresh_status(), rig.mark, [0], set(rig.texts())
     with ExitStack() as stack:
         attacker = Attacker(rig, stack, attack.strangers)
 
@@ -209,9 +210,9 @@ def run(rig: Rig, attack: Attack, seconds: float = SECONDS) -> tuple[float, floa
     missed = max(samples) - min(samples) + 1 - len(samples)
     counter = "link_refused" if attack.spoofs else "link_frames_lost"
     lost = max(after[counter] - before[counter], 0) / sent[0]
-    new = [text for text in rig.said(mark) if text not in said or attack.told in text]
-    told = next((text for text in new if attack.told and attack.told in text), "")
-    return lost, missed / (len(samples) + missed), got, told
+    new = [text for text in rig.texts(mark) if text not in texts or attack.reported in text]
+    reported = next((text for text in new if attack.reported and attack.reported in text), "")
+    return lost, missed / (len(samples) + missed), got, reported
 
 
 def main() -> int:
@@ -228,10 +229,10 @@ def main() -> int:
             try:
                 rig.start()
                 for attack in (one for one in chosen if one.link == link):
-                    lost, out, got, told = run(rig, attack)
-                    fails = max(lost, out) > ALLOWED and not told
+                    lost, out, got, reported = run(rig, attack)
+                    fails = max(lost, out) > ALLOWED and not reported
                     worst += fails
-                    row = (f"{lost:.1%}", f"{out:.1%}", f"{got / 1e3:.1f} kB", told + " FAILS" * fails)
+                    row = (f"{lost:.1%}", f"{out:.1%}", f"{got / 1e3:.1f} kB", reported + " FAILS" * fails)
                     shown.add_row(attack.name, link, *row)
                     print(attack.name, *row, sep=" | ", flush=True)
                 if any(KEY[::-1][:6] in path.read_bytes() for path in rig.logs):

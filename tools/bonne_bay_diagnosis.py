@@ -49,7 +49,7 @@ def main() -> None:
         for seed in range(21, 21 + options.seeds):
             parts = fly(seed, reference)
             calibration = fit(observations(parts["trial 1"], MASSES), "auto").calibration
-            found = diagnose([parts["survey"]], calibration, learned_from=[parts["trial 1"]])
+            found = diagnose([parts["survey"]], calibration, training_logs=[parts["trial 1"]])
             named = ", ".join(
                 f"{h.candidate.cause} ({h.candidate.channel})" if h.candidate.channel else h.candidate.cause
                 for h in found.findings

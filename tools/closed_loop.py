@@ -28,8 +28,8 @@ from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
+from navigation_studies.simulated import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 from terminal import command_line
-from voyages.simulated import GLIDER, HOUR, SPEEDS, Map, synthetic, voyage
 
 from sitl.referee import ArduPilot, Autopilot, Px4
 from sitl.referee.loop import Passage, Run, sail
@@ -52,7 +52,7 @@ PAIRS: tuple[tuple[str, type[Autopilot]], ...] = (
     ("EXTERNAL_POSITION_ESTIMATE", Px4),
     ("GLOBAL_POSITION_SENSOR", Px4),
 )
-HEAD = (
+HEADER = (
     "fix", "autopilot", "telemetry", "map", "follows", "obeying m", "ignoring m", "ratio", "autopilot m",
     "alone m", "claims m", "standardised", "back s", "taken",
 )  # fmt: skip
@@ -70,9 +70,9 @@ class Case(NamedTuple):
 
 
 def passage(case: Case) -> Passage:
-    """Return a voyage of the navigation study."""
+    """Return a track of the navigation study."""
     grid = synthetic(case.kind, case.seed % 10)
-    ds = voyage(grid, GLIDER, 1000 + case.seed, hours=case.hours, speed=SPEEDS[case.seed % 3])
+    ds = track_over(grid, GLIDER, 1000 + case.seed, hours=case.hours, speed=SPEEDS[case.seed % 3])
     last = case.hours * HOUR
     return Passage(
         ds["time"].to_numpy(),
@@ -108,12 +108,14 @@ def one(case: Case) -> list[str]:
     if not fed.any():  # none was sent
         fed = lost
     obeying, ignoring = rms(with_us.error[lost]), rms(without.error[lost])
-    said = [text for second, text in with_us.texts if FOLLOWS in text and second < case.hours * HOUR - BACK]
+    reported = [
+        text for second, text in with_us.texts if FOLLOWS in text and second < case.hours * HOUR - BACK
+    ]
     back = with_us.seconds > case.hours * HOUR - BACK
     far = np.flatnonzero(np.hypot(*with_us.autopilot[back].T) > 3.0 * 2.5)
     return [
         case.fix, case.stack.__name__, case.streams, str(case.kind),
-        said[-1].removeprefix(FOLLOWS).partition(":")[0],
+        reported[-1].removeprefix(FOLLOWS).partition(":")[0],
         f"{obeying:.1f}", f"{ignoring:.1f}", f"{obeying / ignoring:.2f}",
         f"{rms(np.hypot(*with_us.autopilot[fed].T)):.1f}", f"{rms(np.hypot(*without.autopilot[fed].T)):.1f}",
         f"{rms(with_us.claimed[fed]):.1f}", f"{rms(with_us.autopilot[fed] / with_us.claimed[fed, None]):.2f}",
@@ -137,7 +139,7 @@ def main() -> None:
     parser.add_argument("--telemetry", nargs="+", choices=STREAMS, default=STREAMS)
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
-    print(f"| {' | '.join(HEAD)} |\n|{'---|' * len(HEAD)}")
+    print(f"| {' | '.join(HEADER)} |\n|{'---|' * len(HEADER)}")
     with ProcessPoolExecutor(arguments.workers) as pool:
         for line in pool.map(
             one, cases(arguments.runs, arguments.hours, arguments.maps, arguments.telemetry)

@@ -70,7 +70,7 @@ class Score:
         nT, the largest error without a flag.
     sigma : float
         nT, median of those without a flag.
-    said : tuple of str
+    reported : tuple of str
     """
 
     samples: int
@@ -78,7 +78,7 @@ class Score:
     wrong: int
     worst: float
     sigma: float
-    said: tuple[str, ...]
+    reported: tuple[str, ...]
 
 
 def prepare(folder: Path, seed: int, hours: float, *, calibrated_by: int | None = None) -> Flight:
@@ -107,7 +107,7 @@ def score(flight: Flight, rows: xr.Dataset, change: Callable[[Events], Events] =
     for event in change(emulate(rows, config)):
         sent = pipeline.feed(event)
         if sent:
-            listener.hear(b"".join(frame for _, frame in sent))
+            listener.receive(b"".join(frame for _, frame in sent))
     field = listener.field()
     truth = np.interp(field["time"], flight.survey["time"], flight.survey["truth_total_field"])
     error = np.abs(field["total_field"] - truth)
@@ -119,7 +119,7 @@ def score(flight: Flight, rows: xr.Dataset, change: Callable[[Events], Events] =
         int(wrong.sum()),
         float(error[plain].max()) if plain.any() else 0.0,
         float(np.median(field["sigma"][plain])) if plain.any() else 0.0,
-        tuple(listener.said),
+        tuple(listener.texts),
     )
 
 
@@ -273,7 +273,7 @@ def main() -> int:
 def clean(days: float) -> int:
     """Fly gliders without a fault, a day each; print the flags that were false alarms."""
     samples = flagged = wrong = 0
-    said: list[str] = []
+    reported: list[str] = []
     seed = 1000
     while samples < days * 21_600:
         with tempfile.TemporaryDirectory() as name:
@@ -281,8 +281,8 @@ def clean(days: float) -> int:
             found = score(flight, flight.survey)
         seed += 1
         samples, flagged, wrong = samples + found.samples, flagged + found.flagged, wrong + found.wrong
-        said += [text for text in found.said if "calibration " not in text]
-        print(f"{samples} samples, {flagged} flagged, {wrong} beyond 3 sigma; {found.said}", flush=True)
+        reported += [text for text in found.reported if "calibration " not in text]
+        print(f"{samples} samples, {flagged} flagged, {wrong} beyond 3 sigma; {found.reported}", flush=True)
     return 0
 
 
@@ -291,10 +291,10 @@ def show(totals: dict[str, list[Score]]) -> None:
     shown = table("", "fault", "flagged", "wrong", "worst, nT", "sigma, nT", "said", left=("fault", "said"))
     for fault, scores in totals.items():
         samples = sum(one.samples for one in scores)
-        said = [
+        reported = [
             text
             for one in scores
-            for text in one.said
+            for text in one.reported
             if "field" in text or "axis" in text or "noise" in text
         ]
         shown.add_row(
@@ -303,7 +303,7 @@ def show(totals: dict[str, list[Score]]) -> None:
             f"{100 * sum(one.wrong for one in scores) / samples:.2f} %",
             f"{max(one.worst for one in scores):.0f}",
             f"{np.median([one.sigma for one in scores]):.1f}",
-            " | ".join(dict.fromkeys(t for t in said if not t.startswith("field: ")))[:120],
+            " | ".join(dict.fromkeys(t for t in reported if not t.startswith("field: ")))[:120],
         )
     Console(width=None if sys.stdout.isatty() else 200).print(shown)
 

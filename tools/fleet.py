@@ -187,17 +187,17 @@ def main() -> None:
         for number in range(options.deployments)
     ]
     last = options.deployments - 1
-    told = in_order(lesson, [(one,) for one in flights if one.number < last], options)
+    reported = in_order(lesson, [(one,) for one in flights if one.number < last], options)
     where = {name: Mounting(MOUNTINGS[name].at, MOUNTINGS[name].travel) for name in MASSES}
     mounted = {f"vehicle {k}": where for k in range(options.vehicles)} if options.mounted else {}
-    fleet = learn_fleet([one for one in told if isinstance(one, Lesson)], mounted)
+    fleet = learn_fleet([one for one in reported if isinstance(one, Lesson)], mounted)
     scored = [one for one in flights if one.number == last]
     refit = f"refit {last // options.every}"
     priors = [fleet.known(f"vehicle {one.vehicle}", refit) for one in scored]
     cases = [(one, options.runs, prior) for one, prior in zip(scored, priors, strict=True)]
     rows = [row for some in in_order(score, cases, options) for row in some]
     console = Console(width=110)
-    for error in (one for one in told if isinstance(one, str)):
+    for error in (one for one in reported if isinstance(one, str)):
         console.print(f"not learnt from: {error}")
     widths = np.sqrt(np.median(fleet.population.variances.own, axis=1))
     console.print(

@@ -81,7 +81,7 @@ def _mavlink(_: Path) -> Read:
     return lambda data: [Codec(1, 191).parse(data)]
 
 
-def _tape(_: Path) -> Read:
+def _frame_log(_: Path) -> Read:
     from magbridge.mavlink.tlog import LogReader
 
     return lambda data: [(record, record.message) for record in LogReader(BytesIO(data))]
@@ -128,7 +128,7 @@ TARGETS: dict[str, Target] = {
         "ascii", prefix="$PMAG,", separator=",", columns=["time", "x", "y", "z"], checksum="nmea"
     ),
     "mavlink": Target("bytes", _mavlink),
-    "tape": Target("bytes", _tape),
+    "frame_log": Target("bytes", _frame_log),
     "calibration": Target("bytes", _calibration),
     "config": _file("bridge.toml", "config"),
     "polygon": _file("mask.csv", "polygon"),
@@ -233,9 +233,9 @@ class Session:
     def save(self) -> None:
         """Write the counts."""
         self.state["seconds"] = round(time.monotonic() - self._began, 1)
-        beside = self._state.with_suffix(".partial")
-        beside.write_text(json.dumps(self.state, indent=1))
-        beside.replace(self._state)
+        temporary = self._state.with_suffix(".partial")
+        temporary.write_text(json.dumps(self.state, indent=1))
+        temporary.replace(self._state)
 
 
 def blind(session: Session, read: Read, seeds: list[bytes], count: int, seconds: float) -> None:

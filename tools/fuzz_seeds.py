@@ -89,7 +89,7 @@ def _frames(_: Path) -> list[bytes]:
     return [b"".join(frames), *frames]
 
 
-def _tape(folder: Path) -> list[bytes]:
+def _frame_log(folder: Path) -> list[bytes]:
     return [
         b"".join(struct.pack(">Q", 1_700_000_000_000_000 + k) + f for k, f in enumerate(_frames(folder)[1:]))
     ]
@@ -159,12 +159,12 @@ def _slocum(_: Path) -> list[bytes]:
         "total_num_sensors": 3, "sensors_per_cycle": 3, "state_bytes_per_cycle": 1,
         "sensor_list_crc": "0badcafe", "sensor_list_factored": 0,
     }  # fmt: skip
-    head = "".join(f"{name}:    {value}\n" for name, value in tags.items())
+    header = "".join(f"{name}:    {value}\n" for name, value in tags.items())
     sensors = (("m_present_time", 8, "timestamp"), ("m_roll", 4, "rad"), ("m_battpos", 4, "in"))
-    head += "".join(
+    header += "".join(
         f"s: T {k:4} {k:4} {size} {name} {unit}\n" for k, (name, size, unit) in enumerate(sensors)
     )
-    data = head.encode() + b"sa" + struct.pack("<hfd", 0x1234, 123.456, 123456789.12345)
+    data = header.encode() + b"sa" + struct.pack("<hfd", 0x1234, 123.456, 123456789.12345)
     for k in range(20):
         data += b"d" + bytes([0b10101000]) + struct.pack("<dff", 1.7e9 + 4.0 * k, 0.1 * k, 0.3)
     return [data + b"X"]
@@ -174,8 +174,10 @@ def _grid(_: Path, form: str) -> list[bytes]:
     text = "\n".join(" ".join(f"{v:.6g}" for v in row) for row in MAP)
     flipped = "\n".join(" ".join(f"{v:.6g}" for v in row) for row in MAP[::-1])
     if form == "esri":
-        head = f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\n"
-        return [(head + "NODATA_value -9999\n" + flipped).encode()]
+        header = (
+            f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\n"
+        )
+        return [(header + "NODATA_value -9999\n" + flipped).encode()]
     if form == "table":
         x, y = np.meshgrid(LON, LAT)
         rows = zip(x.ravel(), y.ravel(), MAP.ravel(), strict=True)
@@ -201,16 +203,16 @@ def _geosoft(_: Path) -> list[bytes]:
     ny, nx = MAP.shape
     found = []
     for size in (4, 1024 + 4):
-        head = bytearray(512)
-        struct.pack_into("<5i", head, 0, size, 2, nx, ny, 1)
-        struct.pack_into("<5d", head, 20, 0.05, 0.05, LON[0], LAT[0], 0.0)
-        struct.pack_into("<2d", head, 60, 0.0, 1.0)
+        header = bytearray(512)
+        struct.pack_into("<5i", header, 0, size, 2, nx, ny, 1)
+        struct.pack_into("<5d", header, 20, 0.05, 0.05, LON[0], LAT[0], 0.0)
+        struct.pack_into("<2d", header, 60, 0.0, 1.0)
         values = MAP.astype("<f4").tobytes()
         if size > 1024:
             block = bytes(16) + zlib.compress(values)
             index = struct.pack("<qi", 512 + 16 + 12, len(block))
             values = struct.pack("<4i", 0, 0, 1, ny) + index + block
-        found.append(bytes(head) + values)
+        found.append(bytes(header) + values)
     return found
 
 
@@ -247,7 +249,7 @@ SEEDS: dict[str, Callable[[Path], list[bytes]]] = {
         {"prefix": "$PMAG,", "separator": ",", "columns": ["time", "x", "y", "z"], "checksum": "nmea"},
     ),
     "mavlink": _frames,
-    "tape": _tape,
+    "frame_log": _frame_log,
     "calibration": _calibration,
     "config": _config,
     "polygon": lambda _: [b"longitude,latitude\n10.1,54.1\n10.4,54.1\n10.2,54.3\n"],

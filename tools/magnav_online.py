@@ -70,8 +70,8 @@ def online(
         out[k] = total[k] - A[k] @ x[:-1]
         if use[k]:
             h = np.r_[A[k], 1.0]
-            gain = P @ h / (h @ P @ h + noise**2)
-            x += gain * (total[k] - reference[k] - h @ x)
-            P -= np.outer(gain, h @ P)
+            improvement = P @ h / (h @ P @ h + noise**2)
+            x += improvement * (total[k] - reference[k] - h @ x)
+            P -= np.outer(improvement, h @ P)
             P = 0.5 * (P + P.T)
     return out

@@ -11,7 +11,7 @@ unmapped      surveys without a map: a glider's of 6 and 12 h, an aircraft's of 
 dived         gliders that dive under a map flown 90 m above the sea, without and with its continuation
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
-peers         Stone Soup (tools/voyages/stone_soup.py) on the same measurements; MagNav.jl's published flight
+peers         Stone Soup (stone_soup.py there) on the same measurements; MagNav.jl's published flight
 
 A run takes about a second; accuracy with 100 runs a row takes a quarter of an hour on a free core. With
 ``--keep`` finished rows are kept in a folder and used again.
@@ -50,13 +50,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from msgspec.structs import replace as with_options
-from scipy.stats import chi2
-from terminal import command_line
-from voyages.calibrated import Flown, flown
-from voyages.dived import dived
-from voyages.lost import LEVEL, carried, half, level, misled
-from voyages.others import magnav, stone_soup
-from voyages.simulated import (
+from navigation_studies.calibrated import Flown, flown
+from navigation_studies.dived import dived
+from navigation_studies.lost import LEVEL, carried, half, level, misled
+from navigation_studies.others import magnav, stone_soup
+from navigation_studies.simulated import (
     AT_HOURS,
     GLIDER,
     LEFT,
@@ -67,10 +65,12 @@ from voyages.simulated import (
     Score,
     sail,
     synthetic,
-    voyage,
+    track_over,
 )
-from voyages.unmapped import AIRCRAFT, Located, located
-from voyages.unmapped import GLIDER as UNMAPPED
+from navigation_studies.unmapped import AIRCRAFT, Located, located
+from navigation_studies.unmapped import GLIDER as UNMAPPED
+from scipy.stats import chi2
+from terminal import command_line
 
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Block, prior, transition
@@ -105,7 +105,7 @@ class Runs(NamedTuple):
 
 # ---- accuracy, and what calibration buys -------------------------------------------------------------------
 
-HEAD = (
+HEADER = (
     "map, start", "DRMS m", "bound m", "ratio", "90 %", "RMS ratio", "alone m", "lost %", "NEES/2",
     "in limits", "false alarm %", "valid %", "after h", "ms/sample",
 )  # fmt: skip
@@ -114,7 +114,7 @@ HEAD = (
 def one(kind: Map, slow: float, start: float, seed: int) -> Score:
     grid = synthetic(kind, seed % 10)
     options = with_options(GLIDER, bias_sigma=slow, start_sigma=start * grid.correlation_length)
-    return sail(voyage(grid, options, 1000 + seed, speed=SPEEDS[seed % 3]), grid, options).score()
+    return sail(track_over(grid, options, 1000 + seed, speed=SPEEDS[seed % 3]), grid, options).score()
 
 
 def row(label: str, runs: Sequence[Score]) -> list[str]:
@@ -147,7 +147,7 @@ def accuracy(runs: Runs, _asked: argparse.Namespace, left: str = "auto") -> None
         f"\n## Accuracy with {left}: {runs.number} runs of 6 h a row, {min(SPEEDS)} to {max(SPEEDS)} m/s;"
         f" 1 nT white, {slow:g} nT slow, map error 1 nT, current 0.05 m/s\n"
     )
-    table: Table = [HEAD]
+    table: Table = [HEADER]
     for kind in MAPS:
         for start, share in STARTS.items():
             label = f"{kind}; {start} {share * synthetic(kind, 0).correlation_length:.0f} m"
@@ -164,7 +164,7 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
         "start within a length\n"
     )
     found: list[dict[tuple[int, str], Flown]] = runs(partial(flown, kinds))
-    table: Table = [("calibration", "error nT", "claimed nT", *HEAD)]
+    table: Table = [("calibration", "error nT", "claimed nT", *HEADER)]
     for k, kind in enumerate(kinds):
         for method in METHODS:
             made = [glider[k, method] for glider in found]
@@ -247,8 +247,8 @@ def unmapped(runs: Runs, asked: argparse.Namespace) -> None:
         f"## Without a map: {runs.number} surveys a row (aircraft: a quarter), RMS in m over track and runs;"
         "\nworse: those farther off than dead reckoning alone, and those of them beyond twice their sigma\n"
     )
-    head = "bound", "error", "alone", "sigma", "NEES/2", "worse", "beyond", "valid %", "s of CPU"
-    table: Table = [("map, vehicle", *head)]
+    header = "bound", "error", "alone", "sigma", "NEES/2", "worse", "beyond", "valid %", "s of CPU"
+    table: Table = [("map, vehicle", *header)]
     long = replace(UNMAPPED, hours=12.0)
     for name, vehicle, kinds in (
         ("6 h", UNMAPPED, (Map(30, 500), Map(30, 1000), Map(60, 500), Map(60, 1000))),
@@ -295,7 +295,7 @@ def timings() -> tuple[float, float, float, float]:
         tracker.predict(*moved)
         tracker.update(block)
     each = (clock.process_time() - begun) / 5000
-    ds = voyage(grid, options, 5, hours=100_000 / 3600, every=1.0)
+    ds = track_over(grid, options, 5, hours=100_000 / 3600, every=1.0)
     whole = []
     for interval in (options.interval, 0.0):
         begun = clock.process_time()
@@ -324,8 +324,8 @@ def peers(runs: Runs, asked: argparse.Namespace) -> None:
             "## Stone Soup on the same measurements: DRMS (m) of the second half, NEES/2; medians of "
             f"{some.number} runs\n"
         )
-        head = ("bound", "ours", "NEES/2", "EKF", "NEES/2", "20,000 particles", "NEES/2", "ms/update")
-        table: Table = [("map, start", *head)]
+        header = ("bound", "ours", "NEES/2", "EKF", "NEES/2", "20,000 particles", "NEES/2", "ms/update")
+        table: Table = [("map, start", *header)]
         for kind in (Map(20, 1000), Map(60, 2000)):
             for name, share in STARTS.items():
                 found = np.median(some(partial(stone_soup, asked.peers, kind, GLIDER, share)), axis=0)
@@ -338,7 +338,7 @@ def peers(runs: Runs, asked: argparse.Namespace) -> None:
 
 def show(table: Sequence[Sequence[str]]) -> None:
     """Print the head once, then each new row, in columns of one width."""
-    widths = [max(34 if "map" in head else 8, len(head)) for head in table[0]]
+    widths = [max(34 if "map" in header else 8, len(header)) for header in table[0]]
     lines: Iterable[Sequence[str]] = table if len(table) == 2 else table[-1:]
     for line in lines:
         cells = (

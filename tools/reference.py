@@ -63,13 +63,13 @@ def configuration() -> Iterator[str]:
     from magbridge.config import Config  # noqa: PLC0415 - imports the program only where pages are made
     from magbridge.navigate import Options  # noqa: PLC0415
     from magbridge.sensors import DRIVERS  # noqa: PLC0415
-    from magbridge.sensors.options import attributes_of, options_of, told_of  # noqa: PLC0415
+    from magbridge.sensors.options import attributes_of, documented_of, options_of  # noqa: PLC0415
 
     yield "# bridge.toml\n\nWhat every key means, its type and its default. Paths are relative to the file.\n"
     for name, held in get_type_hints(Config).items():
         table = next((one for one in (held, *get_args(held)) if _is_table(one)), None)
         if table is not None:
-            yield from (f"## {name}", "", told_of(table), "")
+            yield from (f"## {name}", "", documented_of(table), "")
             yield from _keys(attributes_of(table))
         elif name == "publish":
             yield from (
@@ -101,9 +101,9 @@ def _default(value: object) -> str:
     return "required" if value is NODEFAULT else f"`{value!r}`"
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
     """Yield the lines of a table in Markdown."""
-    yield from (f"| {' | '.join(head)} |", "|---" * len(head) + "|")
+    yield from (f"| {' | '.join(header)} |", "|---" * len(header) + "|")
     for row in rows:
         yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
     yield ""
@@ -167,8 +167,8 @@ def python() -> str:
     from magbridge import __all__ as names  # noqa: PLC0415
 
     public = (name for name in names if not name.startswith("_") and name != "plot")
-    head = "::: magbridge\n    options: {members: false}\n"
-    return "\n".join(("# Python", "", head, *map(_entry, public), "::: magbridge.plot\n"))
+    header = "::: magbridge\n    options: {members: false}\n"
+    return "\n".join(("# Python", "", header, *map(_entry, public), "::: magbridge.plot\n"))
 
 
 def _entry(name: str) -> str:

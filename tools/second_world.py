@@ -239,7 +239,7 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
     H = glider.reads(survey) + noise(len(seen)) + (effect if effect.ndim == 2 else 0.0)
     found = diagnose([dataset(survey, H, effect if effect.ndim == 1 else 0.0)], calibration)
     named = one_of(one.candidate.cause for one in found.findings)
-    sets = named | one_of(r.candidate.cause for one in found.findings for r in one.rivals)
+    sets = named | one_of(r.candidate.cause for one in found.findings for r in one.competing)
     return {"hidden": name, "named": sorted(named), "sets": sorted(sets), "verdict": found.verdict}
 
 

@@ -10,13 +10,13 @@ from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STA
 
 __all__ = ["Changes"]
 
-BESIDE = spec("MAG_BESIDE").id
+INTERLEAVED = spec("MAG_BESIDE").id
 CLOCK_STEP, NOTICE, PORT, STANDSTILL = (
     spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT", "MAG_STANDSTILL")
 )
 GRACE_US = 500_000
 """µs after a standstill within which more of what waited comes: what a full buffer had no room for."""
-TELL_US = 1_000_000
+NOTICE_US = 1_000_000
 """µs from which on a standstill is announced."""
 
 
@@ -45,18 +45,18 @@ class Changes:
         self.since_us = self.until_us = 0
         self._clock_unset = False
 
-    def hear(self, data: bytes, time_us: int) -> None:
+    def receive(self, data: bytes, time_us: int) -> None:
         """Take frames that came at `time_us`."""
         for message in Codec(0, 0).parse(data):
             if message.id == CLOCK_STEP:
                 self._codec.utc_offset_us += message["step"]
                 step = f"clock was set by {message['step'] * 1e-6:+.3f} s"
-                self._announcer.say(step, MAV_SEVERITY.NOTICE)
+                self._announcer.send_statustext(step, MAV_SEVERITY.NOTICE)
                 self.check_clock()
-            elif message.id == BESIDE:  # in a replay
+            elif message.id == INTERLEAVED:  # in a replay
                 self._codec.skip(message["count"])
             elif message.id == NOTICE:
-                self._announcer.say(message["text"], MAV_SEVERITY(message["severity"]))
+                self._announcer.send_statustext(message["text"], MAV_SEVERITY(message["severity"]))
             elif message.id == STANDSTILL:
                 self._stood_still(time_us, message["duration"])
             elif message.id == PORT:
@@ -76,9 +76,9 @@ class Changes:
         if time_us > self.until_us:  # else one more of a row of them
             self.since_us = time_us - duration_us
         self.until_us = time_us + GRACE_US
-        if duration_us >= TELL_US:
+        if duration_us >= NOTICE_US:
             text = f"stood still for {duration_us * 1e-6:.1f} s: late samples are flagged"
-            self._announcer.say(text, MAV_SEVERITY.WARNING)
+            self._announcer.send_statustext(text, MAV_SEVERITY.WARNING)
 
     def _port(self, port: int, well: bool, reason: str, dropped: int, time_us: int) -> None:
         severity = MAV_SEVERITY.INFO if well else MAV_SEVERITY.ERROR

@@ -207,7 +207,7 @@ def _parameters(config: Config, calibration: Calibration) -> Iterator[Finding]:
         return
     for error in unmet(calibration, config):
         yield Finding(fatal=True, text=str(error))
-    for doubt in calibration.doubts:
+    for doubt in calibration.warnings:
         yield Finding(fatal=False, text=f"{config.path}: calibration.file: {doubt}")
 
 

@@ -66,7 +66,7 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callabl
         if pipeline.sensor.to_send:
             edge.send(Channel.SENSOR, b"".join(pipeline.sensor.to_send))
             pipeline.sensor.to_send.clear()
-        records = pipeline.journal.drain()
+        records = pipeline.recorder.drain()
         if log is not None and records:
             log.extend(records)
         after(event.time_us)

@@ -52,7 +52,7 @@ class FileServer:
         The folder of the logs.
     rate : callable
         Returns bytes/s at which files are sent; 0 refuses every request by silence.
-    tell : callable
+    notify : callable
         Wakes the live thread with a state frame, or with none.
     """
 
@@ -61,16 +61,16 @@ class FileServer:
         texts: Mapping[str, bytes],
         logs: Path | None,
         rate: Callable[[], float],
-        tell: Callable[[bytes], None],
+        notify: Callable[[bytes], None],
     ) -> None:
         tree = Tree(texts, logs)
         self._ftp, self._logs = FtpServer(tree, time.monotonic), LogTransfer(tree)
-        self._rate, self._tell = rate, tell
+        self._rate, self._notify = rate, notify
         self._asked: SimpleQueue[Message | None] = SimpleQueue()
         self._ready: deque[tuple[Sender, Reply]] = deque()
         self._ending = False
         self._under_way: dict[Sender, deque[Iterator[Reply]]] = {}
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._thread = Thread(target=self._serve, name="file server", daemon=True)
         self._thread.start()
 
@@ -79,7 +79,7 @@ class FileServer:
         if self._asked.qsize() < REQUESTS:
             self._asked.put(request)
 
-    def take(self) -> tuple[Sender, list[Reply]]:
+    def drain(self) -> tuple[Sender, list[Reply]]:
         """Return what is to be sent now, and to whom; returns at once."""
         sender, replies = (0, 0), list[Reply]()
         while self._ready and len(replies) < BATCH and (not replies or self._ready[0][0] == sender):
@@ -120,8 +120,8 @@ class FileServer:
         waiting = self._under_way.setdefault(sender, deque(maxlen=UNDER_WAY))
         if request.id == FTP.id:
             replies = self._ftp.handle(sender, request["payload"])
-            head = bytes((0, *sender))
-            waiting.append((FTP, head + payload) for payload in self._told_once(sender, replies))
+            header = bytes((0, *sender))
+            waiting.append((FTP, header + payload) for payload in self._reported_once(sender, replies))
         elif request.id == LIST:
             waiting.append(self._logs.entries(request["start"], request["end"]))
         elif request.id == DATA:
@@ -129,15 +129,15 @@ class FileServer:
         elif request.id == END:
             waiting.clear()
 
-    def _told_once(self, sender: Sender, replies: Iterator[bytes]) -> Iterator[bytes]:
+    def _reported_once(self, sender: Sender, replies: Iterator[bytes]) -> Iterator[bytes]:
         """Hand on replies; tell of the first refusal to a station that is more than the end of a file."""
         for payload in replies:
             yield payload
             if why := FtpServer.refusal(payload):
                 text = f"file for {sender[0]}:{sender[1]} refused: {why}"
-                if text not in self._told and len(self._told) < REQUESTS:
-                    self._told.add(text)
-                    self._tell(states.notice(text[:50]))
+                if text not in self._reported and len(self._reported) < REQUESTS:
+                    self._reported.add(text)
+                    self._notify(states.notice(text[:50]))
 
     def _turn(self) -> None:
         """Make ready a batch, of each station in turn, and pause as long as it may take."""
@@ -149,7 +149,7 @@ class FileServer:
             len(self._ready) >= READY and not self._ending
         ):  # the link is full, or the live thread has other things to do
             time.sleep(PAUSE)
-            self._tell(b"")
+            self._notify(b"")
         for _ in range(BATCH):
             if not self._under_way:
                 break
@@ -164,5 +164,5 @@ class FileServer:
                 self._ready.append((sender, reply))
                 size += len(reply[1])
         if self._ready:
-            self._tell(b"")
+            self._notify(b"")
         time.sleep(size / rate)

@@ -39,7 +39,7 @@ class Gps:
         self._last_us = self._since_us = -LONGEST_US
         self._allowed_us = 0
 
-    def hear(self, message: Message, time_us: int) -> bool:
+    def receive(self, message: Message, time_us: int) -> bool:
         """Take in a GPS_RAW_INT; return whether it holds a position."""
         good: bool = message["fix_type"] >= FIX_3D
         if not good:
@@ -101,7 +101,7 @@ class Fixing:
         """Whether a fix leaves the autopilot's velocity alone: ArduPilot's setLatLng does, PX4 does not."""
         return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4
 
-    def hear(self, message: Message, time_us: int) -> None:
+    def receive(self, message: Message, time_us: int) -> None:
         """Take in a message of the autopilot."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
@@ -112,7 +112,7 @@ class Fixing:
         fix = self._fix(at, resets, now_us)
         if isinstance(fix, str):
             self._before_us = None
-            self._tell_none(fix)
+            self._report_none(fix)
             return False
         if self._kind.fused:
             since_us = inf if self._before_us is None else now_us - self._before_us
@@ -173,9 +173,9 @@ class Fixing:
         self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
 
     def _gps(self, message: Message, time_us: int) -> None:
-        if self.gps.hear(message, time_us) and self._before_us is not None:
+        if self.gps.receive(message, time_us) and self._before_us is not None:
             self._before_us = None
-            self._tell_none("GPS is good")
+            self._report_none("GPS is good")
 
     def _heartbeat(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
         self.stack = message["autopilot"]
@@ -194,7 +194,7 @@ class Fixing:
                 target_component=autopilot,
             )
 
-    def _tell_none(self, reason: str) -> None:
+    def _report_none(self, reason: str) -> None:
         wanted = "GPS" not in reason
         self._state(
             f"no fixes to the autopilot: {reason}", MAV_SEVERITY.WARNING if wanted else MAV_SEVERITY.INFO

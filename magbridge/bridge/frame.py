@@ -41,7 +41,7 @@ class Frame:
             spec("ODOMETRY").id: self._sink,
         }
 
-    def hear(self, message: Message, time_us: int) -> None:
+    def receive(self, message: Message, time_us: int) -> None:
         """Take in a message of the autopilot."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)

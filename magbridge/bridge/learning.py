@@ -143,7 +143,7 @@ class Learning:
         learner, component = self.learner, self._component
         for notice in learner.notices:
             severity = MAV_SEVERITY.WARNING if notice.grave else MAV_SEVERITY.NOTICE
-            component.announcer.say(notice.text, severity)
+            component.announcer.send_statustext(notice.text, severity)
         learner.notices.clear()
         if learner.calibration is not self._published:
             self._published = learner.calibration

@@ -135,7 +135,7 @@ class LiveEdge:
         except PortError as error:
             self._lost(channel, error)
 
-    def tell(self, state: bytes) -> None:
+    def notify(self, state: bytes) -> None:
         """Add a state frame to the events; from any thread."""
         self._changes.put(state)
         os.write(self._waker, b"!")
@@ -187,7 +187,7 @@ class LiveEdge:
         return True
 
     def _lost(self, channel: Channel, error: PortError) -> None:
-        self.tell(states.port(channel, self._ports[channel], error.reason))
+        self.notify(states.port(channel, self._ports[channel], error.reason))
 
     def _keep_open(self, channel: Channel, port: Port, tried: threading.Event) -> None:
         """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
@@ -202,7 +202,7 @@ class LiveEdge:
                 except PortError as error:
                     reason = error.reason
                 if not reason or reported != reason:
-                    self.tell(states.port(channel, port, reason))
+                    self.notify(states.port(channel, port, reason))
                 reported = reason
             tried.set()
             time.sleep(RETRY)

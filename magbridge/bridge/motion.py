@@ -73,7 +73,7 @@ class Motion:
         self.source, self.fed_back = Source.NONE, False
         self._navigator, self._component, self._frame = navigator, component, frame
         self._velocity_stays = velocity_stays
-        self._heard_us = 0
+        self._received_us = 0
         self._heading = self._pitch = self._last = nan
         self._steep_us = -GLIDING_US
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
@@ -88,7 +88,7 @@ class Motion:
             spec("VFR_HUD").id: self._speed,
         }
 
-    def hear(self, message: Message, time_us: int) -> None:
+    def receive(self, message: Message, time_us: int) -> None:
         """Take in a message of the vehicle."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
@@ -107,7 +107,7 @@ class Motion:
         self._heading, self._pitch = degrees(message["yaw"]) % 360.0, degrees(message["pitch"])
         if abs(self._pitch) >= GLIDE:
             self._steep_us = time_us
-        if self.source is Source.SPEED and time_us - self._heard_us < FRESH_US:
+        if self.source is Source.SPEED and time_us - self._received_us < FRESH_US:
             self._pass(time_us, heading=self._heading, pitch=self._pitch)
         elif time_us - self._steep_us < GLIDING_US and isfinite(self._frame.depth(time_us)):
             if self._use(Source.GLIDE, time_us, "heading, pitch and depth"):
@@ -184,12 +184,12 @@ class Motion:
     def _use(self, source: Source, time_us: int, words: str, stream: tuple[int, int] | None = None) -> bool:
         """Return whether dead reckoning follows a source, as it does if no better one is fresh."""
         same = (source, stream) == (self.source, self._stream)
-        if not same and source >= self.source and time_us - self._heard_us < FRESH_US:
+        if not same and source >= self.source and time_us - self._received_us < FRESH_US:
             return False
         if not same:
             self._navigator.new_motion(time_us)
             self.source, self._stream, self._step = source, stream, None
-        self._heard_us = time_us
+        self._received_us = time_us
         severity = MAV_SEVERITY.WARNING if source is Source.LAST else MAV_SEVERITY.INFO
         self._component.announcer.state("motion", f"dead reckoning by {words}", severity)
         return True

@@ -64,19 +64,19 @@ class Navigation:
         self._rate: Rate = component.rates["MAG_NAVIGATION"]
         self._state = State.OFF
 
-    def hear(self, message: Message, time_us: int) -> None:
+    def receive(self, message: Message, time_us: int) -> None:
         """Pass on the vehicle's motion, or its position at the surface, from a message to the navigator."""
         if message.component == self._component.peer[1]:
-            self._frame.hear(message, time_us)
-            self.fixing.hear(message, time_us)
-        self.motion.hear(message, time_us)
+            self._frame.receive(message, time_us)
+            self.fixing.receive(message, time_us)
+        self.motion.receive(message, time_us)
         if message.id == GPS:
             self._gps(message, time_us)
 
     def sample(self, time_us: int, corrected: Corrected) -> None:
         """Take a corrected sample."""
         self.navigator.utc_offset_us = self._component.codec.utc_offset_us
-        self._tell(self.navigator.sample(time_us, corrected))
+        self._notify(self.navigator.sample(time_us, corrected))
 
     def _gps(self, message: Message, time_us: int) -> None:
         if message["fix_type"] < FIX_3D:
@@ -85,9 +85,9 @@ class Navigation:
             self.motion.gps_held()
         latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
         accuracy = message["h_acc"] * 1e-3
-        self._tell(self.navigator.fix(time_us, latitude, longitude, accuracy if accuracy > 0.0 else None))
+        self._notify(self.navigator.fix(time_us, latitude, longitude, accuracy if accuracy > 0.0 else None))
 
-    def _tell(self, record: Record | None) -> None:
+    def _notify(self, record: Record | None) -> None:
         """Send an update; and a fix, if fixes have no rate of their own."""
         if record is None:
             return

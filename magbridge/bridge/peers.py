@@ -86,7 +86,7 @@ class Peers:
         self._strangers = 0
         self._answered: list[Peer] = []
         self._look = 0.0
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.ignored = self.withheld = 0
         self.notices: deque[str] = deque(maxlen=8)
 
@@ -111,7 +111,7 @@ class Peers:
             elif message.known:
                 self._prove(peer, message.frame, now)
 
-    def take(self) -> bytes:
+    def drain(self) -> bytes:
         """Return what has come since the last time: first the frames, then what belongs to none."""
         data = b"".join(self._frames + self._stray)
         self._frames, self._stray, self._strangers = [], [], 0
@@ -120,7 +120,7 @@ class Peers:
         return data
 
     def credit(self, frames: Iterable[bytes]) -> None:
-        """Learn which frames of the last :meth:`take` were signed by someone who has the key."""
+        """Learn which frames of the last :meth:`drain` were signed by someone who has the key."""
         now = time.monotonic()
         for frame in frames:
             if peer := self._authors.get(frame):
@@ -147,8 +147,8 @@ class Peers:
         valid.sort(key=lambda peer: (now - peer.pilot > TIMEOUT, peer.since))
         self._answered = valid[:ANSWERED]
         pilots = sum(now - peer.pilot < TIMEOUT for peer in valid)
-        self._tell(f"more than {ANSWERED} peers: the others are not answered", len(valid) > ANSWERED)
-        self._tell("the autopilot speaks from several addresses", pilots > 1)
+        self._notify(f"more than {ANSWERED} peers: the others are not answered", len(valid) > ANSWERED)
+        self._notify("the autopilot speaks from several addresses", pilots > 1)
         return self._answered
 
     def affords(self, peer: Peer | None, size: int) -> bool:
@@ -160,7 +160,7 @@ class Peers:
         self._paid = now
         if size > self._purse:
             self.withheld += size
-            self._tell(f"others get {self._budget / 1e3:g} kB/s in all: link.others_rate", True)
+            self._notify(f"others get {self._budget / 1e3:g} kB/s in all: link.others_rate", True)
             return False
         self._purse -= size
         return True
@@ -188,8 +188,8 @@ class Peers:
                 self._look = 0.0
             peer.pilot = now
 
-    def _tell(self, text: str, holds: bool) -> None:
+    def _notify(self, text: str, holds: bool) -> None:
         """Note a text once, when it begins to hold."""
-        if holds and text not in self._told:
+        if holds and text not in self._reported:
             self.notices.append(text)
-        (self._told.add if holds else self._told.discard)(text)
+        (self._reported.add if holds else self._reported.discard)(text)

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Final
 from magbridge.bridge import states
 from magbridge.bridge.changes import Changes
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.head import beginning, declarations
-from magbridge.bridge.journal import Journal
 from magbridge.bridge.learning import Learning, open_learner
+from magbridge.bridge.log_header import beginning, declarations
 from magbridge.bridge.needs import check
 from magbridge.bridge.position import Position
+from magbridge.bridge.recorder import Recorder
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
@@ -43,7 +43,7 @@ SENSOR: Final = Channel.SENSOR
 ATTITUDE: Final = spec("ATTITUDE").id
 LATELY = 64
 """Samples over which the sample rate is computed."""
-DOUBTS = int(
+DOUBTFUL = int(
     Quality.STALE_TELEMETRY
     | Quality.SATURATED
     | Quality.UNCALIBRATED
@@ -70,7 +70,7 @@ class Pipeline:
     ----------
     component : Component
         The MAVLink side.
-    journal : Journal
+    recorder : Recorder
         All inputs and outputs since it was last drained: the records for the log.
     sensor : SensorLine
         Holds the commands that are to be sent to the sensor.
@@ -138,11 +138,11 @@ class Pipeline:
             searching=has_magic(config.sensor.port),
         )
         self._changes = Changes(self.component.codec, self.component.announcer, self.sensor)
-        self.journal = Journal(config.link.system, config.link.component, active=config.log is not None)
+        self.recorder = Recorder(config.link.system, config.link.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None
         self.learning = Learning(learner, self.component) if learner is not None else None
         self._raw_rate = self.component.rates["MAG_RAW"]
-        self._position = Position(self._tell_no_anomaly)
+        self._position = Position(self._report_no_anomaly)
         self._samples = self._lost = self._quality = 0
         self._late = False
         self._times: deque[int] = deque(maxlen=LATELY)
@@ -166,41 +166,41 @@ class Pipeline:
 
     def feed(self, event: Event) -> list[tuple[int, bytes]]:
         """Process an event; return the frames to send over the link, each with its event time (µs)."""
-        component, journal = self.component, self.journal
+        component, recorder = self.component, self.recorder
         outbox, time_us, channel, data = component.outbox, event.time_us, event.channel, event.data
         component.advance(time_us)
         due = outbox.drain()
-        journal.sent(due)
+        recorder.sent(due)
         if self._late and time_us > self._changes.until_us:
             self._late = False
             self._correction.aligner.late_since_us = 0
         if channel is SENSOR:
-            journal.sensor(time_us, data)
-            self._hear_sensor(data, time_us)
+            recorder.sensor(time_us, data)
+            self._receive_sensor(data, time_us)
         elif channel is LINK:
-            self._hear_link(data, time_us)
+            self._receive_link(data, time_us)
         elif data:
-            journal.state(time_us, data)
-            self._changes.hear(data, time_us)
+            recorder.state(time_us, data)
+            self._changes.receive(data, time_us)
             if self._changes.until_us >= time_us:
                 self._late = True
                 self._correction.aligner.late_since_us = self._changes.since_us
         answers = outbox.drain()
-        journal.sent(answers)
+        recorder.sent(answers)
         return due + answers if due else answers
 
-    def beside(self, messages: Sequence[tuple[Spec, bytes]]) -> bytes:
+    def interleaved(self, messages: Sequence[tuple[Spec, bytes]]) -> bytes:
         """Return the frames of messages that are sent beside those of :meth:`feed` and are not logged."""
         codec = self.component.codec
-        self.journal.state(codec.now_us, states.beside(len(messages)))
+        self.recorder.state(codec.now_us, states.interleaved(len(messages)))
         return b"".join([codec.frame(layout, payload) for layout, payload in messages])
 
-    def _hear_sensor(self, data: bytes, time_us: int) -> None:
+    def _receive_sensor(self, data: bytes, time_us: int) -> None:
         readings = self._driver.feed(data)
         if not readings:
-            self.sensor.mumbled(data, time_us)
+            self.sensor.on_unparsed(data, time_us)
             return
-        self.sensor.spoke(time_us)
+        self.sensor.on_reading(time_us)
         stamps = self._clock.stamp(readings, time_us)
         for reading, stamp in zip(readings, stamps):  # noqa: B905 - one stamp per reading; without strict= it compiles to a plain loop
             self._sample(reading, stamp)
@@ -222,25 +222,25 @@ class Pipeline:
             where=position.where,
         )
         if self._plausibility is not None and self._plausibility.notices:
-            self._tell_implausible(self._plausibility.notices)
+            self._report_implausible(self._plausibility.notices)
         if self._turns.notices:
-            self._tell_implausible(self._turns.notices)
+            self._report_implausible(self._turns.notices)
         if self._direction is not None and self._direction.notices:
-            self._tell_implausible(self._direction.notices)
-        doubts = corrected.quality & DOUBTS
-        if doubts != self._quality:
-            self._tell_doubts(doubts)
+            self._report_implausible(self._direction.notices)
+        doubtful = corrected.quality & DOUBTFUL
+        if doubtful != self._quality:
+            self._report_doubtful(doubtful)
         anomaly = corrected.total_field - main_field
         if self.navigation is not None:
             self.navigation.sample(sample.time_us, corrected)
         publisher = component.publisher
         publisher.publish(sample, corrected, anomaly)
-        if self.journal.active and self._raw_rate.hertz != 0:
-            self.journal.raw(component.codec.now_us, publisher.raw_payload(sample))
+        if self.recorder.active and self._raw_rate.hertz != 0:
+            self.recorder.raw(component.codec.now_us, publisher.raw_payload(sample))
         if self.learning is not None:
             self.learning.sample(sample.time_us)
 
-    def _hear_link(self, data: bytes, time_us: int) -> None:
+    def _receive_link(self, data: bytes, time_us: int) -> None:
         component = self.component
         for message in component.receive(data, time_us):
             for name, value, when_us in self._telemetry.values(message, time_us, component.vehicle.clock):
@@ -252,9 +252,9 @@ class Pipeline:
             elif message.id == ATTITUDE and message.component == self._config.link.autopilot:
                 self._turn(message, time_us)
             if self.navigation is not None:
-                self.navigation.hear(message, time_us)
-        self.journal.link(time_us, component.heard)
-        component.heard.clear()
+                self.navigation.receive(message, time_us)
+        self.recorder.link(time_us, component.received)
+        component.received.clear()
 
     def _turn(self, message: Message, time_us: int) -> None:
         """Take the vehicle's attitude, beside which the vector's direction is judged."""
@@ -270,36 +270,38 @@ class Pipeline:
         ages = {name: parameters.of(f"telemetry.{name}.max_age") for name in self._config.telemetry}
         self._correction.aligner.tune(Align(**settings), ages)
 
-    def _tell_doubts(self, doubts: int) -> None:
-        names = Quality(doubts).names().replace("_", " ")
+    def _report_doubtful(self, doubtful: int) -> None:
+        names = Quality(doubtful).names().replace("_", " ")
         severity = MAV_SEVERITY.WARNING if names else MAV_SEVERITY.INFO
         self.component.announcer.state("quality", f"field: {names or 'good'}", severity)
-        self._quality = doubts
+        self._quality = doubtful
 
-    def _tell_implausible(self, notices: list[str]) -> None:
+    def _report_implausible(self, notices: list[str]) -> None:
         for text in notices:
-            self.component.announcer.say(text, MAV_SEVERITY.ERROR)
+            self.component.announcer.send_statustext(text, MAV_SEVERITY.ERROR)
         notices.clear()
 
-    def _tell_no_anomaly(self, reason: str) -> None:
+    def _report_no_anomaly(self, reason: str) -> None:
         self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
 
     def _begin(self, start: Start, calibration: Calibration | None, *, foreign: bool) -> None:
         """Record what a replay needs, and announce the calibration in use."""
         for frame in self.beginning(start.parameters):
-            self.journal.state(start.time_us, frame)
+            self.recorder.state(start.time_us, frame)
         self._changes.check_clock()
-        say = self.component.announcer.say
+        send_statustext = self.component.announcer.send_statustext
         if foreign:
-            say(f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR)
+            send_statustext(
+                f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR
+            )
         elif calibration is None:
-            say("no calibration: raw field", MAV_SEVERITY.WARNING)
+            send_statustext("no calibration: raw field", MAV_SEVERITY.WARNING)
         elif calibration.method == "none":
-            say("no calibration: learned in flight", MAV_SEVERITY.WARNING)
+            send_statustext("no calibration: learned in flight", MAV_SEVERITY.WARNING)
         else:
-            say(f"calibration {self._calibration_id:08x}, {calibration.method}")
-            if calibration.doubts:
-                say("calibration is not supported by its data", MAV_SEVERITY.WARNING)
+            send_statustext(f"calibration {self._calibration_id:08x}, {calibration.method}")
+            if calibration.warnings:
+                send_statustext("calibration is not supported by its data", MAV_SEVERITY.WARNING)
 
     def beginning(self, parameters: Mapping[str, float]) -> list[bytes]:
         """Return the frames that record how the run started, with these values of the parameters."""
@@ -326,7 +328,7 @@ class Pipeline:
             (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan,
             stale,
             # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
-            self.journal.count + len(self.component.outbox.frames) if self.journal.active else 0,
+            self.recorder.count + len(self.component.outbox.frames) if self.recorder.active else 0,
             self._changes.log_lost,
             self._changes.log_state,
         )

@@ -14,7 +14,7 @@ from magbridge.bridge.check import access
 from magbridge.mavlink import BAD_DATA, Codec
 from magbridge.sensors import DRIVERS, driver_class
 
-__all__ = ["BAUDRATES", "Heard", "Port", "listen", "ports", "recognise"]
+__all__ = ["BAUDRATES", "Port", "Recognised", "listen", "ports", "recognise"]
 
 BAUDRATES = (115_200, 57_600, 9_600, 38_400, 230_400, 19_200, 921_600)
 """Bit/s at which a line is listened to, the most usual first."""
@@ -27,19 +27,19 @@ ENOUGH = 3
 """Readings or frames by which a sender is known."""
 
 
-class Heard(NamedTuple):
+class Recognised(NamedTuple):
     """What a line sends.
 
     Attributes
     ----------
     who : str
         ``mavlink``, ``nmea``, the name of a driver, ``text``, ``bytes``; empty where nothing came.
-    told : str
+    text : str
         More of it, for people: rates, systems, the first line that cannot be parsed.
     """
 
     who: str
-    told: str
+    text: str
 
 
 class Port(NamedTuple):
@@ -69,7 +69,7 @@ def _described(one: Any) -> str:
 
 def listen(
     device: str, baudrates: Sequence[int] = BAUDRATES, seconds: float = 1.5
-) -> tuple[Heard, int | None, bytes]:
+) -> tuple[Recognised, int | None, bytes]:
     """Return what speaks on a device, at which baud rate, and what came; nothing is sent.
 
     Parameters
@@ -81,17 +81,17 @@ def listen(
     seconds : float
         For each.
     """
-    best, at, came = Heard("", "silent"), None, b""
+    best, at, came = Recognised("", "silent"), None, b""
     for baudrate in baudrates:
         try:
             data = _read(device, baudrate, seconds)
         except (serial.SerialException, OSError, ValueError) as error:
-            return Heard("", access(device) or f"cannot be opened: {error}"), None, b""
-        heard = recognise(data, seconds)
-        if heard.who not in {"", "bytes", "text"}:
-            return heard, baudrate, data
-        if (heard.who == "text") > (best.who == "text") or (heard.who and not best.who):
-            best, at, came = heard, baudrate, data
+            return Recognised("", access(device) or f"cannot be opened: {error}"), None, b""
+        recognised = recognise(data, seconds)
+        if recognised.who not in {"", "bytes", "text"}:
+            return recognised, baudrate, data
+        if (recognised.who == "text") > (best.who == "text") or (recognised.who and not best.who):
+            best, at, came = recognised, baudrate, data
         if "://" in device:  # a network's line has no baud rate of ours
             break
     return best, at, came
@@ -109,41 +109,41 @@ def _read(device: str, baudrate: int, seconds: float) -> bytes:
     return data
 
 
-def recognise(data: bytes, seconds: float) -> Heard:
+def recognise(data: bytes, seconds: float) -> Recognised:
     """Return what sent these bytes within `seconds`."""
     if not data:
-        return Heard("", "silent")
+        return Recognised("", "silent")
     for known in (_mavlink(data), _nmea(data), *_drivers(data, seconds)):
         if known is not None:
             return known
     lines = LINE.findall(data)
     printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) / len(data)
     if printable < 0.9 or not lines:
-        return Heard("bytes", f"not understood: {data[:24].hex(' ')}")
+        return Recognised("bytes", f"not understood: {data[:24].hex(' ')}")
     line = lines[len(lines) // 2]
     shown = line.decode("ascii", "replace").strip()[:SHOWN]
     numbers = len(NUMBER.findall(line))
     hint = "; if these are x y z, driver ascii reads them: columns" if numbers >= 3 else ""
-    return Heard("text", f"not understood: {shown!r}{hint}")
+    return Recognised("text", f"not understood: {shown!r}{hint}")
 
 
-def _mavlink(data: bytes) -> Heard | None:
+def _mavlink(data: bytes) -> Recognised | None:
     codec = Codec(255, 190)
     frames = [one for one in codec.parse(data) if one.id != BAD_DATA and one.known]
     if len(frames) < ENOUGH:
         return None
     senders = sorted({(one.system, one.component) for one in frames})
-    return Heard(
+    return Recognised(
         "mavlink", ", ".join(f"system {system} component {component}" for system, component in senders)
     )
 
 
-def _nmea(data: bytes) -> Heard | None:
+def _nmea(data: bytes) -> Recognised | None:
     valid = [line for line in SENTENCE.findall(data) if _checked(line)]
     if len(valid) < ENOUGH:
         return None
     kinds = sorted({line[1:6].decode() for line in valid})
-    return Heard("nmea", f"NMEA 0183: {' '.join(kinds)}")
+    return Recognised("nmea", f"NMEA 0183: {' '.join(kinds)}")
 
 
 def _checked(sentence: bytes) -> bool:
@@ -154,7 +154,7 @@ def _checked(sentence: bytes) -> bool:
     return total == int(digits[:2], 16)
 
 
-def _drivers(data: bytes, seconds: float) -> Iterator[Heard | None]:
+def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
     """Yield what our own drivers make of the bytes: those that need no more than that."""
     for name in DRIVERS:
         for options in OPTIONS.get(name, ({},)):
@@ -164,11 +164,11 @@ def _drivers(data: bytes, seconds: float) -> Iterator[Heard | None]:
             readings = driver.feed(data)
             wasted = driver.bytes_skipped / len(data)
             if len(readings) >= ENOUGH and wasted < 0.5:
-                said = ", ".join(
+                texts = ", ".join(
                     f"{key} = {value!r}" for key, value in options.items() if key != "sensitivity"
                 )
                 rate = f"{len(readings) / seconds:.0f} readings/s"
-                yield Heard(name, f"driver {name}, {rate}" + (f", with {said}" if said else ""))
+                yield Recognised(name, f"driver {name}, {rate}" + (f", with {texts}" if texts else ""))
 
 
 OPTIONS: dict[str, tuple[dict[str, Any], ...]] = {

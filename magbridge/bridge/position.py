@@ -19,7 +19,7 @@ MAX_AGE_US: Final = 60_000_000
 """µs: a glider makes 20 m in a minute, over which the main field changes by less than 0.1 nT."""
 CLOCK_SET_US: Final = 10**15
 """µs since 1970, in 2001: a host whose clock says less has none that was set, and the date is not known."""
-AGAIN_US: Final = 1_000_000
+REPEAT_US: Final = 1_000_000
 """µs after which the main field is computed anew."""
 
 
@@ -28,7 +28,7 @@ class Position:
 
     Parameters
     ----------
-    tell : callable
+    notify : callable
         Takes the reason why there is no main field at a known position.
 
     Attributes
@@ -39,8 +39,8 @@ class Position:
 
     MESSAGE: ClassVar[int] = POSITION.id
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, notify: Callable[[str], None]) -> None:
+        self._notify = notify
         self.where: tuple[float, float] | None = None
         self._depth = 0.0
         self._when_us = self._evaluated_us = 0
@@ -67,7 +67,7 @@ class Position:
         """
         if self.where is None or utc_us < CLOCK_SET_US or abs(time_us - self._when_us) > MAX_AGE_US:
             return nan
-        if abs(utc_us - self._evaluated_us) > AGAIN_US:
+        if abs(utc_us - self._evaluated_us) > REPEAT_US:
             self._evaluated_us = utc_us
             self._field = self._evaluate(utc_us)
         return self._field
@@ -94,5 +94,5 @@ class Position:
                 self._model = NearbyField()
             return self._model.at(*self.where, self._depth, utc_us * 1e-6)[0]
         except (ImportError, MagbridgeError) as error:
-            self._tell(str(error))
+            self._notify(str(error))
             return nan

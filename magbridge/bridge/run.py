@@ -38,7 +38,7 @@ SAVE_US = 1_000_000
 """µs between two savings of parameters: each waits for the disk, and the sensor for it."""
 SWITCH = 0.0005
 """s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
-TELL = 0.2
+NOTICE_PAUSE = 0.2
 """s between two checks for texts to print."""
 LOG_LOOK_US = 1_000_000
 """µs between two checks of the log."""
@@ -77,7 +77,9 @@ def run(path: Path) -> None:
         if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
             signal.signal(number, lambda *_: edge.stop())
     # not before a signal would end the bridge in good order: who hears it may send one
-    Thread(target=_say, args=(pipeline.component.announcer.said,), name="voice", daemon=True).start()
+    Thread(
+        target=_print_statustexts, args=(pipeline.component.announcer.texts,), name="voice", daemon=True
+    ).start()
     sys.setswitchinterval(SWITCH)
     gc.collect()
     gc.freeze()  # these objects live as long as the process: the collector need not scan them
@@ -85,7 +87,9 @@ def run(path: Path) -> None:
 
     logs = config.resolve(config.log.directory) if config.log else None
     parameters, requests = pipeline.component.parameters, pipeline.component.file_requests
-    files = FileServer(pipeline.component.metadata, logs, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.tell)
+    files = FileServer(
+        pipeline.component.metadata, logs, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.notify
+    )
 
     learned = kept_path(config)
 
@@ -93,19 +97,19 @@ def run(path: Path) -> None:
         while requests:
             files.ask(requests.popleft())
         if not link.waiting:
-            station, messages = files.take()
+            station, messages = files.drain()
             if messages:
-                edge.answer(station, pipeline.beside(messages))
+                edge.answer(station, pipeline.interleaved(messages))
         keeper.look(pipeline, time_us)
         if (
             pipeline.learning is not None
             and learned is not None
             and (why := keep(pipeline.learning, learned))
         ):
-            edge.tell(states.notice(why))
+            edge.notify(states.notice(why))
         watch.look(time_us)
-        if pipeline.sensor.stranger:
-            pipeline.sensor.stranger = False
+        if pipeline.sensor.wrong_device:
+            pipeline.sensor.wrong_device = False
             sensor.move_on()
 
     try:
@@ -118,7 +122,7 @@ def run(path: Path) -> None:
             log.close()
 
 
-def _say(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
+def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
     """Print texts on stderr; on its own thread, because a terminal that hangs must not hold up the bridge.
 
     Nor may it hold up the exit, where Python waits for a file object that is in use: hence ``os.write``.
@@ -126,23 +130,25 @@ def _say(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
     """
     stderr = sys.stderr.fileno()
     status = os.fstat(stderr)
-    journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+    to_journal = os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
     while True:
         while texts:
             severity, text = texts.popleft()
-            prefix = f"<{severity:d}>" if journal else "magbridge: "
+            prefix = f"<{severity:d}>" if to_journal else "magbridge: "
             with suppress(OSError):  # nobody reads it, or a full disk
                 os.write(stderr, f"{prefix}{text}\n".encode())
-        time.sleep(TELL)
+        time.sleep(NOTICE_PAUSE)
 
 
 def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter | None:
     if config.log is None:
         return None
     directory = config.resolve(config.log.directory)
-    edge.tell(states.log_state("", 0))
+    edge.notify(states.log_state("", 0))
     limits = config.log
-    return TlogWriter(directory, max_size=limits.max_size, max_age=limits.max_age, head=pipeline.declarations)
+    return TlogWriter(
+        directory, max_size=limits.max_size, max_age=limits.max_age, header=pipeline.declarations
+    )
 
 
 class LogWatch:
@@ -151,7 +157,7 @@ class LogWatch:
     def __init__(self, log: TlogWriter | None, edge: LiveEdge, pipeline: Pipeline) -> None:
         self._log, self._edge, self._pipeline = log, edge, pipeline
         self._revision = -1
-        self._told = ("", 0)
+        self._reported = ("", 0)
         self._look_us = 0
 
     def look(self, time_us: int) -> None:
@@ -164,9 +170,9 @@ class LogWatch:
             self._revision = parameters.revision
             self._log.beginning = self._pipeline.beginning(parameters.changed())
         state = self._log.failure, self._log.lost
-        if state != self._told:
-            self._told = state
-            self._edge.tell(states.log_state(*state))
+        if state != self._reported:
+            self._reported = state
+            self._edge.notify(states.log_state(*state))
 
 
 class Keeper:
@@ -176,7 +182,7 @@ class Keeper:
     """Units of 10 µs for which stamps are reserved at each saving, lest the next run use them again."""
 
     def __init__(self, config: Config) -> None:
-        self._tell: Callable[[bytes], None] = lambda _: None
+        self._notify: Callable[[bytes], None] = lambda _: None
         # named after the configuration: there may be another bridge's beside it
         self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
         self._spoilt = False
@@ -189,15 +195,15 @@ class Keeper:
 
     def attach(self, edge: LiveEdge) -> None:
         """Tell `edge` when something cannot be kept, or could not be read; then the file is set aside."""
-        self._tell = edge.tell
+        self._notify = edge.notify
         if self._spoilt:
             name = self._path.name
             if self._path.is_file():
                 with suppress(OSError):
                     self._path.replace(self._path.with_name(f"{name}.damaged"))
-            self._tell(states.notice(f"cannot be read, not used: {name}", MAV_SEVERITY.ERROR))
+            self._notify(states.notice(f"cannot be read, not used: {name}", MAV_SEVERITY.ERROR))
         if self._key is not None and readable_by_all(self._key):
-            self._tell(states.notice(f"{self._key.name[-20:]}: every user can read this key"))
+            self._notify(states.notice(f"{self._key.name[-20:]}: every user can read this key"))
 
     def start(self, time_us: int) -> Start:
         """Return the start of a run at `time_us`."""
@@ -228,7 +234,7 @@ class Keeper:
         try:
             store.save(self._path, kept)
         except OSError as error:
-            self._tell(states.notice(f"parameters not kept: {error.strerror or error}"))
+            self._notify(states.notice(f"parameters not kept: {error.strerror or error}"))
             return False
         self._kept = kept
         return True

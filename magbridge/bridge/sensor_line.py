@@ -56,7 +56,7 @@ class SensorLine:
     state : MAG_PORT_STATE
     to_send : list of bytes
         Commands that are due; the caller of the pipeline sends them and empties the list.
-    stranger : bool
+    wrong_device : bool
         No reading has come since the line was opened, but a timeout or NMEA 0183 has: it may be another
         instrument's. Whoever opened the line tries another one, if there is one, and sets this back.
     """
@@ -76,21 +76,21 @@ class SensorLine:
         self._announcer, self._timers = announcer, timers
         self.state = MAG_PORT_STATE.ABSENT
         self.to_send: list[bytes] = []
-        self.stranger = self._known = False
-        self._heard_us = start_us
+        self.wrong_device = self._known = False
+        self._received_us = start_us
         # no longer than until the line is taken for silent, so that what is said of it does not depend on it
         self._listen_us = min(LISTEN_US, timeout_us // 2) if searching else 0
         self._commands: tuple[bytes, ...] = ()
         self._tail = b""
-        self._mumbled_us = 0
+        self._unparsed_us = 0
         self._field: Vector | None = None
         self._repeats = self._since_us = 0
         self._hangs = False
         timers.every("sensor", LOOK_US, self._look, start_us + LOOK_US)
 
-    def spoke(self, time_us: int) -> None:
+    def on_reading(self, time_us: int) -> None:
         """Take note of a reading."""
-        self._heard_us, self._known = time_us, True
+        self._received_us, self._known = time_us, True
         if self.state != OK:
             self.state = OK
             self._announcer.state("sensor", f"{self._name} speaks")
@@ -109,13 +109,13 @@ class SensorLine:
             text = f"{self._name} sends the same reading for {SAME_US // 1_000_000} s"
             self._announcer.state("reading", text, MAV_SEVERITY.WARNING)
 
-    def mumbled(self, data: bytes, time_us: int) -> None:
+    def on_unparsed(self, data: bytes, time_us: int) -> None:
         """Take note of bytes that complete no reading."""
-        self._mumbled_us = time_us
-        heard = self._tail + data
-        self._tail = heard[-SENTENCE:]
-        if self._listen_us and not self._known and NMEA.search(heard):
-            self._commands, self.stranger = (), True
+        self._unparsed_us = time_us
+        received = self._tail + data
+        self._tail = received[-SENTENCE:]
+        if self._listen_us and not self._known and NMEA.search(received):
+            self._commands, self.wrong_device = (), True
             self._timers.cancel("command")
 
     def opened(self, time_us: int) -> None:
@@ -130,12 +130,12 @@ class SensorLine:
         self._announcer.state("sensor", f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)
 
     def _look(self, time_us: int) -> None:
-        if time_us - self._heard_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
+        if time_us - self._received_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
             return
-        mumbles = time_us - self._mumbled_us < self._timeout_us // 2
+        mumbles = time_us - self._unparsed_us < self._timeout_us // 2
         what = self._mumble() if mumbles else "is silent"
         self._announcer.state("sensor", f"{self._name} {what}", MAV_SEVERITY.ERROR)
-        self.stranger = not self._known
+        self.wrong_device = not self._known
         self._wake(time_us)
 
     def _mumble(self) -> str:
@@ -147,7 +147,7 @@ class SensorLine:
         return "sends text, but no readings: sensor.options?"
 
     def _wake(self, time_us: int, listen_us: int = 0) -> None:
-        self.state, self._heard_us = MAG_PORT_STATE.SILENT, time_us
+        self.state, self._received_us = MAG_PORT_STATE.SILENT, time_us
         if listen_us:
             self._timers.at("command", time_us + listen_us, lambda t: self._command(t, self._commands))
         else:

@@ -7,7 +7,7 @@ from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.dialect import MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["beside", "clock_step", "log_state", "notice", "opened", "port", "standstill", "too_slow"]
+__all__ = ["clock_step", "interleaved", "log_state", "notice", "opened", "port", "standstill", "too_slow"]
 
 
 def _frame(name: str, **fields: object) -> bytes:
@@ -24,7 +24,7 @@ def standstill(time_us: int, duration_us: int) -> bytes:
     return _frame("MAG_STANDSTILL", time_usec=time_us, duration=min(duration_us, 2**32 - 1))
 
 
-def beside(count: int) -> bytes:
+def interleaved(count: int) -> bytes:
     """Return the frame that says that `count` frames were sent which are not in the log."""
     return _frame("MAG_BESIDE", count=count)
 

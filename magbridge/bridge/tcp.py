@@ -186,7 +186,7 @@ class TcpServer(Port):
                     self._peers.receive(fd, data)
             except PortError:
                 self._dismiss(fd)
-        return self._peers.take()
+        return self._peers.drain()
 
     def write(self, data: bytes) -> None:
         """Send to those clients that are to be answered; without one, `data` are dropped."""

@@ -35,7 +35,7 @@ class UdpPort(Port):
         super().__init__(name)
         self._address, self._peers = address, peers
         self._socket: socket.socket | None = None
-        self._heard = 0.0
+        self._received = 0.0
 
     @property
     def up(self) -> bool:
@@ -48,14 +48,14 @@ class UdpPort(Port):
             opened = self._new()
         except OSError as error:
             raise PortError(self.name, error.strerror or str(error)) from error
-        self._socket, self._heard = opened, time.monotonic()
+        self._socket, self._received = opened, time.monotonic()
 
     def tend(self) -> None:
         """Connect anew if nothing has come for long, and the host, or we, have another address by now."""
         opened, now = self._socket, time.monotonic()
-        if opened is None or self._peers is not None or now - self._heard < PEER_TIMEOUT:
+        if opened is None or self._peers is not None or now - self._received < PEER_TIMEOUT:
             return
-        self._heard = now
+        self._received = now
         with suppress(OSError), self._new() as new:  # not known at present, or closed meanwhile
             if _ends(new) != _ends(opened):
                 # the same descriptor, because the bridge may be waiting for it
@@ -102,8 +102,8 @@ class UdpPort(Port):
             if self._peers is not None:
                 self._peers.receive(peer, datagram)
         if datagrams:
-            self._heard = time.monotonic()
-        return b"".join(datagrams) if self._peers is None else self._peers.take()
+            self._received = time.monotonic()
+        return b"".join(datagrams) if self._peers is None else self._peers.drain()
 
     def credit(self, frames: Iterable[bytes]) -> None:
         """Answer, from now on, who sent these frames."""

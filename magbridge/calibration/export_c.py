@@ -141,8 +141,8 @@ def c_header(calibration: Calibration) -> str:
     """Return ``magbridge_calibration.h``."""
     lines = []
     for k, one in enumerate(calibration.parameters):
-        told = f"{k}: {one.name} [{one.unit or '1'}], from {one.low!r} to {one.high!r}"
-        lines.append(f"/* parameter {told.replace('*/', '')} */")
+        listed = f"{k}: {one.name} [{one.unit or '1'}], from {one.low!r} to {one.high!r}"
+        lines.append(f"/* parameter {listed.replace('*/', '')} */")
     return HEADER.substitute(
         id=f"{calibration_id(calibration):08x}",
         count=len(calibration.parameters),

@@ -55,7 +55,7 @@ class _Version(msgspec.Struct):
 def encode_calibration(calibration: Calibration) -> bytes:
     """Return `calibration` as JSON, one key a line."""
     content = _File(
-        format=4 if calibration.noise.white or calibration.level else 3 if calibration.doubts else 2,
+        format=4 if calibration.noise.white or calibration.level else 3 if calibration.warnings else 2,
         software=calibration.software,
         method=calibration.method,
         sensor=calibration.sensor,
@@ -69,7 +69,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
         boresight=calibration.boresight,
         runs=calibration.runs,
         inputs=calibration.inputs,
-        doubts=calibration.doubts,
+        doubts=calibration.warnings,
         level=calibration.level,
     )
     encode = msgspec.json.encode
@@ -148,8 +148,8 @@ def save(calibration: Calibration, path: str | Path) -> None:
     WriteError
         The file cannot be written; what was there before is as it was.
     """
-    with atomic_path(path) as beside:
-        beside.write_bytes(encode_calibration(calibration))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encode_calibration(calibration))
 
 
 def calibration_id(calibration: Calibration) -> int:
@@ -203,7 +203,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
         method=content.method,
         inputs=content.inputs,
         software=content.software,
-        doubts=content.doubts,
+        warnings=content.doubts,
         level=content.level,
     )
 

@@ -26,6 +26,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import compile_kernel
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import Effect, Parameter, Polynomial, PositionTerm, symmetric
+from magbridge.deprecated import old_name
 from magbridge.errors import CalibrationError
 
 __all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
@@ -122,7 +123,7 @@ class Calibration:
         File -> SHA-256 of what it was made from.
     software : str
         Version that made it.
-    doubts : tuple of str
+    warnings : tuple of str
         Why the data that it was fitted to do not support it; empty where they do.
     level : tuple of float
         How the first coefficients move together where the level of the reference is off by 1-sigma (nT);
@@ -142,8 +143,9 @@ class Calibration:
     method: str = ""
     inputs: dict[str, str] = field(default_factory=dict)
     software: str = ""
-    doubts: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     level: tuple[float, ...] = ()
+    doubts = old_name("doubts", "warnings")
 
     def __post_init__(self) -> None:
         names = tuple(parameter.name for parameter in self.parameters)

@@ -189,7 +189,7 @@ def normal_equations(
         e, g = residuals(part, coefficients)
         J = jacobian(part.phi, g)
         if rho:
-            both = whitening.take(np.column_stack([e, J]))
+            both = whitening.apply(np.column_stack([e, J]))
             e, J = both[:, 0], both[:, 1:]
         if weight is not None:
             root = np.sqrt(weight[start : start + CHUNK])
@@ -231,7 +231,7 @@ class Whitening:
         self._at = 0
         self._last: FloatArray | None = None  # the slow part at the row before, as far as known
 
-    def take(self, values: FloatArray) -> FloatArray:
+    def apply(self, values: FloatArray) -> FloatArray:
         """Whiten the next rows (k, ...) of all n: a block at a time, in order."""
         rows = slice(self._at, self._at + len(values))
         y = values.reshape(len(values), -1)
@@ -276,7 +276,7 @@ def _gains(decay: FloatArray, white: float) -> tuple[FloatArray, FloatArray]:
 
 def whiten(values: FloatArray, steps: FloatArray, rho: float, white: float = 0.0) -> FloatArray:
     """Whiten noise (n, ...), gaps too; see :class:`Whitening`."""
-    return Whitening(steps, rho, white).take(values)
+    return Whitening(steps, rho, white).apply(values)
 
 
 def independent(rho: float, white: float = 0.0) -> float:

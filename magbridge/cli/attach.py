@@ -64,15 +64,15 @@ def init(
 
     known = _loaded(calibration)
     asks = sys.stdin.isatty() and sys.stdout.isatty()
-    driver = driver or _ask("1. Which sensor?", _drivers_told(), "digitizer", asks, "--driver")
-    port = port or _ask("2. On which port?", _ports_told(), "/dev/ttyUSB*", asks, "--port")
+    driver = driver or _ask("1. Which sensor?", _drivers_help(), "digitizer", asks, "--driver")
+    port = port or _ask("2. On which port?", _ports_listed(), "/dev/ttyUSB*", asks, "--port")
     default = "udpout:127.0.0.1:14550"
     link = link or _ask("3. Where is the autopilot or the ground station?", "", default, asks, "--link")
     number = system or _system(_ask("4. The vehicle's system id?", "", "1", asks, "--system"))
     names = parameter
     if not names and known is None and asks:
-        told = "as: battpos [in], ballast [cm3]; none: press Enter"
-        names = tuple(name.strip() for name in _ask("5. Which masses move?", told, "", asks, "").split(","))
+        hint = "as: battpos [in], ballast [cm3]; none: press Enter"
+        names = tuple(name.strip() for name in _ask("5. Which masses move?", hint, "", asks, "").split(","))
         names = tuple(name for name in names if name)
     answers = Answers(
         driver,
@@ -110,13 +110,13 @@ def _relative(file: Path | None, output: Path) -> str | None:
     )
 
 
-def _ask(question: str, told: str, default: str, asks: bool, flag: str) -> str:
+def _ask(question: str, hint: str, default: str, asks: bool, flag: str) -> str:
     if not asks:
         if not default:
             raise WrongUse(f"expected {flag}")
         return default
-    if told:
-        print(told)
+    if hint:
+        print(hint)
     try:
         answer = input(f"{question} [{default}] " if default else f"{question} ").strip()
     except EOFError:
@@ -130,13 +130,13 @@ def _system(answer: str) -> int:
     return int(answer)
 
 
-def _drivers_told() -> str:
+def _drivers_help() -> str:
     from magbridge.sensors.options import driver_names
 
     return f"drivers: {', '.join(driver_names())} (magbridge drivers NAME: its options)"
 
 
-def _ports_told() -> str:
+def _ports_listed() -> str:
     from magbridge.bridge.ports import ports as there
 
     found = [f"  {one.device}  {one.description}" for one in there()]
@@ -185,20 +185,20 @@ def ports(
     asked = [Port(name, "") for name in names] or there()
     found = []
     for port in track(asked, "listening", len(asked)):
-        heard, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)
+        recognised, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)
         found.append(
             {
                 "port": port.device,
                 "device": port.description,
-                "who": heard.who,
-                "said": heard.told,
+                "who": recognised.who,
+                "said": recognised.text,
                 "baudrate": at,
             }
         )
         if not json:
-            speed = f" at {at} bit/s" if at and heard.who else ""
+            speed = f" at {at} bit/s" if at and recognised.who else ""
             about = f" ({port.description})" if port.description else ""
-            print(f"{port.device}{about}: {heard.told}{speed}")
+            print(f"{port.device}{about}: {recognised.text}{speed}")
     if not asked and not json:
         print("no serial port is there")
     if json:

@@ -67,7 +67,7 @@ def demo(
     from sitl import demo as demonstration
 
     with new_folder(out):
-        result = demonstration.demo(out, seed, say=lambda text: print(text, file=sys.stderr))
+        result = demonstration.demo(out, seed, notify=lambda text: print(text, file=sys.stderr))
     print_result(result, demonstration.summary(result), json)
 
 
@@ -76,12 +76,12 @@ def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
     from magbridge.monitor.serve import serve
     from sitl.live import MAP, flying
 
-    def say(text: str) -> None:
+    def notify(text: str) -> None:
         print(text, file=sys.stderr)
 
     with new_folder(out):
         out.mkdir(parents=True, exist_ok=True)
-        with flying(out, seed, say) as link:
+        with flying(out, seed, notify) as link:
             serve(link, 0, "127.0.0.1", port, grid=out / MAP, show=show)
 
 

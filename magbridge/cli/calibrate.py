@@ -152,7 +152,7 @@ def calibrate(
     from magbridge.calibration.fitting.mounted_masses import read_vehicle
     from magbridge.calibration.fitting.observe import observations
     from magbridge.calibration.fitting.offered import AUTO
-    from magbridge.calibration.fitting.sources import idle
+    from magbridge.calibration.fitting.sources import unused_logs
     from magbridge.columns import CHANNELS, require
     from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
@@ -179,7 +179,7 @@ def calibrate(
             observations(deployment, parameter, grid=anomalies),
             inputs=_digests((*files, *([base] if base else []))),
         )
-        for line in idle(logs, data):
+        for line in unused_logs(logs, data):
             complain(line)
         if filter_corner:
             data = unfiltered(data, filter_corner)
@@ -277,18 +277,18 @@ def _fitted(
 ) -> tuple[Fit, list[str]]:
     """Return the fit, and why several logs are not of one vehicle, if they are not."""
     from magbridge.calibration.fitting.fit import fit
-    from magbridge.calibration.fitting.sources import unlike
+    from magbridge.calibration.fitting.sources import heterogeneous_logs
 
-    def again(part: Observations) -> Fit:
+    def refitted(part: Observations) -> Fit:
         return fit(part, method, order)
 
     try:
         found = fit(data, method, order, **options)
     except CalibrationError as error:
-        if doubt := unlike(logs, data, None, again):
+        if doubt := heterogeneous_logs(logs, data, None, refitted):
             raise CalibrationError(doubt) from error
         raise
-    doubt = unlike(logs, data, found, again)
+    doubt = heterogeneous_logs(logs, data, found, refitted)
     return found, [doubt] if doubt else []
 
 

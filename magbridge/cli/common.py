@@ -44,7 +44,6 @@ __all__ = [
     "chosen_parameters",
     "command",
     "complain",
-    "doubts_of",
     "file_to_write",
     "folder_to_write",
     "logs_to_read",
@@ -55,6 +54,7 @@ __all__ = [
     "note_unused_grid",
     "print_result",
     "refuse_unsuited",
+    "warnings_of",
 ]
 
 
@@ -212,10 +212,10 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
             existing(path)
 
 
-def doubts_of(calibration: Calibration, file: Path) -> list[str]:
+def warnings_of(calibration: Calibration, file: Path) -> list[str]:
     """Return a line that says why the data that a calibration was fitted to do not support it, or none."""
-    doubts = "; ".join(calibration.doubts)
-    return [f"{file}: the data it was fitted to do not support it: {doubts}"] if doubts else []
+    warnings = "; ".join(calibration.warnings)
+    return [f"{file}: the data it was fitted to do not support it: {warnings}"] if warnings else []
 
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:

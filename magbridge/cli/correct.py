@@ -18,7 +18,6 @@ from magbridge.cli.common import (
     check_inputs,
     command,
     complain,
-    doubts_of,
     file_to_write,
     logs_to_read,
     note_losses,
@@ -27,6 +26,7 @@ from magbridge.cli.common import (
     note_settings,
     print_result,
     refuse_unsuited,
+    warnings_of,
 )
 from magbridge.columns import CHANNELS, CORRECTED
 from magbridge.errors import ConfigError, DataError, WrongUse
@@ -102,7 +102,7 @@ def correct(
     from magbridge.logs import Writer, read_chunks
 
     known, settings = _known(calibration, config)
-    for doubt in doubts_of(known, source):
+    for doubt in warnings_of(known, source):
         complain(doubt)
     if save is not None and not learn:
         raise WrongUse("--save writes what was learned: give --learn, too")
@@ -123,7 +123,7 @@ def correct(
             corrected = corrected.isel(time=sampled.any("variable").to_numpy())
             writer.append(corrected)
             if correction.learner is not None:
-                _tell(correction.learner)
+                _notify(correction.learner)
             if picture:
                 drawn.append(corrected[list(CORRECTED)])
             tally.add(corrected, part.sizes["time"])
@@ -197,7 +197,7 @@ def _learner(known: Calibration, log: xr.Dataset, settings: Config) -> Learner:
     return learner
 
 
-def _tell(learner: Learner) -> None:
+def _notify(learner: Learner) -> None:
     """Print what learning has changed."""
     for notice in learner.notices:
         complain(f"{notice.text}, {notice.date}")

@@ -15,11 +15,11 @@ from magbridge.cli.common import (
     Reading,
     command,
     complain,
-    doubts_of,
     logs_to_read,
     note_losses,
     note_unused_grid,
     print_result,
+    warnings_of,
 )
 from magbridge.files import digest
 from magbridge.progress import waiting
@@ -41,7 +41,8 @@ def diagnose(
     *files: Path,
     calibration: Path,
     output: Annotated[Folder, Parameter(name=["--output", "-o"])],
-    learned_from: tuple[Path, ...] = (),
+    training_logs: tuple[Path, ...] = (),
+    learned_from: Annotated[tuple[Path, ...], Parameter(show=False)] = (),
     grid: Path | None = None,
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
@@ -55,14 +56,16 @@ def diagnose(
     Parameters
     ----------
     files
-        Logs that the calibration was not fitted to. The gain is measured on whole dives left out in turn, or
-        on eighths of a log with fewer than four dives.
+        Logs that the calibration was not fitted to. The improvement is measured on whole dives left out in
+        turn, or on eighths of a log with fewer than four dives.
     calibration
         The calibration (cal.json).
     output
         The folder to write to.
-    learned_from
+    training_logs
         A log that the calibration was fitted to, to tell what has appeared since; may be repeated.
+    learned_from
+        The old name of --training-logs.
     grid
         An anomaly grid to add to the IGRF, where a log has no reference_field.
     reading
@@ -79,14 +82,17 @@ def diagnose(
     from magbridge.field.read import read_grid
     from magbridge.logs import read
 
+    if learned_from:
+        complain("--learned-from is now called --training-logs")
     known = load(calibration)
     with waiting("reading") as step:
         logs = [read(path, options=reading.options) for path in files]
         note_losses(*(log.attrs for log in logs))
         note_unused_grid(grid, *logs)
-        remarks = doubts_of(known, calibration)
+        remarks = warnings_of(known, calibration)
         own = [path for path in files if digest(path) in known.inputs.values()]
-        again = [log for path, log in zip(files, logs, strict=True) if path in own]
+        own_logs = [log for path, log in zip(files, logs, strict=True) if path in own]
+        others = [path for path in (*training_logs, *learned_from) if path not in files]
         remarks += [f"{path}: {ITSELF}" for path in own]
         remarks += [remark for log in logs for remark in _suspect(log)]
         for remark in remarks:
@@ -95,10 +101,7 @@ def diagnose(
             logs,
             known,
             output,
-            learned_from=[
-                *again,
-                *(read(path, options=reading.options) for path in learned_from if path not in files),
-            ],
+            training_logs=[*own_logs, *(read(path, options=reading.options) for path in others)],
             grid=read_grid(grid) if grid else None,
             progress=step,
             remarks=remarks,
@@ -106,8 +109,8 @@ def diagnose(
     if doubt := unsettled(found.problem, found.possible, found.calibration):
         complain(doubt)
     facts = findings(found, found.causes, remarks)
-    said = summary(facts, "" if own else found.problem.survey.parts)
-    print_result(facts, f"{said}\nreport: {output / 'report.html'}", json)
+    lines = summary(facts, "" if own else found.problem.survey.parts)
+    print_result(facts, f"{lines}\nreport: {output / 'report.html'}", json)
 
 
 def summary(facts: dict[str, Any], parts: str) -> str:
@@ -123,7 +126,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     from magbridge.diagnose.report.words import number
 
     before, after = (number(facts[f"rms_{when}_nT"]) for when in ("before", "after"))
-    low, high = facts["gain"]["interval"]
+    low, high = facts["improvement"]["interval"]
     if any(one["cause"] != "outliers" for one in facts["findings"]):
         rms = f"{before} -> {after} nT RMS, "
         rms += f"on {parts} left out of the fit" if parts else "not held out"
@@ -142,14 +145,14 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
     causes = []
     for one in facts["findings"]:
         others = " or ".join(map(_plain, one["alternatives"]))
-        said = f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}{_followed(one['follows'])}"
-        causes.append(said + f"; or {others}" * bool(others))
+        lines = f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}{_followed(one['follows'])}"
+        causes.append(lines + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:
-        said = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"
+        lines = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"
         size = number(facts["assessment"]["residual"]["rms_nT"])
-        said += f", {size} nT RMS that lasts {rest['correlation_time_s']:.3g} s"
+        lines += f", {size} nT RMS that lasts {rest['correlation_time_s']:.3g} s"
         within = ", ".join(map(_plain, rest["alternatives"]))
-        causes.append(f"{said}{_followed(rest['follows'])}" + f"; resembles {within}" * bool(within))
+        causes.append(f"{lines}{_followed(rest['follows'])}" + f"; resembles {within}" * bool(within))
     return causes or ["no cause"]
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Whole, command, complain, doubts_of, file_to_write
+from magbridge.cli.common import Folder, Whole, command, complain, file_to_write, warnings_of
 from magbridge.errors import DataError, WrongUse
 
 
@@ -46,7 +46,7 @@ def export(
     from magbridge.files import atomic_path, new_folder
 
     known = load(calibration)
-    for doubt in doubts_of(known, calibration):
+    for doubt in warnings_of(known, calibration):
         complain(doubt)
     texts: dict[Path, str] = {}
     if c is not None:

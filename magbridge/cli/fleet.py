@@ -86,12 +86,12 @@ def add(
             for name, one in named.items():
                 added += add_vehicle(there, name, one)
                 for part in one.deployment:
-                    count, said = add_logs(there, name, part, logs_of(file, part))
-                    new, lines = new + count, lines + said
+                    count, notes = add_logs(there, name, part, logs_of(file, part))
+                    new, lines = new + count, lines + notes
         this = Deployment(deployment, (), refit, "" if parameter else sensor)
         if logs:
-            count, said = add_logs(there, vehicle, this, logs)
-            new, lines = new + count, lines + said
+            count, notes = add_logs(there, vehicle, this, logs)
+            new, lines = new + count, lines + notes
         for start, calibration in calibrations:
             given += add_calibration(there, vehicle, this, start, calibration)
     for line in lines:
@@ -258,8 +258,8 @@ def show(
         from magbridge.fleet.page import write_page, write_pages
 
         (write_page if html.suffix == ".html" else write_pages)(found, html, findings(there))
-    told = {name: facts(one) for name, one in found.items()}
-    print_result({"vehicles": told}, "\n".join(_lines(told)), json)
+    facts_of = {name: facts(one) for name, one in found.items()}
+    print_result({"vehicles": facts_of}, "\n".join(_lines(facts_of)), json)
 
 
 @fleet.command
@@ -305,10 +305,10 @@ def export(
     )
 
 
-def _lines(told: dict[str, dict[str, Any]]) -> list[str]:
+def _lines(facts_of: dict[str, dict[str, Any]]) -> list[str]:
     """Return a line for each vehicle, and for each change of it."""
     lines = []
-    for name, one in told.items():
+    for name, one in facts_of.items():
         changes = [(part, change) for part in one["deployments"] for change in part["changes"]]
         lines.append(f"{name}: {len(one['deployments'])} deployments, {len(changes)} changes")
         lines += [

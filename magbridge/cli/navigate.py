@@ -17,13 +17,13 @@ from magbridge.cli.common import (
     Reading,
     command,
     complain,
-    doubts_of,
     logs_to_read,
     note_losses,
     note_missing,
     note_settings,
     print_result,
     refuse_unsuited,
+    warnings_of,
 )
 from magbridge.progress import waiting
 
@@ -145,7 +145,7 @@ def _corrected(
         whole = read(files, required=CHANNELS, options=reading.options)
     deployment = with_true_heading(whole, heading_reference)
     note_losses(deployment.attrs)
-    for doubt in doubts_of(known, calibration):
+    for doubt in warnings_of(known, calibration):
         complain(doubt)
     note_missing(known, deployment)
     note_settings(deployment.attrs)

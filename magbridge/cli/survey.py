@@ -21,10 +21,10 @@ from magbridge.cli.common import (
     chosen_parameters,
     command,
     complain,
-    doubts_of,
     file_to_write,
     note_losses,
     print_result,
+    warnings_of,
 )
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import waiting
@@ -161,7 +161,7 @@ def _samples(
     raw = [one for one in deployments if all(name in one for name in CHANNELS)]
     known = [load(path) for path in calibration]
     for path, one in zip(calibration, known, strict=True):
-        for doubt in doubts_of(one, path):
+        for doubt in warnings_of(one, path):
             complain(doubt)
     if raw and not known:
         known = [_calibrated(raw, parameters, order, save, options, strict=reading.strict)]

@@ -10,10 +10,10 @@ import numpy as np
 from magbridge.diagnose.causes.candidates import Candidate, Group
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import ODDS, REMNANT, log_odds, margin
+from magbridge.diagnose.inference.competing import CompetingHypothesis
+from magbridge.diagnose.inference.evidence import ODDS, REMNANT, bayes_factor_threshold, log_odds
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.left_out import held_out
-from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.inference.state import Hypothesis, shaped_ratio
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
@@ -31,19 +31,23 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
 
     Names and free descriptions both pay for the number of alternatives they were chosen from. The evidence of
     a description of what the names leave is added to theirs; unless it is a remnant of one of the named
-    causes, they pay for it as for a further cause. A cause that the table lacks is a rival like any other:
+    causes, they pay for it as for a further cause. A cause that the table lacks competes like any other:
     names are asserted if they are likelier than every description of the whole signal, and foretell every
     eighth dive as well (there a description that contains their regressors counts, too). They remain possible
     unless one beats them 20:1, the error of their regressors allowed for.
     """
     model = [h.candidate for h in outcome.chosen]
-    uneven = [one for candidate in model if (one := varying(problem, candidate, outcome.trials)) is not None]
-    rest = left = leftover(problem, model, outcome.fit, tone, also=uneven)
+    uneven = [
+        one for candidate in model if (one := varying(problem, candidate, outcome.look_elsewhere)) is not None
+    ]
+    rest = residual = leftover(problem, model, outcome.fit, tone, also=uneven)
     if not model:
         return False, rest
     ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
     shaped = shaped_ratio(ratio, model, outcome.fit)
-    names = log_odds(ratio, model, outcome.trials, shaped) - float(np.log(len(outcome.trials)))
+    names = log_odds(ratio, model, outcome.look_elsewhere, shaped) - float(
+        np.log(len(outcome.look_elsewhere))
+    )
     if rest is not None:
         names += rest.among
         if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
@@ -56,22 +60,22 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
         names -= ODDS
     if free is None:
         return True, rest
-    ours = _foretold(problem, [candidate.columns for candidate in model], outcome.fit, left)
+    ours = _foretold(problem, [candidate.columns for candidate in model], outcome.fit, residual)
     behind = max(free.among - names, _foretold(problem, [], outcome.null, free) - ours - AGAINST)
     if behind <= 0.0:
         return True, rest
     return False, free._replace(within=_within(outcome, behind))
 
 
-def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, beside: Leftover | None) -> float:
+def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, best: Leftover | None) -> float:
     """Return how well every eighth dive is foretold by a model with the best description beside it, if any.
 
     Descriptions that were picked from many places or periods pay for that, as in the fit.
     """
     scores = [held_out(problem, model, fit, interleaved=True).score]
-    for one in beside.fitted if beside else ():
+    for one in best.fitted if best else ():
         score = held_out(problem, [*model, one.columns], one.fit, interleaved=True).score
-        scores.append(score - float(np.log(one.trials)))
+        scores.append(score - float(np.log(one.look_elsewhere)))
     return max(scores)
 
 
@@ -83,16 +87,16 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
     return any(description.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen)
 
 
-def _within(outcome: Outcome, behind: float) -> tuple[Rival, ...]:
-    """Return the names, and their rivals, the likeliest first.
+def _within(outcome: Outcome, behind: float) -> tuple[CompetingHypothesis, ...]:
+    """Return the names, and their competing hypotheses, the likeliest first.
 
-    A description beats the names by `behind`; rivals are those that it does not beat by their margin. Its
-    shape follows the data, whereas a regressor is idealised, a named cause's as well as its rivals'.
+    A description beats the names by `behind`; those that it does not beat by their threshold stay. Its
+    shape follows the data, whereas a regressor is idealised, a named cause's as well as the others'.
     """
-    found: dict[Group, Rival] = {}
-    for hypothesis, rivals in zip(outcome.chosen, outcome.rivals, strict=True):
-        limit = margin(hypothesis.ratio)
-        for one in (Rival(hypothesis.candidate, 0.0), *rivals):
+    found: dict[Group, CompetingHypothesis] = {}
+    for hypothesis, competing in zip(outcome.chosen, outcome.competing, strict=True):
+        limit = bayes_factor_threshold(hypothesis.ratio)
+        for one in (CompetingHypothesis(hypothesis.candidate, 0.0), *competing):
             known = found.get(one.candidate.group)
             if one.behind + behind < limit and (known is None or one.behind + behind < known.behind):
                 found[one.candidate.group] = replace(one, behind=one.behind + behind)

@@ -11,15 +11,16 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms
+from magbridge.deprecated import old_name
 from magbridge.diagnose.assessment.weigh import Assessment, assess
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.improvement import Improvement
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.isolability import Isolability
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.seen import Seen, seen
@@ -44,9 +45,9 @@ class Finding:
     ----------
     hypothesis : Hypothesis
         The cause tested against the model without it.
-    rivals : tuple of Rival
+    competing : tuple of CompetingHypothesis
         The causes that could take its place, the likeliest first.
-    gain : Gain
+    improvement : Improvement
         What this cause gains beside the others.
     coefficients : (k,) array
         In units of their prior width.
@@ -56,11 +57,13 @@ class Finding:
     """
 
     hypothesis: Hypothesis
-    rivals: tuple[Rival, ...]
-    gain: Gain
+    competing: tuple[CompetingHypothesis, ...]
+    improvement: Improvement
     coefficients: FloatArray
     covariance: FloatArray
     chance_alone: float
+    gain = old_name("gain", "improvement")
+    rivals = old_name("rivals", "competing")
 
     @property
     def candidate(self) -> Candidate:
@@ -69,8 +72,8 @@ class Finding:
 
     @property
     def possible(self) -> list[Candidate]:
-        """The cause, and its rivals."""
-        return [self.candidate, *(rival.candidate for rival in self.rivals)]
+        """The cause, and its competing hypotheses."""
+        return [self.candidate, *(competitor.candidate for competitor in self.competing)]
 
     @property
     def signal_to_noise(self) -> float:
@@ -80,12 +83,12 @@ class Finding:
     def field(self, problem: Problem) -> FloatArray:
         """(n,) nT, what it adds to the total field; its columns are in the sensor's nanotesla."""
         columns = self.candidate.columns(slice(0, len(problem)))
-        return np.asarray(columns @ self.coefficients / problem.gain)
+        return np.asarray(columns @ self.coefficients / problem.reference_jacobian)
 
     def follows(self, problem: Problem, fit: Joint) -> Seen:
         """Say what is seen of it in what all other causes leave, or if noise hides it, in its fit."""
         field = self.field(problem)
-        found = seen(problem, field + fit.left / problem.gain)
+        found = seen(problem, field + fit.residual / problem.reference_jacobian)
         known = found if found.channel else seen(problem, field)
         return known._replace(size=rms(field), share=found.share)
 
@@ -109,7 +112,7 @@ class Diagnosis:
         At the extended calibration.
     before, after : (n,) array
         nT, residuals with the calibration as it was given, and with the extended one, held out.
-    total : Gain
+    total : Improvement
         Of all findings together.
     isolability : Isolability
     verdict : str
@@ -127,7 +130,7 @@ class Diagnosis:
     fit: Joint
     before: FloatArray
     after: FloatArray
-    total: Gain
+    total: Improvement
     isolability: Isolability
     verdict: str
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
@@ -149,5 +152,5 @@ class Diagnosis:
 
     @property
     def possible(self) -> list[Candidate]:
-        """The causes of the findings, and their rivals."""
+        """The causes of the findings, and their competing hypotheses."""
         return [candidate for one in self.findings for candidate in one.possible]

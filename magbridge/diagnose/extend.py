@@ -58,8 +58,10 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
             reference = msgspec.structs.replace(
                 reference, bias=reference.bias + float(b[at]), bias_sigma=sigma
             )
-    left = robust_scale(fit.left - np.median(fit.left))  # of the bulk, not of outliers
-    noise = msgspec.structs.replace(calibration.noise, sensor=min(calibration.noise.sensor, left) or left)
+    residual = robust_scale(fit.residual - np.median(fit.residual))  # of the bulk, not of outliers
+    noise = msgspec.structs.replace(
+        calibration.noise, sensor=min(calibration.noise.sensor, residual) or residual
+    )
     return replace(
         calibration,
         effects=(*calibration.effects, *(effect for c in model for effect in c.effects)),
@@ -182,19 +184,19 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     e, g = residuals(samples, coefficients)
     selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
-    again = replace(problem, residual=e, slopes=g)
+    rebuilt = replace(problem, residual=e, jacobian=g)
     # the residual at the first point, extrapolated linearly from this one; errors of the reference and the
     # channels' delays are in both, as `extended` corrects neither
-    again.residual[:] += again.free[:, : DELAYS.start] @ fit.z[: DELAYS.start]
+    rebuilt.residual[:] += rebuilt.calibration_jacobian[:, : DELAYS.start] @ fit.z[: DELAYS.start]
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:
             columns.append(candidate.columns)
         else:
             block = effects[:, at : at + candidate.size] * candidate.width
-            again.residual[:] += block @ fit.coefficients[place]
+            rebuilt.residual[:] += block @ fit.coefficients[place]
             columns.append(block.__getitem__)
             at += candidate.size
-    return again, columns
+    return rebuilt, columns
 
 
 def _since(extended: Calibration, model: Sequence[Candidate]) -> IndexArray:

@@ -14,16 +14,18 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
+from magbridge.deprecated import old_argument
 from magbridge.diagnose.accept import accept
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.causes.time_dependent import interference_tone
+from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.diagnosis import Diagnosis, Finding, counted
 from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
-from magbridge.diagnose.gain import Gain, paired
+from magbridge.diagnose.improvement import Improvement, paired
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
@@ -31,7 +33,6 @@ from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
-from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.seen import memory, seen
@@ -54,12 +55,13 @@ ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 
 
+@old_argument("learned_from", "training_logs")
 def diagnose(
     datasets: Sequence[xr.Dataset],
     calibration: Calibration,
     out_dir: str | os.PathLike[str] | None = None,
     *,
-    learned_from: Sequence[xr.Dataset] = (),
+    training_logs: Sequence[xr.Dataset] = (),
     grid: AnomalyGrid | None = None,
     causes: Mapping[str, Cause] | None = None,
     progress: Callable[[str], object] = str,
@@ -75,7 +77,7 @@ def diagnose(
         What the forward model knows.
     out_dir : path, optional
         Where ``findings.json``, ``calibration.json`` and ``report.html`` go; nothing is written if not given.
-    learned_from : sequence of Dataset, optional
+    training_logs : sequence of Dataset, optional
         The logs that the calibration was made from: what changed since then is seen against them. One that
         is diagnosed itself may be among them, lest what the calibration knows from it counts twice.
     grid : AnomalyGrid, optional
@@ -95,7 +97,7 @@ def diagnose(
     causes = known() if causes is None else causes
     # one thread: for matrices this narrow more only wait, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):
-        diagnosis = _examine(datasets, calibration, learned_from, grid, causes, progress)
+        diagnosis = _examine(datasets, calibration, training_logs, grid, causes, progress)
     if out_dir is not None:
         # matplotlib only where a report is wanted
         from magbridge.diagnose.report.files import write  # noqa: PLC0415
@@ -108,13 +110,13 @@ def diagnose(
 def _examine(
     datasets: Sequence[xr.Dataset],
     calibration: Calibration,
-    learned_from: Sequence[xr.Dataset],
+    training_logs: Sequence[xr.Dataset],
     grid: AnomalyGrid | None,
     causes: Mapping[str, Cause],
     progress: Callable[[str], object],
 ) -> Diagnosis:
     progress("reading")
-    problem = _posed(take(datasets, calibration, learned_from, grid), calibration)
+    problem = _posed(load_survey(datasets, calibration, training_logs, grid), calibration)
     progress("preparing causes")
     candidates, untestable = _put_forward(problem, causes)
     progress("searching")
@@ -122,7 +124,9 @@ def _examine(
     progress("what is left")
     tone = _strongest_tone(problem, candidates)
     stand, rest = accept(problem, outcome, tone)
-    named, rivals, fit = (outcome.chosen, outcome.rivals, outcome.fit) if stand else ((), (), outcome.null)
+    named, competing, fit = (
+        (outcome.chosen, outcome.competing, outcome.fit) if stand else ((), (), outcome.null)
+    )
     model = [h.candidate for h in named]
     off = _off(outcome.fit, named, len(causes))
     wrong = off if off is not None and off.isolated else None
@@ -140,17 +144,17 @@ def _examine(
         settled.let_go()
         if score < held_out(problem, [], outcome.null).score - ODDS:
             # the dives left out speak 20:1 against these names
-            named, rivals, model, fit, after, extended = (), (), [], outcome.null, before, calibration
+            named, competing, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
     rest = rest or _passing(off) or _slow(problem, fit) or _loud(problem, after, counts)
-    chances = chances_alone(candidates, outcome.info, named, outcome.trials, len(causes))
+    chances = chances_alone(candidates, outcome.info, named, outcome.look_elsewhere, len(causes))
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
         problem=problem, outcome=outcome,
-        findings=_findings(problem, named, rivals, fit, after, counts, chances),
+        findings=_findings(problem, named, competing, fit, after, counts, chances),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
-        isolability=isolability(candidates, outcome.info, outcome.trials, len(causes), untestable),
+        isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
         verdict=_verdict(named, wrong, rest, total), causes=causes,
     )  # fmt: skip
 
@@ -207,7 +211,7 @@ def _off(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | Non
 def _findings(
     problem: Problem,
     named: Sequence[Hypothesis],
-    rivals: Sequence[tuple[Rival, ...]],
+    competing: Sequence[tuple[CompetingHypothesis, ...]],
     fit: Joint,
     after: FloatArray,
     counts: BoolArray,
@@ -216,14 +220,16 @@ def _findings(
     """Collect each cause's results; its gain is that over a fit of the others without it."""
     found, q = [], len(fit.z)
     places = slices([h.candidate for h in named])
-    for k, (own, hypothesis, others, chance) in enumerate(zip(places, named, rivals, chances, strict=True)):
+    for k, (own, hypothesis, others, chance) in enumerate(
+        zip(places, named, competing, chances, strict=True)
+    ):
         columns = [h.candidate.columns for i, h in enumerate(named) if i != k]
         kept = np.delete(fit.prior, slice(q + own.start, q + own.stop))
         alone = replace(fit, coefficients=np.delete(fit.coefficients, own), prior=kept)
-        without = held_out(problem, columns, alone).left
-        gain = paired(without, after, problem.survey.dive, counts)
+        without = held_out(problem, columns, alone).residual
+        improvement = paired(without, after, problem.survey.dive, counts)
         covariance = fit.effects_covariance[own, own]
-        found.append(Finding(hypothesis, others, gain, fit.coefficients[own], covariance, chance))
+        found.append(Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, chance))
     return tuple(found)
 
 
@@ -248,18 +254,20 @@ def _slow(problem: Problem, fit: Joint) -> Leftover | None:
 
     Noise of a long memory can describe anything slow: what it describes is still no noise of the sensor.
     """
-    left = fit.left / problem.gain
-    found = memory(problem, left)
+    residual = fit.residual / problem.reference_jacobian
+    found = memory(problem, residual)
     far = found.slow >= SLOW or found.rms >= SMOOTH * found.white
     if not far or found.rms < NEGLIGIBLE * float(np.median(problem.survey.reference)):
         return None
     power = found.means * found.samples * found.slow
     ratio = power * (found.rms / max(found.white, 1e-9)) ** 2
-    channel = seen(problem, left).channel
+    channel = seen(problem, residual).channel
     return Leftover("drift", float(np.sqrt(ratio)), float(chi2.sf(power, found.means)), 0.0, None, channel)
 
 
-def _verdict(named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Gain) -> str:
+def _verdict(
+    named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Improvement
+) -> str:
     """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part."""
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"

@@ -97,7 +97,7 @@ class Memory(NamedTuple):
 def seen(problem: Problem, signal: FloatArray) -> Seen:
     """Say which series a signal (n,), nT of the total field, follows."""
     part = slice(None, None, -(-len(signal) // ROWS))
-    u = -(problem.slopes[:, 6:] / problem.gain[:, None])[part]
+    u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
     axes = np.column_stack([np.ones(len(u)), u])
     y = signal[part] - signal[part].mean()
     total = float(y @ y)
@@ -133,14 +133,14 @@ def seen(problem: Problem, signal: FloatArray) -> Seen:
     return Seen(None, 0.0, axis(waves, slow) if slow * total >= SLOW * float(y @ y) else None, size, share)
 
 
-def _by_chance(share: float, terms: int, left: FloatArray) -> float:
+def _by_chance(share: float, terms: int, residual: FloatArray) -> float:
     """Return the chance that a series explains such a share of something that has nothing to do with it.
 
-    Fisher's F; of what is `left` (n, 4), seen along each axis, only so many samples are independent as its
+    Fisher's F; of a `residual` (n, 4), seen along each axis, only so many samples are independent as its
     memory allows (Bartlett 1946).
     """
-    n = len(left)
-    freedom = max(n / (1.0 + 2.0 * max(map(_remembered, left.T))) - terms - len(AXES), 1.0)
+    n = len(residual)
+    freedom = max(n / (1.0 + 2.0 * max(map(_remembered, residual.T))) - terms - len(AXES), 1.0)
     return float(fdtrc(terms, freedom, share / terms / max((1.0 - share) / freedom, 1e-300)))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import floor, isfinite, log10
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 
 __all__ = ["label", "measured", "names_of", "number", "series_of"]
 
@@ -16,9 +16,11 @@ def label(cause: str, channel: str | None) -> str:
     return cause.replace("_", " ") + (f" ({channel})" if channel else "")
 
 
-def names_of(rivals: Sequence[Rival], joint: str = ", ") -> str:
+def names_of(competing: Sequence[CompetingHypothesis], joint: str = ", ") -> str:
     """Return causes as a list in words, the likeliest first."""
-    return joint.join(label(rival.candidate.cause, series_of(rival.candidate)) for rival in rivals)
+    return joint.join(
+        label(hypothesis.candidate.cause, series_of(hypothesis.candidate)) for hypothesis in competing
+    )
 
 
 def series_of(candidate: Candidate) -> str | None:

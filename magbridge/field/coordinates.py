@@ -105,8 +105,8 @@ def _are_degrees(path: Path, x: RealArray, y: RealArray, unit: str, crs: Any) ->
 
 def _reference_system(path: Path, crs: str | dict[str, Any] | None) -> Any:
     """Return pyproj's CRS of what the file states, or of the ``.prj`` beside it; None where there is none."""
-    beside = path.with_suffix(".prj")
-    if not crs and not beside.is_file():
+    sidecar = path.with_suffix(".prj")
+    if not crs and not sidecar.is_file():
         return None
     try:
         from pyproj import CRS  # noqa: PLC0415  an extra of its own
@@ -116,9 +116,9 @@ def _reference_system(path: Path, crs: str | dict[str, Any] | None) -> Any:
     try:
         if isinstance(crs, dict):
             return CRS.from_cf(crs)
-        return CRS.from_user_input(crs or beside.read_text(errors="replace"))
+        return CRS.from_user_input(crs or sidecar.read_text(errors="replace"))
     except (CRSError, KeyError, ValueError):
-        source = "" if crs else f" in {beside.name}"
+        source = "" if crs else f" in {sidecar.name}"
         raise FormatError(path, f"expected a coordinate reference system{source}, found none known") from None
 
 

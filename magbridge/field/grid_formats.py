@@ -125,22 +125,22 @@ def ascii_grid(path: Path) -> Parts:
         A header or a number is missing.
     """
     words = path.read_text(**TEXT).split()
-    head: dict[str, float] = {}
+    header: dict[str, float] = {}
     at = 0
     try:
         while words[at][0].isalpha():
-            head[words[at].lower()] = float(words[at + 1])
+            header[words[at].lower()] = float(words[at + 1])
             at += 2
-        nx, ny = int(head["ncols"]), int(head["nrows"])
-        dx, dy = head.get("cellsize", head.get("dx", 0.0)), head.get("cellsize", head.get("dy", 0.0))
-        x0 = head["xllcenter"] if "xllcenter" in head else head["xllcorner"] + dx / 2
-        y0 = head["yllcenter"] if "yllcenter" in head else head["yllcorner"] + dy / 2
+        nx, ny = int(header["ncols"]), int(header["nrows"])
+        dx, dy = header.get("cellsize", header.get("dx", 0.0)), header.get("cellsize", header.get("dy", 0.0))
+        x0 = header["xllcenter"] if "xllcenter" in header else header["xllcorner"] + dx / 2
+        y0 = header["yllcenter"] if "yllcenter" in header else header["yllcorner"] + dy / 2
         values = np.array(words[at:], float).reshape(ny, nx)[::-1]
     except (IndexError, KeyError, ValueError, OverflowError) as error:
         raise FormatError(
             path, "expected an ESRI ASCII grid: ncols, nrows, corner, cellsize, rows"
         ) from error
-    values[values == head.get("nodata_value", -9999.0)] = np.nan
+    values[values == header.get("nodata_value", -9999.0)] = np.nan
     return x0 + dx * np.arange(nx), y0 + dy * np.arange(ny), values, {}
 
 
@@ -197,9 +197,9 @@ def geotiff(path: Path) -> Parts:
 
 def _gdal(text: str) -> tuple[float, float, str]:
     """Return scale, offset and unit of the first band in GDAL's items, ``<Item role="scale">0.1</Item>``."""
-    said = {}
+    declared = {}
     for attributes, value in re.findall(r"<Item([^>]*)>([^<]*)</Item>", text):
         role = re.search(r'role="(\w+)"', attributes)
         if role and 'sample="0"' in attributes:
-            said[role[1].lower()] = value.strip()
-    return float(said.get("scale", 1.0)), float(said.get("offset", 0.0)), said.get("unittype", "")
+            declared[role[1].lower()] = value.strip()
+    return float(declared.get("scale", 1.0)), float(declared.get("offset", 0.0)), declared.get("unittype", "")

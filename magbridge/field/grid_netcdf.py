@@ -134,8 +134,8 @@ def write(grid: AnomalyGrid, path: str | Path) -> None:
     if isfinite(grid.altitude):
         attrs |= {"altitude": grid.altitude, "altitude_units": "m above the ellipsoid"}
     packed = {name: {"zlib": True, "dtype": "float32"} for name in fields}
-    with atomic_path(path) as beside, systems_reason(beside):
-        xr.Dataset(fields, axes, attrs).to_netcdf(beside, engine="netcdf4", encoding=packed)
+    with atomic_path(path) as temporary, systems_reason(temporary):
+        xr.Dataset(fields, axes, attrs).to_netcdf(temporary, engine="netcdf4", encoding=packed)
 
 
 def _names(name: str, attrs: Any) -> set[str]:

@@ -24,7 +24,7 @@ LONG = 20 * 86_400.0
 """s before and after the time that it is fitted at."""
 
 
-AGAIN_US = 1_000_000
+REPEAT_US = 1_000_000
 """µs after which the field at the same place is computed anew."""
 
 
@@ -51,7 +51,7 @@ class HeldField:
         OutOfRange
             As :func:`~magbridge.field.igrf.total_field`.
         """
-        if where != self._where or abs(utc_us - self._when_us) > AGAIN_US:
+        if where != self._where or abs(utc_us - self._when_us) > REPEAT_US:
             self._field = self._model.at(*where, utc_us * 1e-6)[0]
             self._where, self._when_us = where, utc_us
         return self._field

@@ -199,8 +199,8 @@ def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
     figure.colorbar(image, ax=axes, label="anomaly, nT", shrink=0.8)
     figure.supxlabel("longitude, deg", fontsize="medium")
     figure.supylabel("latitude, deg", fontsize="medium")
-    with atomic_path(path) as beside:
-        figure.savefig(beside, dpi=110)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
 def _masked(grid: AnomalyGrid, polygon: FloatArray) -> AnomalyGrid:

@@ -108,8 +108,8 @@ def about_mean(deployment: xr.Dataset) -> xr.Dataset:
     radius = sphere_radius(raw[np.isfinite(raw).all(axis=1)])
     if not EARTHS[0] < radius < EARTHS[1]:
         source = deployment.attrs.get("source", "deployment")
-        told = f"a sphere of {radius:.0f} nT through its readings: too few attitudes, or another unit"
-        raise FormatError(source, f"expected a field of the Earth's size, not {told}")
+        how = f"a sphere of {radius:.0f} nT through its readings: too few attitudes, or another unit"
+        raise FormatError(source, f"expected a field of the Earth's size, not {how}")
     return deployment.assign(reference_field=("time", np.full(len(raw), radius), {"units": "nT"}))
 
 

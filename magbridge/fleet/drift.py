@@ -89,11 +89,11 @@ def history(fleet: Fleet, vehicle: str) -> History:
     changes: list[tuple[Change, ...]] = []
     for lesson in mine:
         before = fleet.known(vehicle, lesson.refit, lesson.time)
-        told = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
+        evidence = lesson.brought(fleet.parameters, np.eye(len(fleet.basis)))
         S = before.covariance
-        gain = np.linalg.solve(np.eye(len(S)) + S @ told.precision, S)  # (S^-1 + J)^-1
+        gain = np.linalg.solve(np.eye(len(S)) + S @ evidence.precision, S)  # (S^-1 + J)^-1
         P = 0.5 * (gain + gain.T)
-        after = P @ told.vector + np.linalg.solve(np.eye(len(S)) + S @ told.precision, before.mean)
+        after = P @ evidence.vector + np.linalg.solve(np.eye(len(S)) + S @ evidence.precision, before.mean)
         moved = np.maximum(np.diag(S) - np.diag(P), 0.0)[places]
         rows.append(
             (before.mean[places], np.sqrt(np.diag(S))[places], after[places], np.sqrt(np.diag(P))[places])

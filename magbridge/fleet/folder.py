@@ -42,9 +42,9 @@ class FolderCatalogue(Catalogue):
         self._keys_of: dict[Path, frozenset[str]] = {}  # a file's content never changes
         mark = folder / MARK
         if create and not mark.exists():
-            with atomic_path(mark) as beside:
+            with atomic_path(mark) as temporary:
                 folder.mkdir(parents=True, exist_ok=True)
-                beside.write_bytes(msgspec.json.encode({"format": FORMAT}))
+                temporary.write_bytes(msgspec.json.encode({"format": FORMAT}))
         if not mark.is_file():
             raise FormatError(folder, "expected a fleet's catalogue (magbridge fleet add makes one)")
         try:
@@ -110,7 +110,7 @@ class FolderCatalogue(Catalogue):
         if not path.exists():
             whole = BytesIO()  # polars hides why it cannot write to a file
             frame.write_parquet(whole, compression="zstd")
-            with atomic_path(path) as beside:
-                beside.parent.mkdir(exist_ok=True)
-                beside.write_bytes(whole.getbuffer())
+            with atomic_path(path) as temporary:
+                temporary.parent.mkdir(exist_ok=True)
+                temporary.write_bytes(whole.getbuffer())
         return path

@@ -85,8 +85,8 @@ def _row(
         "job": GIVEN, "attempt": 1, "vehicle": vehicle, "deployment": deployment.name,
         "refit": deployment.refit or deployment.name, "start": start, "sensor": sensor,
         "method": calibration.method, "rms": float(np.sqrt(squares / max(samples, 1))),
-        "noise": calibration.noise.sensor, "expected": None, "supported": not calibration.doubts,
-        "warnings": list(calibration.doubts), "calibration": encode_calibration(calibration).decode(),
+        "noise": calibration.noise.sensor, "expected": None, "supported": not calibration.warnings,
+        "warnings": list(calibration.warnings), "calibration": encode_calibration(calibration).decode(),
         **packed(_information(calibration, order)),
     }  # fmt: skip
 

@@ -106,9 +106,9 @@ class Population:
         P = P + by_vehicle.S
         branches: dict[str, list[Information]] = defaultdict(list)
         for one in past:
-            branches[one.refit].append(_up(one.information, by_power_up).told)
+            branches[one.refit].append(_up(one.information, by_power_up).evidence)
         own = branches.pop(refit, [])
-        elsewhere = [_up(_summed(leaves), by_refit).told for leaves in branches.values()]
+        elsewhere = [_up(_summed(leaves), by_refit).evidence for leaves in branches.values()]
         mean, P = _updated(mean, P, elsewhere)
         mean, P = _updated(mean, P + by_refit.S, own)
         return mean, P + by_power_up.S
@@ -118,7 +118,7 @@ class Population:
 class _Passed:
     """A node's message to its parent, with what the way down needs: ``x | p ~ N(G p + g, R)``."""
 
-    told: Information
+    evidence: Information
     G: FloatArray
     g: FloatArray
     R: FloatArray
@@ -168,16 +168,16 @@ def _round(
         tree[one.vehicle][one.refit].append(_up(one.information, spreads[one.vehicle][2]))
     middle = {
         vehicle: {
-            refit: _up(_summed([leaf.told for leaf in leaves]), spreads[vehicle][1])
+            refit: _up(_summed([leaf.evidence for leaf in leaves]), spreads[vehicle][1])
             for refit, leaves in refits.items()
         }
         for vehicle, refits in tree.items()
     }
     top = {
-        vehicle: _up(_summed([one.told for one in refits.values()]), spreads[vehicle][0])
+        vehicle: _up(_summed([one.evidence for one in refits.values()]), spreads[vehicle][0])
         for vehicle, refits in middle.items()
     }
-    total = _summed([Information(np.eye(K), np.zeros(K)), *(one.told for one in top.values())])
+    total = _summed([Information(np.eye(K), np.zeros(K)), *(one.evidence for one in top.values())])
     mean, P = _moments(total)
     score = 0.5 * (total.vector @ mean - np.linalg.slogdet(total.precision)[1])
     sums = Sums(K, len(shapes.groups))
@@ -192,7 +192,7 @@ def _round(
                 score += leaf.score
                 _down(leaf, *here, sums, 2, by[2])
     score += log_prior(variances, groups, shapes)
-    each = {name: one.told for name, one in top.items()}
+    each = {name: one.evidence for name, one in top.items()}
     return Population(variances, shapes, total, each, float(score)), sums
 
 
@@ -218,12 +218,14 @@ def _down(
     return own, node.R + node.G @ P @ node.G.T
 
 
-def _updated(mean: FloatArray, P: FloatArray, told: Sequence[Information]) -> tuple[FloatArray, FloatArray]:
+def _updated(
+    mean: FloatArray, P: FloatArray, evidence: Sequence[Information]
+) -> tuple[FloatArray, FloatArray]:
     """Return a Gaussian with what is told of it."""
-    if not told:
+    if not evidence:
         return mean, P
     J = np.asarray(np.linalg.inv(P), float)
-    return _moments(_summed([Information(J, J @ mean), *told]))
+    return _moments(_summed([Information(J, J @ mean), *evidence]))
 
 
 def _moments(of: Information) -> tuple[FloatArray, FloatArray]:
@@ -232,8 +234,8 @@ def _moments(of: Information) -> tuple[FloatArray, FloatArray]:
     return P @ of.vector, P
 
 
-def _summed(told: Sequence[Information]) -> Information:
-    J, h = (np.asarray(np.sum(parts, axis=0)) for parts in zip(*told, strict=True))
+def _summed(evidence: Sequence[Information]) -> Information:
+    J, h = (np.asarray(np.sum(parts, axis=0)) for parts in zip(*evidence, strict=True))
     return Information(J, h)
 
 

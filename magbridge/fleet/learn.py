@@ -63,11 +63,11 @@ class Lesson(NamedTuple):
         return Information(B.T @ self.information.precision @ B, B.T @ self.information.vector)
 
 
-def packed(told: Information | None) -> dict[str, bytes]:
+def packed(evidence: Information | None) -> dict[str, bytes]:
     """Return information as columns of the catalogue: little-endian doubles, row by row; empty: none."""
-    if told is None:
+    if evidence is None:
         return {"precision": b"", "vector": b""}
-    return {name: np.asarray(part, "<f8").tobytes() for name, part in told._asdict().items()}
+    return {name: np.asarray(part, "<f8").tobytes() for name, part in evidence._asdict().items()}
 
 
 def unpacked(row: Mapping[str, bytes]) -> Information:

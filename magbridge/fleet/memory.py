@@ -149,8 +149,8 @@ def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
     rows = [row for row in current_files(catalogue.rows("files")) if row["sha256"] in wanted]
     found = {(row["vehicle"], row["refit"]) for row in rows}
     if len({vehicle for vehicle, _ in found}) != 1:
-        said = "of several of its vehicles" if found else "in its catalogue of none"
-        raise WrongUse(f"--fleet {catalogue.name}: the logs are {said}: name the vehicle (--member)")
+        note = "of several of its vehicles" if found else "in its catalogue of none"
+        raise WrongUse(f"--fleet {catalogue.name}: the logs are {note}: name the vehicle (--member)")
     return sorted(found)[-1]
 
 

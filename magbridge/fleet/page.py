@@ -70,8 +70,8 @@ def write_pages(histories: Mapping[str, History], folder: Path, findings: Findin
     """
     with new_folder(folder):
         numbers = {"vehicles": {name: facts(one) for name, one in histories.items()}}
-        with atomic_path(folder / "fleet.json") as beside:
-            beside.write_bytes(msgspec.json.encode(numbers))
+        with atomic_path(folder / "fleet.json") as temporary:
+            temporary.write_bytes(msgspec.json.encode(numbers))
         for name, one in histories.items():
             back = '<p><a href="index.html">Fleet</a></p>'
             _write(folder / f"{name}.html", name, [back, *_vehicle(name, one, findings.get(name, ()), "h1")])
@@ -93,8 +93,8 @@ def _write(path: Path, title: str, body: Sequence[str]) -> None:
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
         f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
-    with atomic_path(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _table(headings: str, rows: Sequence[str]) -> str:
@@ -110,12 +110,12 @@ def _overview(histories: Mapping[str, History], links: Mapping[str, str]) -> Ite
     )
     rows = []
     for name, one in histories.items():
-        told = "; ".join(f"{_day(when)} {escape(', '.join(what))}" for when, what in _changed(one)[-2:])
+        evidence = "; ".join(f"{_day(when)} {escape(', '.join(what))}" for when, what in _changed(one)[-2:])
         last = _day(one.lessons[-1].time) if one.lessons else ""
         rows.append(
             f'<tr><td><a href="{escape(links[name])}">{escape(name)}</a></td><td class=number>'
             f"{len(one.lessons)}</td><td>{last}</td><td class=number>{len(_changed(one))}</td>"
-            f"<td class=changed>{told}</td></tr>"
+            f"<td class=changed>{evidence}</td></tr>"
         )
     yield _table("vehicle, deployments, last, with changes, latest changes", rows)
 

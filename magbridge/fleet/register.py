@@ -100,7 +100,7 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
     for row in sorted(catalogue.rows("vehicles"), key=lambda row: row["version"]):
         last = found.get(row["vehicle"], row)
         if any(last[key] != row[key] for key in SAME):
-            both = " and ".join(_told(one) for one in (last, row))
+            both = " and ".join(_described(one) for one in (last, row))
             raise FormatError(
                 catalogue.name,
                 f"two vehicles are named {row['vehicle']!r}: {both}; the row of one of them has to go",
@@ -143,7 +143,8 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     known = vehicles(catalogue).get(name, {**row, "version": 0})
     if any(known[key] != row[key] for key in SAME):
         raise WrongUse(
-            f"{name}: {catalogue.name} has another vehicle of that name: {_told(known)}, not {_told(row)}"
+            f"{name}: {catalogue.name} has another vehicle of that name: {_described(known)}, "
+            f"not {_described(row)}"
         )
     if known == {**row, "version": known["version"]} and known["version"]:
         return 0
@@ -217,6 +218,6 @@ def _check_name(name: str, of: str) -> None:
         raise WrongUse(f"{name!r}: expected {of}'s name without slashes, not beginning with a dot")
 
 
-def _told(row: Row) -> str:
+def _described(row: Row) -> str:
     masses = ", ".join(row["parameters"]) or "no moving masses"
     return f"serial {row['serial'] or 'not given'}, sensor {row['sensor'] or 'not given'}, {masses}"

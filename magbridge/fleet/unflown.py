@@ -28,5 +28,5 @@ def unflown(fleet: Fleet, vehicle: str, refit: str = "", noise: float = 0.0) -> 
     return Calibration(
         known.parameters, (Polynomial(exponents=known.exponents),), np.asarray(known.mean), known.covariance,
         Noise(noise), Reference(known.field), method="fleet", software=f"magbridge {__version__}",
-        doubts=("no run of this deployment: its coefficients are what its fleet lets expect",),
+        warnings=("no run of this deployment: its coefficients are what its fleet lets expect",),
     )  # fmt: skip

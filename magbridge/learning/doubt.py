@@ -58,7 +58,7 @@ STANDS_OUT: Final = 3.0
 """Sigmas of an innovation at which the first onset begins anew."""
 FROM_ZERO: Final = ("offset_step", "current_field", "clock_offset", "map_error")
 """Causes that add as much as their regressor, not as much as it has changed since the onset."""
-RIVALS: Final = log(20.0)
+COMPETING: Final = log(20.0)
 """How far behind the best a cause may be, and still fit."""
 NOISIER_OVER: Final = 3000
 """Samples over which it is followed how much noisier the innovations are than their sigma."""
@@ -217,7 +217,7 @@ class Doubt:
     def _fitting(self) -> list[int]:
         """The rows that fit, the likeliest first."""
         order = np.argsort(-self.statistic, kind="stable").tolist()
-        return [row for row in order if self.statistic[row] > self.statistic[order[0]] - RIVALS]
+        return [row for row in order if self.statistic[row] > self.statistic[order[0]] - COMPETING]
 
     def _alarm(self) -> Alarm:
         fits = self._fitting

@@ -90,12 +90,12 @@ class Estimator:
         self._Ph = np.zeros(self.states)
 
     def know(
-        self, coefficients: FloatArray, beside: FloatArray, covariance: FloatArray, nuisance: Nuisance
+        self, coefficients: FloatArray, nuisances: FloatArray, covariance: FloatArray, nuisance: Nuisance
     ) -> None:
         """Take what a fit says for all that is known of coefficients (K,) and nuisance (3,), jointly."""
         self._nuisance = nuisance
         both = np.r_[: self.size, self.states - STATES : self.states]
-        self._x[both] = np.concatenate([coefficients, beside])
+        self._x[both] = np.concatenate([coefficients, nuisances])
         self._P[:] = 0.0
         self._P[np.ix_(both, both)] = covariance
 

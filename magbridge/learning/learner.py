@@ -163,7 +163,7 @@ class Learner:
     def _begin(self) -> None:
         self._restart()
         self.samples = 0
-        self._last_us = self._told_us = 0
+        self._last_us = self._reported_us = 0
         self._where: tuple[float, float] | None = None
         self._before: FloatArray | None = None
 
@@ -269,8 +269,8 @@ class Learner:
         """Say once an hour or more passes without a sample to learn from."""
         if not self._last_us:
             self._last_us = time_us
-        if time_us - self._last_us > SHORT_US and self._told_us != self._last_us:
-            self._told_us = self._last_us
+        if time_us - self._last_us > SHORT_US and self._reported_us != self._last_us:
+            self._reported_us = self._last_us
             self._notify("learning: an hour without a sample to learn from", grave=True)
 
     def _moved(self, time_us: int, where: tuple[float, float]) -> tuple[float, float]:
@@ -310,7 +310,7 @@ class Learner:
         fitted = start.fit(estimator.coefficients, self._nuisance)
         self._noise = msgspec.structs.replace(self._noise, sensor=fitted.noise)
         self._nuisance = Nuisance(self._noise, self._spread)
-        estimator.know(fitted.coefficients, fitted.beside, fitted.covariance, self._nuisance)
+        estimator.know(fitted.coefficients, fitted.nuisances, fitted.covariance, self._nuisance)
         self._publication.judge.restart(self._nuisance)
         if self._publication.learned:
             self._publication.renew(self.learned())

@@ -11,7 +11,7 @@ __all__ = ["Standing"]
 
 SURE: Final = 6.0
 """By which a doubt's log-likelihood ratio has to grow until it is learned what is behind it."""
-RIVAL: Final = 3.0
+COMPETING: Final = 3.0
 """And by which more for each further cause that fits: a bit more evidence often leaves fewer of them, where
 sorting out what was learned of all takes hours."""
 PATIENCE: Final = 128
@@ -76,4 +76,4 @@ class Standing:
         if self.alarm is None:
             return False
         fit = len(self.alarm.channels)
-        return self.alarm.strength > self._sure + RIVAL * (fit - 1) or self._doubted > PATIENCE * fit
+        return self.alarm.strength > self._sure + COMPETING * (fit - 1) or self._doubted > PATIENCE * fit

@@ -76,7 +76,7 @@ class Fitted(NamedTuple):
     Attributes
     ----------
     coefficients : (K,) array
-    beside : (3,) array
+    nuisances : (3,) array
         The nuisance after the last sample.
     covariance : (K + 3, K + 3) array
         Of both.
@@ -85,7 +85,7 @@ class Fitted(NamedTuple):
     """
 
     coefficients: FloatArray
-    beside: FloatArray
+    nuisances: FloatArray
     covariance: FloatArray
     noise: float
 
@@ -127,12 +127,12 @@ class Start:
         """Fit all samples, beginning at `coefficients` (K,)."""
         c, z = coefficients, np.full(self._root.shape[1], np.inf)
         for _ in range(STEPS):
-            r, J, beside, B, Pb = self._whitened(c, nuisance)
+            r, J, nuisances, B, Pb = self._whitened(c, nuisance)
             JL = J @ self._root
             H = np.eye(JL.shape[1]) + JL.T @ JL
             before, z = z, np.asarray(np.linalg.solve(H, -JL.T @ (r + J @ (self._prior - c))))
             step = self._prior + self._root @ z - c
-            c, beside, r = c + step, beside + B @ step, r + J @ step
+            c, nuisances, r = c + step, nuisances + B @ step, r + J @ step
             if float(np.abs(z - before).max()) < SMALL:
                 break
         rms = float(np.sqrt(np.mean(r * r)))
@@ -140,7 +140,7 @@ class Start:
         both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
         covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
         covariance[-STATES:, -STATES:] += Pb
-        return Fitted(c, beside, covariance, noise)
+        return Fitted(c, nuisances, covariance, noise)
 
     def _whitened(
         self, c: FloatArray, nuisance: Nuisance

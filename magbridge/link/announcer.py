@@ -23,19 +23,19 @@ class Announcer:
 
     Attributes
     ----------
-    said : deque of (MAV_SEVERITY, str)
+    texts : deque of (MAV_SEVERITY, str)
         The last texts sent; another thread may take them out and print them.
     """
 
     def __init__(self, outbox: Outbox, timers: Timers) -> None:
         self._outbox, self._timers = outbox, timers
-        self.said: deque[tuple[MAV_SEVERITY, str]] = deque(maxlen=LATELY)
+        self.texts: deque[tuple[MAV_SEVERITY, str]] = deque(maxlen=LATELY)
         self._last: dict[str, tuple[str, int]] = {}
         self._number = 0
 
-    def say(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
+    def send_statustext(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
         """Send `text`, in pieces where it is long; what is not ASCII becomes a question mark."""
-        self.said.append((severity, text))
+        self.texts.append((severity, text))
         data = text.encode("ascii", "replace")
         pieces = [data[i : i + CHUNK] for i in range(0, len(data), CHUNK)]
         if len(pieces) > 1:
@@ -56,20 +56,20 @@ class Announcer:
         self._last.pop(key, None)
 
     def state(
-        self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, again: bool = False
+        self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, recurring: bool = False
     ) -> None:
         """Announce that the state of `key` is now `text`, unless that was announced last.
 
-        An event that may happen `again` is announced again, but not within `PAUSE_US`.
+        A `recurring` event is announced again, but not within `PAUSE_US`.
         """
         now_us = self._outbox.codec.now_us
-        said, when_us = self._last.get(key, ("", now_us - PAUSE_US))
+        texts, when_us = self._last.get(key, ("", now_us - PAUSE_US))
         timer = f"say {key}"
         self._timers.cancel(timer)
-        if said == text and not (again and now_us - when_us >= PAUSE_US):
+        if texts == text and not (recurring and now_us - when_us >= PAUSE_US):
             return
         if now_us - when_us < PAUSE_US:
             self._timers.at(timer, when_us + PAUSE_US, lambda _: self.state(key, text, severity))
             return
         self._last[key] = text, now_us
-        self.say(text, severity)
+        self.send_statustext(text, severity)

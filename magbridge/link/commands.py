@@ -91,7 +91,7 @@ class Commands:
             result = MAV_RESULT.TEMPORARILY_REJECTED
         elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._authority.may_change(message):
             text = f"{message.system}:{message.component} may not set a rate: no station, no autopilot"
-            self._announcer.state("rate", text, MAV_SEVERITY.WARNING, again=True)
+            self._announcer.state("rate", text, MAV_SEVERITY.WARNING, recurring=True)
             result = MAV_RESULT.DENIED
         else:
             result = command(values) if command else self._unsupported(number)
@@ -118,7 +118,7 @@ class Commands:
     def _unsupported(self, number: int) -> MAV_RESULT:
         if number in CALIBRATES:
             text = "this magnetometer is calibrated from its logs: magbridge calibrate"
-            self._announcer.state("calibrate", text, MAV_SEVERITY.NOTICE, again=True)
+            self._announcer.state("calibrate", text, MAV_SEVERITY.NOTICE, recurring=True)
         return MAV_RESULT.UNSUPPORTED
 
     def _only_us(self, number: int, first: float) -> bool:

@@ -21,7 +21,7 @@ from magbridge.link.rates import Rate, period_us
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
-from magbridge.mavlink import REFUSED, Codec, Message, Signing, TapeWriter, spec
+from magbridge.mavlink import REFUSED, Codec, FrameLogWriter, Message, Signing, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 
 __all__ = ["LIMITS", "TIMESYNC_US", "Component", "check_publish"]
@@ -93,7 +93,7 @@ class Component:
     ----------
     outbox : Outbox
         What is to be sent.
-    heard : list of bytes
+    received : list of bytes
         Everything that came, as frames for the log (see `TapeReader`); the bridge empties it.
     genuine : list of bytes
         The signed frames of the last :meth:`receive` that were accepted.
@@ -122,19 +122,21 @@ class Component:
         self._link = link
         self.codec = Codec(link.system, link.component, signing)
         self.codec.now_us = start_us
-        self._tape = TapeWriter(link.system, link.component)
+        self._frame_log = FrameLogWriter(link.system, link.component)
         self.outbox, self.timers = Outbox(self.codec), Timers()
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
         self.genuine: list[bytes] = []
         self._whole = link.shared
-        self._refusals_told = 0
+        self._refusals_reported = 0
         self.announcer = Announcer(self.outbox, self.timers)
         self.vehicle = Vehicle(link.system, link.component, link.autopilot, self.announcer, self.timers)
         self.parameters = Parameters([*rates({**DEFAULTS, **publish}, LIMITS), *tunables])
         for name in self.parameters.restore(kept or {}):
-            self.announcer.say(f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING)
+            self.announcer.send_statustext(
+                f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING
+            )
         if changed := self.parameters.changed():
-            self.announcer.say(f"kept from the link, not as configured: {', '.join(changed)}")
+            self.announcer.send_statustext(f"kept from the link, not as configured: {', '.join(changed)}")
         self.rates = {name: Rate(self.parameters[rate_name(name)]) for name in LIMITS}
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
         self.metadata = metadata.files(self.parameters.table.values(), link.component)
@@ -211,20 +213,20 @@ class Component:
         ours = []
         messages = self.codec.parse(data, whole=self._whole)
         self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
-        self.heard += self._tape.frames(messages, self.codec.pending)
+        self.received += self._frame_log.frames(messages, self.codec.pending)
         for message in messages:
             if not message.known:
                 if message.id == REFUSED:
-                    self._tell_refusals(message)
+                    self._report_refusals(message)
                 continue
             handler = self._handlers.get(message.id)
             if handler:
                 handler(message)
-            if self.vehicle.hear(message, t_us):
+            if self.vehicle.receive(message, t_us):
                 ours.append(message)
         return ours
 
-    def _tell_refusals(self, message: Message) -> None:
+    def _report_refusals(self, message: Message) -> None:
         """Say once for each reason why frames are refused: else their sender would only seem to be away."""
         if message.frame[7:10] == SETUP_SIGNING:
             text = f"key from {message.system}:{message.component} not taken: keys come from a file"
@@ -232,10 +234,10 @@ class Component:
         if self.codec.signing is None:
             return
         refusals = list(self.codec.signing.refusals.items())
-        for why, (system, component) in refusals[self._refusals_told :]:
+        for why, (system, component) in refusals[self._refusals_reported :]:
             text = f"frames of {system}:{component} refused: {why}"
             self.announcer.state(f"refused: {why}", text, MAV_SEVERITY.WARNING)
-        self._refusals_told = len(refusals)
+        self._refusals_reported = len(refusals)
 
     def _begin(self, t_us: int) -> None:
         self.codec.now_us = t_us
@@ -266,7 +268,7 @@ class Component:
         target = message["target_system"], message["target_component"]
         if target == (self._link.system, self._link.component):
             text = "logs are not erased over the link"
-            self.announcer.state("erase", text, MAV_SEVERITY.WARNING, again=True)
+            self.announcer.state("erase", text, MAV_SEVERITY.WARNING, recurring=True)
 
     def _timesync(self, message: Message) -> None:
         now_us = self.codec.now_us

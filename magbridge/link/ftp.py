@@ -109,7 +109,7 @@ class Request(NamedTuple):
         offset: int | None = None, complete: bool = False,
     ) -> bytes:  # fmt: skip
         """Return the payload of a reply, the `ahead`-th to this request."""
-        head = HEADER.pack(
+        header = HEADER.pack(
             (self.sequence + ahead) & 0xFFFF,
             self.session if session is None else session,
             opcode,
@@ -118,7 +118,7 @@ class Request(NamedTuple):
             complete,
             self.offset if offset is None else offset,
         )
-        return (head + data).ljust(HEADER.size + DATA, b"\0")
+        return (header + data).ljust(HEADER.size + DATA, b"\0")
 
 
 class Session:

@@ -26,20 +26,20 @@ class Numbers:
 
     Attributes
     ----------
-    heard, lost : int
+    received, lost : int
         Frames that came, and those that are missing.
     """
 
-    __slots__ = ("_last", "_missing", "heard", "lost")
+    __slots__ = ("_last", "_missing", "lost", "received")
 
     def __init__(self, first: int) -> None:
-        self.heard = self.lost = 0
+        self.received = self.lost = 0
         self._last = first
         self._missing = 0  # bit k: the frame k before the latest has not come
 
     def count(self, number: int) -> None:
         """Count a frame; one that comes late is no longer lost, and a duplicate changes nothing."""
-        self.heard += 1
+        self.received += 1
         ahead = (number - self._last + 128) % 256 - 128
         if -WINDOW < ahead <= 0:
             late = self._missing & 1 << -ahead
@@ -85,13 +85,13 @@ class Losses:
 
     def _look(self, _: int) -> None:
         for component, numbers in self._numbers.items():
-            heard, lost = self._before.get(component, (0, 0))
-            self._before[component] = numbers.heard, numbers.lost
-            heard, lost = numbers.heard - heard, numbers.lost - lost
-            if lost >= LEAST and lost > MANY * (heard + lost):
+            received, lost = self._before.get(component, (0, 0))
+            self._before[component] = numbers.received, numbers.lost
+            received, lost = numbers.received - received, numbers.lost - lost
+            if lost >= LEAST and lost > MANY * (received + lost):
                 # a router keeps back what is for others alone
                 who = f"{self._system}:{component}"
                 text = f"{who}: over {MANY:.0%} of its frames missing, or for others"
                 self._announcer.state(f"losses {component}", text, MAV_SEVERITY.WARNING)
-            elif heard and not lost:
+            elif received and not lost:
                 self._announcer.forget(f"losses {component}")

@@ -14,7 +14,7 @@ __all__ = ["ParameterService"]
 
 PACE_US = 20_000
 """µs between the values of a list: 50 a second, which a slow radio can carry."""
-AGAIN_US = 10_000_000
+REPEAT_US = 10_000_000
 """µs between two lists that nobody asked for."""
 FORGOTTEN_US = 60_000_000
 """µs without a heartbeat after which a station is new again."""
@@ -58,7 +58,7 @@ class ParameterService:
         )
 
     def greet(self, station: tuple[int, int]) -> None:
-        """Send all parameters to a station that is new, and once more `AGAIN_US` later.
+        """Send all parameters to a station that is new, and once more `REPEAT_US` later.
 
         QGroundControl with an autopilot never asks another component for its parameters, and what it is sent
         before it has those of the autopilot it forgets.
@@ -77,7 +77,7 @@ class ParameterService:
         self._unasked -= 1
         if self._unasked:
             self._begin()
-            self._timers.at("parameters unasked", time_us + AGAIN_US, self._list_unasked)
+            self._timers.at("parameters unasked", time_us + REPEAT_US, self._list_unasked)
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
         """Begin to send all parameters, one every `PACE_US`; of a list under way, the rest comes first."""
@@ -129,4 +129,4 @@ class ParameterService:
         self.send(name)
 
     def _refuse(self, name: str, why: str) -> None:
-        self._announcer.state(f"refused {name}", f"{name}: {why}", MAV_SEVERITY.WARNING, again=True)
+        self._announcer.state(f"refused {name}", f"{name}: {why}", MAV_SEVERITY.WARNING, recurring=True)

@@ -54,7 +54,7 @@ def load(path: str | Path) -> Kept:
 
 def save(path: str | Path, kept: Kept) -> None:
     """Write the file, whole or not at all, and sync it to the disk: power may be cut at any moment."""
-    with atomic_path(path) as beside, beside.open("wb") as file:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(msgspec.json.format(msgspec.json.encode(kept), indent=2))
         file.flush()
         os.fsync(file.fileno())

@@ -62,10 +62,10 @@ class Vehicle:
         """Number of frames missing by the autopilot's sequence numbers."""
         return self._losses.of(self.autopilot)
 
-    def hear(self, message: Message, t_us: int) -> bool:
+    def receive(self, message: Message, t_us: int) -> bool:
         """Take note of a message; return whether it is telemetry of our vehicle."""
         if message.system != self.system:
-            self._stranger(message)
+            self._other_sender(message)
             return False
         if message.component == self.component:
             self._announcer.state(
@@ -80,7 +80,7 @@ class Vehicle:
                 self._present(t_us)
         return True
 
-    def _stranger(self, message: Message) -> None:
+    def _other_sender(self, message: Message) -> None:
         """Announce another vehicle on the link; a ground station is not a vehicle."""
         if message.id != HEARTBEAT:
             return
@@ -118,7 +118,9 @@ class Vehicle:
             self.reboots += 1
             self.clock.reset()
             self._stamps.clear()
-            self._announcer.say(f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING)
+            self._announcer.send_statustext(
+                f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING
+            )
         elif self._behind or (self._boot_us and ahead_ms > (t_us - self._boot_us) // 1000 + LEAP_MS):
             self._behind = 0
             self._change(t_us)

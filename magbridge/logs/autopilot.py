@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.logs.compasses import Compass, choose, listed, said
+from magbridge.logs.compasses import Compass, choose, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, same_columns, sliced, uncounted
 from magbridge.logs.order import in_order
 from magbridge.logs.resample import latest
@@ -86,7 +86,7 @@ def pieces(
     """
     dated = [run for run in runs if run.offset is not None]
     chosen = choose(path, [one.compass for one in runs[0].magnetometers], compass)
-    notes = said(chosen, compass)
+    notes = compass_notes(chosen, compass)
     if len(runs) > 1:
         notes.append(f"{len(runs)} boots, each a run of its own")
     counted = dict(attrs)

@@ -36,10 +36,10 @@ COUNT = {"Raw": 0.1 * NT_PER_UNIT["uT"], "Uni": NT_PER_UNIT["uT"]}
 Pieces = Iterator[tuple[xr.Dataset, Sequence[int]]]
 
 
-def reader(head: Sequence[str]) -> Callable[[Path, Iterator[str], int], Pieces] | None:
+def reader(header: Sequence[str]) -> Callable[[Path, Iterator[str], int], Pieces] | None:
     """Return the reader of a capture that begins with these lines; None: it is none that is known."""
-    kinds = [match[1] for line in head if (match := LINE.fullmatch(line.strip()))]
-    if not kinds or len(kinds) < len(head) / 4:
+    kinds = [match[1] for line in header if (match := LINE.fullmatch(line.strip()))]
+    if not kinds or len(kinds) < len(header) / 4:
         return None
     kind = "Uni" if "Uni" in kinds else "Raw"
     return lambda path, lines, rows: _motioncal(path, lines, rows, kind)
@@ -58,8 +58,8 @@ def _motioncal(path: Path, lines: Iterator[str], rows: int, kind: str) -> Pieces
             elif not match and line.strip() and not line.startswith(OTHERS):
                 damaged += 1
 
-    told = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {RATE:g} lines a second"
-    attrs = {"time_reference": "boot", GUESSED: told, HISTORY: f"{path.name} was read with: {told}"}
+    note = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {RATE:g} lines a second"
+    attrs = {"time_reference": "boot", GUESSED: note, HISTORY: f"{path.name} was read with: {note}"}
     found, done = wanted(), 0
     block = list(islice(found, rows))
     if not block:

@@ -143,16 +143,16 @@ def _kind(heading: str, numbers: FloatArray, *, certain: bool) -> tuple[str, str
 def _written(heading: str, texts: Sequence[str], zone: str | None) -> Clock:
     times = pd.Series(list(texts), dtype=object)
     zoned = all(re.search(r"(Z|UTC|GMT|[+-]\d\d:?\d\d)$", text) for text in texts)
-    said = "" if zoned else f"times in {zone}" if zone else "times in UTC"
+    zone_note = "" if zoned else f"times in {zone}" if zone else "times in UTC"
     if pd.to_datetime(times, format="ISO8601", utc=True, errors="coerce").notna().all():
-        return Clock("iso", said)
+        return Clock("iso", zone_note)
     fit = [f"{date} {hour}" for date in DATES for hour in HOURS if _fits(times, f"{date} {hour}")]
     if not fit:
         return Clock("iso")  # each cell will be refused with its row
     if len(fit) > 1 and len({_order(pattern) for pattern in fit}) > 1:
         which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit[:2])
         raise ValueError(f"day or month first? {texts[0]!r} can be both: {which}")
-    return Clock(fit[0], f"{fit[0]}, {said}" if said else fit[0])
+    return Clock(fit[0], f"{fit[0]}, {zone_note}" if zone_note else fit[0])
 
 
 def _order(pattern: str) -> bool:

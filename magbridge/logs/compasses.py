@@ -24,11 +24,11 @@ __all__ = [
     "Compass",
     "by_columns",
     "choose",
+    "compass_notes",
     "compasses_in",
     "compasses_of",
     "listed",
     "rate",
-    "said",
 ]
 
 OTHER = re.compile(r"mag[1-9]\d*_x$")
@@ -124,7 +124,7 @@ def choose(path: Path, found: Sequence[Compass], wanted: str | None) -> list[Com
     return [msgspec.structs.replace(one, chosen=one is best) for one in found]
 
 
-def said(found: Sequence[Compass], wanted: str | None) -> list[str]:
+def compass_notes(found: Sequence[Compass], wanted: str | None) -> list[str]:
     """Return what a user should be told of the choice: that there was one, and what speaks against it."""
     best = next(one for one in found if one.chosen)
     words = []

@@ -32,7 +32,7 @@ __all__ = ["OWN_SCALE", "Flash", "Records", "number_of", "read_binary"]
 Bytes = NDArray[np.uint8]
 
 FMT = 128
-HEAD = 3
+HEADER = 3
 PASS = 1 << 24
 """Bytes in which headers are searched at once."""
 LETTERS = {
@@ -60,7 +60,7 @@ LETTERS = {
 }
 OWN_SCALE = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 """Letters of fields that hold the value times this."""
-LAYOUT = np.dtype([("", "u1", HEAD), *zip(("type", "length", "name", "letters", "columns"),
+LAYOUT = np.dtype([("", "u1", HEADER), *zip(("type", "length", "name", "letters", "columns"),
                                            ("u1", "u1", "S4", "S16", "S64"), strict=True)])  # fmt: skip
 
 
@@ -156,9 +156,9 @@ def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
         name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
         known = all(letter in LETTERS for letter in letters)
         size = (
-            HEAD + sum(np.dtype(LETTERS[letter]).itemsize for letter in letters) if known else one["length"]
+            HEADER + sum(np.dtype(LETTERS[letter]).itemsize for letter in letters) if known else one["length"]
         )
-        if size == one["length"] > HEAD and name.isalnum():
+        if size == one["length"] > HEADER and name.isalnum():
             kinds.append(
                 _Kind(int(start), int(one["type"]), int(size), name, letters, tuple(columns.split(",")))
             )
@@ -229,7 +229,7 @@ def _gather(data: Bytes, at: IndexArray, layout: np.dtype[Any], offset: int = 0)
 
 
 def _decoded(data: Bytes, kind: _Kind, at: IndexArray, wanted: Collection[str]) -> Records:
-    fields, texts, offset = {}, {}, HEAD
+    fields, texts, offset = {}, {}, HEADER
     for name, letter in zip(kind.columns, kind.letters, strict=False):
         layout = np.dtype(LETTERS.get(letter, "V1"))
         if letter not in LETTERS or offset + layout.itemsize > kind.length:

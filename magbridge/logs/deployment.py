@@ -281,7 +281,7 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             else:
                 joined.setdefault(key, value)
     for key in (GUESSED, HISTORY, LOSSES, NOTES):
-        told = [line for attrs in all_attrs for line in str(attrs.get(key, "")).splitlines()]
-        if told:
-            joined[key] = "\n".join(dict.fromkeys(told))
+        joined_lines = [line for attrs in all_attrs for line in str(attrs.get(key, "")).splitlines()]
+        if joined_lines:
+            joined[key] = "\n".join(dict.fromkeys(joined_lines))
     return joined | {"source": ", ".join(sources)}

@@ -62,9 +62,9 @@ def split(heading: str) -> tuple[str, str]:
         return heading.strip(), ""
     if not unit:
         for sign in "/_":
-            head, _, tail = name.rpartition(sign)
-            if head and usual(tail) in NT_PER_UNIT and tail not in {"T", "G"}:
-                return head.strip(), tail
+            header, _, tail = name.rpartition(sign)
+            if header and usual(tail) in NT_PER_UNIT and tail not in {"T", "G"}:
+                return header.strip(), tail
     return name, unit.strip()
 
 

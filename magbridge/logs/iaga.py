@@ -41,7 +41,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     first = next((k for k, line in enumerate(lines) if line.startswith("DATE ")), None)
     if first is None:
         raise FormatError(path, "expected the line DATE TIME DOY ... of IAGA-2002")
-    head = {line[1:24].strip().lower(): line[24:69].strip() for line in lines[:first]}
+    header = {line[1:24].strip().lower(): line[24:69].strip() for line in lines[:first]}
     elements = [name[-1].lower() for name in lines[first].split()[3:7]]
     fields = [line.split() for line in lines[first + 1 :] if line.strip()]
     whole = [parsed for one in fields if (parsed := _row(one, len(elements))) is not None]
@@ -58,11 +58,11 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         columns["total_field"] = total
     for name in ("latitude", "longitude"):
         try:
-            place = float(head.get(f"geodetic {name}") or "nan")
+            place = float(header.get(f"geodetic {name}") or "nan")
         except ValueError:
             raise FormatError(path, "expected a number of degrees", column=f"Geodetic {name}") from None
         columns[name] = np.full(len(time), (place + 180.0) % 360.0 - 180.0 if name == "longitude" else place)
-    attrs = {"observatory": head.get("iaga code", "")}
+    attrs = {"observatory": header.get("iaga code", "")}
     read = deployment(path, time, columns, units, attrs)
     yield from sliced(with_losses(read, {"rows_dropped": len(fields) - len(whole)}), rows)
 

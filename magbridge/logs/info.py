@@ -161,11 +161,11 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
             fitting = [
                 unit for unit, factor in NT_PER_UNIT.items() if EARTHS[0] < length * factor < EARTHS[1]
             ]
-            told = [
+            lines = [
                 f'; in {unit} it would be the Earth\'s: --column mag_x="mag_x [{unit}]" and so on'
                 for unit in fitting[:1]
             ]
-            hints.append(f"the vector's length is {length:.4g} nT (median){''.join(told)}")
+            hints.append(f"the vector's length is {length:.4g} nT (median){''.join(lines)}")
     if log.attrs.get("time_reference") == "boot":
         hints.append("times count from a start that the log does not tell: --date says when it was")
     if "heading" in log and "heading_reference" not in log.attrs:

@@ -22,9 +22,9 @@ from magbridge.logs.headings import aliases, is_unit, split
 from magbridge.logs.makers import declared_by_maker
 from magbridge.logs.mapping import Declared
 
-__all__ = ["BLANKS", "HEAD", "Layout", "cells", "layout_of"]
+__all__ = ["BLANKS", "HEADER", "Layout", "cells", "layout_of"]
 
-HEAD = 200
+HEADER = 200
 """Lines at the start of a file by which its layout is found."""
 ATTRIBUTE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
 COMMENTS = "#", "%", "//"
@@ -254,8 +254,8 @@ def _name(
         if (not headings[k] and not name) or (name and name in final[:k]):
             raise FormatError(path, f"expected a name of its own for column {k + 1}, not {name!r}", row=row)
         unit = declares[k]
-        if name in declared.columns and (told := declared.columns[name].unit) is not None:
-            unit = told
+        if name in declared.columns and (declared_unit := declared.columns[name].unit) is not None:
+            unit = declared_unit
         elif name in declared.columns and not unit and declared.columns[name].heading:
             unit = split(declared.columns[name].heading or "")[1]
         if name == "heading" and "magnetic" in f"{headings[k]} {unit}".lower():

@@ -90,8 +90,8 @@ def declared(column: Sequence[str], file: Path | None) -> Declared:
     WrongUse
         A text without its name.
     """
-    told = _load(file) if file else Declared()
-    return msgspec.structs.replace(told, columns={**told.columns, **dict(map(_named, column))})
+    declaration = _load(file) if file else Declared()
+    return msgspec.structs.replace(declaration, columns={**declaration.columns, **dict(map(_named, column))})
 
 
 def _load(path: Path) -> Declared:
@@ -107,7 +107,7 @@ def _named(text: str) -> tuple[str, Source]:
     return name, Source(heading=heading)
 
 
-def renamed(dataset: xr.Dataset, told: Declared) -> xr.Dataset:
+def renamed(dataset: xr.Dataset, declaration: Declared) -> xr.Dataset:
     """Return a deployment of a format that names its columns itself with the columns as declared.
 
     Raises
@@ -119,16 +119,18 @@ def renamed(dataset: xr.Dataset, told: Declared) -> xr.Dataset:
     from magbridge.logs.deployment import deployment  # noqa: PLC0415
 
     taken: dict[str, Any] = {}
-    for name, source in told.columns.items():
+    for name, source in declaration.columns.items():
         theirs, unit = _column(dataset, name, source)
         require(dataset, [theirs])
         values = source.scale * dataset[theirs].to_numpy() + source.offset
         unit = unit or str(dataset[theirs].attrs.get("units", ""))
         part = deployment(dataset.attrs["source"], dataset["time"].to_numpy(), {name: values}, {name: unit})
         taken[name] = part[name]
-    used = {_column(dataset, name, source)[0] for name, source in told.columns.items()}
-    named = dataset.drop_vars(used - told.columns.keys()).assign(taken)
-    return named.assign_attrs({"heading_reference": told.heading_reference} if told.heading_reference else {})
+    used = {_column(dataset, name, source)[0] for name, source in declaration.columns.items()}
+    named = dataset.drop_vars(used - declaration.columns.keys()).assign(taken)
+    return named.assign_attrs(
+        {"heading_reference": declaration.heading_reference} if declaration.heading_reference else {}
+    )
 
 
 def _column(dataset: xr.Dataset, name: str, source: Source) -> tuple[str, str]:

@@ -106,8 +106,8 @@ def _read(path: Path, reader: Any) -> xr.Dataset:
             if name in values:
                 values[name][k] = value
     seconds, rest = np.divmod(stamps, 10**9)
-    units = {name: said["units"] for name, said in columns.items()}
-    meanings = {name: said["long_name"] for name, said in columns.items()}
+    units = {name: described["units"] for name, described in columns.items()}
+    meanings = {name: described["long_name"] for name, described in columns.items()}
     return deployment(path, seconds + rest * 1e-9, values, units, attrs, meanings)
 
 
@@ -157,23 +157,28 @@ class FileWriter:
         for topic in (RAW, FIELD, FLAGS, VEHICLE, OTHERS):
             names = [name for name in columns if topic_of(name) == topic]
             if names:
-                said = {name: {key: str(columns[name][key]) for key in ("units", "long_name")}
+                described = {name: {key: str(columns[name][key]) for key in ("units", "long_name")}
                         for name in names}  # fmt: skip
                 properties = {
                     name: {**NUMBER, "description": f"{one['units']}, {one['long_name']}"}
-                    for name, one in said.items()
+                    for name, one in described.items()
                 }
                 if topic == FLAGS:
                     properties |= {flag: {"type": "boolean"} for flag in _flags(0)}
                 title = f"{PROFILE}.{topic[1:].title()}"
-                self._register(topic, title, {"timestamp": WHEN, **properties}, names, said)
+                self._register(topic, title, {"timestamp": WHEN, **properties}, names, described)
         if {"latitude", "longitude"} <= columns.keys():
             self._register(POSITION, "foxglove.LocationFix", LOCATION, [], {})
 
     def _register(
-        self, topic: str, title: str, properties: Mapping[str, Any], names: list[str], said: Mapping[str, Any]
+        self,
+        topic: str,
+        title: str,
+        properties: Mapping[str, Any],
+        names: list[str],
+        described: Mapping[str, Any],
     ) -> None:
-        schema = {"title": title, "type": "object", "properties": properties, "columns": said}
+        schema = {"title": title, "type": "object", "properties": properties, "columns": described}
         number = self._writer.register_schema(title, "jsonschema", json.dumps(schema).encode())
         self._topics[topic] = self._writer.register_channel(topic, "json", number), names
 

@@ -117,9 +117,9 @@ def complete(path: Path, metadata: Metadata) -> None:
             _scalar(file, name, str, text, long_name=PLATFORM.get(name, name.replace("_", " ").lower()))
         for name, attributes in PLACES.items():
             term = attributes["vocabulary"]
-            told = {key: value for key, value in attributes.items() if key != "vocabulary"}
+            attached = {key: value for key, value in attributes.items() if key != "vocabulary"}
             vocabulary = f"https://vocab.nerc.ac.uk/collection/OG1/current/{term}/"
-            file[name].setncatts(told | {f"{name.lower()}_vocabulary": vocabulary})
+            file[name].setncatts(attached | {f"{name.lower()}_vocabulary": vocabulary})
         _fixes(file, known)
         _sensor(file, metadata.sensor)
 

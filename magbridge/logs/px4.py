@@ -202,11 +202,11 @@ def _uncalibrated(
     slot = _calibration(device, parameters)
     rotated = slot is not None and parameters.get(f"CAL_MAG{slot}_ROT", 0) > 0
     if slot is not None and not rotated:
-        head = f"CAL_MAG{slot}_"
-        x, y, z = (parameters.get(f"{head}{axis}SCALE", 1.0) or 1.0 for axis in "XYZ")
-        xy, xz, yz = (parameters.get(f"{head}{axis}ODIAG", 0.0) for axis in "XYZ")
+        header = f"CAL_MAG{slot}_"
+        x, y, z = (parameters.get(f"{header}{axis}SCALE", 1.0) or 1.0 for axis in "XYZ")
+        xy, xz, yz = (parameters.get(f"{header}{axis}ODIAG", 0.0) for axis in "XYZ")
         matrix = np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
-        offset = np.array([[parameters.get(f"{head}{axis}OFF", 0.0)] for axis in "XYZ"])
+        offset = np.array([[parameters.get(f"{header}{axis}OFF", 0.0)] for axis in "XYZ"])
         raw = np.linalg.solve(matrix, np.stack([table[axis] for axis in axes])) + offset
         table = {**table, **dict(zip(axes, raw, strict=True))}
     return _magnetometer(number, device, table, axes, parameters, in_use)

@@ -116,7 +116,7 @@ class _Files:
     def __init__(self, paths: Sequence[Path], options: Options) -> None:
         self.paths, self._options = paths, options
         self._bad: dict[Path, FormatError] = {}
-        self._told = 0
+        self._reported = 0
         self._together: dict[int, Iterator[Any]] | None = None
 
     def pieces(self, k: int, rows: int) -> Iterator[xr.Dataset]:
@@ -135,8 +135,8 @@ class _Files:
         """Return a deployment with the files counted and named that were skipped since the last call."""
         from magbridge.logs.deployment import with_losses  # noqa: PLC0415 - xarray is for ashore
 
-        lines = [str(error) for error in self._bad.values()][self._told :]
-        self._told += len(lines)
+        lines = [str(error) for error in self._bad.values()][self._reported :]
+        self._reported += len(lines)
         return with_losses(dataset, {"files_skipped": len(lines)}, lines) if lines else dataset
 
 

@@ -33,7 +33,7 @@ FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd"
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
 LEADS = {**FLIGHT, ".log": ".eng"}
 """Suffix of a file that is read with another of its name, to that of the other."""
-HEAD = 4096
+HEADER = 4096
 """Bytes at the beginning of a file by which it is recognised."""
 
 
@@ -170,11 +170,11 @@ def _recognised(path: Path) -> Format | None:
         return FORMATS["ros"]
     try:
         with path.open("rb") as file:
-            head = file.read(HEAD)
+            header = file.read(HEADER)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
     signed = (one for one in FORMATS.values() if one.signature is not None)
-    return next((one for one in signed if re.match(one.signature or b"", head, re.DOTALL)), None)
+    return next((one for one in signed if re.match(one.signature or b"", header, re.DOTALL)), None)
 
 
 def metadata_path(path: Path) -> Path:

@@ -113,9 +113,9 @@ def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) ->
         for name, column in navigation.data_vars.items()
         if name not in payload
     }  # fmt: skip
-    told = f"{' '.join(taken)} between the samples of {path.name}"
+    note = f"{' '.join(taken)} between the samples of {path.name}"
     remarks = [line for line in named_losses(navigation.attrs) if "heading" in line]
-    return with_losses(payload.assign(taken).assign_attrs({HISTORY: told}), {}, remarks)
+    return with_losses(payload.assign(taken).assign_attrs({HISTORY: note}), {}, remarks)
 
 
 def _read(path: Path) -> xr.Dataset:
@@ -151,8 +151,8 @@ def _table(path: Path) -> tuple[pd.DataFrame, int]:
         text = (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8", "replace")
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise FormatError(path, f"expected a whole gzip file: {error}") from None
-    head, *lines = text.splitlines()
-    names = [name.strip() for name in head.rstrip(";\r").split(";")]
+    header, *lines = text.splitlines()
+    names = [name.strip() for name in header.rstrip(";\r").split(";")]
     fields = [line.rstrip(";\r").split(";", len(names)) for line in lines if line.strip()]
     whole = [one + [""] * (len(names) - len(one)) for one in fields if len(one) <= len(names)]
     if not whole:

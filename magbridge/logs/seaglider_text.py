@@ -43,9 +43,9 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 def _samples(path: Path) -> Dive:
     """Return what the ``.eng`` holds."""
-    head, rows = _split(path)
-    names = re.split(r"[,\s]+", head.get("columns", "").replace(".", "_").strip())
-    start = _start(path, head)
+    header, rows = _split(path)
+    names = re.split(r"[,\s]+", header.get("columns", "").replace(".", "_").strip())
+    start = _start(path, header)
     width = len(names)
     whole = [fields for fields in (line.split() for line in rows) if len(fields) == width]
     try:
@@ -62,8 +62,8 @@ def _samples(path: Path) -> Dive:
 
 def _add_log(known: Dive, path: Path) -> None:
     """Add what the ``.log`` holds: parameters, manoeuvres (s from the start of the dive), fixes."""
-    head, rows = _split(path)
-    start = _start(path, head)
+    header, rows = _split(path)
+    start = _start(path, header)
     names: list[str] = []
     manoeuvres: list[list[float]] = []
     fixes: list[tuple[float, float, float]] = []
@@ -90,14 +90,14 @@ def _split(path: Path) -> tuple[dict[str, str], list[str]]:
     """Return the header of a file, and the lines after it."""
     lines = path.read_text(encoding="ascii", errors="replace").splitlines()
     ends = next((k for k, line in enumerate(lines) if line.lstrip("%").startswith("data:")), len(lines))
-    head = {found[1]: found[2] for line in lines[:ends] if (found := HEADER.match(line))}
-    return head, lines[ends + 1 :]
+    header = {found[1]: found[2] for line in lines[:ends] if (found := HEADER.match(line))}
+    return header, lines[ends + 1 :]
 
 
-def _start(path: Path, head: dict[str, str]) -> float:
+def _start(path: Path, header: dict[str, str]) -> float:
     """Return the s since 1970 of ``start: 02 03 126 19 35 52``, month day year-1900 hour minute second."""
     try:
-        month, day, year, hour, minute, second = (int(part) for part in head["start"].split())
+        month, day, year, hour, minute, second = (int(part) for part in header["start"].split())
         return datetime(1900 + year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
     except (KeyError, ValueError):
         raise FormatError(path, "expected its start, as of a Seaglider's dive", column="start") from None

@@ -37,14 +37,14 @@ class Table:
         What was dropped.
     """
 
-    def __init__(self, path: Path, layout: Layout, head: Sequence[str], *, strict: bool) -> None:
+    def __init__(self, path: Path, layout: Layout, first_lines: Sequence[str], *, strict: bool) -> None:
         self._path, self._layout, self._declared = path, layout, layout.declared
         self.faults = Faults(path, strict=strict)
         if "time" not in layout.names:
             raise FormatError(path, absent("time", layout.headings), row=layout.row, column="time")
         self._time = layout.names.index("time")
         heading, unit = layout.headings[self._time].strip(), layout.units.pop("time", "")
-        first = [cells(line, layout.separator) for line in head[layout.first :] if line.strip()]
+        first = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
         texts = [self._stamp(row) for row in first if max(self._time, layout.date or 0) < len(row)]
         try:
             self._clock = clock_of(heading, unit, texts, self._declared.zone)

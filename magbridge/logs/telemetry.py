@@ -76,9 +76,9 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
         for record in pieces.reader:
             pieces.put(record)
             if len(pieces.rows) > rows:  # the last one still waits for its correction
-                yield by_columns(pieces.take(rows), wanted)
+                yield by_columns(pieces.pop_rows(rows), wanted)
         if pieces.rows:
-            yield by_columns(pieces.take(len(pieces.rows)), wanted)
+            yield by_columns(pieces.pop_rows(len(pieces.rows)), wanted)
 
 
 def _of_compass(path: Path, found: Survey, wanted: str | None) -> tuple[Survey, list[Compass]]:
@@ -109,13 +109,13 @@ class Rows:
             letters: [(self._slot[column], scale, offset) for column, scale, offset in columns]
             for letters, columns in survey.named.items()
         }
-        said = {column for columns in survey.named.values() for column, _, _ in columns}
-        said |= {one.column for one in survey.declared}
+        known = {column for columns in survey.named.values() for column, _, _ in columns}
+        known |= {one.column for one in survey.declared}
         self._tables = {
             number: [
                 (self._slot[value.column], value.get)
                 for value in values
-                if value.column in self._slot and value.column not in said
+                if value.column in self._slot and value.column not in known
             ]
             for number, values in TELEMETRY.items()
         }
@@ -144,7 +144,7 @@ class Rows:
         if message.system != self._survey.system:
             return
         if not (self._survey.ours and record.channel == Channel.SENT):
-            self._take(message, record.time_us)
+            self._receive(message, record.time_us)
         if number == self._source and message.component == self._survey.component:
             columns = self._make(message.payload)
             for one in self._counted:
@@ -155,7 +155,7 @@ class Rows:
         elif number == FIELD and self.rows:
             self._correct(correction(message.payload))
 
-    def _take(self, message: Message, time_us: int) -> None:
+    def _receive(self, message: Message, time_us: int) -> None:
         """Note the telemetry in a message, from the component that each column is taken from."""
         number, payload, component = message.id, message.payload, message.component
         if self._survey.senders.get(number) == component:
@@ -194,7 +194,7 @@ class Rows:
             for name in CORRECTED:
                 row[self._slot[name]] = columns[name]
 
-    def take(self, n: int) -> xr.Dataset:
+    def pop_rows(self, n: int) -> xr.Dataset:
         """Return the first `n` rows; the attributes count the losses since the last call."""
         array, self.rows = np.array(self.rows[:n]), self.rows[n:]
         lost = self.reader.bytes_skipped, self.reader.damages

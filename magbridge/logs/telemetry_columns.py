@@ -14,7 +14,7 @@ import xarray as xr
 from msgspec.structs import replace
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.logs.compasses import Compass, listed, said
+from magbridge.logs.compasses import Compass, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted
 from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import IMUS, TELEMETRY
@@ -64,7 +64,7 @@ def whole(path: Path, survey: Survey, compasses: Sequence[Compass], wanted: str 
         seconds = float(time_us[-1] - time_us[0]) / 1e6
         timed = [replace(one, rate=(one.samples - 1) / seconds if seconds > 0 else 0.0) for one in compasses]
         attrs |= listed(timed)
-        attrs[NOTES] = "\n".join([*noted(survey.attrs), *said(timed, wanted)])
+        attrs[NOTES] = "\n".join([*noted(survey.attrs), *compass_notes(timed, wanted)])
     return deployment(path, time_us / 1e6, columns, units, attrs)
 
 

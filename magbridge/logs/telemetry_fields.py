@@ -113,14 +113,18 @@ class Declared(Value):
         The only sender that counts.
     """
 
-    def __init__(self, said: Message) -> None:
-        super().__init__(said["column"], said["message"], said["field"])
-        self.unit, self.scale, self.offset = said["unit"] or "1", said["scale"], said["offset"]
+    def __init__(self, declaration: Message) -> None:
+        super().__init__(declaration["column"], declaration["message"], declaration["field"])
+        self.unit, self.scale, self.offset = (
+            declaration["unit"] or "1",
+            declaration["scale"],
+            declaration["offset"],
+        )
         self._unknown = ()
-        layout = spec(said["message"])
+        layout = spec(declaration["message"])
         self.message = layout.id
-        self.component: int | None = said["component"] or None
-        self.match = dict(part.split("=", 1) for part in said["match"].split(",") if part)
+        self.component: int | None = declaration["component"] or None
+        self.match = dict(part.split("=", 1) for part in declaration["match"].split(",") if part)
         self._others = [(layout.fields[name], text) for name, text in self.match.items()]
 
     def find(self, payload: bytes) -> float | None:

@@ -62,14 +62,14 @@ class FileWriter:
         if first:
             self._start_us = times[0] if times else 0
             self._declare(dataset)
-        say = [self._attitude] * any(name in columns for name in ATTITUDE)
-        say += [self._position] * any(name in columns for name in POSITION)
-        say += [self._telemetry, self._raw]
-        say += [self._field] * ("total_field" in columns)
+        senders = [self._attitude] * any(name in columns for name in ATTITUDE)
+        senders += [self._position] * any(name in columns for name in POSITION)
+        senders += [self._telemetry, self._raw]
+        senders += [self._field] * ("total_field" in columns)
         values = [_single(name, dataset[name].values).tolist() for name in columns]
         for time_us, *row in zip(times, *values, strict=True):
             named = dict(zip(columns, row, strict=True))
-            for one in say:
+            for one in senders:
                 one(time_us, named)
 
     def close(self) -> None:
@@ -77,7 +77,7 @@ class FileWriter:
         self._file.close()
 
     def _declare(self, dataset: xr.Dataset) -> None:
-        said: list[dict[str, Any]] = [
+        declared: list[dict[str, Any]] = [
             {"column": key, "unit" if isinstance(value, str) else "scale": value}
             for key, value in lasting(dataset.attrs).items()
         ]
@@ -90,12 +90,14 @@ class FileWriter:
             self._named.append((name, short.encode()))
             unit = str(dataset[name].attrs.get("units", "1"))
             if (short, unit) != (name, "1"):
-                said.append({"column": name, "unit": unit, "match": f"name={short}"} | NAMED_VALUE)
-        for one in said:
+                declared.append({"column": name, "unit": unit, "match": f"name={short}"} | NAMED_VALUE)
+        for one in declared:
             frame = self._bridge.pack("MAG_COLUMN", **one)
             self._file.write(pack_record(self._start_us, Channel.STATE, frame))
 
-    def _say(self, time_us: int, channel: Channel, codec: Codec, layout: Spec, *values: Any) -> None:
+    def _write_message(
+        self, time_us: int, channel: Channel, codec: Codec, layout: Spec, *values: Any
+    ) -> None:
         frame = codec.frame(layout, layout.struct.pack(*values))
         self._file.write(pack_record(time_us, channel, frame))
 
@@ -104,7 +106,7 @@ class FileWriter:
 
     def _attitude(self, time_us: int, row: Row) -> None:
         angles = [radians(row.get(name, nan)) for name in ATTITUDE]
-        self._say(
+        self._write_message(
             time_us, Channel.LINK, self._autopilot, ATTITUDE_, self._boot_ms(time_us), *angles, nan, nan, nan
         )
 
@@ -116,19 +118,19 @@ class FileWriter:
         altitude = _integer(-row.get("depth", nan) * 1e3)
         boot_ms = self._boot_ms(time_us)
         fields = boot_ms, latitude, longitude, altitude, altitude, 0, 0, 0, UNKNOWN_HEADING
-        self._say(time_us, Channel.LINK, self._autopilot, POSITION_, *fields)
+        self._write_message(time_us, Channel.LINK, self._autopilot, POSITION_, *fields)
 
     def _telemetry(self, time_us: int, row: Row) -> None:
         boot_ms = self._boot_ms(time_us)
         for name, short in self._named:
-            self._say(time_us, Channel.LINK, self._autopilot, NAMED_, boot_ms, row[name], short)
+            self._write_message(time_us, Channel.LINK, self._autopilot, NAMED_, boot_ms, row[name], short)
 
     def _raw(self, time_us: int, row: Row) -> None:
         x, y, z, temperature, supply, cycle = (row.get(name, nan) for name in SAMPLE)
         delays = [_delay(row.get(name, nan), time_us) for name in CHANNEL_TIMES]
         fields = time_us, 0, x, y, z, 0, 0, 0, *delays, temperature, supply
         power = (int(cycle) & 0xFFFF, 0, POWER_CYCLE) if isfinite(cycle) else (0, 0, 0)
-        self._say(time_us, Channel.SENT, self._bridge, RAW_, *fields, *power)
+        self._write_message(time_us, Channel.SENT, self._bridge, RAW_, *fields, *power)
 
     def _field(self, time_us: int, row: Row) -> None:
         total, sigma, x, y, z, anomaly, quality = (row.get(name, nan) for name in CORRECTED)
@@ -137,7 +139,7 @@ class FileWriter:
         flags = int(Quality.UNCALIBRATED) if isnan(quality) else int(quality)
         self._sequence += 1
         fields = time_us, total, self._sequence, 0, sigma, x, y, z, nan, nan, nan, anomaly, nan, nan, flags, 0
-        self._say(time_us, Channel.SENT, self._bridge, FIELD_, *fields)
+        self._write_message(time_us, Channel.SENT, self._bridge, FIELD_, *fields)
 
 
 def short_name(name: str, taken: Collection[str]) -> str:

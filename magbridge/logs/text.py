@@ -33,7 +33,7 @@ from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
 from magbridge.logs.deployment import GUESSED, HISTORY, deployment, lasting, with_losses
-from magbridge.logs.layout import HEAD, layout_of
+from magbridge.logs.layout import HEADER, layout_of
 from magbridge.logs.options import Options
 from magbridge.logs.registry import metadata_path
 from magbridge.logs.table import Table
@@ -92,18 +92,18 @@ def _chunks(
 ) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the rows, each piece with the numbers of its lines."""
     lines = _lines(file)
-    head = list(islice(lines, HEAD))
-    if reader := captures.reader(head):
-        yield from reader(path, chain(head, lines), rows)
+    header = list(islice(lines, HEADER))
+    if reader := captures.reader(header):
+        yield from reader(path, chain(header, lines), rows)
         return
-    layout = layout_of(path, head, options.declared)
-    table = Table(path, layout, head, strict=options.strict)
+    layout = layout_of(path, header, options.declared)
+    table = Table(path, layout, header, strict=options.strict)
     attrs = {**_attributes(path), **layout.attrs, **table.attrs}
     if guesses := [*guess, *layout.guesses, *table.guesses]:
-        told = "; ".join(guesses)
+        note = "; ".join(guesses)
         before = [str(attrs[HISTORY])] if HISTORY in attrs else []
-        attrs |= {GUESSED: told, HISTORY: "\n".join([*before, f"{path.name} was read with: {told}"])}
-    numbered = enumerate(chain(head[layout.first :], lines), layout.first + 1)
+        attrs |= {GUESSED: note, HISTORY: "\n".join([*before, f"{path.name} was read with: {note}"])}
+    numbered = enumerate(chain(header[layout.first :], lines), layout.first + 1)
     wanted = ((row, line) for row, line in numbered if line.strip() and not line.startswith("#"))
     while block := list(islice(wanted, rows)):
         time, columns, numbers = table.read([line for _, line in block], [row for row, _ in block])
@@ -175,13 +175,13 @@ def _metadata(dataset: xr.Dataset, headings: Sequence[str]) -> bytes:
 
 def _attributes(path: Path) -> dict[str, str | float]:
     """Return what stands beside the file."""
-    beside = metadata_path(path)
-    if not beside.is_file():
+    sidecar = metadata_path(path)
+    if not sidecar.is_file():
         return {}
     try:
-        return msgspec.json.decode(beside.read_bytes(), type=Metadata).notes[0]
+        return msgspec.json.decode(sidecar.read_bytes(), type=Metadata).notes[0]
     except (msgspec.MsgspecError, IndexError):
-        raise FormatError(beside, "expected the metadata of a CSV file, with one note") from None
+        raise FormatError(sidecar, "expected the metadata of a CSV file, with one note") from None
 
 
 def _texts(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[str]:

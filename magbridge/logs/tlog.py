@@ -59,7 +59,7 @@ class TlogWriter:
         MB after which a new file begins.
     max_age : float
         h of the events' time after which a new file begins.
-    head : sequence of bytes
+    header : sequence of bytes
         Frames written to every file after its first record: what a reader needs to read that file alone.
     beginning : sequence of bytes
         Frames at the beginning of the first file after a failure: the record of the run's start.
@@ -82,12 +82,12 @@ class TlogWriter:
         *,
         max_size: float = 64.0,
         max_age: float = 24.0,
-        head: Sequence[bytes] = (),
+        header: Sequence[bytes] = (),
         beginning: Sequence[bytes] = (),
     ) -> None:
         self._directory = Path(directory)
         self._max_size, self._max_age_us = round(max_size * 1e6), round(max_age * 3.6e9)
-        self._head, self.beginning = tuple(head), beginning
+        self._header, self.beginning = tuple(header), beginning
         self.records, self.failure = 0, ""
         # used by the live thread
         self._queue: SimpleQueue[Sequence[Record]] = SimpleQueue()
@@ -200,7 +200,7 @@ class TlogWriter:
         """Write whole records; when that fails, leave none half-written."""
         if not self._size:
             first = 0 if self._torn else 1
-            frames = (*self.beginning, *self._head) if self._torn else self._head
+            frames = (*self.beginning, *self._header) if self._torn else self._header
             declared = [(records[0][0], Channel.STATE, frame) for frame in frames]
             data = pack_records([*records[:first], *declared, *records[first:]])
         rest, time_us = memoryview(data), records[-1][0]

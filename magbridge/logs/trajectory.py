@@ -193,8 +193,8 @@ def _meaning(variable: Any, called: str) -> tuple[str, float]:
 
 def _is_magnetic(column: _Column) -> bool:
     """Tell whether a heading says that it is measured from magnetic north."""
-    said = " ".join(str(column.variable.getncattr(name)) for name in column.variable.ncattrs())
-    return column.name == "heading" and "magnetic" in said.lower()
+    text = " ".join(str(column.variable.getncattr(name)) for name in column.variable.ncattrs())
+    return column.name == "heading" and "magnetic" in text.lower()
 
 
 def _flags(file: Any, name: str) -> Any | None:
@@ -233,8 +233,8 @@ def _bad(flags: Any, rows: slice) -> BoolArray:
         stored = np.array([int(one) if one.isdigit() else 0 for one in stored.astype("U1")])
     codes: Sequence[Any] = BAD_CODES
     if hasattr(flags, "flag_meanings") and hasattr(flags, "flag_values"):
-        said = zip(np.atleast_1d(flags.flag_values), str(flags.flag_meanings).split(), strict=False)
-        codes = [int(value) for value, meaning in said if BAD.search(meaning.lower())]
+        text = zip(np.atleast_1d(flags.flag_values), str(flags.flag_meanings).split(), strict=False)
+        codes = [int(value) for value, meaning in text if BAD.search(meaning.lower())]
     return np.isin(stored, codes)
 
 

@@ -70,8 +70,8 @@ class Writer:
     ) -> None:
         self._stack.__exit__(kind, error, trace)
         if kind is None and (metadata := getattr(self._file, "metadata", b"")):
-            with atomic_path(metadata_path(self._path)) as beside:
-                beside.write_bytes(metadata)
+            with atomic_path(metadata_path(self._path)) as temporary:
+                temporary.write_bytes(metadata)
 
     def append(self, dataset: xr.Dataset) -> None:
         """Write the rows of `dataset`, which begin after the last ones.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from magbridge.mavlink.codec import Codec
+from magbridge.mavlink.frame_log import FrameLogReader, FrameLogWriter
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
 from magbridge.mavlink.secrets import SECRET
 from magbridge.mavlink.signing import Signing, Stream, load_key, readable_by_all
 from magbridge.mavlink.source import Source
-from magbridge.mavlink.tape import TapeReader, TapeWriter
 from magbridge.mavlink.tlog import LogReader, Record, pack_record, pack_records
 
 __all__ = [
@@ -15,6 +15,8 @@ __all__ = [
     "REFUSED",
     "SECRET",
     "Codec",
+    "FrameLogReader",
+    "FrameLogWriter",
     "LogReader",
     "Message",
     "Record",
@@ -22,8 +24,6 @@ __all__ = [
     "Source",
     "Spec",
     "Stream",
-    "TapeReader",
-    "TapeWriter",
     "load_key",
     "pack_record",
     "pack_records",

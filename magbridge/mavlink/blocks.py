@@ -123,14 +123,14 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     start = np.flatnonzero(((magic == V2) | (magic == V1)) & (raw[:n] == 0) & (raw[1 : n + 1] < 0x10))
     window = raw[np.minimum(start[:, None] + np.arange(LAYOUT.itemsize), len(raw) - 1)]
     records = window.view(LAYOUT)[:, 0] if len(start) else np.empty(0, LAYOUT)
-    stamp, head = records["stamp"].astype(np.int64), records["head"].astype(np.int64)
-    two = head[:, 0] == V2
-    flags = np.where(two, head[:, 2], 0)
-    number = np.where(two, head[:, 7] | head[:, 8] << 8 | head[:, 9] << 16, head[:, 5])
-    system, component = np.where(two, head[:, 5], head[:, 3]), np.where(two, head[:, 6], head[:, 4])
+    stamp, header = records["stamp"].astype(np.int64), records["head"].astype(np.int64)
+    two = header[:, 0] == V2
+    flags = np.where(two, header[:, 2], 0)
+    number = np.where(two, header[:, 7] | header[:, 8] << 8 | header[:, 9] << 16, header[:, 5])
+    system, component = np.where(two, header[:, 5], header[:, 3]), np.where(two, header[:, 6], header[:, 4])
     frame = start + 8
     payload = frame + np.where(two, 10, 6)
-    checksum = payload + head[:, 1]
+    checksum = payload + header[:, 1]
     end = checksum + 2 + np.where(flags > 0, SIGNATURE, 0)
     extra = np.where(number < len(KNOWN), KNOWN[np.minimum(number, len(KNOWN) - 1)], -1)
     fits = (flags <= 1) & (end <= len(raw)) & (stamp < LATEST)
@@ -143,7 +143,7 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
         raw[checksum[known]].astype(np.int64) | raw[checksum[known] + 1].astype(np.int64) << 8
     )
     # outside the dialect: believed where another follows
-    unknown = np.flatnonzero(fits & (extra < 0) & two & (head[:, 3] == 0) & (number <= LAST))
+    unknown = np.flatnonzero(fits & (extra < 0) & two & (header[:, 3] == 0) & (number <= LAST))
     after = end[unknown] + 8
     follows = np.isin(raw[np.minimum(after, len(raw) - 1)], (V1, V2)) & (after < len(raw))
     good[unknown] = follows | (after >= len(raw))

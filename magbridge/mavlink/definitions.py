@@ -61,11 +61,14 @@ def write_definitions(folder: Path) -> list[Path]:
     written = []
     for name in DIALECTS:
         module = (folder / name).with_suffix(".py")
-        said = StringIO()
-        with redirect_stdout(said), redirect_stderr(said):  # mavgen tells of every file that it looks at
+        reported = StringIO()
+        with (
+            redirect_stdout(reported),
+            redirect_stderr(reported),
+        ):  # mavgen tells of every file that it looks at
             options = mavgen.Opts(str(module), wire_protocol="2.0", language="Python3", validate=False)
             done = mavgen.mavgen(options, [str(folder / name)])
         if not done or not module.exists():
-            raise DataError(f"mavgen made no {module.name}: {said.getvalue().strip()}")
+            raise DataError(f"mavgen made no {module.name}: {reported.getvalue().strip()}")
         written += [folder / name, module]
     return written

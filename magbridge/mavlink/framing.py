@@ -88,16 +88,16 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
         The end, or `NOT_A_FRAME`, or `MORE` where it cannot be told without the bytes from `stop` on.
     """
     available = stop - start
-    head = 10 if data[start] == V2 else 6
-    flags = data[start + 2] if head == 10 and available > 2 else 0
+    header = 10 if data[start] == V2 else 6
+    flags = data[start + 2] if header == 10 and available > 2 else 0
     # an incompatibility flag that we do not know: by the standard, not to be read
-    if flags > SIGNED or available < head:
+    if flags > SIGNED or available < header:
         return NOT_A_FRAME if flags > SIGNED else MORE
-    number = data[start + 5] if head == 6 else _number(data, start)
+    number = data[start + 5] if header == 6 else _number(data, start)
     extra = EXTRA.get(number)
-    if extra is None and (head == 6 or data[start + 3] or number > LAST):
+    if extra is None and (header == 6 or data[start + 3] or number > LAST):
         return NOT_A_FRAME
-    checksum = start + head + data[start + 1]
+    checksum = start + header + data[start + 1]
     end = checksum + 2 + (SIGNATURE if flags else 0)
     if end > stop:
         return MORE
@@ -111,14 +111,14 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
 
 def message(frame: bytes) -> Message:
     """Take apart a frame that :func:`frame_end` has accepted."""
-    head = 10 if frame[0] == V2 else 6
-    number = frame[5] if head == 6 else _number(frame, 0)
-    payload = frame[head : head + frame[1]]
+    header = 10 if frame[0] == V2 else 6
+    number = frame[5] if header == 6 else _number(frame, 0)
+    payload = frame[header : header + frame[1]]
     known = number in EXTRA
     if known:
         payload = payload.ljust(spec(number).size, b"\0")
     # the sequence, the sender's system and its component stand before the message's id
-    sender = 4 if head == 10 else 2
+    sender = 4 if header == 10 else 2
     return Message(number, frame[sender + 1], frame[sender + 2], frame[sender], payload, frame, known)
 
 

@@ -26,11 +26,11 @@ V2 = 0xFD
 
 def without_secret(frame: bytes) -> bytes:
     """Return a frame of such a message with zeros for its payload, and the checksum that belongs to it."""
-    head = 10 if frame[0] == V2 else 6
-    number = int.from_bytes(frame[7:10], "little") if head == 10 else frame[5]
-    body = frame[1:head] + bytes(frame[1])
+    header = 10 if frame[0] == V2 else 6
+    number = int.from_bytes(frame[7:10], "little") if header == 10 else frame[5]
+    body = frame[1:header] + bytes(frame[1])
     checksum = mcrf4xx(body + bytes((spec(number).extra,)))
-    end = head + frame[1]
+    end = header + frame[1]
     return frame[:1] + body + checksum.to_bytes(2, "little") + frame[end + 2 :]
 
 

@@ -26,12 +26,12 @@ class Source:
         Where the last value came from.
     """
 
-    __slots__ = ("_autopilot", "_heard_us", "_patience_us", "component", "wanted")
+    __slots__ = ("_autopilot", "_patience_us", "_received_us", "component", "wanted")
 
     def __init__(self, autopilot: int, patience_us: int, wanted: int | None = None) -> None:
         self._autopilot, self._patience_us, self.wanted = autopilot, patience_us, wanted
         self.component: int | None = None
-        self._heard_us = 0
+        self._received_us = 0
 
     def admit(self, component: int, time_us: int) -> bool:
         """Say whether a value counts that came from `component` at `time_us` (µs)."""
@@ -42,9 +42,9 @@ class Source:
             elif (
                 self.component is not None
                 and component != self._autopilot
-                and time_us - self._heard_us <= self._patience_us
+                and time_us - self._received_us <= self._patience_us
             ):
                 return False
             self.component = component
-        self._heard_us = time_us
+        self._received_us = time_us
         return True

@@ -52,7 +52,7 @@ def bundle(state: State, now: float, link: str) -> bytes:
         "about.json": json.dumps(about, indent=1, ensure_ascii=False),
         "texts.csv": _table(
             ["time", "severity", "text"],
-            [[_utc(wall + said.time), said.severity, said.text] for said in state.texts],
+            [[_utc(wall + received.time), received.severity, received.text] for received in state.texts],
         ),
         "alarms.csv": _table(
             ["since", "last", "active", "acknowledged", "count", "alarm"],

@@ -33,7 +33,7 @@ class Fleet:
         self.states: dict[tuple[int, int], State] = {}
         self._beat = self._checked = -inf
 
-    def hear(self, message: Message, now: float) -> None:
+    def receive(self, message: Message, now: float) -> None:
         """Take a message that came at `now`, s of a clock that nobody sets."""
         if not message.known:
             return
@@ -41,7 +41,7 @@ class Fleet:
         if sender not in self.states and message.id in BRIDGES and self._room(now):
             self.states[sender] = State(sender, message.sequence - 1)
         if sender in self.states:
-            self.states[sender].hear(message, now)
+            self.states[sender].receive(message, now)
             return
         for state in self.states.values():
             if state.bridge is not None and state.bridge[0] == message.system:
@@ -51,8 +51,8 @@ class Fleet:
         """Make room for one more bridge; False where all that are known still speak."""
         if len(self.states) < MOST:
             return True
-        silent, state = min(self.states.items(), key=lambda item: item[1].heard)
-        if now - state.heard <= AWAY:
+        silent, state = min(self.states.items(), key=lambda item: item[1].received_at)
+        if now - state.received_at <= AWAY:
             return False
         del self.states[silent]
         return True

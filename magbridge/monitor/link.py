@@ -68,11 +68,11 @@ class StationLink:
     def _turn(self) -> None:
         ready, _, _ = select.select(self.port.fds(), [], [], 0.1)
         self._codec.now_us = time.time_ns() // 1000
-        heard = self._codec.parse(self.port.read()) if ready else []
+        messages = self._codec.parse(self.port.read()) if ready else []
         moment = now()
         with self.lock:
-            for message in heard:
-                self.fleet.hear(message, moment)
+            for message in messages:
+                self.fleet.receive(message, moment)
             requests = self.fleet.due(moment)
         for name, fields in requests:
             self.port.write(self._codec.pack(name, **fields))

@@ -101,7 +101,7 @@ class Page:
             self._choose(next(iter(states)))
         self._offer(list(states))
         state, moment = self._state, now()
-        self._tell_stream(state, moment)
+        self._show_stream(state, moment)
         for panel in (
             self._figures,
             self._flags,
@@ -143,7 +143,7 @@ class Page:
             self._choose(bridge)
             self._show()
 
-    def _tell_stream(self, state: State, moment: float) -> None:
+    def _show_stream(self, state: State, moment: float) -> None:
         quiet = silence(state, moment)
         if quiet and self._station.refused:
             quiet += f"; frames refused for their signature: {self._station.refused}"

@@ -135,11 +135,14 @@ class Texts:
         with self._box:
             if not state.texts:
                 nothing()
-            for said in state.texts:
-                bad, warned = said.severity <= MAV_SEVERITY.ERROR, said.severity == MAV_SEVERITY.WARNING
+            for received in state.texts:
+                bad, warned = (
+                    received.severity <= MAV_SEVERITY.ERROR,
+                    received.severity == MAV_SEVERITY.WARNING,
+                )
                 with ui.row().classes("gap-3 flex-nowrap text-sm"):
-                    ui.label(clock(said.time)).classes(f"{MUTED} tabular-nums")
-                    ui.label(said.text).style(f"color: {RED if bad else AMBER if warned else INK}")
+                    ui.label(clock(received.time)).classes(f"{MUTED} tabular-nums")
+                    ui.label(received.text).style(f"color: {RED if bad else AMBER if warned else INK}")
 
 
 class Parameters:

@@ -67,7 +67,7 @@ class State:
     ----------
     began : float
         When its first message came; inf before.
-    heard, sampled, reported, navigated : float
+    received_at, sampled, reported, navigated : float
         When its last message, MAG_FIELD, MAG_STATUS and MAG_NAVIGATION came; -inf before the first.
     interval, report_interval : float
         s between its last two MAG_FIELDs, and MAG_STATUSes; 0 before the second.
@@ -95,7 +95,7 @@ class State:
     def __init__(self, bridge: tuple[int, int] | None = None, sequence: int = -1) -> None:
         self.bridge = bridge
         self.began = inf
-        self.heard = self.sampled = self.reported = self.navigated = -inf
+        self.received_at = self.sampled = self.reported = self.navigated = -inf
         self.interval = self.report_interval = 0.0
         self.received = self.lost = 0
         self.field: dict[str, Any] = {}
@@ -134,11 +134,11 @@ class State:
             }.items()
         }
 
-    def hear(self, message: Message, now: float) -> None:
+    def receive(self, message: Message, now: float) -> None:
         """Take a message of the bridge that came at `now`."""
         gap = (message.sequence - self._sequence - 1) % 256
         self.lost += gap if gap < 128 else 0  # a larger step is a message that comes late
-        self._sequence, self.heard = message.sequence, now
+        self._sequence, self.received_at = message.sequence, now
         self.began = min(self.began, now)
         self.received += 1
         if handle := self._handlers.get(message.id):
@@ -230,15 +230,15 @@ class State:
 
     def _text(self, message: Message, now: float) -> None:
         number, piece = message["id"], message["chunk_seq"]
-        said = Text(now, message["severity"], message["text"])
+        statustext = Text(now, message["severity"], message["text"])
         if piece and self._piece == (number, piece - 1):
-            said = said._replace(text=self.texts.popleft().text + said.text)
+            statustext = statustext._replace(text=self.texts.popleft().text + statustext.text)
         self._piece = number, piece
-        self.texts.appendleft(said)
-        if said.severity <= MAV_SEVERITY.ERROR:
-            self.alarms.announce(f"text: {said.text}", said.text, now)
-        name, _, reason = said.text.partition(": ")
-        if name in self.parameters and said.severity <= MAV_SEVERITY.WARNING:
+        self.texts.appendleft(statustext)
+        if statustext.severity <= MAV_SEVERITY.ERROR:
+            self.alarms.announce(f"text: {statustext.text}", statustext.text, now)
+        name, _, reason = statustext.text.partition(": ")
+        if name in self.parameters and statustext.severity <= MAV_SEVERITY.WARNING:
             self.parameters[name].error = reason
 
     def _value(self, message: Message, now: float) -> None:

@@ -61,8 +61,8 @@ def ago(seconds: float) -> str:
 
 def silence(state: State, now: float) -> str:
     """Return what is wrong with the stream; an empty text while messages, field and status come."""
-    if _late(state.heard, 0.0, now):
-        return _unheard("nothing", state.heard, now)
+    if _late(state.received_at, 0.0, now):
+        return _unheard("nothing", state.received_at, now)
     missing = []
     if _late(state.sampled, state.interval, now):
         missing.append(_unheard("no field", state.sampled, now))

@@ -185,7 +185,7 @@ class Bank:
         """Drop hypotheses of negligible weight, split wide ones, now and then merge those at one place."""
         keep = self.w > FADED * self.w.max()
         if not keep.all():
-            self._take(keep)
+            self._select(keep)
         while len(self) > MOST:  # coarsen the resolution; dropping any could lose the true place
             self.resolution *= COARSER
             self._merge()
@@ -198,7 +198,7 @@ class Bank:
         if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MOST:
             self._split(wide)
 
-    def _take(self, keep: BoolArray) -> None:
+    def _select(self, keep: BoolArray) -> None:
         w = self.w[keep]
         self.w, self.x, self.P = w / w.sum(), self.x[:, keep], self.P[:, :, keep]
 

@@ -225,5 +225,5 @@ def _plain(axis: Axes) -> None:
 
 
 def _save(figure: Figure, path: str | Path) -> None:
-    with atomic_path(path) as beside:
-        figure.savefig(beside, dpi=110)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)

@@ -53,8 +53,8 @@ class Estimate:
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     valid : bool
         The position can be used: the map has described the field at odds of ``options.doubt``; the
-        filter began as wide as its rivals do, or they have since come to the same place; and nothing speaks
-        against it now.
+        filter began as wide as competing filters do, or they have since come to the same place; and nothing
+        speaks against it now.
     moved : tuple of ndarray
         F and Q of the last prediction, for a smoother.
     jumps : list of Jump
@@ -77,7 +77,7 @@ class Estimate:
         self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
         self._lost = False
         self._searches = 0
-        self._confirmed = False  # rivals that began wider have come to the same place
+        self._confirmed = False  # competing filters that began wider have come to the same place
         self._described = False  # the map has described the field
 
     @property
@@ -203,7 +203,7 @@ class Estimate:
         self._monitor, self._confirmed = None, False
 
     def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
-        """Compare the filter with its rivals, and replace it if one of them has won."""
+        """Compare the filter with competing ones, and replace it if one of them has won."""
         assert self._filter is not None
         unmapped = self._unmapped.update(block, seconds, metres, self._filter.curvature_variance)
         self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
@@ -248,7 +248,7 @@ class Estimate:
         return width <= max(SPLIT * self._resolution, 0.25 * self.grid.correlation_length)
 
     def _reach(self) -> float:
-        """Return the 1-sigma (m) of the places around the filter that its rivals start from."""
+        """Return the 1-sigma (m) of the places around the filter that competing filters start from."""
         length = self.grid.correlation_length * (0.5 if self._confirmed else 1.0)
         return max(REACH, widest(self._alone), min(length, 5.0 * REACH))
 

@@ -100,7 +100,7 @@ def _sigma(result: xr.Dataset, rows: BoolArray) -> float:
 
 def _jumps(jumps: Sequence[Jump], start: float) -> list[str]:
     hours = [(jump.time_us * 1e-6 - start) / 3600.0 for jump in jumps]
-    said = []
+    sentences = []
     for hour, jump in zip(hours, jumps[:LISTED], strict=False):
         far = hypot(jump.north, jump.east)
         moved = f"moved {far:.0f} m ({_compass(jump.north, jump.east)})" if far >= 0.5 else "restarted there"
@@ -110,11 +110,11 @@ def _jumps(jumps: Sequence[Jump], start: float) -> list[str]:
                 f", {far / jump.allowed:.0f} times what dead reckoning allows:"
                 " the start or the map is in the wrong place (datum?)"
             )
-        said.append(sentence)
+        sentences.append(sentence)
     if (others := len(jumps) - LISTED) > 0:
         times = "once more" if others == 1 else f"another {others} times, the last time"
-        said.append(f"moved {times} after {hours[-1]:.1f} h")
-    return said
+        sentences.append(f"moved {times} after {hours[-1]:.1f} h")
+    return sentences
 
 
 def _level(result: xr.Dataset, options: Options) -> list[str]:
@@ -126,11 +126,11 @@ def _level(result: xr.Dataset, options: Options) -> list[str]:
     bias, sigma = float(last["bias"].mean()), float(last["bias_sigma"].mean())
     if abs(bias) < LEVEL * max(options.bias_sigma, sigma):
         return []
-    said = (
+    sentences = (
         f"the measured level differs from the map's by {bias:+.0f} nT, where the calibration allows"
         f" {options.bias_sigma:.1f} nT: the map's main field may be of another epoch, or at another altitude"
     )
-    return [said]
+    return [sentences]
 
 
 class _Shift(NamedTuple):

@@ -30,7 +30,7 @@ AGREES = 9.0
 ELSEWHERE = 16.0
 """Squared distance in sigmas beyond which they are not."""
 PATIENCE_US = 45_000_000
-"""µs over which blocks are averaged to one measurement of the rivals."""
+"""µs over which blocks are averaged to one measurement of the competing filters."""
 STRIDES = 3.0
 """Distance over that which a block covers: they are averaged after it, if that comes sooner."""
 

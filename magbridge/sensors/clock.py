@@ -124,7 +124,7 @@ class DeviceClock:
         return stamps
 
     def update(
-        self, device_time: float, arrival_us: int, sequence: int | None = None, tells: bool = True
+        self, device_time: float, arrival_us: int, sequence: int | None = None, informative: bool = True
     ) -> Stamp:
         """Return when a reading was taken.
 
@@ -136,7 +136,7 @@ class DeviceClock:
             µs on the host's clock.
         sequence : int or None
             The instrument's count of readings.
-        tells : bool
+        informative : bool
             Whether the relation between the clocks is learned from this reading; False for one that only
             waited for a later one.
         """
@@ -150,9 +150,9 @@ class DeviceClock:
         elif timed:
             if sequence is None and self._period:  # a nominal rate but no number
                 missing = max(round((device_time - self._device_time) / self._period) - 1, 0)
-            time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, tells)
+            time_us, restarted, stepped = self._by_time(device_time, arrival_us, self._origin_us, informative)
         elif self._period:
-            time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, tells)
+            time_us, stepped, unseen = self._by_count(arrival_us, self._origin_us, missing, informative)
             missing += unseen
         else:
             time_us = float(arrival_us)
@@ -197,7 +197,7 @@ class DeviceClock:
         self._floor.restart(0.0, 0.0)
 
     def _by_time(
-        self, device_time: float, arrival_us: int, origin_us: int, tells: bool
+        self, device_time: float, arrival_us: int, origin_us: int, informative: bool
     ) -> tuple[float, bool, bool]:
         """Return the host time (µs), and whether the instrument was restarted, or a clock set."""
         step = device_time - self._device_time
@@ -215,13 +215,13 @@ class DeviceClock:
         if restarted or step < 0.0 or above < -tolerance:
             self._begin(device_time, arrival_us)
             return float(arrival_us), restarted, not restarted
-        late = floor.add(x, y, above, tolerance) if tells else 0.0
+        late = floor.add(x, y, above, tolerance) if informative else 0.0
         if late:
             floor.restart(*floor.lowest)
         return origin_us + 1e6 * x + floor.at(x), False, late > 0.0
 
     def _by_count(
-        self, arrival_us: int, origin_us: int, missing: int, tells: bool
+        self, arrival_us: int, origin_us: int, missing: int, informative: bool
     ) -> tuple[float, bool, int]:
         """Return the host time (µs), whether it stepped back, and how many more readings are missing."""
         floor, period_us = self._floor, 1e6 * self._period
@@ -231,7 +231,7 @@ class DeviceClock:
         above = y - floor.at(x)
         limit = max(HALF * period_us, TOLERANCE)
         if -limit <= above <= limit + 10.0 * floor.delay:
-            above = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter) if tells else 0.0
+            above = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter) if informative else 0.0
         beats = round(above / period_us)
         if beats:
             self._count += beats

@@ -10,7 +10,7 @@ import msgspec
 from magbridge.plugins import plugins
 from magbridge.sensors import DRIVERS, driver_class
 
-__all__ = ["Option", "attributes_of", "driver_names", "options_of", "told_of"]
+__all__ = ["Option", "attributes_of", "documented_of", "driver_names", "options_of"]
 
 
 class Option(NamedTuple):
@@ -55,15 +55,15 @@ def options_of(driver: str) -> list[Option]:
 
 def attributes_of(struct: Any) -> list[Option]:
     """Return the fields of a msgspec struct with what its docstring tells of each."""
-    told = _attributes(struct.__doc__ or "")
+    documented = _attributes(struct.__doc__ or "")
     return [
         Option(name, kind, _default(field), meaning)
         for field in msgspec.structs.fields(struct)
-        for name, (kind, meaning) in [(field.name, told.get(field.name, ("", "")))]
+        for name, (kind, meaning) in [(field.name, documented.get(field.name, ("", "")))]
     ]
 
 
-def told_of(struct: Any) -> str:
+def documented_of(struct: Any) -> str:
     """Return a struct's docstring up to its attributes, as one paragraph."""
     return " ".join((struct.__doc__ or "").partition("Attributes\n")[0].split())
 

@@ -50,24 +50,24 @@ FORMATS = {
 """Data type: format character. The high nibble of a type is its size in bytes (24 bits have no character)."""
 
 HEADER = Struct("<BBH")
-RPC_HEAD = Struct("<HH")
+RPC_HEADER = Struct("<HH")
 FLOAT = Struct("<f")
-TIMEBASE_HEAD = Struct("<HBBQIIIf")
+TIMEBASE_HEADER = Struct("<HBBQIIIf")
 """Number, source, epoch, start, numerator and denominator of the period in µs, flags, stability."""
-SOURCE_HEAD = Struct("<HHIIiHHB")
+SOURCE_HEADER = Struct("<HHIIiHHB")
 """Number, timebase, period, offset, format, flags, channels, type; then name, columns, title,
 unit by tabs."""
-STREAM_HEAD = Struct("<HHIIQHH")
+STREAM_HEADER = Struct("<HHIIQHH")
 """Number, timebase, period in its ticks, offset, sample number, components, flags."""
 COMPONENT = Struct("<HHII")
 """Source, flags, period, offset."""
-DEVICE_HEAD = Struct("<BBIBBB")
+DEVICE_HEADER = Struct("<BBIBBB")
 """Length, length of the name, session, lengths of two strings, streams."""
-STREAM_RECORD_HEAD = Struct("<BBBBHHB")
+STREAM_RECORD_HEADER = Struct("<BBBBHHB")
 """Length, stream, columns, segments, bytes of a sample, samples kept, length of the name."""
-SEGMENT_HEAD = Struct("<BBBBBBIIIIfB")
+SEGMENT_HEADER = Struct("<BBBBBBIIIIfB")
 """Length, stream, segment, flags, epoch, length of a string, session, start, rate, decimation, filter (2)."""
-COLUMN_HEAD = Struct("<BBBBBBB")
+COLUMN_HEADER = Struct("<BBBBBBB")
 """Length, stream, index, type, lengths of name, unit and description."""
 
 
@@ -119,19 +119,19 @@ def pack(kind: int, payload: bytes, routing: bytes = b"") -> bytes:
 
 def request(number: int, method: str, routing: bytes = b"") -> bytes:
     """Return a remote procedure call without arguments."""
-    return pack(RPC_REQUEST, RPC_HEAD.pack(number, 0x8000 | len(method)) + method.encode(), routing)
+    return pack(RPC_REQUEST, RPC_HEADER.pack(number, 0x8000 | len(method)) + method.encode(), routing)
 
 
 def timebase(payload: bytes) -> tuple[int, float]:
     """Read a timebase: its number and its period in s."""
-    number, _, _, _, numerator, denominator, _, _ = TIMEBASE_HEAD.unpack_from(payload)
+    number, _, _, _, numerator, denominator, _, _ = TIMEBASE_HEADER.unpack_from(payload)
     return number, 1e-6 * numerator / (denominator or 1)
 
 
 def source(payload: bytes) -> tuple[int, tuple[Column, ...]]:
     """Read a source: its number and its columns, named ``source.column``."""
-    number, _, _, _, _, _, channels, kind = SOURCE_HEAD.unpack_from(payload)
-    texts = [*payload[SOURCE_HEAD.size :].decode("utf-8", "replace").split("\t"), "", "", ""]
+    number, _, _, _, _, _, channels, kind = SOURCE_HEADER.unpack_from(payload)
+    texts = [*payload[SOURCE_HEADER.size :].decode("utf-8", "replace").split("\t"), "", "", ""]
     name, unit, names = texts[0], texts[3], texts[1].split(",")
     if channels == 1 or len(names) != channels:
         return number, (Column(name, unit, kind),) * min(channels, 128)
@@ -140,26 +140,26 @@ def source(payload: bytes) -> tuple[int, tuple[Column, ...]]:
 
 def stream(payload: bytes) -> tuple[int, Stream]:
     """Read a stream of generation 1."""
-    number, timebase, period, _, _, count, _ = STREAM_HEAD.unpack_from(payload)
-    parts = [COMPONENT.unpack_from(payload, STREAM_HEAD.size + COMPONENT.size * k)[0] for k in range(count)]
+    number, timebase, period, _, _, count, _ = STREAM_HEADER.unpack_from(payload)
+    parts = [COMPONENT.unpack_from(payload, STREAM_HEADER.size + COMPONENT.size * k)[0] for k in range(count)]
     return number, Stream(tuple(parts), timebase, period)
 
 
 def stream_record(record: bytes) -> tuple[int, Stream]:
     """Read a stream of generation 2."""
-    _, number, columns, _, _, _, _ = STREAM_RECORD_HEAD.unpack_from(record)
+    _, number, columns, _, _, _, _ = STREAM_RECORD_HEADER.unpack_from(record)
     return number, Stream(tuple(range(columns)))
 
 
 def segment(record: bytes) -> tuple[tuple[int, int], Segment]:
     """Read a segment: the numbers of its stream and of itself, and its times."""
-    head = SEGMENT_HEAD.unpack_from(record)
-    return (head[1], head[2]), Segment(head[7], head[8] or 1, head[9] or 1)
+    header = SEGMENT_HEADER.unpack_from(record)
+    return (header[1], header[2]), Segment(header[7], header[8] or 1, header[9] or 1)
 
 
 def column(record: bytes) -> tuple[tuple[int, int], Column]:
     """Read a column: the numbers of its stream and of itself, and its description."""
-    size, number, index, kind, name, unit, _ = COLUMN_HEAD.unpack_from(record)
+    size, number, index, kind, name, unit, _ = COLUMN_HEADER.unpack_from(record)
     text = record[size:]
     words = text[:name].decode("utf-8", "replace"), text[name : name + unit].decode("utf-8", "replace")
     return (number, index), Column(*words, kind)

@@ -58,8 +58,8 @@ def draw_survey(
     _map(figure, axes[0, 1], grid, grid.sigma, "1-sigma of the map (nT)", "viridis", (0.0, top))
     _residuals(axes[1, 0], residual)
     _crossings(figure, axes[1, 1], samples, found, misties, (longitude[step], latitude[step]))
-    with atomic_path(path) as beside:
-        figure.savefig(beside, format=path.suffix[1:].lower(), dpi=150)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=150)
 
 
 def _map(

@@ -48,17 +48,17 @@ def write_geotiff(grid: AnomalyGrid, path: Path) -> None:
     ):
         tags.tagtype[tag] = kind
         tags[tag] = value
-    with atomic_path(path) as beside:
+    with atomic_path(path) as temporary:
         image = Image.fromarray(np.ascontiguousarray(grid.anomaly[::-1], np.float32))
-        image.save(beside, format="TIFF", tiffinfo=tags)
+        image.save(temporary, format="TIFF", tiffinfo=tags)
 
 
 def write_tracks(samples: Samples, path: Path) -> None:
     """Write every line's track, as GeoJSON or, where the suffix is .kml, as KML."""
     tracks = {f"{label}": _track(samples, label) for label in np.unique(samples.line).tolist()}
-    with atomic_path(path) as beside:
+    with atomic_path(path) as temporary:
         if path.suffix.lower() == ".kml":
-            beside.write_text(_kml(tracks), encoding="utf-8")
+            temporary.write_text(_kml(tracks), encoding="utf-8")
             return
         features = [
             {
@@ -69,7 +69,7 @@ def write_tracks(samples: Samples, path: Path) -> None:
             for label, track in tracks.items()
         ]
         content = {"type": "FeatureCollection", "features": features}
-        beside.write_text(json.dumps(content), encoding="utf-8")
+        temporary.write_text(json.dumps(content), encoding="utf-8")
 
 
 def write_crossovers(
@@ -98,7 +98,7 @@ def write_points(
 
 
 def _write_csv(path: Path, heads: list[str], columns: Sequence[FloatArray | IndexArray]) -> None:
-    with atomic_path(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(heads)
         writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
@@ -119,5 +119,5 @@ def _kml(tracks: dict[str, FloatArray]) -> str:
         + "</coordinates></LineString></Placemark>"
         for label, track in tracks.items()
     )
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
-    return f"{head}\n{marks}\n</Document></kml>\n"
+    header = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    return f"{header}\n{marks}\n</Document></kml>\n"

@@ -44,10 +44,10 @@ class TwinleafEncoder(Encoder):
         if self.options.temperature:
             values.append(reading.temperature)
         if self.generation == 1:
-            head = (number % wire.WRAP_1).to_bytes(4, "little")
+            header = (number % wire.WRAP_1).to_bytes(4, "little")
         else:
-            head = (number % wire.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
-        samples = head + b"".join(tio.FLOAT.pack(value) for value in values)
+            header = (number % wire.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
+        samples = header + b"".join(tio.FLOAT.pack(value) for value in values)
         packet = self._slip(tio.SAMPLES + STREAM[self.generation], samples)
         if self._described:
             return packet
@@ -65,7 +65,7 @@ class TwinleafEncoder(Encoder):
             kind, _, length = tio.HEADER.unpack_from(packet)
             if kind != tio.RPC_REQUEST or packet[4 + length : -4] != self._routing:
                 continue
-            number, size = tio.RPC_HEAD.unpack_from(packet, 4)
+            number, size = tio.RPC_HEADER.unpack_from(packet, 4)
             method = packet[8 : 8 + size % 0x8000]
             reply = number.to_bytes(2, "little")
             if method == b"dev.metadata" and self.generation == 2:
@@ -93,15 +93,15 @@ class TwinleafEncoder(Encoder):
         sources = [(f"{name}\t{axes}\t{name}\t{self._unit}", 3)]
         sources += [(f"{column}\t\t{column}\tC", 1) for column in self._columns[3:]]
         packets = self._slip(
-            tio.TIMEBASE, tio.TIMEBASE_HEAD.pack(0, 1, 1, 0, numerator, denominator, 1, 0.0) + bytes(16)
+            tio.TIMEBASE, tio.TIMEBASE_HEADER.pack(0, 1, 1, 0, numerator, denominator, 1, 0.0) + bytes(16)
         )
         components = b""
         for number, (text, channels) in enumerate(sources):
-            head = tio.SOURCE_HEAD.pack(number, 0, 1, 0, 0, 0, channels, FLOAT32)
-            packets += self._slip(tio.SOURCE, head + text.encode())
+            header = tio.SOURCE_HEADER.pack(number, 0, 1, 0, 0, 0, channels, FLOAT32)
+            packets += self._slip(tio.SOURCE, header + text.encode())
             components += tio.COMPONENT.pack(number, 0, 1, 0)
         return packets + self._slip(
-            tio.STREAM, tio.STREAM_HEAD.pack(0, 0, 1, 0, 0, len(sources), 0) + components
+            tio.STREAM, tio.STREAM_HEADER.pack(0, 0, 1, 0, 0, len(sources), 0) + components
         )
 
     def _records(self) -> list[tuple[int, bytes]]:
@@ -109,23 +109,25 @@ class TwinleafEncoder(Encoder):
         session, stream = self.power_cycle, STREAM[2]
         size, active = 4 * len(self._columns), 3
         records = [
-            (tio.DEVICE_RECORD, tio.DEVICE_HEAD.pack(tio.DEVICE_HEAD.size, 0, session, 0, 0, 1)),
+            (tio.DEVICE_RECORD, tio.DEVICE_HEADER.pack(tio.DEVICE_HEADER.size, 0, session, 0, 0, 1)),
             (
                 tio.STREAM_RECORD,
-                tio.STREAM_RECORD_HEAD.pack(
-                    tio.STREAM_RECORD_HEAD.size, stream, len(self._columns), 1, size, 0, 0
+                tio.STREAM_RECORD_HEADER.pack(
+                    tio.STREAM_RECORD_HEADER.size, stream, len(self._columns), 1, size, 0, 0
                 ),
             ),
             (
                 tio.SEGMENT_RECORD,
-                tio.SEGMENT_HEAD.pack(
-                    tio.SEGMENT_HEAD.size, stream, session % 256, active, 1, 0, session, 0,
+                tio.SEGMENT_HEADER.pack(
+                    tio.SEGMENT_HEADER.size, stream, session % 256, active, 1, 0, session, 0,
                     self._rate.numerator, self._rate.denominator, 0.0, 0,
                 ),
             ),
         ]  # fmt: skip
         for index, name in enumerate(self._columns):
             unit = self._unit if index < 3 else "C"
-            head = tio.COLUMN_HEAD.pack(tio.COLUMN_HEAD.size, stream, index, FLOAT32, len(name), len(unit), 0)
-            records.append((tio.COLUMN_RECORD, head + name.encode() + unit.encode()))
+            header = tio.COLUMN_HEADER.pack(
+                tio.COLUMN_HEADER.size, stream, index, FLOAT32, len(name), len(unit), 0
+            )
+            records.append((tio.COLUMN_RECORD, header + name.encode() + unit.encode()))
         return records

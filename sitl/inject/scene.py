@@ -69,7 +69,7 @@ class Scene:
         """Add ``shape(t) vector``, (n,) times (3,) nT in body axes, to the field at the sensor."""
         self.field = self.field + shape[:, None] * vector
 
-    def tell(self, vector: Array) -> None:
+    def record_truth(self, vector: Array) -> None:
         """Note as the truth what the channels read of a `vector` (3,) in body axes."""
         self.truth |= dict(zip("xyz", (self.instrument.matrix() @ vector).tolist(), strict=True))
 

@@ -21,7 +21,7 @@ def heat_offset(scene: Scene, size: float, rng: Generator) -> None:
     """An offset that follows the core's temperature; size in nT/degC."""
     warmer, vector = _warmer(scene, rng), size * direction(rng)
     scene.add(warmer, vector)
-    scene.tell(vector)
+    scene.record_truth(vector)
 
 
 def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
@@ -36,7 +36,7 @@ def jump(scene: Scene, size: float, rng: Generator) -> None:
     settled = np.where(scene.t > t0, 1.0 - 0.15 * np.exp(-np.maximum(scene.t - t0, 0.0) / 20.0), 0.0)
     vector = size * direction(rng)
     scene.add(settled, vector)
-    scene.tell(vector)
+    scene.record_truth(vector)
 
 
 def creep(scene: Scene, size: float, rng: Generator) -> None:

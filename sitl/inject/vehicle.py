@@ -29,7 +29,7 @@ def wires(scene: Scene, size: float, rng: Generator) -> None:
         total += MU_0_OVER_4_PI * np.sum(np.cross(dl, r) / np.linalg.norm(r, axis=1)[:, None] ** 3, axis=0)
     vector = size * total / np.linalg.norm(total)
     scene.add(scene.logged[name][0], vector)
-    scene.tell(vector)
+    scene.record_truth(vector)
 
 
 def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
@@ -87,4 +87,4 @@ def squeezed(scene: Scene, size: float, rng: Generator) -> None:
     vector = size * direction(rng)
     slope = float(np.polyfit(depth, strain, 1)[0])
     scene.add(strain / slope, slope * vector)
-    scene.tell(slope * vector)
+    scene.record_truth(slope * vector)

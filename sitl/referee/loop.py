@@ -105,15 +105,15 @@ def sail(
         component.advance(now_us)
         answers += exchange(component, autopilot)
         for message in component.receive(answers + autopilot.step(now_us, truth), now_us):
-            navigation.hear(message, now_us)
-        component.heard.clear()
+            navigation.receive(message, now_us)
+        component.received.clear()
         while samples and samples[0][0] * 1e6 <= now_us:
             when, field, sigma = samples.popleft()
             corrected = Corrected(field, sigma, (field, 0.0, 0.0), (sigma, sigma, sigma), 0)
             navigation.sample(round(when * 1e6), corrected)
         answers = exchange(component, autopilot)
-        texts += [(seconds, text) for _, text in component.announcer.said]
-        component.announcer.said.clear()
+        texts += [(seconds, text) for _, text in component.announcer.texts]
+        component.announcer.texts.clear()
         off = separation(*truth.place, *autopilot.place)
         own, claimed = own_error(navigation, now_us, truth), autopilot.filter.sigma
         rows.append((seconds, own, *off, claimed, navigation.fixing.sent))

@@ -49,14 +49,14 @@ class ScriptedEdge:
     def events(self, _deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield the events of the timetable; the bytes come through the ports."""
         for time_us, channel, size, data in self._entries:
-            yield Event(time_us, channel, data if channel is Channel.STATE else self._take(channel, size))
+            yield Event(time_us, channel, data if channel is Channel.STATE else self._read(channel, size))
         self.flush()
 
     def _wait_for_times(self) -> bytes:
         self.flush()  # in a paced replay, what was published must be seen before the next event
         return os.read(self._timetable, 65536)
 
-    def _take(self, channel: Channel, size: int) -> bytes:
+    def _read(self, channel: Channel, size: int) -> bytes:
         """Return exactly `size` bytes of a port, waiting for them."""
         unread = self._unread[channel]
         while len(unread) < size:
@@ -102,7 +102,7 @@ def main() -> int:
         link.open()
         edge = ScriptedEdge({Channel.SENSOR: sensor, Channel.LINK: link}, chosen.timetable)
         pipeline = set_up(config, edge.start())
-        log = TlogWriter(chosen.log, head=pipeline.declarations) if chosen.log else None
+        log = TlogWriter(chosen.log, header=pipeline.declarations) if chosen.log else None
         drive(pipeline, edge, log, lambda _: None)
         if log is not None:
             log.close(timeout=60.0)

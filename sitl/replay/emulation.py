@@ -68,16 +68,16 @@ def emulate(deployment: xr.Dataset, config: Config) -> Iterator[Event]:
         yield Event(begin_us, Channel.SENSOR, answers)
     last_us = begin_us
     for time_us, row in _rows(deployment):
-        told_us = max(last_us, time_us - TELEMETRY_LEAD_US & ~3)
-        for beat_us, frame in autopilot.heartbeats(told_us):
+        reported_us = max(last_us, time_us - TELEMETRY_LEAD_US & ~3)
+        for beat_us, frame in autopilot.heartbeats(reported_us):
             yield Event(max(last_us, beat_us), Channel.LINK, frame)
         frames = autopilot.row(time_us, row)
         if frames:
-            yield Event(told_us, Channel.LINK, b"".join(frames))
-        last_us = told_us
+            yield Event(reported_us, Channel.LINK, b"".join(frames))
+        last_us = reported_us
         data, delay_us = _reading(fluxgate, (time_us - begin_us) * 1e-6, row, time_us)
         if data:
-            last_us = max(told_us, time_us + delay_us + LINE_DELAY_US & ~3)
+            last_us = max(reported_us, time_us + delay_us + LINE_DELAY_US & ~3)
             yield Event(last_us, Channel.SENSOR, data)
 
 

@@ -34,14 +34,14 @@ class Listener:
     ----------
     counts : Counter
         Messages by name.
-    said : list of str
+    texts : list of str
         The STATUSTEXTs, in order.
     navigation : Counter
         Number of navigation updates by the filter's state.
     """
 
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.texts: list[str] = []
         self.navigation: Counter[str] = Counter()
         self._counts: Counter[int] = Counter()
         self._codec = Codec(255, 190)
@@ -53,14 +53,14 @@ class Listener:
         """Messages by name."""
         return {spec(number).name: count for number, count in self._counts.items()}
 
-    def hear(self, data: bytes) -> None:
+    def receive(self, data: bytes) -> None:
         """Take bytes as they come."""
         for message in self._codec.parse(data):
             self._counts[message.id] += 1
             if message.id == FIELD.id:
                 self._values.extend(field.get(message.payload) for field in self._fields)
             elif message.id == TEXT.id:
-                self.said.append(message["text"])
+                self.texts.append(message["text"])
             elif message.id == NAVIGATION.id:
                 self.navigation[MAG_NAVIGATION_STATE(message["state"]).name.lower()] += 1
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from magbridge.bridge.events import Event, Start
 from magbridge.errors import FormatError
 from magbridge.link.component import TIMESYNC_US
-from magbridge.mavlink import LogReader, Record, Stream, TapeReader, spec
+from magbridge.mavlink import FrameLogReader, LogReader, Record, Stream, spec
 from magbridge.records import Channel
 
 __all__ = ["Recorded", "is_own_log", "runs"]
@@ -105,7 +105,7 @@ class Recorded:
 
     def events(self) -> Iterator[Event]:
         """Yield the inputs; the outputs are added to `published`."""
-        tape = TapeReader()
+        frame_log = FrameLogReader()
         time_us = self.start.time_us
         inputs = (record for record in self._records() if not self._went_out(record) and _is_event(record))
         for (time_us, channel), group in groupby(inputs, lambda record: (record.time_us, record.channel)):
@@ -114,7 +114,7 @@ class Recorded:
                     yield Event(time_us, Channel.STATE, record.frame)
             elif channel == Channel.SENSOR:
                 yield Event(time_us, Channel.SENSOR, _sensor_bytes(group))
-            elif data := b"".join(tape.data(record.frame) for record in group):
+            elif data := b"".join(frame_log.data(record.frame) for record in group):
                 yield Event(time_us, Channel.LINK, data)
         # timers that fired after the last input
         yield Event(max(time_us, self._last_us), Channel.STATE, b"")

@@ -111,7 +111,7 @@ def agreement(published: bytearray, recorded: Recorded) -> Result:
     """Return how many samples agree if the log begins late; of a whole log the bytes are compared."""
     if not recorded.late:
         return {"late_s": 0.0}
-    ours, theirs = (_heard(stream) for stream in (published, recorded.published))
+    ours, theirs = (_received(stream) for stream in (published, recorded.published))
     count = len(theirs["time"]) if len(ours["time"]) else 0
     off = np.zeros(0)
     if count:
@@ -125,9 +125,9 @@ def agreement(published: bytearray, recorded: Recorded) -> Result:
     }
 
 
-def _heard(stream: bytearray) -> dict[str, FloatArray]:
+def _received(stream: bytearray) -> dict[str, FloatArray]:
     listener = Listener()
-    listener.hear(bytes(stream))
+    listener.receive(bytes(stream))
     return listener.field()
 
 
@@ -147,7 +147,7 @@ def _play(
     if deployment.sizes["time"] < 2:
         raise DataError(f"{deployment.attrs['source']}: one row: at least 2 needed")
     listener = Listener()
-    stage = Stage(config, listener.hear, log)
+    stage = Stage(config, listener.receive, log)
     begun = time.monotonic()
     events = track(emulate(deployment, load(config)), "replaying")
     stage.play(Start(start_us(deployment)), events, speed)
@@ -166,7 +166,7 @@ def _play(
         "rows": len(times),
         "messages": dict(sorted(listener.counts.items())),
         "flags": listener.flags(),
-        "said": listener.said,
+        "said": listener.texts,
         "navigation": dict(listener.navigation),
         "span_s": float(times[-1] - times[0]),
         "seconds": seconds,

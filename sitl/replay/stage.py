@@ -102,11 +102,11 @@ class Stage:
     def _failure(self, otherwise: str = "") -> MagbridgeError:
         """End the bridge; return why it failed: the error for its exit code, with its last line on stderr."""
         try:
-            _, said = self._bridge.communicate(timeout=PATIENCE)
+            _, texts = self._bridge.communicate(timeout=PATIENCE)
         except subprocess.TimeoutExpired:
             self._bridge.kill()
-            _, said = self._bridge.communicate()
-        words = said.decode(errors="replace").strip().rpartition("\n")[2]
+            _, texts = self._bridge.communicate()
+        words = texts.decode(errors="replace").strip().rpartition("\n")[2]
         if words and self._bridge.returncode == WrongUse.exit_code:
             return WrongUse(words)
         return PortError("replay", words or otherwise or f"the bridge ended with {self._bridge.returncode}")

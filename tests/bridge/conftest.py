@@ -22,13 +22,13 @@ def table() -> Iterator[Callable[[str, str, str, str], None]]:
 
     yield row
     if path := os.environ.get("MAGBRIDGE_FAULTS"):
-        head = (
+        header = (
             "fault",
             "what the bridge publishes meanwhile",
             "recovers after",
             "what is lost, and where it is counted",
         )
-        lines = [head, ("---",) * 4, *ROWS]
+        lines = [header, ("---",) * 4, *ROWS]
         Path(path).write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")
 
 

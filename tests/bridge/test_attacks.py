@@ -28,10 +28,10 @@ def test_a_signed_bridge_that_anyone_can_reach(make_rig: MakeRig) -> None:
         assert rig.stop() == 0
         for path in rig.logs:
             path.unlink()
-        rig.heard.clear()
-        rig.again()
+        rig.received.clear()
+        rig.restart()
     rig.fresh_status()
-    rig.heard.clear()  # what the last bridge but one said may have come only now
+    rig.received.clear()  # what the last bridge but one said may have come only now
     before, mark = rig.fresh_status(), rig.mark
     with ExitStack() as stack:
         strangers = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(40)]
@@ -47,13 +47,13 @@ def test_a_signed_bridge_that_anyone_can_reach(make_rig: MakeRig) -> None:
         with rig.autopilot.retelling(shout):
             rig.run(1.5)
         assert not select.select(strangers, [], [], 0)[0]
-    rig.autopilot.say("SETUP_SIGNING", target_system=1, target_component=191, secret_key=SECRET)
-    rig.until_said("key from 1:1 not taken: keys come from a file", mark)
+    rig.autopilot.send_message("SETUP_SIGNING", target_system=1, target_component=191, secret_key=SECRET)
+    rig.until_reported("key from 1:1 not taken: keys come from a file", mark)
     after = rig.fresh_status()
     assert after["link_frames_lost"] - before["link_frames_lost"] <= 1  # that one
     assert after["link_refused"] - before["link_refused"] >= 40 * 20
     assert rig.undue_flags(mark) == ""
-    assert not any("old time stamp" in text for text in rig.said())
+    assert not any("old time stamp" in text for text in rig.texts())
     replays(rig)
     assert not any(SECRET[:6] in path.read_bytes() for path in rig.logs)
 
@@ -82,6 +82,6 @@ def test_an_attack_costs_the_autopilot_nothing_or_is_told(
     besieged: Callable[[str], Rig], attack: Attack
 ) -> None:
     rig = besieged(attack.link)
-    lost, out, _, told = run(rig, attack, 0.3)
-    assert max(lost, out) <= ALLOWED or told
-    assert any(attack.told in text for text in rig.said()), "each once while it lasts"
+    lost, out, _, reported = run(rig, attack, 0.3)
+    assert max(lost, out) <= ALLOWED or reported
+    assert any(attack.reported in text for text in rig.texts()), "each once while it lasts"

@@ -65,7 +65,7 @@ def test_everything_is_said_at_once(config: Path) -> None:
     config.write_text(
         text.replace("cal.json", "none.json") + "[publish]\nMAG_FELD = 1\nMAG_RAW = 1e9\n[lgo]\n"
     )
-    said = "\n".join(lines(config, fatal=True))
+    texts = "\n".join(lines(config, fatal=True))
     for words in (
         "sensor.baudrat: unknown key",
         "lgo: unknown key",
@@ -77,7 +77,7 @@ def test_everything_is_said_at_once(config: Path) -> None:
         "publish.MAG_FELD: expected one of",
         "publish.MAG_RAW: expected a rate from",
     ):
-        assert words in said
+        assert words in texts
     assert any("no /dev/no_such_device now" in line for line in lines(config, fatal=False))
 
 

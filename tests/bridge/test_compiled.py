@@ -29,9 +29,9 @@ for moving in (False, True):
     for event in edge.events(lambda: 0):
         for time_us, frame in pipeline.feed(event):
             digest.update(time_us.to_bytes(8, "big") + frame)
-        for time_us, channel, frame in pipeline.journal.drain():
+        for time_us, channel, frame in pipeline.recorder.drain():
             digest.update((time_us | channel).to_bytes(8, "big") + frame)
-print(align.__file__[-3:], digest.hexdigest(), pipeline.journal.count)
+print(align.__file__[-3:], digest.hexdigest(), pipeline.recorder.count)
 """
 
 

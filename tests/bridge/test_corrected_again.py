@@ -35,7 +35,7 @@ def test_what_was_set_in_the_course_of_the_log_is_told(
     station = Codec(1, 1)
     log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
     asked = {10: ("MB_SETTLE_TIME", 4.0), 20: ("MB_SETTLE_TIME", -1.0), 30: ("MB_R_HIGHRES_IMU", 1.0)}
-    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as writer:
+    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as writer:
         for k in range(40):
             if k in asked:
                 name, value = asked[k]
@@ -44,7 +44,7 @@ def test_what_was_set_in_the_course_of_the_log_is_told(
                 pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.LINK, frame))
             line = b"12340.5 43210.9 -234.5 4.0 %d 7\r\n" % k
             pipeline.feed(Event(START + k * 1_000_000, Channel.SENSOR, line))
-            writer.extend(pipeline.journal.drain())
+            writer.extend(pipeline.recorder.drain())
     logs.write(logs.read(sorted((tmp_path / "logs").iterdir())), log)
     assert main(["correct", str(log), "--calibration", str(tmp_path / "cal.json"), "-o", str(out)]) == 0
     assert "MB_* parameters were set once in the course of the log" in capsys.readouterr().err
@@ -56,7 +56,7 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
     rng = np.random.default_rng(1)
     pipeline = small_bridge(tmp_path, Start(START, KEPT), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
-    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as log:
+    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as log:
         for k in range(400):
             position = np.nan if 300 <= k < 310 else 0.1 * (k // 50)
             if rng.random() < 0.4 and not 200 <= k < 260:
@@ -64,7 +64,7 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
                 pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.LINK, frame))
             line = b"12340.5 43210.9 -234.5 4.0 %d 7\r\n" % k
             pipeline.feed(Event(START + k * 1_000_000, Channel.SENSOR, line))
-            log.extend(pipeline.journal.drain())
+            log.extend(pipeline.recorder.drain())
     rows = logs.read(sorted((tmp_path / "logs").iterdir()))
     logs.write(rows, tmp_path / f"converted.{suffix}")
     converted = logs.read(tmp_path / f"converted.{suffix}")
@@ -86,7 +86,7 @@ def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
     """The rows of a log do not tell that the bridge stood still for 5 s, while the mass moved."""
     pipeline = small_bridge(tmp_path, Start(START), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
-    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as log:
+    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as log:
         for k in range(20):
             if k == 10:
                 stall = states.standstill(START + k * 1_000_000, 5_000_000)
@@ -96,7 +96,7 @@ def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
             pipeline.feed(Event(START + k * 1_000_000 - 400_000, Channel.LINK, frame))
             line = b"12340.5 43210.9 -234.5 4.0 %d 7\r\n" % k
             pipeline.feed(Event(START + k * 1_000_000, Channel.SENSOR, line))
-            log.extend(pipeline.journal.drain())
+            log.extend(pipeline.recorder.drain())
     rows = logs.read(sorted((tmp_path / "logs").iterdir()))
     again = correct_rows(Correction(load_calibration(tmp_path / "cal.json")), rows)
     late = rows["quality"].to_numpy().astype(int) & Quality.LATE_JOIN != 0

@@ -28,23 +28,23 @@ class Station:
         self._socket.setblocking(False)
         self._socket.connect(rig.autopilot.address)
         self._sequence = 0
-        self.heard: list[Message] = []
+        self.received: list[Message] = []
 
-    def say(self, name: str, **fields: object) -> None:
+    def send_message(self, name: str, **fields: object) -> None:
         self._codec.now_us = self._rig.autopilot.codec.now_us
         self._socket.send(self._codec.pack(name, **fields))
 
     def ask(self, opcode: int, data: bytes = b"", *, session: int = 0, size: int = 0, offset: int = 0) -> int:
         """Send an FTP request; return where what follows begins in what is heard."""
-        mark, self._sequence = len(self.heard), self._sequence + 1
-        head = HEADER.pack(self._sequence, session, opcode, size or len(data), 0, 0, offset)
-        payload = (head + data).ljust(251, b"\0")
-        self.say("FILE_TRANSFER_PROTOCOL", target_system=1, target_component=191, payload=payload)
+        mark, self._sequence = len(self.received), self._sequence + 1
+        header = HEADER.pack(self._sequence, session, opcode, size or len(data), 0, 0, offset)
+        payload = (header + data).ljust(251, b"\0")
+        self.send_message("FILE_TRANSFER_PROTOCOL", target_system=1, target_component=191, payload=payload)
         return mark
 
     def replies(self, mark: int) -> Iterator[tuple[int, int, bytes]]:
         """Yield opcode, whether the burst is complete, data of the FTP replies heard since."""
-        for message in self.heard[mark:]:
+        for message in self.received[mark:]:
             if message.name == "FILE_TRANSFER_PROTOCOL":
                 _, _, opcode, size, _, complete, _ = HEADER.unpack_from(message["payload"])
                 yield opcode, complete, message["payload"][12 : 12 + size]
@@ -53,7 +53,7 @@ class Station:
         def met() -> object:
             try:
                 while True:
-                    self.heard += self._ear.parse(self._socket.recv(65536))
+                    self.received += self._ear.parse(self._socket.recv(65536))
             except BlockingIOError:
                 return condition()
 
@@ -72,7 +72,7 @@ def test_a_log_is_read_while_the_bridge_measures(make_rig: MakeRig, key: bytes |
     rig.start()
     mark, before = rig.mark, rig.fresh_status()
     station = Station(rig, key)
-    station.say("HEARTBEAT", type=6, autopilot=8)
+    station.send_message("HEARTBEAT", type=6, autopilot=8)
     start = station.ask(Opcode.OPEN_READ, f"@MAV_LOG/{LOG}".encode())
     station.until(lambda: list(station.replies(start)))
     assert list(station.replies(start)) == [(Opcode.ACK, 0, len(content).to_bytes(4, "little"))]
@@ -85,22 +85,22 @@ def test_a_log_is_read_while_the_bridge_measures(make_rig: MakeRig, key: bytes |
     start = station.ask(Opcode.OPEN_READ, b"../key.bin")
     station.until(lambda: list(station.replies(start)))
     assert [kind for kind, _, _ in station.replies(start)] == [Opcode.NAK]
-    rig.until_said("file for 255:190 refused: file not found", mark)
-    station.say("LOG_REQUEST_LIST", target_system=1, target_component=191, end=0xFFFF)
-    station.until(lambda: any(one.name == "LOG_ENTRY" for one in station.heard))
-    station.say("LOG_REQUEST_DATA", target_system=1, target_component=191, id=1, count=900)
-    station.until(lambda: sum(one.name == "LOG_DATA" for one in station.heard) == 10)
-    logged = b"".join(one["data"] for one in station.heard if one.name == "LOG_DATA")
+    rig.until_reported("file for 255:190 refused: file not found", mark)
+    station.send_message("LOG_REQUEST_LIST", target_system=1, target_component=191, end=0xFFFF)
+    station.until(lambda: any(one.name == "LOG_ENTRY" for one in station.received))
+    station.send_message("LOG_REQUEST_DATA", target_system=1, target_component=191, id=1, count=900)
+    station.until(lambda: sum(one.name == "LOG_DATA" for one in station.received) == 10)
+    logged = b"".join(one["data"] for one in station.received if one.name == "LOG_DATA")
     assert logged == content[:900]
-    station.say("LOG_ERASE", target_system=1, target_component=191)
-    rig.until_said("logs are not erased over the link", mark)
+    station.send_message("LOG_ERASE", target_system=1, target_component=191)
+    rig.until_reported("logs are not erased over the link", mark)
     assert (rig.folder / "logs" / LOG).read_bytes() == content
     after = rig.fresh_status()
     assert after["samples_lost"] == before["samples_lost"]
     assert rig.undue_flags(mark) == ""
     # nobody else got the file, and what the station got is numbered without a gap
     assert not rig.of("FILE_TRANSFER_PROTOCOL", mark)
-    numbers = [one.sequence for one in station.heard if one.system == 1]
+    numbers = [one.sequence for one in station.received if one.system == 1]
     assert all((b - a) % 256 == 1 for a, b in itertools.pairwise(numbers))
     station.close()
     (rig.folder / "logs" / LOG).unlink()

@@ -10,16 +10,16 @@ GOOD = {"fix_type": 3, "lat": 495000000, "lon": -579000000, "h_acc": 2000}
 
 def test_none_while_gps_is_good_and_none_from_the_moment_it_is_back() -> None:
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
-    bench.hear("GPS_RAW_INT", **GOOD)
+    bench.receive("GPS_RAW_INT", **GOOD)
     assert bench.fix() == []
     bench.to(2)
-    bench.hear("GPS_RAW_INT", fix_type=1)
+    bench.receive("GPS_RAW_INT", fix_type=1)
     assert [one.name for one in bench.fix()] == ["COMMAND_INT"], "lost as soon as it says so"
     bench.to(4)
-    bench.hear("GPS_RAW_INT", **GOOD)
+    bench.receive("GPS_RAW_INT", **GOOD)
     assert bench.fix() == []
     bench.to(10)
-    assert bench.said("fixes") == [
+    assert bench.texts_with("fixes") == [
         "no fixes to the autopilot: GPS is good",
         "fixes go to the autopilot: GPS is lost",
         "no fixes to the autopilot: GPS is good",
@@ -30,14 +30,14 @@ def test_a_silent_gps_is_lost_but_a_slow_one_is_not() -> None:
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
     for k in range(5):
         bench.to(k)
-        bench.hear("GPS_RAW_INT", **GOOD)
+        bench.receive("GPS_RAW_INT", **GOOD)
     bench.to(8.9)
     assert bench.fix() == []
     bench.to(9.1)
     assert bench.fix()
     for k in (20, 40, 60):
         bench.to(k)
-        bench.hear("GPS_RAW_INT", **GOOD)
+        bench.receive("GPS_RAW_INT", **GOOD)
     bench.to(90)
     assert bench.fix() == []
     bench.to(121)
@@ -50,34 +50,34 @@ def test_odometry_waits_for_origin_attitude_and_height() -> None:
     assert {one.name for one in asked} == {"COMMAND_LONG"}
     assert [(one["command"], one["param1"]) for one in asked] == [(512, 49.0)] * 3, "every 5 s"
     assert bench.fix() == []
-    bench.hear("GPS_GLOBAL_ORIGIN", latitude=0, longitude=0)  # not set yet
-    bench.hear("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000, altitude=5000)
+    bench.receive("GPS_GLOBAL_ORIGIN", latitude=0, longitude=0)  # not set yet
+    bench.receive("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000, altitude=5000)
     bench.to(12)
     assert bench.fix() == []
-    bench.hear("ATTITUDE", yaw=0.5)
+    bench.receive("ATTITUDE", yaw=0.5)
     bench.to(14)
     assert bench.fix() == []
-    bench.hear("GLOBAL_POSITION_INT", alt=-2000)
+    bench.receive("GLOBAL_POSITION_INT", alt=-2000)
     bench.to(16)
     (sent,) = bench.fix()
     assert sent["z"] == pytest.approx(7.0), "2 m under the sea is 7 m under the origin"
-    assert bench.said("fixes to") == [
+    assert bench.texts_with("fixes to") == [
         "no fixes to the autopilot: no origin of the autopilot's frame",
         "no fixes to the autopilot: no attitude from the autopilot",
         "no fixes to the autopilot: no height from the autopilot",
     ]
     bench.to(30)
-    bench.hear("GLOBAL_POSITION_INT", alt=-2000)
+    bench.receive("GLOBAL_POSITION_INT", alt=-2000)
     assert bench.fix() == [], "that attitude is old"
     assert not any(one.name == "COMMAND_LONG" for one in bench.to(60)), "the origin is known"
 
 
 def test_a_reboot_takes_the_origin_with_it() -> None:
     bench = Bench("ODOMETRY")
-    bench.hear("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
+    bench.receive("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
     bench.to(20)
     for boot_ms in (100_000, 101_000, 500, 600, 700, 800):
-        bench.hear("ATTITUDE", time_boot_ms=boot_ms)
+        bench.receive("ATTITUDE", time_boot_ms=boot_ms)
     assert any(one["command"] == 512 for one in bench.to(26) if one.name == "COMMAND_LONG")
 
 
@@ -94,37 +94,37 @@ def test_a_reboot_takes_the_origin_with_it() -> None:
 )
 def test_what_an_autopilot_cannot_use_is_not_sent(kind: str, stack: int, reason: str) -> None:
     bench = Bench(kind)
-    bench.hear("HEARTBEAT", autopilot=stack)
+    bench.receive("HEARTBEAT", autopilot=stack)
     for k in range(5):
         bench.to(2 * k)
         assert bench.fix() == []
-    assert bench.said("fixes") == [f"no fixes to the autopilot: {reason}"]
+    assert bench.texts_with("fixes") == [f"no fixes to the autopilot: {reason}"]
 
 
 def test_a_refusal_is_told_once_and_so_is_its_end() -> None:
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
-    bench.hear("COMMAND_ACK", **ACK, result=2)
-    assert bench.said("refuses") == [], "nothing was asked of it yet"
+    bench.receive("COMMAND_ACK", **ACK, result=2)
+    assert bench.texts_with("refuses") == [], "nothing was asked of it yet"
     for k in range(10):
         bench.to(10 * k)
         bench.fix()
-        bench.hear("COMMAND_ACK", **{**ACK, "command": 512}, result=4)
-        bench.hear("COMMAND_ACK", **ACK, result=2)
-    assert bench.said("refuses") == ["the autopilot refuses fixes: DENIED"]
+        bench.receive("COMMAND_ACK", **{**ACK, "command": 512}, result=4)
+        bench.receive("COMMAND_ACK", **ACK, result=2)
+    assert bench.texts_with("refuses") == ["the autopilot refuses fixes: DENIED"]
     for k in range(10, 13):
         bench.to(10 * k)
         bench.fix()
-        bench.hear("COMMAND_ACK", **ACK, result=0)
-    assert bench.said("fixes") == ["the autopilot takes fixes"]
+        bench.receive("COMMAND_ACK", **ACK, result=0)
+    assert bench.texts_with("fixes") == ["the autopilot takes fixes"]
     fixing = bench.navigation.fixing
     assert (fixing.sent, fixing.refused, fixing.accepted) == (13, 10, 3)
     bench.to(200)
     bench.fix()
-    bench.hear("COMMAND_ACK", **ACK, result=4)
-    assert "FAILED (it still uses GPS, has no origin, or nothing" in bench.said("refuses")[0]
+    bench.receive("COMMAND_ACK", **ACK, result=4)
+    assert "FAILED (it still uses GPS, has no origin, or nothing" in bench.texts_with("refuses")[0]
     bench.to(210)
-    bench.hear("COMMAND_ACK", **ACK, result=77)
-    assert bench.said("refuses") == ["the autopilot refuses fixes: result 77"]
+    bench.receive("COMMAND_ACK", **ACK, result=77)
+    assert bench.texts_with("refuses") == ["the autopilot refuses fixes: result 77"]
 
 
 def test_an_autopilot_that_does_not_answer_is_told() -> None:
@@ -132,19 +132,19 @@ def test_an_autopilot_that_does_not_answer_is_told() -> None:
     for k in range(3):
         bench.to(10 * k)
         bench.fix()
-    assert bench.said("answer") == []
+    assert bench.texts_with("answer") == []
     bench.to(40)
     bench.fix()
-    assert bench.said("answer") == ["the autopilot does not answer fixes"]
+    assert bench.texts_with("answer") == ["the autopilot does not answer fixes"]
 
 
 def test_what_ardupilot_would_believe_too_much_is_not_sent() -> None:
     """Its EKF takes no external position for worse than 10 m, and five alike a second for five new ones."""
     bench = Bench("ODOMETRY")
-    bench.hear("HEARTBEAT", autopilot=ARDUPILOT)
-    bench.hear("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
-    bench.hear("ATTITUDE")
-    bench.hear("LOCAL_POSITION_NED", z=1.0)
+    bench.receive("HEARTBEAT", autopilot=ARDUPILOT)
+    bench.receive("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
+    bench.receive("ATTITUDE")
+    bench.receive("LOCAL_POSITION_NED", z=1.0)
     (first,) = bench.fix(sigma=1.5)
     bench.to(0.2)
     (second,) = bench.fix(sigma=1.5)
@@ -154,7 +154,7 @@ def test_what_ardupilot_would_believe_too_much_is_not_sent() -> None:
         bench.to(0.4 + 0.2 * k)
         assert bench.fix(sigma=sigma) == []
     bench.to(5)
-    assert bench.said("claim") == [
+    assert bench.texts_with("claim") == [
         "no fixes to the autopilot: ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
     ]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from disks import full_disk
-from turning import bridge, events, heard, named
+from turning import bridge, events, named, received
 
 from magbridge.bridge.learning import Learning, keep, kept_path
 from magbridge.bridge.pipeline import Pipeline
@@ -64,14 +64,14 @@ def test_a_disk_that_does_not_take_it_leaves_the_old_one(flown: Flown, to: str, 
     path.write_bytes(before := (folder / "cal.json").read_bytes())
     names = {one.name for one in folder.iterdir()}
     with full_disk(64):
-        told = keep(learning, folder / f"{to}cal-learned.json")
-    assert told == f"learned, but not kept: {why}"
-    assert len(told) <= 50
+        reported = keep(learning, folder / f"{to}cal-learned.json")
+    assert reported == f"learned, but not kept: {why}"
+    assert len(reported) <= 50
     assert path.read_bytes() == before
     assert {one.name for one in folder.iterdir()} == names
     sent = [frame for event in events(folder)[-2:] for frame in pipeline.feed(event)]
     learned = calibration_id(learning.learner.calibration)
-    assert named(heard(sent), "MAG_FIELD")[-1]["calibration_id"] == learned
+    assert named(received(sent), "MAG_FIELD")[-1]["calibration_id"] == learned
 
 
 def test_killed_while_it_is_written_the_old_one_stays_and_the_first_flies(flown: Flown) -> None:

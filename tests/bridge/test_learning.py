@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from turning import bridge, events, heard, named
+from turning import bridge, events, named, received
 
 from magbridge import logs
 from magbridge.bridge.events import Event
@@ -32,10 +32,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pipeline, li
     folder = tmp_path_factory.mktemp("flight")
     pipeline = bridge(folder)
     sent = []
-    with TlogWriter(folder / "logs", head=pipeline.declarations) as log:
+    with TlogWriter(folder / "logs", header=pipeline.declarations) as log:
         for event in events(folder):
             sent += pipeline.feed(event)
-            log.extend(pipeline.journal.drain())
+            log.extend(pipeline.recorder.drain())
     return folder, pipeline, sent
 
 
@@ -44,7 +44,7 @@ def test_what_was_learned_is_announced_and_named_in_every_message(
 ) -> None:
     """The id changes once what is learned is published, in MAG_FIELD and in MAG_STATUS alike."""
     folder, pipeline, sent = flight
-    messages = heard(sent)
+    messages = received(sent)
     first = calibration_id(load(folder / "cal.json"))
     assert pipeline.learning is not None
     last = calibration_id(pipeline.learning.learner.calibration)
@@ -79,7 +79,7 @@ def test_ashore_it_learns_what_it_learned_live(
     assert main([*order, "--learn", "--save", str(learned)]) == 0
     assert "learned from" in capsys.readouterr().out
     total = logs.read(out)["total_field"].to_numpy()
-    live = np.array([message["total_field"] for message in named(heard(sent), "MAG_FIELD")])
+    live = np.array([message["total_field"] for message in named(received(sent), "MAG_FIELD")])
     np.testing.assert_array_equal(total, live)
     assert pipeline.learning is not None
     kept = load(learned)
@@ -102,7 +102,7 @@ def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
 
     def order(name: str, value: float) -> list[Message]:
         frame = station.pack("PARAM_SET", param_id=name, param_value=value, **to)
-        return heard(pipeline.feed(Event(feed[800].time_us + 1, Channel.LINK, frame)))
+        return received(pipeline.feed(Event(feed[800].time_us + 1, Channel.LINK, frame)))
 
     answer = named(order("MB_LEARN_DO", 2.0), "PARAM_VALUE")[-1]
     assert (answer["param_id"], answer["param_value"]) == ("MB_LEARN_DO", 0.0)
@@ -151,11 +151,11 @@ def test_the_causes_bits_are_those_of_the_dialect() -> None:
 def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     """Without a calibration, the field is flagged until there is one; the log gives the same again."""
     pipeline, sent = bridge(tmp_path, known=False), []
-    with TlogWriter(tmp_path / "logs", head=pipeline.declarations) as log:
+    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as log:
         for event in events(tmp_path):
             sent += pipeline.feed(event)
-            log.extend(pipeline.journal.drain())
-    fields = named(heard(sent), "MAG_FIELD")
+            log.extend(pipeline.recorder.drain())
+    fields = named(received(sent), "MAG_FIELD")
     assert int(fields[0]["flags"]) & Quality.UNCALIBRATED
     assert fields[0]["total_field_sigma"] > 1000.0
     assert not int(fields[-1]["flags"]) & Quality.UNCALIBRATED
@@ -193,8 +193,8 @@ def test_the_same_bytes_on_another_number_of_cores(name: str) -> None:
     """Linear algebra has one thread where samples are learned from: several round otherwise."""
     free = {key: value for key, value in os.environ.items() if "NUM_THREADS" not in key}
     command = [sys.executable, "-c", THREADS, name, "nowhere.toml"]
-    told = subprocess.run(command, env=free, capture_output=True, text=True, check=True).stdout
-    assert told.splitlines()[-1] == "{1}"
+    reported = subprocess.run(command, env=free, capture_output=True, text=True, check=True).stdout
+    assert reported.splitlines()[-1] == "{1}"
 
 
 def test_correct_wants_to_know_what_to_begin_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

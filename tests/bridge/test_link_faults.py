@@ -54,7 +54,7 @@ def test_telemetry_stale(rig: Rig, table: Row, how: str) -> None:
         assert doubtful["total_field_sigma"] > sigma
         assert doubtful["telemetry_age"] > 0.5
     back = rig.until_well()
-    rig.until_said("field: good", mark)
+    rig.until_reported("field: good", mark)
     assert noticed < soon(1.5)
     for message in rig.of("MAG_FIELD", mark):
         assert bool(message["flags"] & Quality.STALE_TELEMETRY) == (message["telemetry_age"] > 0.5)
@@ -108,7 +108,7 @@ def test_telemetry_out_of_order(rig: Rig, table: Row) -> None:
     assert rig.undue_flags(mark) == ""
     assert lost < 4  # those that were kept back in the end
     assert after["vehicle_reboots"] == before["vehicle_reboots"]
-    assert not any("two autopilots" in line for line in rig.said(mark))
+    assert not any("two autopilots" in line for line in rig.texts(mark))
     table(
         "telemetry out of order: four messages shuffled",
         "no change: a value older than the newest is ignored",
@@ -137,13 +137,13 @@ def test_second_system_on_the_link(rig: Rig, table: Row) -> None:
         ]  # fmt: skip
 
     with rig.autopilot.retelling(join):
-        delay = rig.until_said("vehicle 2 is on the link too: ignored", mark)
+        delay = rig.until_reported("vehicle 2 is on the link too: ignored", mark)
         rig.run(0.5)
     assert rig.undue_flags(mark) == ""
     assert not rig.of("PARAM_VALUE", mark)
     fields = np.array([message["total_field"] for message in rig.of("MAG_FIELD", mark)])
     assert np.ptp(fields) < 1.0
-    assert len([line for line in rig.said(mark) if "vehicle 2" in line]) == 1
+    assert len([line for line in rig.texts(mark) if "vehicle 2" in line]) == 1
     assert shouted
     table(
         "a second vehicle on the link whose telemetry has the same names",
@@ -165,11 +165,11 @@ def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
         return [frame, other.pack("SYS_STATUS"), other.pack("ATTITUDE", time_boot_ms=86_400_000 + 50 * count)]
 
     with rig.autopilot.retelling(both):
-        delay = rig.until_said("two autopilots speak as 1:1", mark)
+        delay = rig.until_reported("two autopilots speak as 1:1", mark)
     back = rig.until_well()
     assert rig.undue_flags(mark) == ""
     assert np.ptp([message["total_field"] for message in rig.of("MAG_FIELD", mark)]) < 1.0
-    assert len([line for line in rig.said(mark) if "two autopilots" in line]) == 1
+    assert len([line for line in rig.texts(mark) if "two autopilots" in line]) == 1
     table(
         "two programs answer as the autopilot (1:1)",
         f"STATUSTEXT after {delay:.2f} s; flags: {rig.flags(mark) or 'none'}",
@@ -183,7 +183,7 @@ def test_another_bridge_answers(rig: Rig, table: Row) -> None:
     rig.until_well()
     mark = rig.mark
     rig.autopilot.send(Codec(1, 191).pack("HEARTBEAT", type=18, autopilot=8))
-    delay = rig.until_said("another program speaks as 1:191", mark)
+    delay = rig.until_reported("another program speaks as 1:191", mark)
     back = rig.until_well()
     assert rig.undue_flags(mark) == ""
     table(
@@ -199,11 +199,11 @@ def test_parameter_out_of_range(rig: Rig, table: Row) -> None:
     rig.until_well()
     mark = rig.mark
     for value in (0.5, float("nan"), float("inf"), -1.0):
-        rig.autopilot.say(
+        rig.autopilot.send_message(
             "PARAM_SET", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_value=value,
             param_type=REAL32,
         )  # fmt: skip
-    rig.until_said("MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000", mark)
+    rig.until_reported("MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000", mark)
     rig.until(lambda: len(rig.of("PARAM_VALUE", mark)) == 4)
     assert {message["param_value"] for message in rig.of("PARAM_VALUE", mark)} == {2.5}
     assert rig.undue_flags(mark) == ""
@@ -220,7 +220,7 @@ def test_autopilot_reboots(rig: Rig, table: Row) -> None:
     rig.until_well()
     before, mark = rig.fresh_status(), rig.mark
     rig.autopilot.reboot()
-    rig.until_said("autopilot 1:1 rebooted", mark)
+    rig.until_reported("autopilot 1:1 rebooted", mark)
     back = rig.until_well()
     after = rig.fresh_status()
     assert after["vehicle_reboots"] == before["vehicle_reboots"] + 1
@@ -243,7 +243,7 @@ def test_udp_peer_gone_and_back(rig: Rig, table: Row) -> None:
     rig.run(ABSENT_S + 0.7)
     rig.autopilot.up()
     back = rig.until_well()
-    rig.until_said("autopilot 1:1 found", mark)
+    rig.until_reported("autopilot 1:1 found", mark)
     first = next(message for message in rig.of("MAG_FIELD", mark) if message["sequence"] > last + 50)
     after = rig.fresh_status()
     lost = first["sequence"] - last - 1

@@ -10,7 +10,7 @@ from pathlib import Path
 from small import START, small_bridge
 
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.head import declarations
+from magbridge.bridge.log_header import declarations
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.model import Parameter
 from magbridge.logs.tlog import TlogWriter
@@ -54,8 +54,8 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
         def play(begin: int, end: int) -> None:
             for event in events(pipeline, begin, end):
                 pipeline.feed(event)
-                log.extend(pipeline.journal.drain())
-            while log.records + log.lost < pipeline.journal.count:
+                log.extend(pipeline.recorder.drain())
+            while log.records + log.lost < pipeline.recorder.count:
                 time.sleep(0.002)
 
         play(0, 400)
@@ -82,10 +82,10 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
     assert result["same_samples"] > 0.9 * result["samples"]
     assert agreement(published, Recorded(first)) == {"late_s": 0.0}
     more = {"files": second, "messages": recorded.messages, "bytes": 1, "seconds": 1.0, "same_config": True}
-    said = summary(
+    texts = summary(
         {"runs": [result | more | {"identical": False, "first_difference": 0, "beyond": 0, "damages": 0}]}
     )
-    assert f"begins {recorded.late:.1f} s into the run" in said
+    assert f"begins {recorded.late:.1f} s into the run" in texts
 
 
 def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> None:
@@ -93,10 +93,10 @@ def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> No
     pipeline = bridge(tmp_path, Start(START))
     fed = list(events(pipeline, 0, 60))
     lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
-    head = declarations(1, 191, pipeline._config.telemetry, 0.0)
-    with TlogWriter(tmp_path / "logs", head=head, max_size=1e-3) as log:
+    header = declarations(1, 191, pipeline._config.telemetry, 0.0)
+    with TlogWriter(tmp_path / "logs", header=header, max_size=1e-3) as log:
         sent = pipeline.feed(Event(fed[-1].time_us, Channel.SENSOR, lines))
-        log.extend(pipeline.journal.drain())
+        log.extend(pipeline.recorder.drain())
     files = sorted((tmp_path / "logs").iterdir())
     assert len(files) > 2
     recorded = Recorded(files)

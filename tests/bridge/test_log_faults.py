@@ -71,12 +71,12 @@ def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> No
     mark = rig.mark
     fill()
     rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
-    rig.until(lambda: any(line.startswith("log: ") for line in rig.said(mark)))
+    rig.until(lambda: any(line.startswith("log: ") for line in rig.texts(mark)))
     lost = rig.until_status(lambda status: status["log_lost"] > 0)["log_lost"]
     rig.until_status(lambda status: status["log_lost"] > lost)
     make_room()
     mended = rig.until(lambda: rig.status["log_state"] == LOG_OK)
-    rig.until_said("log: being written", mark)
+    rig.until_reported("log: being written", mark)
     assert rig.undue_flags(mark) == ""
     fields = [message["sequence"] for message in rig.of("MAG_FIELD")]
     assert fields == list(range(fields[0], fields[0] + len(fields)))
@@ -89,11 +89,11 @@ def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> No
             assert reader.damages == 0
     recorded, published = rig.replay(rig.logs[:1])
     assert first_difference(published[: len(recorded.published)], recorded.published) is None
-    said = next(line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line)
-    assert said == ("log: No space left on device" if small_disk is not None else "log: File too large")
+    texts = next(line for line in rig.texts(mark) if line.startswith("log: ") and "written" not in line)
+    assert texts == ("log: No space left on device" if small_disk is not None else "log: File too large")
     table(
         "disk full, then room again",
-        f'the field goes on without a flag; STATUSTEXT "{said}", `log_state` failed',
+        f'the field goes on without a flag; STATUSTEXT "{texts}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
         f"the log in between: `log_lost` {lost} records; what was written before can be read to its end",
     )
@@ -108,7 +108,7 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
     gone.unlink()
     rig.until_status(lambda status: status["log_state"] == LOG_FAILED)
     mended = rig.until(lambda: rig.status["log_state"] == LOG_OK)
-    rig.until_said("log: being written", mark)
+    rig.until_reported("log: being written", mark)
     rig.run(1.0)
     assert rig.undue_flags(mark) == ""
     assert rig.stop() == 0
@@ -118,12 +118,12 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
     recorded, published = rig.replay([anew])
     assert recorded.late > 5.0
     assert recorded.start.parameters == {"MB_GAP_FACTOR": 3.0}
-    again = agreement(bytearray(published), recorded)
-    assert again["samples"] > 50
-    (said,) = {line for line in rig.said(mark) if line.startswith("log: ") and "written" not in line}
+    restart = agreement(bytearray(published), recorded)
+    assert restart["samples"] > 50
+    (texts,) = {line for line in rig.texts(mark) if line.startswith("log: ") and "written" not in line}
     table(
         "somebody deletes the log while it is being written",
-        f'the field goes on without a flag; STATUSTEXT "{said}", `log_state` failed',
+        f'the field goes on without a flag; STATUSTEXT "{texts}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
         f"the deleted log and the records until the new one: `log_lost` {rig.status['log_lost']} records; "
         "the new one lacks what the bridge knew when it began; its replay says so, and in how many samples "
@@ -135,7 +135,7 @@ def set_parameter(rig: Rig) -> None:
     """Set a parameter as a station would."""
     mark = rig.mark
     to = {"target_system": 1, "target_component": 191}
-    rig.autopilot.say("PARAM_SET", **to, param_id="MB_GAP_FACTOR", param_value=3.0, param_type=9)
+    rig.autopilot.send_message("PARAM_SET", **to, param_id="MB_GAP_FACTOR", param_value=3.0, param_type=9)
     rig.until(lambda: rig.of("PARAM_VALUE", mark))
 
 
@@ -152,18 +152,18 @@ def test_killed_without_warning(make_rig: MakeRig, table: Row) -> None:
     recorded, published = rig.replay()
     assert recorded.damages <= 1
     assert first_difference(published[: len(recorded.published)], recorded.published) is None
-    heard = [message.frame for _, message in rig.heard]
-    missing = [frame for frame in heard[-200:] if frame not in recorded.published]
+    received = [message.frame for _, message in rig.received]
+    missing = [frame for frame in received[-200:] if frame not in recorded.published]
     assert len(missing) <= 20, "more than the last event"
-    assert missing == heard[len(heard) - len(missing) :]
+    assert missing == received[len(received) - len(missing) :]
     with log.open("rb") as file:
         channels = {record.channel for record in LogReader(file)}
     assert channels == set(Channel)
 
     mark = rig.mark
-    back = rig.again()
+    back = rig.restart()
     assert len(rig.logs) == 2
-    rig.autopilot.say(
+    rig.autopilot.send_message(
         "PARAM_REQUEST_READ", target_system=1, target_component=191, param_id="MB_GAP_FACTOR", param_index=-1
     )
     rig.until(lambda: rig.of("PARAM_VALUE", mark))

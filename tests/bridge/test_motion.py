@@ -16,7 +16,7 @@ from magbridge.field.geodesy import separation
 def made(kind: str = "GLOBAL_POSITION_SENSOR", stack: int = PX4) -> Bench:
     """Return a bench whose position is known."""
     bench = Bench(kind)
-    bench.hear("HEARTBEAT", autopilot=stack)
+    bench.receive("HEARTBEAT", autopilot=stack)
     bench.navigation.navigator.fix(bench.now_us, *PLACE, 5.0)
     return bench
 
@@ -32,15 +32,15 @@ def source(bench: Bench) -> Source:
 
 def local(bench: Bench, seconds: int, x: float, vx: float = 1.0, **fields: Any) -> None:
     bench.to(seconds)
-    bench.hear("LOCAL_POSITION_NED", x=x, vx=vx, **fields)
+    bench.receive("LOCAL_POSITION_NED", x=x, vx=vx, **fields)
 
 
 def test_speed_is_preferred_to_the_autopilots_position() -> None:
     bench = made()
     for k in range(1, 11):
         local(bench, k, 50.0 * k, vx=50.0)
-        bench.hear("ATTITUDE", yaw=np.pi / 2)
-        bench.hear("VFR_HUD", airspeed=2.0)
+        bench.receive("ATTITUDE", yaw=np.pi / 2)
+        bench.receive("VFR_HUD", airspeed=2.0)
     assert source(bench) is Source.SPEED
     assert moved(bench) == pytest.approx((0.0, 18.0), abs=1.0)
 
@@ -49,16 +49,16 @@ def test_the_autopilots_position_until_a_fix_is_sent_then_the_last_speed() -> No
     bench = made()
     for k in range(1, 11):
         local(bench, k, float(k))
-        bench.hear("ATTITUDE", yaw=0.0)
+        bench.receive("ATTITUDE", yaw=0.0)
     assert source(bench) is Source.TRACK
     assert moved(bench)[0] == pytest.approx(9.0, abs=0.1)
     bench.fix()
     for k in range(11, 21):
         local(bench, k, 40.0 * k, vx=40.0)  # the fix comes back
-        bench.hear("ATTITUDE", yaw=0.0)
+        bench.receive("ATTITUDE", yaw=0.0)
     assert source(bench) is Source.LAST
     assert moved(bench)[0] == pytest.approx(18.0, abs=1.5)
-    assert bench.said("dead reckoning by") == [
+    assert bench.texts_with("dead reckoning by") == [
         "dead reckoning by the autopilot's position",
         "dead reckoning by heading and the last known speed: no other is sent",
     ]
@@ -80,7 +80,7 @@ def test_gps_that_held_cleans_the_autopilots_position() -> None:
     assert bench.navigation.motion.fed_back
     for k in range(2, 70):
         bench.to(k)
-        bench.hear("GPS_RAW_INT", fix_type=3, lat=round(PLACE[0] * 1e7), lon=round(PLACE[1] * 1e7))
+        bench.receive("GPS_RAW_INT", fix_type=3, lat=round(PLACE[0] * 1e7), lon=round(PLACE[1] * 1e7))
         assert bench.navigation.motion.fed_back == (k <= 62)
 
 
@@ -88,10 +88,10 @@ def test_the_position_of_another_component_stays() -> None:
     bench = made()
     for k in range(1, 11):
         bench.to(k)
-        bench.hear(
+        bench.receive(
             "ODOMETRY", component=197, x=2.0 * k, q=(1.0, 0.0, 0.0, 0.0), frame_id=1, child_frame_id=12
         )
-        bench.hear("LOCAL_POSITION_NED", x=500.0 * k, vx=500.0)
+        bench.receive("LOCAL_POSITION_NED", x=500.0 * k, vx=500.0)
         bench.fix()
     assert source(bench) is Source.OTHER
     assert moved(bench)[0] == pytest.approx(18.0, abs=0.1)
@@ -101,7 +101,7 @@ def test_two_streams_are_not_mixed() -> None:
     bench = made()
     for k in range(1, 6):
         local(bench, k, float(k))
-        bench.hear("ODOMETRY", x=1000.0 + k, q=(1.0, 0.0, 0.0, 0.0), child_frame_id=12, vx=1.0)
+        bench.receive("ODOMETRY", x=1000.0 + k, q=(1.0, 0.0, 0.0, 0.0), child_frame_id=12, vx=1.0)
     assert moved(bench)[0] == pytest.approx(4.0, abs=0.1)
 
 
@@ -113,7 +113,7 @@ def test_a_jump_is_not_a_motion(counted: bool) -> None:
         bench.to(k)
         x = 2.0 * k + 300.0 * (k > 5)
         fields: dict[str, Any] = {"vx": 0.0 if counted else 2.0, "reset_counter": int(counted and k > 5)}
-        bench.hear("ODOMETRY", x=x, q=(1.0, 0.0, 0.0, 0.0), child_frame_id=12, **fields)
+        bench.receive("ODOMETRY", x=x, q=(1.0, 0.0, 0.0, 0.0), child_frame_id=12, **fields)
     assert moved(bench)[0] == pytest.approx(16.0 if counted else 18.0, abs=0.1)
 
 
@@ -127,28 +127,28 @@ def test_a_velocity_in_the_body_is_turned() -> None:
 
 def test_speed_that_ends_is_not_followed_for_ever() -> None:
     bench = made()
-    bench.hear("ATTITUDE", yaw=0.0)
-    bench.hear("VFR_HUD", airspeed=1.5)
+    bench.receive("ATTITUDE", yaw=0.0)
+    bench.receive("VFR_HUD", airspeed=1.5)
     for k in range(1, 60):
         bench.to(k)
-        bench.hear("ATTITUDE", yaw=0.0)
-        bench.hear("VFR_HUD", airspeed=0.0)  # not measured
+        bench.receive("ATTITUDE", yaw=0.0)
+        bench.receive("VFR_HUD", airspeed=0.0)  # not measured
     assert source(bench) is Source.LAST
     assert moved(bench)[0] == pytest.approx(1.5 * 59, abs=3.0)
 
 
 def test_without_any_motion_no_fix_is_sent() -> None:
     bench = made()
-    bench.hear("GLOBAL_POSITION_INT", alt=-1000)
+    bench.receive("GLOBAL_POSITION_INT", alt=-1000)
     assert source(bench) is Source.NONE
 
 
 def test_depth_counts_from_the_sea_on_high_ground() -> None:
     bench = made()
-    bench.hear("LOCAL_POSITION_NED", z=4.0)
+    bench.receive("LOCAL_POSITION_NED", z=4.0)
     bench.to(1)
-    bench.hear("GPS_GLOBAL_ORIGIN", latitude=1, longitude=1, altitude=350_000)
-    bench.hear("LOCAL_POSITION_NED", z=4.0)
+    bench.receive("GPS_GLOBAL_ORIGIN", latitude=1, longitude=1, altitude=350_000)
+    bench.receive("LOCAL_POSITION_NED", z=4.0)
     assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-346.0)
-    bench.hear("GLOBAL_POSITION_INT", alt=347_000)
+    bench.receive("GLOBAL_POSITION_INT", alt=347_000)
     assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-347.0)

@@ -113,7 +113,7 @@ def feed(pipeline: Pipeline, given: Iterable[Event]) -> list[tuple[int, bytes]]:
     return [sent for event in given for sent in pipeline.feed(event)]
 
 
-def heard(stream: bytes) -> dict[str, list[Message]]:
+def received(stream: bytes) -> dict[str, list[Message]]:
     messages: dict[str, list[Message]] = {}
     for message in Codec(255, 190).parse(stream):
         messages.setdefault(message.name, []).append(message)
@@ -147,14 +147,14 @@ class Sailed(NamedTuple):
 def sailed(request: pytest.FixtureRequest, folder: Path) -> Sailed:
     pipeline = bridge(folder, request.param)
     sent = feed(pipeline, events(folder))
-    messages = heard(b"".join(frame for _, frame in sent))
+    messages = received(b"".join(frame for _, frame in sent))
     return Sailed(request.param, pipeline, sent, messages[MESSAGES[request.param]])
 
 
 def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None:
     """Decoded, each is within its sigma of the truth, and in its frame."""
     kind, _, sent, fixes = sailed
-    last = heard(b"".join(frame for _, frame in sent))["MAG_NAVIGATION"][-1]
+    last = received(b"".join(frame for _, frame in sent))["MAG_NAVIGATION"][-1]
     honest = np.sqrt(0.5 * (last["covariance_nn"] + last["covariance_ee"]))
     assert len(fixes) > 50
     for fix in fixes[-40::8]:
@@ -194,7 +194,7 @@ def test_a_fix_says_where_the_vehicle_is_when_it_is_sent(sailed: Sailed) -> None
 
 def test_no_fix_before_the_position_is_valid(sailed: Sailed) -> None:
     _, _, sent, fixes = sailed
-    messages = heard(b"".join(frame for _, frame in sent))
+    messages = received(b"".join(frame for _, frame in sent))
     tracking = next(one for one in messages["MAG_NAVIGATION"] if one["state"] == TRACKING)["time_usec"]
     first_us = next(time_us for time_us, frame in sent if frame == fixes[0].frame)
     assert first_us > tracking
@@ -223,7 +223,7 @@ def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:
     beat = Codec(1, 1).pack("ATTITUDE") + Codec(1, 1).pack("GLOBAL_POSITION_INT", alt=-1000)
     last_us = events(folder)[-1].time_us
     silence = [Event(last_us + 200_000 * k, Channel.LINK, beat) for k in range(600)]
-    after = heard(b"".join(frame for _, frame in feed(sailed.pipeline, silence)))["ODOMETRY"]
+    after = received(b"".join(frame for _, frame in feed(sailed.pipeline, silence)))["ODOMETRY"]
     grown = [one["pose_covariance"][0] for one in after]
     assert grown == sorted(grown)
     assert 2.0 < (after[-1]["time_usec"] - times[-1]) * 1e-6 < 45.0

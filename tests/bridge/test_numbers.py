@@ -94,5 +94,5 @@ def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
 
 def texts(sent: list[tuple[int, bytes]]) -> list[str]:
     """Return each text that was said."""
-    heard = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
-    return [one["text"] for one in heard if one.name == "STATUSTEXT"]
+    received = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
+    return [one["text"] for one in received if one.name == "STATUSTEXT"]

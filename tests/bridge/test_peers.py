@@ -41,7 +41,7 @@ def opened(kind: str, *, budget: float = inf, signed: bool = False) -> Iterator[
         yield port, place
 
 
-def hear(port: Port, size: int) -> bytes:
+def receive(port: Port, size: int) -> bytes:
     data = b""
     while len(data) < size:
         assert select.select(port.fds(), [], [], 2.0)[0], data
@@ -61,15 +61,15 @@ def udp(stack: ExitStack, count: int) -> list[socket.socket]:
 
 
 def test_a_header_swallows_nothing_of_another_peer() -> None:
-    bridge, heard = Codec(1, 191), []
+    bridge, received = Codec(1, 191), []
     with opened("udpin") as (port, place), ExitStack() as stack:
-        autopilot, stranger = udp(stack, 2)
+        autopilot, wrong_device = udp(stack, 2)
         for k in range(30):
-            stranger.sendto(header(20 + k), place)
+            wrong_device.sendto(header(20 + k), place)
             autopilot.sendto(beat(), place)
             while select.select(port.fds(), [], [], 0.02)[0]:
-                heard += bridge.parse(port.read(), whole=True)
-    assert [one.name for one in heard].count("HEARTBEAT") == 30
+                received += bridge.parse(port.read(), whole=True)
+    assert [one.name for one in received].count("HEARTBEAT") == 30
 
 
 def test_frames_come_first_and_a_frame_in_pieces_is_whole() -> None:
@@ -78,23 +78,23 @@ def test_frames_come_first_and_a_frame_in_pieces_is_whole() -> None:
     noise, frame = b"noise" + header(30) + bytes(9), beat()
     for who, data in ((1, frame[:7]), (2, noise), (1, frame[7:]), (2, bytes(5000)), (3, frame)):
         both.receive(who, data)
-    data = both.take()
+    data = both.drain()
     assert data.startswith(frame * 2)
     assert len(data) == 2 * len(frame) + 4096
     messages = Codec(1, 191).parse(data, whole=True)
     assert [one.name for one in messages[:2]] == ["HEARTBEAT"] * 2
     assert b"".join(one.frame for one in messages) == data
-    assert both.take() == b""
+    assert both.drain() == b""
 
 
 @pytest.mark.parametrize("word", [b"", b"x", b"\xfd", beat()[:-1], beat()[:-1] + b"\0", header(1) + bytes(3)])
 def test_who_says_nothing_valid_is_not_answered(word: bytes) -> None:
     with opened("udpin") as (port, place), ExitStack() as stack:
-        (stranger,) = udp(stack, 1)
-        stranger.sendto(word, place)
+        (wrong_device,) = udp(stack, 1)
+        wrong_device.sendto(word, place)
         assert select.select(port.fds(), [], [], 1)[0]
         port.read()
-        assert answered([stranger], port) == []
+        assert answered([wrong_device], port) == []
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
@@ -108,10 +108,10 @@ def test_where_we_sign_only_a_signature_is_answered(kind: str) -> None:
             everyone = [stack.enter_context(socket.create_connection(place)) for _ in range(2)]
         for k, one in enumerate(everyone):
             one.send(beat(1 + k))
-        hear(port, 2 * len(beat()))
+        receive(port, 2 * len(beat()))
         assert answered(everyone, port) == []
         everyone[0].send(beat(1))
-        hear(port, len(beat()))
+        receive(port, len(beat()))
         port.credit([beat(1)])
         assert answered(everyone, port) == [0]
 
@@ -123,7 +123,7 @@ def test_strangers_never_take_the_autopilot_s_place(first: bool) -> None:
         everyone = [autopilot, *strangers]
         for one in everyone if first else reversed(everyone):
             one.sendto(beat(1 if one is autopilot else 99), place)
-        hear(port, 41 * len(beat()))
+        receive(port, 41 * len(beat()))
         reached = answered(everyone, port)
         assert len(reached) == ANSWERED
         assert 0 in reached
@@ -153,14 +153,14 @@ def test_a_peer_that_falls_silent_is_no_longer_answered(monkeypatch: pytest.Monk
 def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
     both = Peers(PILOT)
     both.receive("autopilot", beat())
-    both.take()
+    both.drain()
     for k in range(10 * KNOWN):
         both.receive(k, beat(99)[:-1] + b"?" + bytes(1000))
     for _ in range(100):
         both.receive("station", beat(190, 255) * 20)
     for _ in range(1000):
         both.receive("autopilot", beat())
-    frames = [one for one in Codec(1, 191).parse(both.take(), whole=True) if one.known]
+    frames = [one for one in Codec(1, 191).parse(both.drain(), whole=True) if one.known]
     assert sum(one.component == 1 for one in frames) == 1000
     assert sum(one.component == 190 for one in frames) <= SHARE / len(beat())
     assert both.ignored > 10 * KNOWN * 900
@@ -176,7 +176,7 @@ def test_others_share_a_budget_and_the_autopilot_has_none(kind: str) -> None:
             one.connect(place)
         for k, one in enumerate(everyone[: 2 if kind == "tcpin" else 3]):
             one.send(beat(1 + k))
-        hear(port, (2 if kind == "tcpin" else 3) * len(beat()))
+        receive(port, (2 if kind == "tcpin" else 3) * len(beat()))
         while select.select(port.fds(), [], [], 0.05)[0]:
             port.read()  # accepts the last one
         begun = time.monotonic()
@@ -201,13 +201,13 @@ def test_connections_never_turn_the_autopilot_out() -> None:
     with opened("tcpin") as (port, place), ExitStack() as stack:
         autopilot = stack.enter_context(socket.create_connection(place))
         autopilot.sendall(beat())
-        assert hear(port, len(beat())) == beat()
+        assert receive(port, len(beat())) == beat()
         for _ in range(200):
             stack.enter_context(socket.create_connection(place))
             port.read()
         assert len(port.fds()) <= CONNECTIONS + 1
         autopilot.sendall(beat())
-        assert hear(port, len(beat())) == beat()
+        assert receive(port, len(beat())) == beat()
         port.write(b"field")
         assert autopilot.recv(9) == b"field"
 
@@ -221,5 +221,5 @@ def test_a_client_that_only_listens_has_to_go_for_one_that_speaks(monkeypatch: p
         assert len(answered(mute, port)) == CONNECTIONS
         late = stack.enter_context(socket.create_connection(place))
         late.sendall(beat())
-        assert hear(port, len(beat())) == beat()
+        assert receive(port, len(beat())) == beat()
         assert mute[0].recv(9) == b""

@@ -156,25 +156,25 @@ def test_what_waits_for_a_slow_reader(key: bytes | None) -> None:
         codec.now_us = time.time_ns() // 1000
         port.write(sample(codec, count := count + 1))
     time.sleep(2 * LATE)
-    told = count
-    while count < told + 5 or count % 100 == 0:  # no text at the end
+    reported = count
+    while count < reported + 5 or count % 100 == 0:  # no text at the end
         port.write(sample(codec, count := count + 1))
-    heard: list[Message] = []
+    received: list[Message] = []
     reader.now_us = codec.now_us
-    while len(heard) < 3 or heard[-3].name != "MAG_FIELD" or heard[-3]["sequence"] < count:
+    while len(received) < 3 or received[-3].name != "MAG_FIELD" or received[-3]["sequence"] < count:
         port.flush()
-        heard += reader.parse(drained(client, 1))
+        received += reader.parse(drained(client, 1))
     client.close()
     port.close()
     assert reader.bytes_skipped == 0
-    assert all(one.known for one in heard)
-    fields = [one["sequence"] for one in heard if one.name == "MAG_FIELD"]
+    assert all(one.known for one in received)
+    fields = [one["sequence"] for one in received if one.name == "MAG_FIELD"]
     assert fields == sorted(fields)
     assert fields[-1] == count
-    assert len(fields) < told
-    names = [one["name"] for one in heard if one.name == "NAMED_VALUE_FLOAT"]
+    assert len(fields) < reported
+    names = [one["name"] for one in received if one.name == "NAMED_VALUE_FLOAT"]
     assert names[-2:] == ["mag_total", "mag_sigma"]
-    assert [one["text"] for one in heard if one.name == "STATUSTEXT"] == [
+    assert [one["text"] for one in received if one.name == "STATUSTEXT"] == [
         f"{number}" for number in range(100, count + 1, 100)
     ]
 
@@ -232,10 +232,10 @@ def test_a_server_takes_the_next_client() -> None:
     for word in (BEAT, BEAT * 2):
         with socket.create_connection(address) as client:
             client.sendall(word)
-            heard = b""
-            while heard != word:
+            received = b""
+            while received != word:
                 assert select.select(port.fds(), [], [], 5)[0]
-                heard += port.read()
+                received += port.read()
             port.write(b"answer")
             assert drained(client, 6) == b"answer"
         assert port.up
@@ -257,14 +257,14 @@ def test_a_link_by_ipv6_and_by_both(kinds: tuple[str, str], host: str, to: str) 
     with socket.socket(fileno=os.dup(here.fds()[0])) as listener:
         there = open_link(f"{kinds[1]}:{to}:{listener.getsockname()[1]}", 0)
     there.open()
-    heard = b""
+    received = b""
     for one, other in ((there, here), (here, there)):
         one.write(BEAT)
-        while not heard:
+        while not received:
             assert select.select(other.fds(), [], [], 5)[0]
-            heard = other.read()
-        assert heard == BEAT
-        heard = b""
+            received = other.read()
+        assert received == BEAT
+        received = b""
     here.close()
     there.close()
 

@@ -51,12 +51,12 @@ def speaking(data: bytes) -> Iterator[str]:
     master, slave = pty.openpty()
     stop = threading.Event()
 
-    def say() -> None:
+    def send_message() -> None:
         while not stop.wait(0.02):
             if data:
                 os.write(master, data)
 
-    talker = threading.Thread(target=say)
+    talker = threading.Thread(target=send_message)
     talker.start()
     try:
         yield os.ttyname(slave)
@@ -70,35 +70,35 @@ def speaking(data: bytes) -> Iterator[str]:
 @pytest.mark.parametrize("who", SPEAKERS)
 def test_recognised(who: str) -> None:
     with speaking(SPEAKERS[who]) as device:
-        heard, baudrate, _ = listen(device, (9600,), 0.4)
-    assert heard.who == who
+        received, baudrate, _ = listen(device, (9600,), 0.4)
+    assert received.who == who
     assert baudrate == (9600 if who else None)
 
 
 def test_the_line_that_cannot_be_parsed_is_shown() -> None:
-    assert recognise(SPEAKERS["text"], 1.0).told.startswith(
+    assert recognise(SPEAKERS["text"], 1.0).text.startswith(
         "not understood: 'B=4.5 X 1 2 3'; if these are x y z"
     )
-    assert "80 81 82" in recognise(SPEAKERS["bytes"], 1.0).told
+    assert "80 81 82" in recognise(SPEAKERS["bytes"], 1.0).text
 
 
 def test_systems_are_named() -> None:
-    assert recognise(SPEAKERS["mavlink"], 1.0).told == "system 7 component 1"
+    assert recognise(SPEAKERS["mavlink"], 1.0).text == "system 7 component 1"
 
 
 def test_ports_as_a_command(command: Command) -> None:
     with speaking(SPEAKERS["nmea"]) as device:
-        said = command("ports", device, "/dev/no_such", "--seconds", "0.3", "--baudrate", "9600", "--json")
-    first, second = json.loads(said.out)["ports"]
+        output = command("ports", device, "/dev/no_such", "--seconds", "0.3", "--baudrate", "9600", "--json")
+    first, second = json.loads(output.out)["ports"]
     assert (first["who"], first["said"], first["baudrate"]) == ("nmea", "NMEA 0183: GPGGA", 9600)
     assert "cannot be opened" in second["said"] or "may not be opened" in second["said"]
 
 
 @pytest.mark.parametrize("driver", driver_names())
 def test_every_option_of_a_driver_is_told(driver: str, command: Command) -> None:
-    said = command("drivers", driver).out
+    output = command("drivers", driver).out
     for one in options_of(driver):
-        assert one.name in said
+        assert one.name in output
         assert one.kind
         assert one.meaning, one.name
 
@@ -125,8 +125,8 @@ def test_init_writes_what_run_would_start_with(
 
 
 def test_init_says_what_is_left_to_fill_in(command: Command) -> None:
-    said = command("init", "--driver", "digitizer")
-    assert "sensor.options.sensitivity: missing key" in said.err
+    output = command("init", "--driver", "digitizer")
+    assert "sensor.options.sensitivity: missing key" in output.err
     assert "FILL IN" in Path("bridge.toml").read_text()
     assert "1 thing to mend" in command("run", "--check", "--config", "bridge.toml", code=2).err
 
@@ -165,12 +165,12 @@ def test_init_asks_five_questions_on_a_terminal(typed: bytes, words: str, here: 
     ) as process:
         os.close(slave)
         os.write(master, typed)
-        said = b""
+        output = b""
         with suppress(OSError):  # the terminal ends with its last program
             while piece := os.read(master, 4096):
-                said += piece
+                output += piece
     os.close(master)
-    text = said.decode()
+    text = output.decode()
     assert words in text
     assert "Traceback" not in text
     written = (here / "bridge.toml").exists()

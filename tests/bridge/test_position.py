@@ -23,11 +23,11 @@ AGO = 20 * YEAR
 
 
 def position_at(
-    latitude: float, longitude: float, altitude: float, tell: Callable[[str], None] = print
+    latitude: float, longitude: float, altitude: float, notify: Callable[[str], None] = print
 ) -> Position:
     fields = {"lat": round(latitude * 1e7), "lon": round(longitude * 1e7), "alt": round(altitude * 1e3)}
     (message,) = Codec(0, 0).parse(Codec(1, 1).pack("GLOBAL_POSITION_INT", **fields))
-    position = Position(tell)
+    position = Position(notify)
     position.update(message, START)
     return position
 
@@ -70,8 +70,8 @@ def test_the_anomaly_follows_when_the_host_s_clock_is_set(tmp_path: Path) -> Non
         sent = bridge.feed(
             Event(START + second * SECOND, Channel.SENSOR, b"1 2 50000 4 %d %d\n" % (second, second))
         )
-        heard = [message for _, frame in sent for message in ear.parse(frame)]
-        seen += [message for message in heard if message.name == "MAG_FIELD"]
+        received = [message for _, frame in sent for message in ear.parse(frame)]
+        seen += [message for message in received if message.name == "MAG_FIELD"]
         bridge.feed(Event(START + 2 * SECOND, Channel.STATE, clock_step(START, -AGO)))
     then, now = (total_field(-57.9, 49.5, 0.0, t * 1e-6).item() for t in (START - AGO, START))
     change = seen[1]["anomaly"] - seen[0]["anomaly"] - seen[1]["total_field"] + seen[0]["total_field"]
@@ -80,8 +80,8 @@ def test_the_anomaly_follows_when_the_host_s_clock_is_set(tmp_path: Path) -> Non
 
 
 def test_why_there_is_no_field_is_told() -> None:
-    told: list[str] = []
-    position = position_at(49.5, -57.9, 0.0, told.append)
+    reported: list[str] = []
+    position = position_at(49.5, -57.9, 0.0, reported.append)
     assert isnan(position.main_field(START, round(datetime(2031, 1, 1, tzinfo=UTC).timestamp() * 1e6)))
-    assert len(told) == 1
-    assert "2031-01-01" in told[0]
+    assert len(reported) == 1
+    assert "2031-01-01" in reported[0]

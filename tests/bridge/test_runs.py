@@ -38,9 +38,9 @@ def test_neither_sensor_nor_autopilot_at_the_start(make_rig: MakeRig, table: Row
     replays(rig)
     (log,) = rig.logs
     with log.open("rb") as file:
-        said = [record.message["text"] for record in LogReader(file) if record.message.name == "STATUSTEXT"]
-    assert any(text.startswith("digitizer lost: no such device: /") for text in said)
-    assert any(text.startswith(f"link: Connection refused: {rig.url[:8]}") for text in said)
+        texts = [record.message["text"] for record in LogReader(file) if record.message.name == "STATUSTEXT"]
+    assert any(text.startswith("digitizer lost: no such device: /") for text in texts)
+    assert any(text.startswith(f"link: Connection refused: {rig.url[:8]}") for text in texts)
 
 
 @pytest.mark.parametrize("speaks", [True, False])
@@ -81,7 +81,7 @@ def test_tcp_server_gone_and_back(make_rig: MakeRig, table: Row) -> None:
     assert rig.process.poll() is None
     rig.autopilot.up()
     back = rig.until_well()
-    rig.until_said("link: open", mark)
+    rig.until_reported("link: open", mark)
     sequences = [message["sequence"] for message in rig.of("MAG_FIELD", mark)]
     lost = next(number for number in sequences if number > last + 20) - last - 1
     assert sequences == sorted(sequences)
@@ -101,13 +101,13 @@ def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
     rig = make_rig("serial")
     rig.start()
     mark, deadline = rig.mark, time.monotonic() + 60.0
-    while not said_in(rig.logs, "link: too slow"):
+    while not texts_in(rig.logs, "link: too slow"):
         assert time.monotonic() < deadline
         for _ in range(100):
             rig.fluxgate.turn()
             time.sleep(0.005)
     back = rig.until_well()
-    rig.until_said("bytes not sent so far", mark, 30.0)
+    rig.until_reported("bytes not sent so far", mark, 30.0)
     table(
         "autopilot's serial line too slow: nobody reads it",
         "whole messages are dropped, those first that a newer one replaces; "
@@ -119,7 +119,7 @@ def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
     replays(rig)
 
 
-def said_in(logs: list[Path], text: str) -> bool:
+def texts_in(logs: list[Path], text: str) -> bool:
     """Say whether a bridge has said `text`, as far as its log is on the disk."""
     return any(text.encode() in path.read_bytes() for path in logs)
 
@@ -133,7 +133,7 @@ def test_autopilot_on_a_serial_line_pulled_out_and_back(make_rig: MakeRig, table
     rig.run(1.0)
     rig.autopilot.up()
     back = rig.until_well()
-    rig.until_said("link: open", mark)
+    rig.until_reported("link: open", mark)
     lost = rig.of("MAG_FIELD", mark)[0]["sequence"] - last - 1
     table(
         "autopilot on a serial line: pulled out, back after 1.0 s",
@@ -155,9 +155,9 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
         before = rig.of("MAG_FIELD")[-1]
         seen = rig.mark
         rig.step(step)
-        noticed = rig.until_said("clock was set by", seen)
+        noticed = rig.until_reported("clock was set by", seen)
         # less than the threshold is slewing, and so may a late look at one of two clocks be off
-        (reported,) = [float(text.split()[-2]) for text in rig.said(seen) if "clock was set by" in text]
+        (reported,) = [float(text.split()[-2]) for text in rig.texts(seen) if "clock was set by" in text]
         assert reported == pytest.approx(step, abs=Clock.THRESHOLD_US * 1e-6)
         rig.run(0.2)
         after = rig.of("MAG_FIELD")[-1]
@@ -202,10 +202,10 @@ def test_forged_signed_packets(make_rig: MakeRig, table: Row) -> None:
     rig.run(0.8)  # beyond max_age: only later genuine telemetry keeps the field good
     rig.until_answered()
     assert rig.undue_flags(mark) == ""
-    told = sorted(text for text in rig.said(mark) if "refused" in text)
+    reported = sorted(text for text in rig.texts(mark) if "refused" in text)
     reasons = ("an old time stamp", "not signed", "signed with another key")
-    assert told == [f"frames of 1:1 refused: {why}" for why in reasons]
-    assert all(message.frame[2] & 1 for _, message in rig.heard)
+    assert reported == [f"frames of 1:1 refused: {why}" for why in reasons]
+    assert all(message.frame[2] & 1 for _, message in rig.received)
     table(
         "forged packets: a time stamp far in the future, another key, no signature, a replayed genuine "
         "packet",

@@ -26,12 +26,12 @@ def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None
     rig.fluxgate.unplug(after=17)
     away = time.monotonic()
     rig.until_status(lambda status: status["sensor_state"] == LOST)
-    delay = rig.until_said("digitizer lost", mark)
+    delay = rig.until_reported("digitizer lost", mark)
     rig.until(lambda: any(beat["system_status"] == 5 for beat in rig.of("HEARTBEAT", mark)))  # critical
     rig.run(0.3)
     rig.fluxgate.plug()
     gone, back = time.monotonic() - away, rig.until_well()
-    rig.until_said("digitizer speaks", mark)
+    rig.until_reported("digitizer speaks", mark)
     after = rig.fresh_status()
     assert rig.undue_flags(mark) == "gap"
     lost = after["samples_lost"] - before["samples_lost"]
@@ -57,7 +57,7 @@ def test_sensor_silent(rig: Rig, table: Row) -> None:
     silent = rig.until_status(lambda status: status["sensor_state"] == SILENT)
     assert before["sample_rate"] > 1.0
     assert isnan(silent["sample_rate"])
-    noticed = rig.until_said("digitizer is silent", mark)
+    noticed = rig.until_reported("digitizer is silent", mark)
     rig.fluxgate.speaks = True
     back = rig.until_well()
     lost = rig.fresh_status()["samples_lost"] - before["samples_lost"]
@@ -113,8 +113,8 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
 
         def refused() -> bool:
             try:
-                heard = ear.parse(sink.recv(65536))
-                texts.extend(message["text"] for message in heard if message.name == "STATUSTEXT")
+                received = ear.parse(sink.recv(65536))
+                texts.extend(message["text"] for message in received if message.name == "STATUSTEXT")
             except BlockingIOError:
                 pass
             return any("digitizer lost" in text for text in texts)
@@ -147,7 +147,7 @@ def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -
     rig.fluxgate.plug("ttyUSB1", powered_anew=True)
     rig.normal = 32  # offset_suspect: until it is calibrated again
     back = rig.until_well()
-    rig.until_said("offset suspect", mark)
+    rig.until_reported("offset suspect", mark)
     sigma = rig.of("MAG_FIELD")[-1]["total_field_sigma"]
     assert sigma > 20
     table(

@@ -31,7 +31,7 @@ class Bench:
         )
         self._ear = Codec(0, 0)
         self.raw: list[float] = []
-        self.said: list[str] = []
+        self.texts: list[str] = []
 
     def feed(self, seconds: float, channel: Channel, data: bytes) -> None:
         event = Event(START + round(seconds * 1e6), channel, data)
@@ -40,12 +40,12 @@ class Bench:
                 if message.name == "MAG_RAW":
                     self.raw.append(message["x"])
                 elif message.name == "STATUSTEXT":
-                    self.said.append(message["text"])
+                    self.texts.append(message["text"])
 
     def open(self, seconds: float) -> None:
         self.feed(seconds, Channel.STATE, states.opened(MAG_PORT_NAME.SENSOR))
 
-    def hear(self, seconds: float, data: bytes) -> None:
+    def receive(self, seconds: float, data: bytes) -> None:
         self.feed(seconds, Channel.SENSOR, data)
 
 
@@ -59,28 +59,28 @@ def bench(tmp_path: Path) -> Bench:
 def test_half_a_line_is_no_sample(bench: Bench) -> None:
     """Neither the one that the bridge came into, nor two halves from before and after an unplugging."""
     whole = LINE % 1.0
-    bench.hear(0.1, whole[4:])
-    bench.hear(0.2, whole + whole[:9])
+    bench.receive(0.1, whole[4:])
+    bench.receive(0.2, whole + whole[:9])
     bench.open(1.0)
-    bench.hear(1.1, whole[11:])
-    bench.hear(1.2, LINE % 2.0)
+    bench.receive(1.1, whole[11:])
+    bench.receive(1.2, LINE % 2.0)
     assert bench.raw == [12340.5, 12340.5]
 
 
 def test_an_instrument_that_sends_rarely_is_heard_each_time(bench: Bench) -> None:
     """`sensor.timeout` is 10 s: that it is asked to start anew costs no reading."""
     for k in range(5):
-        bench.hear(15.0 * k, LINE % (15.0 * k))
+        bench.receive(15.0 * k, LINE % (15.0 * k))
     assert len(bench.raw) == 4  # the first may have been half a line
-    assert "ascii is silent" in bench.said
+    assert "ascii is silent" in bench.texts
 
 
 def test_an_instrument_that_hangs_is_told(bench: Bench) -> None:
     """After a minute, and that it changes again; a few readings that happen to be equal are none."""
     for k in range(130):
         z = -234.5 if 5 <= k < 30 or 40 <= k < 110 else float(k)
-        bench.hear(k, b"12340.5 43210.9 %.1f 4.0 %d 7\r\n" % (z, k))
-        hangs = [text for text in bench.said if "reading" in text]
+        bench.receive(k, b"12340.5 43210.9 %.1f 4.0 %d 7\r\n" % (z, k))
+        hangs = [text for text in bench.texts if "reading" in text]
         assert len(hangs) == (k >= 100) + (k >= 110)
     assert hangs == ["ascii sends the same reading for 60 s", "ascii's readings change again"]
 
@@ -98,16 +98,16 @@ GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
 )
 def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench, line: bytes, what: str) -> None:
     for k in range(41):
-        bench.hear(k, line)
+        bench.receive(k, line)
     assert not bench.raw
-    assert bench.said[-1] == f"ascii {what}"
-    assert len([text for text in bench.said if "readings" in text]) == 1
+    assert bench.texts[-1] == f"ascii {what}"
+    assert len([text for text in bench.texts if "readings" in text]) == 1
     bench.feed(65.0, Channel.STATE, b"")
-    assert bench.said[-1] == "ascii is silent"
+    assert bench.texts[-1] == "ascii is silent"
 
 
 @pytest.mark.parametrize(
-    ("searching", "heard", "sent"),
+    ("searching", "received", "sent"),
     [
         (True, GGA[30:] + GGA, []),  # a GPS, in the middle of a sentence
         (True, GGA.replace(b"GPGGA", b"PMAGN"), [1.3]),  # a maker's own sentence: maybe the sensor's
@@ -117,7 +117,7 @@ def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench, line: b
     ],
 )
 def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
-    searching: bool, heard: bytes, sent: list[float]
+    searching: bool, received: bytes, sent: list[float]
 ) -> None:
     timers, codec = Timers(), Codec(1, 191)
     announcer = Announcer(Outbox(codec), timers)
@@ -128,11 +128,11 @@ def test_a_line_found_by_a_pattern_is_listened_to_before_it_gets_commands(
         timers.advance(100_000 * k, lambda _: None)
         times += [0.1 * k for _ in line.to_send]
         line.to_send.clear()
-        if heard and k % 10 == 7:
-            line.mumbled(heard[:11], 100_000 * k)
-            line.mumbled(heard[11:], 100_000 * k)
+        if received and k % 10 == 7:
+            line.on_unparsed(received[:11], 100_000 * k)
+            line.on_unparsed(received[11:], 100_000 * k)
     assert times == pytest.approx(sent, abs=0.11)
-    assert line.stranger == (sent == [])
+    assert line.wrong_device == (sent == [])
 
 
 def test_what_turns_out_to_be_a_gps_gets_no_further_commands() -> None:
@@ -145,10 +145,10 @@ def test_what_turns_out_to_be_a_gps_gets_no_further_commands() -> None:
         timers.advance(now_us, lambda _: None)
         sent += line.to_send
         line.to_send.clear()
-        if sent and not line.stranger:
-            line.mumbled(GGA, now_us)
+        if sent and not line.wrong_device:
+            line.on_unparsed(GGA, now_us)
     assert sent == [b"1"]
-    assert line.stranger
+    assert line.wrong_device
 
 
 def test_commands_are_a_tenth_of_a_second_apart() -> None:

@@ -55,7 +55,7 @@ def test_a_standstill_just_before_a_mass_moves(
     rig.run(still)
     rig.process.send_signal(signal.SIGCONT)
     back = rig.until_well()
-    rig.until_said("stood still for", mark)
+    rig.until_reported("stood still for", mark)
     rig.run(0.5)
     samples = rig.of("MAG_FIELD", mark)
     assert len(samples) >= 4 * still

@@ -42,7 +42,7 @@ def test_a_terminal_is_told_what_the_link_is(tmp_path: Path, number: signal.Sign
 
 
 def test_a_calibration_that_its_data_do_not_support_is_told(tmp_path: Path) -> None:
-    save(replace(identity(), method="nominal", doubts=("few headings",)), tmp_path / "cal.json")
+    save(replace(identity(), method="nominal", warnings=("few headings",)), tmp_path / "cal.json")
     with on_a_terminal(tmp_path, '[calibration]\nfile = "cal.json"') as (process, terminal):
         read_until(terminal, ("calibration is not supported by its data",))
         process.terminate()

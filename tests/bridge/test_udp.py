@@ -104,10 +104,10 @@ def test_datagrams_that_waited_come_at_once() -> None:
         _, bridge = peer.recvfrom(10)
         for k in range(200):
             peer.sendto(bytes((k,)) * 600, bridge)
-        heard = [port.read() for _ in range(3)]
+        received = [port.read() for _ in range(3)]
         for data in (b"first", b"", b"after an empty one"):
             peer.sendto(data, bridge)
         assert port.read() == b"firstafter an empty one"
         port.close()
-    assert [len(data) for data in heard] == [66_000, 54_000, 0]
-    assert b"".join(heard)[::600] == bytes(range(200))
+    assert [len(data) for data in received] == [66_000, 54_000, 0]
+    assert b"".join(received)[::600] == bytes(range(200))

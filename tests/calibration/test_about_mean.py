@@ -45,8 +45,8 @@ def test_calibrate_about_a_mean(here: Path, command: Command) -> None:
     asked = "calibrate", "turns.csv", "-o", "cal.json"
     write(turned(), "turns.csv")
     assert "--about-mean" in command.refuses(*asked)
-    said = command(*asked, "--about-mean")
-    assert "turns.csv: fitted about a mean of " in said.err
+    output = command(*asked, "--about-mean")
+    assert "turns.csv: fitted about a mean of " in output.err
     found = load(here / "cal.json")
     assert found.coefficients[6:9] == pytest.approx(IRON, abs=10.0)
     command("correct", "turns.csv", "--calibration", "cal.json", "-o", "corrected.csv")

@@ -78,42 +78,42 @@ BAD: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
 def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
     spoil, words = BAD[case]
     write(spoil(runs), "bad.csv")
-    said = command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
-    assert words in said
-    assert said.startswith("bad.csv: ")
+    output = command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
+    assert words in output
+    assert output.startswith("bad.csv: ")
     assert not Path("cal.json").exists()
 
 
 def test_a_log_is_known_by_its_file(runs: xr.Dataset, command: Command) -> None:
     """Beside what it says of its own source."""
     write(runs.drop_vars("mag_x"), "bad.nc")
-    said = command.refuses("calibrate", "bad.nc", *PARAMETERS, "-o", "cal.json")
-    assert said.startswith("bad.nc (simulated: demo): column 'mag_x': expected this column")
+    output = command.refuses("calibrate", "bad.nc", *PARAMETERS, "-o", "cal.json")
+    assert output.startswith("bad.nc (simulated: demo): column 'mag_x': expected this column")
 
 
 def test_a_column_of_strings(good: tuple[Path, Path], command: Command) -> None:
-    head, *rows = good[0].read_text().splitlines()
-    place = [name.partition(" ")[0] for name in head.split(",")].index("ballast")
+    header, *rows = good[0].read_text().splitlines()
+    place = [name.partition(" ")[0] for name in header.split(",")].index("ballast")
     cells = [row.split(",") for row in rows]
     spoilt = [",".join([*row[:place], "in", *row[place + 1 :]]) for row in cells]
-    Path("bad.csv").write_text("\n".join([head, *spoilt, ""]))
-    said = command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
-    assert said.startswith("bad.csv: column 'ballast': expected this column; there are: mag_x ")
-    assert said.endswith("; guessed: left out, no numbers: ballast")
+    Path("bad.csv").write_text("\n".join([header, *spoilt, ""]))
+    output = command.refuses("calibrate", "bad.csv", *PARAMETERS, "-o", "cal.json")
+    assert output.startswith("bad.csv: column 'ballast': expected this column; there are: mag_x ")
+    assert output.endswith("; guessed: left out, no numbers: ballast")
 
 
 def test_positions_outside_the_grid(good: tuple[Path, Path], command: Command) -> None:
     axis = np.arange(10.0, 11.0, 0.1)
     AnomalyGrid(axis, axis, np.zeros((len(axis), len(axis)))).save("far.nc")
-    said = command.refuses("calibrate", good[0], *PARAMETERS, "--grid", "far.nc", "-o", "cal.json")
-    assert "far.nc" in said
+    output = command.refuses("calibrate", good[0], *PARAMETERS, "--grid", "far.nc", "-o", "cal.json")
+    assert "far.nc" in output
 
 
 def test_a_run_given_twice_counts_once(good: tuple[Path, Path], command: Command) -> None:
     Path("again.csv").write_bytes(good[0].read_bytes())
-    said = command("calibrate", good[0], "again.csv", *PARAMETERS, "-o", "cal.json").err
-    assert f"again.csv: identical to {good[0]}; its samples are counted once" in said
-    assert "in the logs: 563 duplicate rows" in said
+    output = command("calibrate", good[0], "again.csv", *PARAMETERS, "-o", "cal.json").err
+    assert f"again.csv: identical to {good[0]}; its samples are counted once" in output
+    assert "in the logs: 563 duplicate rows" in output
     once, twice = (json.loads(path.read_text()) for path in (good[1], Path("cal.json")))
     assert once["coefficients"] == twice["coefficients"]
 
@@ -130,14 +130,14 @@ def test_a_log_that_adds_nothing_is_told(runs: xr.Dataset, good: tuple[Path, Pat
     write(later(runs, 2).drop_vars("battpos"), "no_mass.csv")
     write(runs.assign(mag_x=runs["mag_x"] + 100.0), "same_times.csv")
     logs = good[0], "no_x.csv", "no_mass.csv", "same_times.csv"
-    said = command("calibrate", *logs, *PARAMETERS, "-o", "cal.json", "--json")
-    idle = [line for line in said.err.splitlines() if "adds no sample" in line]
+    output = command("calibrate", *logs, *PARAMETERS, "-o", "cal.json", "--json")
+    idle = [line for line in output.err.splitlines() if "adds no sample" in line]
     assert [line.partition(": adds no sample to the fit: ")[::2] for line in idle] == [
         ("magbridge: no_x.csv", "'mag_x' has no number"),
         ("magbridge: no_mass.csv", "'battpos' has no number"),
         ("magbridge: same_times.csv", "runs.csv has samples at the same times, and the first counts"),
     ]
-    assert json.loads(said.out)["left_out"] == 2 * 563
+    assert json.loads(output.out)["left_out"] == 2 * 563
     once, all_logs = (json.loads(path.read_text())["coefficients"] for path in (good[1], Path("cal.json")))
     assert once == all_logs
 
@@ -150,9 +150,9 @@ def test_logs_of_two_vehicles_are_told_apart(
     write(changed(later(runs, 1), **iron), "other.csv")
     write(later(runs, 1), "own.csv")
     for name in ("own.csv", "other.csv"):
-        said = command("calibrate", good[0], name, "--method", "nominal", "-o", "cal.json").err
-        assert ("one calibration does not fit all logs" in said) == (name == "other.csv"), said
-    assert "each on its own runs.csv " in said
+        output = command("calibrate", good[0], name, "--method", "nominal", "-o", "cal.json").err
+        assert ("one calibration does not fit all logs" in output) == (name == "other.csv"), output
+    assert "each on its own runs.csv " in output
 
 
 def test_where_two_vehicles_leave_no_fit_at_all(runs: xr.Dataset, command: Command) -> None:
@@ -161,8 +161,8 @@ def test_where_two_vehicles_leave_no_fit_at_all(runs: xr.Dataset, command: Comma
     write(runs, "one.csv")
     write(later(other.drop_vars("reference_field"), 1), "two.csv")
     fit = "calibrate", "one.csv", "two.csv", *PARAMETERS, "--method", "cubic", "-o", "cal.json"
-    said = command.refuses(*fit)
-    assert said.startswith(
+    output = command.refuses(*fit)
+    assert output.startswith(
         "one.csv, two.csv: one calibration does not fit all logs: together the fit collapses, each on its "
     )
     assert not Path("cal.json").exists()
@@ -183,7 +183,7 @@ def test_a_bad_calibration(
 ) -> None:
     log, cal = good
     Path("bad.json").write_text(edit(cal.read_text()))
-    said = command.refuses("correct", log, "--calibration", "bad.json", "-o", "x.csv")
-    assert words in said
-    assert "bad.json" in said
+    output = command.refuses("correct", log, "--calibration", "bad.json", "-o", "x.csv")
+    assert words in output
+    assert "bad.json" in output
     assert not Path("x.csv").exists()

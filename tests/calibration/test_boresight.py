@@ -50,8 +50,8 @@ def test_magnetic_headings_that_are_taken_for_true_are_told(pitch: float, turn: 
     )  # fmt: skip
     read = attitude - [0.0, 0.0, np.arctan2(east, north)]
     assert magnetic_headings(identity(), right) == ""
-    said = magnetic_headings(identity(), replace(right, attitude=read))
-    assert "headings look magnetic: with the declination of -17.4 degrees" in said
+    output = magnetic_headings(identity(), replace(right, attitude=read))
+    assert "headings look magnetic: with the declination of -17.4 degrees" in output
     found = np.degrees(np.linalg.norm(find_boresight(identity(), replace(right, attitude=read)).rotation))
     assert found == pytest.approx(turn, abs=0.7)
     warnings = fit(replace(right, attitude=read), "nominal").warnings

@@ -37,10 +37,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_each_compass_gets_a_calibration_of_its_own(flight: Path, here: Path, command: Command) -> None:
-    said = command("calibrate", flight, "--compass", "all", "-o", "cal.json", "--json")
+    output = command("calibrate", flight, "--compass", "all", "-o", "cal.json", "--json")
     assert sorted(path.name for path in here.iterdir()) == ["cal_0.json", "cal_1.json"]
-    assert "compass 2: " in said.err
-    for number, line in enumerate(said.out.splitlines()):
+    assert "compass 2: " in output.err
+    for number, line in enumerate(output.out.splitlines()):
         result = json.loads(line)
         assert result["file"] == f"cal_{number}.json"
         np.testing.assert_allclose(result["paper"]["T_nT"], 100 * OFFSETS[number], rtol=0, atol=60)

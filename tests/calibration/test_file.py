@@ -106,10 +106,10 @@ def test_an_older_format_is_read(cal: Calibration) -> None:
 
 
 def test_doubts_come_back_and_older_readers_refuse_them(cal: Calibration) -> None:
-    doubtful = replace(cal, doubts=("all headings lie within 60 degrees",))
+    doubtful = replace(cal, warnings=("all headings lie within 60 degrees",))
     data = encode_calibration(doubtful)
     assert json.loads(data)["format"] == 3
-    assert decode_calibration(data).doubts == doubtful.doubts
+    assert decode_calibration(data).warnings == doubtful.warnings
     assert "doubts" not in json.loads(encode_calibration(cal))  # with the id that it always had
 
 
@@ -208,11 +208,11 @@ def test_any_edit_is_read_or_refused_in_one_line(data: st.DataObject, cal: Calib
     try:
         read = decode_calibration(json.dumps(content).encode(), "cal.json")
     except (FormatError, CalibrationError) as refused:
-        said = str(refused)
+        output = str(refused)
     else:
-        said = f"cal.json: {read.method}"
-    assert said.startswith("cal.json: ")
-    assert "\n" not in said or said == f"cal.json: {content['method']}"
+        output = f"cal.json: {read.method}"
+    assert output.startswith("cal.json: ")
+    assert "\n" not in output or output == f"cal.json: {content['method']}"
 
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -224,9 +224,9 @@ def test_any_damage_is_read_or_refused_in_one_line(places: list[tuple[int, int]]
     try:
         assert isinstance(decode_calibration(bytes(content), "cal.json"), Calibration)
     except (FormatError, CalibrationError) as refused:
-        said = str(refused)
-        assert said.startswith("cal.json: ")
-        assert "\n" not in said
+        output = str(refused)
+        assert output.startswith("cal.json: ")
+        assert "\n" not in output
 
 
 def test_a_key_that_is_no_text(cal: Calibration) -> None:

@@ -322,7 +322,7 @@ def test_a_slow_part_beside_white_noise_is_whitened_in_any_blocks() -> None:
     white = whiten(X, steps, 0.95, 0.3)
     np.testing.assert_allclose(white.T @ white, X.T @ np.linalg.solve(C, X), rtol=1e-9)
     whitening = Whitening(steps, 0.95, 0.3)
-    np.testing.assert_allclose(np.vstack([whitening.take(part) for part in np.array_split(X, 7)]), white)
+    np.testing.assert_allclose(np.vstack([whitening.apply(part) for part in np.array_split(X, 7)]), white)
     assert np.log(whitening.variance).sum() == pytest.approx(np.linalg.slogdet(C)[1])
 
 

@@ -22,10 +22,10 @@ def test_a_mass_that_was_left_out_is_named(declared: tuple[str, ...], seed: int)
     others = {name: log[name].to_numpy()[rows] for name in ("ballast", "sensor_temperature")}
     columns = {"noise": noise, "walk": np.cumsum(noise), "clock": data.time, **others}
     others = {name: column for name, column in columns.items() if name not in declared}
-    said = undeclared(fit(data, "auto").calibration, data, others)
+    output = undeclared(fit(data, "auto").calibration, data, others)
     if "ballast" in declared:
-        assert not said
+        assert not output
     else:
-        (line,) = said
+        (line,) = output
         assert line.startswith("column 'ballast' is not declared and moves the field, by about ")
         assert line.endswith("--parameter ballast")

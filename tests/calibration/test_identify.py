@@ -26,8 +26,10 @@ def test_table_1_sees_63_of_90_coefficients(glider: Gliders) -> None:
 def test_readings_that_a_fit_multiplies_are_told(glider: Gliders) -> None:
     """Anomalies shrink with the readings: a reference that is wrong along the track can do that unnoticed."""
     runs = glider(0, 2).runs
-    told = [fit(replace(runs, field=gain * runs.field), "nominal").warnings for gain in (1.0, 1.3, 0.8)]
-    plain, shrunk, grown = (" ".join(one).partition("the fit multiplies the readings by ")[2] for one in told)
+    reported = [fit(replace(runs, field=gain * runs.field), "nominal").warnings for gain in (1.0, 1.3, 0.8)]
+    plain, shrunk, grown = (
+        " ".join(one).partition("the fit multiplies the readings by ")[2] for one in reported
+    )
     assert not plain
     assert float(shrunk[:4]) < 0.8
     assert float(grown[:4]) > 1.1
@@ -52,8 +54,8 @@ def test_a_fit_from_a_corner_of_the_compass_is_not_supported(glider: Gliders) ->
     turned = np.degrees(runs.attitude[:, 2]) % 360.0
     found = fit(runs.part((turned > 200.0) & (turned < 260.0)), "nominal")
     assert not found.supported
-    assert any("all headings lie within 60 degrees" in doubt for doubt in found.calibration.doubts)
-    assert found.calibration.doubts[-1] in found.warnings[0]
+    assert any("all headings lie within 60 degrees" in doubt for doubt in found.calibration.warnings)
+    assert found.calibration.warnings[-1] in found.warnings[0]
     assert fit(runs, "nominal").supported
 
 

@@ -143,7 +143,7 @@ def test_two_vehicles_in_one_log_are_not_supported() -> None:
     field[880:] += [300.0, -200.0, 150.0]
     found = fit(replace(data, field=field), "survey")
     assert not found.supported
-    assert any("two vehicles in one log" in line for line in found.calibration.doubts)
+    assert any("two vehicles in one log" in line for line in found.calibration.warnings)
 
 
 def over(data: Observations, length: float) -> Observations:
@@ -160,7 +160,7 @@ def test_rock_rougher_than_the_tracks_is_not_supported(survey: Survey) -> None:
     data = over(flown(legs=3)[0], 35.0)
     found = fit(data.part(np.arange(len(data)) % 2 == 0), "survey")
     assert not found.supported
-    assert sum("half the distance between your tracks" in line for line in found.calibration.doubts) == 1
+    assert sum("half the distance between your tracks" in line for line in found.calibration.warnings) == 1
     assert survey[2].supported
 
 

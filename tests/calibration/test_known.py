@@ -40,17 +40,17 @@ def test_information_is_the_posterior_without_its_prior() -> None:
     prior = Prior(np.diag(rng.uniform(0.5, 2.0, 5)), E, offset)
     known = np.linalg.inv(E @ np.linalg.inv(prior.precision) @ E.T)
     P = np.linalg.inv(J + known)
-    told = Information.left_by(prior, P @ (h + known @ offset), P)
-    np.testing.assert_allclose(told.precision, J, atol=1e-8)
-    np.testing.assert_allclose(told.vector, h, atol=1e-8)
+    reported = Information.left_by(prior, P @ (h + known @ offset), P)
+    np.testing.assert_allclose(reported.precision, J, atol=1e-8)
+    np.testing.assert_allclose(reported.vector, h, atol=1e-8)
 
 
 def test_an_unknown_direction_is_not_told() -> None:
     J = np.diag([4.0, 9.0])
     v = np.array([1.0, 0.0])
-    told = Information(J, J @ np.array([2.0, 3.0])).blurred(v, 10.0)
-    np.testing.assert_allclose(np.linalg.inv(told.precision), np.linalg.inv(J) + 100.0 * np.outer(v, v))
-    np.testing.assert_allclose(np.linalg.solve(told.precision, told.vector), [2.0, 3.0])
+    reported = Information(J, J @ np.array([2.0, 3.0])).blurred(v, 10.0)
+    np.testing.assert_allclose(np.linalg.inv(reported.precision), np.linalg.inv(J) + 100.0 * np.outer(v, v))
+    np.testing.assert_allclose(np.linalg.solve(reported.precision, reported.vector), [2.0, 3.0])
 
 
 def test_two_runs_are_enough_for_a_vehicle_that_is_known(glider: Gliders) -> None:

@@ -66,9 +66,9 @@ def test_where_nothing_moves_the_field_nothing_is_taken() -> None:
 
 def test_on_the_command_line(tmp_path: Path, command: Command) -> None:
     write(flight(), tmp_path / "flight.csv")
-    said = command("calibrate", tmp_path / "flight.csv", "--parameter", "auto", "-o", tmp_path / "cal.json")
-    assert "--parameter battery_current: " in said.err
-    assert "is not declared" not in said.err
+    output = command("calibrate", tmp_path / "flight.csv", "--parameter", "auto", "-o", tmp_path / "cal.json")
+    assert "--parameter battery_current: " in output.err
+    assert "is not declared" not in output.err
     command(
         "correct", tmp_path / "flight.csv", "--calibration", tmp_path / "cal.json", "-o", tmp_path / "c.csv"
     )

@@ -226,8 +226,8 @@ def test_a_name_that_is_not_of_the_locale(deployment: Path, here: Path) -> None:
     write(read(deployment).isel(time=slice(0, 60)), "log.nc")
     Path("log.nc").rename(name)
     done = run("convert", name, "-o", "x.csv", PYTHONUTF8="1")
-    said = rb"magbridge: m\udce4.nc: a name that cannot be written in utf-8: rename it" + b"\n"
-    assert (done.returncode, done.stderr) == (1, said)
+    output = rb"magbridge: m\udce4.nc: a name that cannot be written in utf-8: rename it" + b"\n"
+    assert (done.returncode, done.stderr) == (1, output)
     assert len(list(here.iterdir())) == 1
 
 

@@ -92,8 +92,8 @@ def test_a_fit_can_be_looked_at(deployment: Path, command: Command) -> None:
 def test_correct_writes_what_the_contract_names(
     deployment: Path, calibration: Path, command: Command
 ) -> None:
-    said = command("correct", deployment, "--calibration", calibration, "-o", "corrected.nc", "--json")
-    result, corrected = json.loads(said.out), read("corrected.nc")
+    output = command("correct", deployment, "--calibration", calibration, "-o", "corrected.nc", "--json")
+    result, corrected = json.loads(output.out), read("corrected.nc")
     assert result["rows"] == corrected.sizes["time"] == 3600
     names = ["total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality"]
     assert list(corrected)[: len(names)] == names
@@ -132,9 +132,9 @@ def test_a_field_that_the_earth_does_not_have_is_said(
     own = read(deployment).isel(time=slice(0, 100))
     for name, iron in (("own.nc", 0.0), ("other.nc", 50_000.0)):
         write(own.assign(mag_z=own["mag_z"] + iron), name)
-        said = command("correct", name, "--calibration", calibration, "-o", "out.nc")
+        output = command("correct", name, "--calibration", calibration, "-o", "out.nc")
         doubt = "another vehicle's? 100 of 100 corrected total fields are none of the Earth's"
-        assert (doubt in said.err) == bool(iron)
+        assert (doubt in output.err) == bool(iron)
 
 
 def test_what_uses_a_calibration_repeats_that_its_data_do_not_support_it(
@@ -174,13 +174,13 @@ def test_a_column_that_the_calibration_needs_is_missed_aloud(deployment: Path, c
     save_calibration(needing, "cal.json")
     log = read(deployment).isel(time=slice(0, 50))
     write(log.drop_vars("battpos"), "bare.csv")
-    said = command("correct", "bare.csv", "--calibration", "cal.json", "-o", "x.csv", "--json")
-    assert "no column 'battpos', which the calibration needs: every sample is flagged" in said.err
-    assert json.loads(said.out)["flags"]["stale_telemetry"] == json.loads(said.out)["flagged"] == 50
-    said = command("correct", deployment, "--calibration", "cal.json", "-o", "x.csv")
-    assert not said.err
-    assert "stale" not in said.out
-    assert "extrapolated " in said.out
+    output = command("correct", "bare.csv", "--calibration", "cal.json", "-o", "x.csv", "--json")
+    assert "no column 'battpos', which the calibration needs: every sample is flagged" in output.err
+    assert json.loads(output.out)["flags"]["stale_telemetry"] == json.loads(output.out)["flagged"] == 50
+    output = command("correct", deployment, "--calibration", "cal.json", "-o", "x.csv")
+    assert not output.err
+    assert "stale" not in output.out
+    assert "extrapolated " in output.out
 
 
 def test_a_grid_that_is_not_used_is_told(deployment: Path, calibration: Path, command: Command) -> None:
@@ -217,8 +217,8 @@ def test_numbers_that_may_say_not_known_are_told(
 def test_a_log_that_the_calibration_was_made_from_is_told(deployment: Path, command: Command) -> None:
     write(read(deployment).isel(time=slice(0, FEW)), "log.csv")
     command("calibrate", "log.csv", "--method", "nominal", "-o", "cal.json")
-    said = command("diagnose", "log.csv", "--calibration", "cal.json", "-o", "doubt", code=1)
-    assert "log.csv: the calibration was fitted to this log" in said.err
+    output = command("diagnose", "log.csv", "--calibration", "cal.json", "-o", "doubt", code=1)
+    assert "log.csv: the calibration was fitted to this log" in output.err
 
 
 def test_logs_of_one_name_are_all_remembered(deployment: Path, command: Command) -> None:
@@ -230,8 +230,8 @@ def test_logs_of_one_name_are_all_remembered(deployment: Path, command: Command)
     command("calibrate", "one/log.csv", "two/log.csv", "--method", "nominal", "-o", "cal.json")
     assert list(load_calibration("cal.json").inputs) == ["one/log.csv", "two/log.csv"]
     for log in ("one/log.csv", "two/log.csv"):
-        said = command("diagnose", log, "--calibration", "cal.json", "-o", "doubt", code=1)
-        assert f"{log}: the calibration was fitted to this log" in said.err
+        output = command("diagnose", log, "--calibration", "cal.json", "-o", "doubt", code=1)
+        assert f"{log}: the calibration was fitted to this log" in output.err
 
 
 @pytest.mark.parametrize("names", [(), ("battpos", "ballast")], ids=["nominal", "two masses"])
@@ -308,8 +308,8 @@ def test_only_what_the_sensor_measured_is_corrected(
     write(masses.assign_coords(time=rows["time"] - 0.5), "vehicle.csv")
     write(rows.drop_vars(masses), "instrument.csv")
     asked = "correct", "vehicle.csv", "instrument.csv", "--calibration", calibration
-    said = command(*asked, "-o", "out.nc", "--json")
-    result, out = json.loads(said.out), read("out.nc")
+    output = command(*asked, "-o", "out.nc", "--json")
+    result, out = json.loads(output.out), read("out.nc")
     assert (result["rows"], result["left_out"]) == (300, 300)
     np.testing.assert_allclose(out["time"], rows["time"], atol=1e-5)
     before, after = (one["quality"].to_numpy().astype(int) for one in (whole, out))

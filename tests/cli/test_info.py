@@ -17,10 +17,10 @@ START = 1.6e9
 
 
 def test_info_of_the_demo(deployment: Path, command: Command) -> None:
-    said = command("info", deployment)
-    assert "battpos" in said.out
-    assert "calibrate" in said.out
-    assert "may move the field, for --parameter: battpos ballast" in " ".join(said.err.split())
+    output = command("info", deployment)
+    assert "battpos" in output.out
+    assert "calibrate" in output.out
+    assert "may move the field, for --parameter: battpos ballast" in " ".join(output.err.split())
     facts = json.loads(command("info", deployment, "--json").out)[str(deployment)]
     assert facts["rows"] == 3600
     assert all(not lacks for lacks in facts["uses"].values())
@@ -72,8 +72,8 @@ def test_info_of_nothing_is_one_line(command: Command) -> None:
 def test_columns_are_declared_on_the_command_line(command: Command) -> None:
     Path("theirs.csv").write_text("Zeit;Fx [uT];Fy [uT];Fz [uT]\n2022-05-04T12:00:00Z;30,0;5,0;45,0\n")
     columns = [f"--column=mag_{axis}=F{axis} [uT]" for axis in "xyz"]
-    said = command("convert", "theirs.csv", "-o", "ours.csv", *columns)
-    assert "guessed: decimal commas; fields separated by ';'; time is 'Zeit'" in said.err
+    output = command("convert", "theirs.csv", "-o", "ours.csv", *columns)
+    assert "guessed: decimal commas; fields separated by ';'; time is 'Zeit'" in output.err
     assert float(read("ours.csv")["mag_z"][0]) == 45_000.0
     assert "theirs.csv was read with: decimal commas" in read("ours.csv").attrs["history"]
     assert "guessed" not in command("convert", "ours.csv", "-o", "again.nc").err
@@ -102,9 +102,9 @@ TAKE_LOGS = "calibrate convert correct diagnose info navigate plan replay simula
 
 @pytest.mark.parametrize("name", TAKE_LOGS.split())
 def test_every_command_that_takes_a_log_is_told_how_to_read_it(name: str, command: Command) -> None:
-    said = command(name, "--help").out
+    output = command(name, "--help").out
     for option in ("--column ", "--columns", "--compass", "--date", "--strict"):
-        assert option in said, option
+        assert option in output, option
 
 
 def test_a_replay_of_columns_under_other_names(deployment: Path, here: Path, command: Command) -> None:
@@ -128,18 +128,18 @@ def test_compasses_that_are_columns_are_listed(here: Path, command: Command) -> 
         (2, 9, 2),
     ]
     write(log, here / "two.csv")
-    said = command("info", here / "two.csv")
-    assert "compass 0: 2 Hz, 9 samples, read as mag_x mag_y mag_z" in said.out
-    assert "compass 2: 2 Hz, 9 samples\n" in said.out
+    output = command("info", here / "two.csv")
+    assert "compass 0: 2 Hz, 9 samples, read as mag_x mag_y mag_z" in output.out
+    assert "compass 2: 2 Hz, 9 samples\n" in output.out
 
 
 def test_what_was_lost_is_named(here: Path, command: Command) -> None:
     (here / "one.csv").write_text(
         "time,depth\n" + "".join(f"{START + k},{k}\n" for k in range(9)) + f"{START},3\n"
     )
-    said = command("info", here / "one.csv")
-    assert "in the logs: 1 row dropped" in said.err
-    assert "row 11" in said.err
+    output = command("info", here / "one.csv")
+    assert "in the logs: 1 row dropped" in output.err
+    assert "row 11" in output.err
     assert (
         "row 11"
         in json.loads(command("info", here / "one.csv", "--json").out)[str(here / "one.csv")]["losses"][0]

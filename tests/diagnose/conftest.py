@@ -7,8 +7,8 @@ import pytest
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
+from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.joint import fit_joint
 from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 from sitl import load, simulate
@@ -24,7 +24,7 @@ def problem() -> Problem:
         observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
     )
     calibration = fit(learned, "auto").calibration
-    return pose(take([parts["survey"]], calibration), calibration)
+    return pose(load_survey([parts["survey"]], calibration), calibration)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ from posed import candidate, missed, right
 from magbridge.diagnose.accept import _within, accept
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import ODDS, margin
+from magbridge.diagnose.inference.evidence import ODDS, bayes_factor_threshold
 from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.unexplained.varying import varying
 
@@ -22,13 +22,16 @@ def test_names_stay_until_a_description_beats_them_by_their_margin() -> None:
     """The name that loses least stays longest; 20:1 and the error of its regressor away none is left."""
     t, rng = np.arange(ROWS), np.random.default_rng(8)
     acts = np.sign(np.sin(t / 9.0))
-    said = {"a": acts, "like a": acts + 0.1 * rng.normal(size=ROWS), "b": rng.normal(size=ROWS)}
-    candidates = [candidate(cause, x) for cause, x in said.items()]
+    output = {"a": acts, "like a": acts + 0.1 * rng.normal(size=ROWS), "b": rng.normal(size=ROWS)}
+    candidates = [candidate(cause, x) for cause, x in output.items()]
     outcome = search(replace(right(ROWS), residual=0.5 * acts + rng.normal(size=ROWS)), candidates, 3)
-    limit = margin(outcome.chosen[0].ratio)
+    limit = bayes_factor_threshold(outcome.chosen[0].ratio)
     assert limit > ODDS
     steps = np.linspace(0.0, limit, 30)
-    sets = [{rival.candidate.cause: rival.behind for rival in _within(outcome, behind)} for behind in steps]
+    sets = [
+        {competitor.candidate.cause: competitor.behind for competitor in _within(outcome, behind)}
+        for behind in steps
+    ]
     assert sets[0].keys() == {"a", "like a"}
     assert not sets[-1]
     for behind, within, less in zip(steps, sets, [*sets[1:], {}], strict=True):
@@ -45,13 +48,15 @@ def test_a_name_is_asserted_possible_or_ruled_out() -> None:
     problem = replace(problem, residual=bent + np.random.default_rng(9).normal(size=ROWS))
     name = candidate("a", bent)
     outcome = search(problem, [name], 1)
-    said = []
-    for price in np.arange(4.0, 9.0) * margin(outcome.chosen[0].ratio):
-        stands, rest = accept(problem, replace(outcome, trials={"a": float(np.exp(price))}), None)
-        said.append("asserted" if stands else "possible" if rest is not None and rest.within else "ruled out")
-    assert said == sorted(said)
-    assert said.count("possible") == 1
-    assert {"asserted", "ruled out"} < set(said)
+    output = []
+    for price in np.arange(4.0, 9.0) * bayes_factor_threshold(outcome.chosen[0].ratio):
+        stands, rest = accept(problem, replace(outcome, look_elsewhere={"a": float(np.exp(price))}), None)
+        output.append(
+            "asserted" if stands else "possible" if rest is not None and rest.within else "ruled out"
+        )
+    assert output == sorted(output)
+    assert output.count("possible") == 1
+    assert {"asserted", "ruled out"} < set(output)
 
 
 def test_dives_left_out_overrule_a_name_that_fits() -> None:

@@ -19,7 +19,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Sensor
-from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report import files
 from magbridge.diagnose.run import diagnose
@@ -89,13 +89,13 @@ def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Cali
 def test_how_old_a_parameter_was_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     """The log of a bridge says it; nothing can follow it."""
     aged = plain[0].assign(age_battpos=plain[0]["time"] % 3.0)
-    assert take([aged], plain[1]).channels.keys() == take([plain[0]], plain[1]).channels.keys()
+    assert load_survey([aged], plain[1]).channels.keys() == load_survey([plain[0]], plain[1]).channels.keys()
 
 
 def test_a_sample_that_is_given_twice_is_one(plain: tuple[xr.Dataset, Calibration]) -> None:
     ds, calibration = plain
     again = np.sort([*range(ds.sizes["time"]), *range(5, 500, 20)])
-    once, twice = take([ds], calibration), take([ds.isel(time=again)], calibration)
+    once, twice = load_survey([ds], calibration), load_survey([ds.isel(time=again)], calibration)
     for name in ("time", "field", "reference", "steps", "dive"):
         np.testing.assert_array_equal(getattr(once, name), getattr(twice, name))
 
@@ -147,7 +147,7 @@ def test_an_effects_channel_that_holds_nothing_is_said_to_be_empty(
 
 def test_a_log_given_twice_is_refused(plain: tuple[xr.Dataset, Calibration]) -> None:
     with pytest.raises(DataError, match="given twice"):
-        diagnose([plain[0]], plain[1], learned_from=[plain[0].copy()])
+        diagnose([plain[0]], plain[1], training_logs=[plain[0].copy()])
 
 
 def test_a_hundred_samples_are_few_but_enough(plain: tuple[xr.Dataset, Calibration]) -> None:
@@ -168,11 +168,11 @@ def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(
     ds, calibration = plain
     late = {name: ds[name].where(some(ds, 9)) for name in ("roll", "pitch", "heading")}
     never = {name: np.nan * ds[name] for name in ("latitude", "longitude", "depth")}
-    survey = take([ds.assign(late | never)], calibration)
+    survey = load_survey([ds.assign(late | never)], calibration)
     assert survey.attitude is not None
     assert np.isfinite(survey.attitude).all()
     assert survey.place is None
-    assert take([ds.assign(roll=np.nan * ds["roll"])], calibration).attitude is None
+    assert load_survey([ds.assign(roll=np.nan * ds["roll"])], calibration).attitude is None
     assert diagnose([ds.assign(late | never)], calibration).verdict == "nothing_found"
 
 
@@ -180,7 +180,9 @@ def test_a_track_across_the_date_line_is_one_track(plain: tuple[xr.Dataset, Cali
     ds, calibration = plain
     moved = wrap((ds["longitude"] - ds["longitude"].mean()).to_numpy() + 180.0)
     assert moved.min() < -179.0 < 179.0 < moved.max()
-    there, here = (take([one], calibration).place for one in (ds.assign(longitude=("time", moved)), ds))
+    there, here = (
+        load_survey([one], calibration).place for one in (ds.assign(longitude=("time", moved)), ds)
+    )
     np.testing.assert_allclose(there, here, atol=1e-4)
 
 
@@ -189,7 +191,7 @@ def test_a_place_is_in_metres_on_the_ellipsoid(plain: tuple[xr.Dataset, Calibrat
     ds, calibration = plain
     track = np.linspace([-5e3, 10e3], [5e3, -10e3], ds.sizes["time"])
     latitude, longitude = offset(0.0, 10.0, *track.T)
-    survey = take([ds.assign(latitude=("time", latitude), longitude=("time", longitude))], calibration)
+    survey = load_survey([ds.assign(latitude=("time", latitude), longitude=("time", longitude))], calibration)
     track = track[np.isin(ds["time"], survey.time)]
     assert survey.place is not None
     np.testing.assert_allclose(survey.place[:, :2], track - np.median(track, axis=0), atol=0.1)
@@ -199,15 +201,15 @@ def test_where_there_are_no_dives_it_is_not_said_that_dives_were_left_out(
     plain: tuple[xr.Dataset, Calibration],
 ) -> None:
     ds, calibration = plain
-    assert take([ds], calibration).parts == "dives"
-    assert take([ds.drop_vars(["depth", "run"])], calibration).parts == "eighths of the log"
+    assert load_survey([ds], calibration).parts == "dives"
+    assert load_survey([ds.drop_vars(["depth", "run"])], calibration).parts == "eighths of the log"
 
 
 def test_another_magnetometer_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     """It would explain whatever the Earth's field does."""
     ds, calibration = plain
     both = ds.assign(second=ds["mag_x"].assign_attrs(units="nT"))
-    assert "second" not in take([both], calibration).channels
+    assert "second" not in load_survey([both], calibration).channels
 
 
 def test_the_command_line_says_it_in_one_line(
@@ -215,6 +217,6 @@ def test_the_command_line_says_it_in_one_line(
 ) -> None:
     save(plain[1], "cal.json")
     write(plain[0].isel(time=slice(0, 3)), "three.nc")
-    said = command.refuses("diagnose", "three.nc", "--calibration", "cal.json", "-o", "out")
-    assert said == "three.nc (simulated: demo): 3 samples, at least 60 needed"
+    output = command.refuses("diagnose", "three.nc", "--calibration", "cal.json", "-o", "out")
+    assert output == "three.nc (simulated: demo): 3 samples, at least 60 needed"
     assert not Path("out").exists()

@@ -23,7 +23,7 @@ from magbridge.calibration.file import load
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.assessment.weigh import useful
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected
@@ -33,7 +33,7 @@ TOOLS = Path(__file__).parents[2] / "tools"
 SAFE = 0.97
 """Theory's chance that the set holds the truth, from which on it must."""
 FAR = 8.0
-"""Signal-to-noise that a rival's best imitation leaves, from which on it has no place beside the truth."""
+"""Signal-to-noise left by a competing cause's best imitation, beyond which it has no place by the truth."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -207,7 +207,7 @@ def test_a_channels_name_does_not_decide(
     renamed = ds.rename({written[1]: "zz"})
     found = diagnose([renamed], calibration)
     assert found.findings[0].candidate.channel == "zz"
-    assert "do not use it" in useful(replace(found, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
+    assert "do not use it" in useful(replace(found, total=Improvement(1.0, 1.0, 1.0, (0.9, 1.1))))
     assert "It leaves" not in useful(found)
     first = found.findings[0]
     sun = replace(first.candidate, cause="diurnal_variation", channel=None, effects=())

@@ -62,11 +62,11 @@ def test_a_converter_whose_steps_differ_is_described() -> None:
     """Signal-to-noise 10, in one level for each of 25 steps and channel."""
     rng = np.random.default_rng(3)
     reading = rng.uniform(-5e4, 5e4, (4000, 3))
-    slopes = reading / np.linalg.norm(reading, axis=1)[:, None]
+    jacobian = reading / np.linalg.norm(reading, axis=1)[:, None]
     code = np.round(reading / 4000.0).astype(int)
-    bent = np.sum(slopes * np.take_along_axis(rng.normal(size=(26, 3)), code % 26, axis=0), axis=1)
+    bent = np.sum(jacobian * np.take_along_axis(rng.normal(size=(26, 3)), code % 26, axis=0), axis=1)
     given = 10.0 * bent / np.linalg.norm(bent) + rng.normal(size=4000)
-    X = response(reading, slopes.__getitem__)(slice(None))
+    X = response(reading, jacobian.__getitem__)(slice(None))
     S, b = X.T @ X, X.T @ given
     assert Statistic(S, np.array([width**2 for _, width in bends()])).best(b).ratio > 2.0 * 10.0
 
@@ -129,7 +129,7 @@ def test_turns_and_the_surface_are_among_the_descriptions(
     survey, rows = problem.survey, slice(0, len(problem))
     assert survey.attitude is not None
     columns = [one.columns(rows) for one in listed]
-    seen = problem.slopes[:, 6:] @ [0.4, -0.8, 0.45]
+    seen = problem.jacobian[:, 6:] @ [0.4, -0.8, 0.45]
     turning = np.gradient(np.unwrap(np.radians(survey.attitude[:, 2])), survey.time)
     best, second = sorted(left_of(followed(survey.time, turning, 15.0) * seen, X) for X in columns)[:2]
     assert best < 0.2
@@ -173,12 +173,14 @@ def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
     held = [one for one in listed if one.holds(bend)]
     assert len(held) == 2
 
-    def left(X: np.ndarray) -> float:
+    def remaining_power(X: np.ndarray) -> float:
         scale = np.linalg.norm(X, axis=0)
         return float(np.linalg.norm(bent - X / scale @ np.linalg.lstsq(X / scale, bent, rcond=1e-12)[0]))
 
     for one in held:
-        assert left(np.hstack([problem.slopes, one.columns(rows)])) < 0.01 * left(problem.slopes)
+        assert remaining_power(np.hstack([problem.jacobian, one.columns(rows)])) < 0.01 * remaining_power(
+            problem.jacobian
+        )
         assert one.covers([bend])
         assert not one.covers([bend, step])
         assert not one.covers([])

@@ -12,8 +12,8 @@ from magbridge.diagnose.compare.design_columns import (
     Columns,
     Interpolated,
     Mixture,
-    beside,
     parts,
+    side_by_side,
     times,
     together,
 )
@@ -45,7 +45,7 @@ def test_columns_that_are_no_mixture_are_their_own_part(table: FloatArray) -> No
 
 
 def test_blocks_beside_each_other_are_stored_column_by_column(table: FloatArray) -> None:
-    whole = beside([table[:, :1], np.asfortranarray(table[:, 1:])])
+    whole = side_by_side([table[:, :1], np.asfortranarray(table[:, 1:])])
     np.testing.assert_array_equal(whole, table)
     assert whole.flags.f_contiguous
 

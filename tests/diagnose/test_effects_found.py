@@ -130,7 +130,7 @@ def test_the_search_uses_the_models_own_derivative(
 
 def test_the_calibrations_own_columns_are_derivatives_too(agreeing: Survey, calibration: Calibration) -> None:
     problem = pose(agreeing, calibration)
-    own = problem.free.shape[1] - 3  # the last are delays of the log's
+    own = problem.calibration_jacobian.shape[1] - 3  # the last are delays of the log's
     assert not problem.directions[:, own:].any()
     for k in range(own):
 
@@ -139,7 +139,11 @@ def test_the_calibrations_own_columns_are_derivatives_too(agreeing: Survey, cali
             return residuals(*samples_of(agreeing, c))[0]
 
         difference = (moved(1e-3) - moved(-1e-3)) / 2e-3
-        np.testing.assert_allclose(-difference, problem.free[:, k], atol=1e-5 * np.abs(problem.free).max())
+        np.testing.assert_allclose(
+            -difference,
+            problem.calibration_jacobian[:, k],
+            atol=1e-5 * np.abs(problem.calibration_jacobian).max(),
+        )
 
 
 def test_a_drift_is_held_beyond_what_it_was_learned_from(survey: Survey, calibration: Calibration) -> None:

@@ -8,7 +8,14 @@ from posed import candidate
 from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.inference.evidence import LEVEL, evidence_of, log_bayes, log_odds, score, trials
+from magbridge.diagnose.inference.evidence import (
+    LEVEL,
+    evidence_of,
+    log_bayes,
+    log_odds,
+    look_elsewhere_factors,
+    score,
+)
 from magbridge.diagnose.inference.information import Information
 
 
@@ -61,16 +68,18 @@ def test_numbers_of_one_size_are_not_weighed_twice() -> None:
 
 def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
     model = [sized("clock_offset"), sized("reference_bias")]
-    trials = {"clock_offset": 1.0, "reference_bias": 3.0}
-    price = log_bayes(200.0, 2) - log_odds(200.0, model, trials, 200.0)
+    look_elsewhere = {"clock_offset": 1.0, "reference_bias": 3.0}
+    price = log_bayes(200.0, 2) - log_odds(200.0, model, look_elsewhere, 200.0)
     assert price == pytest.approx(np.log(20.0 * 2.0 * 3.0))
 
 
 def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
     """What takes any shape has a prior of its own: beside it a cause is worth what it is alone."""
     step, chart = sized("offset_step", 3), sized("map_error", 6, spectra=np.ones((1, 6)))
-    trials = {"offset_step": 1.0, "map_error": 1.0}
-    worth = log_odds(225.0, [step, chart], trials, 25.0) - log_odds(200.0, [chart], trials, 0.0)
+    look_elsewhere = {"offset_step": 1.0, "map_error": 1.0}
+    worth = log_odds(225.0, [step, chart], look_elsewhere, 25.0) - log_odds(
+        200.0, [chart], look_elsewhere, 0.0
+    )
     assert worth == pytest.approx(log_bayes(25.0, 3) - np.log(20.0 * 2.0))
 
 
@@ -78,7 +87,7 @@ def counted(S: np.ndarray, sizes: list[int]) -> float:
     """Independent hypotheses behind one cause."""
     grid = [sized("hysteresis", size) for size in sizes]
     info = Information(S, np.zeros(len(S)), np.zeros((0, len(S))))
-    return trials(info, grid, slices(grid))["hysteresis"]
+    return look_elsewhere_factors(info, grid, slices(grid))["hysteresis"]
 
 
 def test_hypotheses_count_as_often_as_one_of_them_passes() -> None:

@@ -142,10 +142,10 @@ def test_a_rate_that_is_noise_live_is_left_out() -> None:
 
 
 def test_what_was_let_go_is_made_again(problem: Problem) -> None:
-    before = problem.free
+    before = problem.calibration_jacobian
     problem.let_go()
-    assert problem.free is not before
-    np.testing.assert_array_equal(problem.free, before)
+    assert problem.calibration_jacobian is not before
+    np.testing.assert_array_equal(problem.calibration_jacobian, before)
 
 
 def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
@@ -163,7 +163,7 @@ def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
     fit = fit_joint(problem, [late.columns], 1)
     _, _, settled = relinearised(problem, [late], fit)
     np.testing.assert_allclose(settled.coefficients * late.width, there, atol=0.5)
-    np.testing.assert_allclose(settled.left, 0.0, atol=0.5)
+    np.testing.assert_allclose(settled.residual, 0.0, atol=0.5)
 
 
 def test_a_maps_error_is_in_the_level_of_what_was_fitted_to_the_same_map() -> None:

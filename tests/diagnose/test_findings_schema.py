@@ -18,8 +18,8 @@ from study import deployment
 
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.findings import FORMAT, findings_json
 from magbridge.diagnose.report.page import report_html
 from magbridge.diagnose.run import diagnose
@@ -41,13 +41,13 @@ def found() -> Iterator[Diagnosis]:
 
 def variants(found: Diagnosis) -> dict[str, Diagnosis]:
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, "amps")
-    rival = Rival(candidate("offset_drift", np.ones(1)), 1.0)
-    contested = replace(found.findings[0], rivals=(rival,), coefficients=10.0 * np.ones(3))
+    competitor = CompetingHypothesis(candidate("offset_drift", np.ones(1)), 1.0)
+    contested = replace(found.findings[0], competing=(competitor,), coefficients=10.0 * np.ones(3))
     return {
         "named": found,
         "contested": replace(found, findings=(contested,)),
         "nothing": replace(found, findings=(), verdict="nothing_found"),
-        "rest": replace(found, unexplained=rest._replace(within=(rival,)), verdict="partly_explained"),
+        "rest": replace(found, unexplained=rest._replace(within=(competitor,)), verdict="partly_explained"),
         "wrong": replace(found, wrong=Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0)),
     }
 

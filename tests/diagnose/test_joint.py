@@ -31,7 +31,8 @@ def test_a_likelihood_is_the_gaussian_s_less_what_the_priors_cost() -> None:
     problem = replace(right(ROWS), residual=y)
     fits = [fit_joint(problem, [], 1), fit_joint(problem, [column.__getitem__], 1)]
     naive = [
-        -0.5 * ROWS * (np.log(2.0 * np.pi * np.mean(left**2)) + 1.0) for left in (fit.left for fit in fits)
+        -0.5 * ROWS * (np.log(2.0 * np.pi * np.mean(residual**2)) + 1.0)
+        for residual in (fit.residual for fit in fits)
     ]
     gained = fits[1].log_likelihood - fits[0].log_likelihood
     assert gained == pytest.approx(naive[1] - naive[0] - 0.5 * RIDGE * fits[1].coefficients[0] ** 2, rel=0.05)

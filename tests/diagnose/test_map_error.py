@@ -46,11 +46,11 @@ def flown(altitude: float) -> NDArray[np.float64]:
 
 def test_what_a_map_as_flown_lacks_grows_with_depth() -> None:
     """Without the depths, one place has two errors."""
-    missing, left = flown(90.0), []
+    missing, residual = flown(90.0), []
     for down in (DOWN, np.zeros(N)):
         problem = drawn(right(N), missing, down)
-        left.append(float(np.std(fitted(problem, map_error(problem)[0]).left)))
-    assert left[0] < 0.1 * np.std(missing) < 0.2 * np.std(missing) < left[1], left
+        residual.append(float(np.std(fitted(problem, map_error(problem)[0]).residual)))
+    assert residual[0] < 0.1 * np.std(missing) < 0.2 * np.std(missing) < residual[1], residual
 
 
 @pytest.mark.parametrize("altitude", [60.0, 100.0, 150.0])
@@ -61,7 +61,7 @@ def test_the_mean_of_what_a_map_lacks_is_known(altitude: float) -> None:
     chart, _ = map_error(problem)
     [constant] = reference_bias(problem)
     fit = fit_joint(problem, [chart.columns, constant.columns], 1, spectra=[chart.spectra, None])
-    error = chart.columns(slice(None)) @ fit.coefficients[: chart.size] / problem.gain
+    error = chart.columns(slice(None)) @ fit.coefficients[: chart.size] / problem.reference_jacobian
     assert abs(error.mean() - missing.mean()) < 0.2 * np.sqrt(np.mean(missing**2))
 
 
@@ -70,8 +70,8 @@ def test_what_is_drawn_wrong_is_the_same_at_every_depth() -> None:
     problem = drawn(right(N), wrong, DOWN)
     _, chart = map_error(problem)
     fit = fitted(problem, chart)
-    assert np.std(fit.left) < 0.1 * np.std(wrong)
-    error = chart.columns(slice(None)) @ fit.coefficients / problem.gain
+    assert np.std(fit.residual) < 0.1 * np.std(wrong)
+    error = chart.columns(slice(None)) @ fit.coefficients / problem.reference_jacobian
     np.testing.assert_allclose(error, error[::-1], atol=1e-6)  # there and back
 
 

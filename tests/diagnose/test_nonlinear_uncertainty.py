@@ -42,9 +42,9 @@ def test_the_covariance_is_that_of_a_fit_in_which_the_lag_is_free(problem: Probl
     slope = CELL * fit.coefficients[0] * t / LAG**2 * np.exp(-t / LAG)
 
     def every(rows: slice) -> np.ndarray:
-        return np.column_stack([problem.free[rows], one.columns(rows), slope[rows]])
+        return np.column_stack([problem.calibration_jacobian[rows], one.columns(rows), slope[rows]])
 
-    P = normal(every, fit.noise.response(fit.left), fit.noise)[0] + np.diag(np.append(fit.prior, 1.0))
+    P = normal(every, fit.noise.response(fit.residual), fit.noise)[0] + np.diag(np.append(fit.prior, 1.0))
     expected = np.linalg.inv(P)[:-1, :-1]
     found = loosened(problem, [one], [one.columns], fit).covariance
     np.testing.assert_allclose(np.sqrt(np.diag(found)), np.sqrt(np.diag(expected)), rtol=0.03)
@@ -79,10 +79,10 @@ def test_other_peaks_of_the_likelihood_count_by_their_evidence() -> None:
     t = np.arange(ROWS)
     signal = 0.25 * (t >= 60) + 0.5 * (t >= 240)
     problem = replace(right(ROWS), residual=signal + np.random.default_rng(6).normal(size=ROWS))
-    beside = replace(decay(LAG), cause="other", shape={}, rebuild=None, cells=())
+    conditional_on = replace(decay(LAG), cause="other", shape={}, rebuild=None, cells=())
     grid = [step(float(onset)) for onset in range(10, ROWS, 10)]
-    fits = [fitted(problem, beside, one) for one in grid]
-    null = fitted(problem, beside).log_likelihood
+    fits = [fitted(problem, conditional_on, one) for one in grid]
+    null = fitted(problem, conditional_on).log_likelihood
     weight = np.exp([log_bayes(2.0 * (one.log_likelihood - null), 1) for one in fits])
     best = int(np.argmax(weight))
     fit = fits[best]
@@ -94,7 +94,7 @@ def test_other_peaks_of_the_likelihood_count_by_their_evidence() -> None:
         w * (np.outer(d, d) + one.covariance - fit.covariance)
         for w, d, one in zip(weight, apart, fits, strict=True)
     )
-    model = [beside, grid[best]]
+    model = [conditional_on, grid[best]]
     found = loosened(problem, model, [one.columns for one in model], fit, grid).covariance
     # each of those fits has noise of its own, so that weights differ a little
     units = np.sqrt(np.outer(np.diag(found), np.diag(found)))

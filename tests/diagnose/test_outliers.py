@@ -25,14 +25,14 @@ PULSE = np.array([6.0, 12.0, 6.0])
 
 def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float = 50.0) -> Outliers | None:
     rng = np.random.default_rng(seed)
-    left = lfilter([1.0], [1.0, -rho], rng.standard_t(nu, N))
+    residual = lfilter([1.0], [1.0, -rho], rng.standard_t(nu, N))
     for row in rows:
-        left[row - 1 : row + 2] += shape * rng.choice([-1.0, 1.0])
+        residual[row - 1 : row + 2] += shape * rng.choice([-1.0, 1.0])
     steps = np.ones(N, int)
     steps[[0, N // 3]] = FAR
-    noise = fit_noise(left, Past(steps, 2))
+    noise = fit_noise(residual, Past(steps, 2))
     none = np.zeros(0)
-    return outliers(Joint(noise.log_likelihood, none, none, np.zeros((0, 0)), noise, left, none), 18)
+    return outliers(Joint(noise.log_likelihood, none, none, np.zeros((0, 0)), noise, residual, none), 18)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
@@ -53,10 +53,10 @@ def test_isolated_samples_are_told_from_a_passage(rho: float) -> None:
 def test_good_neighbours_are_rarely_doubted(nu: float, rho: float) -> None:
     """Nor those of the noise's own large innovations, which its correlation carries on."""
     rows = np.arange(300, N, 500)
-    told = [one.neighbours for seed in range(25) if (one := found(3.0 * SPIKE, rows, rho, seed, nu))]
-    assert len(told) == 25
-    assert 0.3 < np.mean(told) < 0.75
-    assert np.mean(np.array(told) < 0.1) < 0.25
+    reported = [one.neighbours for seed in range(25) if (one := found(3.0 * SPIKE, rows, rho, seed, nu))]
+    assert len(reported) == 25
+    assert 0.3 < np.mean(reported) < 0.75
+    assert np.mean(np.array(reported) < 0.1) < 0.25
 
 
 def test_beside_a_gap_there_is_none_to_ask() -> None:
@@ -79,8 +79,8 @@ def test_a_diagnosis_names_isolated_samples_only(shape: np.ndarray, isolated: bo
         off[row - 1 : row + 2] = 3.0 * shape
     for name in ("mag_x", "mag_y", "mag_z"):
         survey[name] = survey[name] * (1.0 + off / survey["reference_field"].to_numpy())
-    told = diagnose([survey], calibration)
-    assert not told.findings
-    assert (told.wrong is not None) is isolated
-    assert (told.unexplained is None) is isolated
-    assert isolated or told.unexplained.kind == "transient"
+    reported = diagnose([survey], calibration)
+    assert not reported.findings
+    assert (reported.wrong is not None) is isolated
+    assert (reported.unexplained is None) is isolated
+    assert isolated or reported.unexplained.kind == "transient"

@@ -9,7 +9,7 @@ import numpy as np
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Noise, identity
-from magbridge.diagnose.compare.take import take
+from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
 from sitl.dataset import segments
@@ -20,7 +20,7 @@ def test_what_a_calibration_learned_from_a_log_does_not_count_twice() -> None:
     ds = segments(simulate(load("demo"), 2))["calibration"]
     calibration = fit(observations(ds, ("battpos", "ballast")), "auto").calibration
     twice, once = (
-        {one.hypothesis.candidate.cause for one in diagnose([ds], calibration, learned_from=again).findings}
+        {one.hypothesis.candidate.cause for one in diagnose([ds], calibration, training_logs=again).findings}
         for again in ((), (ds,))
     )
     assert "filter_lag" in once - twice
@@ -32,9 +32,9 @@ def test_a_report_names_and_counts_the_dives_of_what_is_diagnosed_alone() -> Non
     survey = parts["survey"].drop_vars("run").assign_attrs(source="survey.nc")
     learned = parts["calibration"].assign_attrs(source="runs.nc")
     calibration = replace(identity(), noise=Noise(1.0))
-    alone, beside = take([survey], calibration), take([survey], calibration, [learned])
-    assert alone.dives == beside.dives == len(set(alone.dive.tolist())) > 1
-    assert alone.source == beside.source == "survey.nc"
-    new = beside.dive[~beside.learned]
+    alone, both = load_survey([survey], calibration), load_survey([survey], calibration, [learned])
+    assert alone.dives == both.dives == len(set(alone.dive.tolist())) > 1
+    assert alone.source == both.source == "survey.nc"
+    new = both.dive[~both.learned]
     np.testing.assert_array_equal(new - new[0], alone.dive - alone.dive[0])
-    assert not set(beside.dive[beside.learned].tolist()) & set(new.tolist())
+    assert not set(both.dive[both.learned].tolist()) & set(new.tolist())

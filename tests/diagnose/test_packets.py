@@ -45,12 +45,12 @@ def test_two_packets_are_found_where_they_are_in_noise_of_any_correlation(
     for moment, period, length in ((0.3 * n, 40.0, 90.0), (0.7 * n, 25.0, 30.0)):
         planted += 2.5 * np.exp(-0.5 * ((t - moment) / length) ** 2) * np.cos(2 * np.pi * t / period + 1.0)
     noise = drawn(problem, rho, rng)
-    given = replace(problem, residual=problem.gain * planted + noise)
+    given = replace(problem, residual=problem.reference_jacobian * planted + noise)
     found, best = fitted(given)
     estimate = found.columns(slice(None)) @ best.estimate
-    planted *= problem.gain
+    planted *= problem.reference_jacobian
     assert np.sum((estimate - planted) ** 2) < np.sum(planted**2) / 3.0
-    assert 0.5 * best.ratio - np.log(found.trials) > 10.0
+    assert 0.5 * best.ratio - np.log(found.look_elsewhere) > 10.0
     assert 20.0 < found.period / np.median(np.diff(problem.survey.time)) < 50.0
 
 
@@ -78,7 +78,7 @@ def test_a_packet_keeps_its_period_and_place_where_samples_are_lost(kept: str) -
     t = np.arange(n)
     planted = 2.5 * np.exp(-0.5 * ((t - 1200.0) / 90.0) ** 2) * np.cos(2 * np.pi * t / 41.0 + 1.0)
     log = pose(thinned(whole.survey, here), whole.calibration)
-    planted = log.gain * planted[here]
+    planted = log.reference_jacobian * planted[here]
     given = replace(log, residual=planted + drawn(log, 0.5, rng))
     found, best = fitted(given)
     assert np.sum((found.columns(slice(None)) @ best.estimate - planted) ** 2) < 0.2 * np.sum(planted**2)

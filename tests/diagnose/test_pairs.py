@@ -11,10 +11,10 @@ import pytest
 from posed import candidate, right
 
 from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.inference.competing import sets_of
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.exchange import _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
-from magbridge.diagnose.inference.rivals import sets_of
 from magbridge.diagnose.inference.search import _backward_elimination
 from magbridge.diagnose.inference.state import State
 
@@ -46,7 +46,7 @@ def test_all_pairs_at_once_are_one_after_the_other(state: State) -> None:
     """What stands there loses to each pair by what the two say, the second beside the first."""
     model = [state.candidates[2], state.candidates[4]]
     base = state.fit(model)
-    info = state.beside(model, base)
+    info = state.conditional_on(model, base)
     pairs = {(pair.first.cause, pair.second.cause): pair for pair in pairs_of(state, info, model, base, 0, 1)}
     ends = np.cumsum([state.at[-1].stop, *(c.size for c in model)])
     own = np.arange(ends[0], ends[-1])
@@ -77,8 +77,8 @@ def test_a_cause_that_is_not_worth_a_further_one_is_dropped(state: State) -> Non
     """It passes its test, but two others of S/N 17 and 24 may leave as much."""
     a, b, other = (state.candidates[k] for k in (0, 1, 4))
     weak = copy(state)
-    left = 0.2 * other.columns(slice(None))[:, 0]
-    weak.problem = replace(state.problem, residual=state.problem.residual + left)
+    residual = 0.2 * other.columns(slice(None))[:, 0]
+    weak.problem = replace(state.problem, residual=state.problem.residual + residual)
     weak.null = weak.fit([])
     base = weak.fit([a, b, other])
     ratio = weak.ratio(base) - weak.ratio(weak.fit([a, b]))
@@ -90,9 +90,9 @@ def test_a_cause_that_is_not_worth_a_further_one_is_dropped(state: State) -> Non
 def test_the_sets_hold_whatever_a_whole_within_20_to_1_is_made_of(state: State) -> None:
     model = [state.candidates[3], state.candidates[1]]
     base = state.fit(model)
-    sets = sets_of(state, state.beside(model, base), model, base)
-    assert "a" in {rival.candidate.cause for rival in sets[0]}
-    assert "other" not in {rival.candidate.cause for some in sets for rival in some}
+    sets = sets_of(state, state.conditional_on(model, base), model, base)
+    assert "a" in {competitor.candidate.cause for competitor in sets[0]}
+    assert "other" not in {competitor.candidate.cause for some in sets for competitor in some}
 
 
 def test_numbers_of_one_common_size_stay_a_whole(state: State) -> None:

@@ -20,10 +20,10 @@ def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None
     far = np.linalg.norm(r, axis=1)[:, None]
     m, earth = np.array([0.3, -0.8, 0.5]), np.array([0.5, 0.1, 0.85])
     field = (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3
-    planted = problem.gain * (field @ earth)
+    planted = problem.reference_jacobian * (field @ earth)
     planted *= 6.0 / np.abs(planted).max()
     noise = np.random.default_rng(5).normal(size=len(problem))
     given = replace(problem, residual=planted + noise)
-    columns, trials = passage(given, fit_joint(given, [], 1))
+    columns, look_elsewhere = passage(given, fit_joint(given, [], 1))
     assert missed(planted, columns(slice(None))) < 0.1
-    assert 100 < trials < 10 * len(problem)
+    assert 100 < look_elsewhere < 10 * len(problem)

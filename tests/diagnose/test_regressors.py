@@ -223,11 +223,11 @@ def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
         beyond = np.array([face, *slab, slab[-1]])  # half of it: nothing flows through the middle
         slab = slab + 0.05 * np.diff(beyond, 2)
         centre.append(slab[-1])
-    heard = np.array(centre) - np.mean(centre)
+    received = np.array(centre) - np.mean(centre)
 
     def least(stages: int) -> float:
         followed = (lagged(t, water, lag, stages) for lag in np.geomspace(500.0, 10_000.0, 40))
-        return min(missed(heard, (y - y.mean())[:, None]) for y in followed)
+        return min(missed(received, (y - y.mean())[:, None]) for y in followed)
 
     assert least(2) < 0.25 * least(1)
 
@@ -237,8 +237,8 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
     rng, t = np.random.default_rng(8), np.linspace(0.0, 1.0, len(problem))
     channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=np.sin(12.0 * t))}
     problem = replace(problem, survey=replace(problem.survey, channels=channels))
-    p, slopes = channels["p"].values, problem.slopes[:, 6:]
-    powers = (p[:, None, None] ** np.arange(4)[:, None] * slopes[:, None, :]).reshape(len(p), -1)
+    p, jacobian = channels["p"].values, problem.jacobian[:, 6:]
+    powers = (p[:, None, None] ** np.arange(4)[:, None] * jacobian[:, None, :]).reshape(len(p), -1)
     listed = [c.columns(slice(0, len(p))) for c in actuator_order(problem) if c.spectra is not None]
 
     def beyond(columns: np.ndarray, field: np.ndarray) -> float:
@@ -249,8 +249,8 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
             [p - rng.uniform(-1.0, 1.0), np.full_like(p, rng.uniform(0.3, 0.8)), np.zeros_like(p)]
         )
         far, m = np.linalg.norm(r, axis=1)[:, None], rng.normal(size=3)
-        field = np.sum(slopes * (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3, axis=1)
-        next_power = beyond(p[:, None] ** 4 * slopes, field)
+        field = np.sum(jacobian * (3.0 * r * (r @ m)[:, None] / far**2 - m) / far**3, axis=1)
+        next_power = beyond(p[:, None] ** 4 * jacobian, field)
         assert min(beyond(columns, field) for columns in listed) < min(0.2, 0.4 * next_power)
 
 
@@ -261,15 +261,17 @@ def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Proble
     channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=values)}
     problem = replace(problem, survey=replace(problem.survey, channels=channels))
     term, changed, *_ = (c.columns(slice(0, len(x))) for c in actuator_order(problem))
-    slopes = problem.slopes[:, 6:]
-    left = x**3 - np.polyval(np.polyfit(x, x**3, 2), x)
-    np.testing.assert_allclose(term, term[-1] / slopes[-1] * slopes * (left / left[-1])[:, None], atol=1.0)
-    field = slopes @ [3.0, -2.0, 1.0] / (4.0 + x) ** 3
+    jacobian = problem.jacobian[:, 6:]
+    residual = x**3 - np.polyval(np.polyfit(x, x**3, 2), x)
+    np.testing.assert_allclose(
+        term, term[-1] / jacobian[-1] * jacobian * (residual / residual[-1])[:, None], atol=1.0
+    )
+    field = jacobian @ [3.0, -2.0, 1.0] / (4.0 + x) ** 3
 
     def missed(columns: np.ndarray) -> float:
         return float(np.linalg.norm(field - columns @ np.linalg.lstsq(columns, field, rcond=1e-9)[0]))
 
-    assert missed(np.hstack([slopes, changed])) < 0.02 * missed(np.hstack([slopes, term]))
+    assert missed(np.hstack([jacobian, changed])) < 0.02 * missed(np.hstack([jacobian, term]))
 
 
 def test_a_response_bends_by_no_more_than_is_plausible(problem: Problem) -> None:
@@ -283,6 +285,6 @@ def test_a_response_bends_by_no_more_than_is_plausible(problem: Problem) -> None
 
 def test_a_core_that_shows_through_changes_the_sensitivity_too(problem: Problem) -> None:
     """A feedback of finite gain leaves the core the field that its output takes: not flat at zero."""
-    shown = np.einsum("ni,ni->n", problem.slopes[:, 6:], np.arctanh(0.8 * problem.reading / 5e4))
+    shown = np.einsum("ni,ni->n", problem.jacobian[:, 6:], np.arctanh(0.8 * problem.reading / 5e4))
     every = CAUSES["nonlinearity"].candidates(problem)[-1].columns(slice(0, len(problem)))
     assert missed(shown, every) < 0.04 * missed(shown, every[:, 3:])

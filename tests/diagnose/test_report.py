@@ -12,7 +12,7 @@ import pytest
 from posed import candidate, right
 
 from magbridge.cli.diagnose import causes_of, summary
-from magbridge.diagnose.assessment.notes import IMPLAUSIBLE, Note, rivalled
+from magbridge.diagnose.assessment.notes import IMPLAUSIBLE, Note, not_separated
 from magbridge.diagnose.assessment.numbers import times_usual
 from magbridge.diagnose.assessment.weigh import unsettled
 from magbridge.diagnose.causes import CAUSES
@@ -20,8 +20,8 @@ from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.survey import Channel, _channels
 from magbridge.diagnose.diagnosis import Finding
-from magbridge.diagnose.gain import Gain
-from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.improvement import Improvement
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import _folded, _outliers, nameless
@@ -116,14 +116,14 @@ def test_the_command_says_what_the_gain_was_measured_on() -> None:
         "follows": None,
     }
     facts = {"verdict": "explained", "findings": [one], "unexplained": None, "rms_before_nT": 117.42}
-    facts |= {"rms_after_nT": 74.42, "gain": {"interval": [0.486, 0.84]}}
+    facts |= {"rms_after_nT": 74.42, "improvement": {"interval": [0.486, 0.84]}}
     facts |= {"assessment": {"fit_for_use": "once_settled", "answer": "Only once these doubts are settled."}}
     first, use, second = summary(facts, "dives").splitlines()
     assert first == "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %)"
     assert use == "  fit for use: once settled. Only once these doubts are settled."
     assert second == "  clock_offset, S/N 9.0"
     assert "nT RMS, not held out (0.49" in summary(facts, "")
-    assert "95 %): no gain is shown" in summary(facts | {"gain": {"interval": [0.9, 1.02]}}, "dives")
+    assert "95 %): no gain is shown" in summary(facts | {"improvement": {"interval": [0.9, 1.02]}}, "dives")
     plain = facts | {"verdict": "nothing_found", "findings": []}
     assert summary(plain, "dives").startswith(
         "nothing_found: 117 nT RMS; nothing is added to the calibration"
@@ -152,19 +152,22 @@ def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
 
 def test_a_constant_of_the_reference_is_one_at_any_attitude() -> None:
     """Whatever the sensor's scales, which differ from channel to channel."""
-    problem = replace(right(100), gain=np.linspace(0.9, 1.1, 100))
+    problem = replace(right(100), reference_jacobian=np.linspace(0.9, 1.1, 100))
     bias = CAUSES["reference_bias"].candidates(problem)[0]
     named = Hypothesis(bias, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)
-    finding = Finding(named, (), Gain(2.0, 1.0, 0.5, (0.4, 0.6)), np.array([0.5]), np.eye(1), 1.0)
+    finding = Finding(named, (), Improvement(2.0, 1.0, 0.5, (0.4, 0.6)), np.array([0.5]), np.eye(1), 1.0)
     np.testing.assert_allclose(finding.field(problem), 0.5 * bias.width[0])
 
 
 def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
     """As on a log of a compass in steps of 100 nT: a name, and 588 nT that became 587."""
-    none, much = Gain(588.1, 587.3, 0.999, (0.863, 1.021)), Gain(117.0, 75.8, 0.65, (0.48, 0.83))
+    none, much = (
+        Improvement(588.1, 587.3, 0.999, (0.863, 1.021)),
+        Improvement(117.0, 75.8, 0.65, (0.48, 0.83)),
+    )
     assert improved(none, "eighths of the log") == (
         "On eighths of the log left out of the fit, 588 nT RMS became 587 nT (ratio 1.00, 95 % interval "
-        "0.86 to 1.02: no gain is shown)."
+        "0.86 to 1.02: no improvement is shown)."
     )
     assert improved(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
     assert (none.shown, much.shown) == (False, True)
@@ -174,9 +177,12 @@ def test_names_that_gain_nothing_explain_only_in_part() -> None:
     """As where a survey is diagnosed with the calibration that was fitted to it."""
     candidate = CAUSES["reference_bias"].candidates(right(100))[0]
     named = [Hypothesis(candidate, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)]
-    gains = [Gain(588.1, 587.3, 0.999, (0.863, upper)) for upper in (1.021, 0.999)]
-    assert [_verdict(named, None, None, gain) for gain in gains] == ["partly_explained", "explained"]
-    assert _verdict([], None, None, gains[0]) == "nothing_found"
+    improvements = [Improvement(588.1, 587.3, 0.999, (0.863, upper)) for upper in (1.021, 0.999)]
+    assert [_verdict(named, None, None, improvement) for improvement in improvements] == [
+        "partly_explained",
+        "explained",
+    ]
+    assert _verdict([], None, None, improvements[0]) == "nothing_found"
 
 
 def test_a_long_table_of_terms_is_folded_to_a_line() -> None:
@@ -222,8 +228,8 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
     charted = replace(problem.calibration, covariance=louder.covariance + 30.0**2 * np.outer(s, s))
     assert "by +0.0 nT, to within 30.0 nT" in unsettled(problem, [order, bias], charted)
     named = Hypothesis(order, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)
-    alone = Finding(named, (), Gain(2.0, 1.0, 0.5, (0.4, 0.6)), np.array([0.5]), np.eye(1), 1.0)
-    contested = replace(alone, rivals=(Rival(bias, behind=3.0),))
+    alone = Finding(named, (), Improvement(2.0, 1.0, 0.5, (0.4, 0.6)), np.array([0.5]), np.eye(1), 1.0)
+    contested = replace(alone, competing=(CompetingHypothesis(bias, behind=3.0),))
     assert unsettled(problem, contested.possible, louder) == text
     assert not unsettled(problem, alone.possible, louder)
     assert not unsettled(problem, [bias], problem.calibration)
@@ -232,13 +238,13 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
 def test_names_that_something_unexplained_keeps_are_told() -> None:
     """With what would tell the likeliest of them; what fits no cause has no names."""
     drift, current = (
-        Rival(candidate(cause, np.ones(1), channel=channel), behind)
+        CompetingHypothesis(candidate(cause, np.ones(1), channel=channel), behind)
         for cause, channel, behind in (("offset_drift", None, 0.0), ("current_field", "motor<1>", 1.0))
     )
     rest = Leftover("drift", 9.0, 1e-9, 12.0, None, None, within=(drift, current))
-    said = nameless(rest, CAUSES)
-    assert "It resembles: offset drift, current field (motor&lt;1&gt;)." in said
-    assert CAUSES["offset_drift"].separated_by in said
+    output = nameless(rest, CAUSES)
+    assert "It resembles: offset drift, current field (motor&lt;1&gt;)." in output
+    assert CAUSES["offset_drift"].separated_by in output
     assert nameless(rest._replace(within=()), CAUSES) == "It fits no known cause, so it has no name."
 
 
@@ -256,17 +262,17 @@ def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     )  # fmt: skip
     cause = CAUSES["temperature_offset"]
     alone, channels, causes = (
-        _text(rivalled(own, cause, [Rival(one, 1.0) for one in rivals], 0.97))
-        for rivals in ([], [twin], [twin, other])
+        _text(not_separated(own, cause, [CompetingHypothesis(one, 1.0) for one in competing], 0.97))
+        for competing in ([], [twin], [twin, other])
     )
     assert "water would do nearly as well" in channels
-    for said in (alone, channels):
-        assert "none comes within odds of 20:1" in said
-        assert said.endswith("told from all other known causes in 97 of 100 cases.")
+    for output in (alone, channels):
+        assert "none comes within odds of 20:1" in output
+        assert output.endswith("told from all other known causes in 97 of 100 cases.")
     assert "cannot tell it from temperature offset (water) or offset drift (" in causes
     assert cause.separated_by in causes
     assert "in 97 of 100 cases; here it was not." in causes
-    certain = _text(rivalled(own, cause, [Rival(other, 1.0)], 0.999))
+    certain = _text(not_separated(own, cause, [CompetingHypothesis(other, 1.0)], 0.999))
     assert "in more than 99 of 100 cases" in certain
 
 

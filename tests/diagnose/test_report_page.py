@@ -15,9 +15,9 @@ from study import deployment
 from magbridge.diagnose.assessment.weigh import OWN, Assessment
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.improvement import Improvement
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.report.canvas import ends, rolling
 from magbridge.diagnose.report.details import remaining, visible
 from magbridge.diagnose.report.page import report_html
@@ -60,19 +60,19 @@ def test_nothing_speaks_against_a_clear_case(clear: Diagnosis) -> None:
 
 
 def test_without_a_gain_it_does_not_fly(clear: Diagnosis) -> None:
-    found = answer(replace(clear, total=Gain(1.0, 1.0, 1.0, (0.9, 1.1))))
+    found = answer(replace(clear, total=Improvement(1.0, 1.0, 1.0, (0.9, 1.1))))
     assert (found.answer, found.fit_for_use) == ("Not on the evidence of this log.", "no")
     assert "do not use it" in reasons(found)[0]
 
 
 def test_another_possible_cause_is_a_doubt_that_a_manoeuvre_settles(clear: Diagnosis) -> None:
     """Another channel of the same cause is none: the name holds."""
-    other = Rival(candidate("offset_drift", np.ones(1)), 1.0)
-    twin = Rival(candidate("current_field", np.ones(1), channel="amps_c"), 1.0)
-    found = answer(with_(clear, rivals=(other,)))
+    other = CompetingHypothesis(candidate("offset_drift", np.ones(1)), 1.0)
+    twin = CompetingHypothesis(candidate("current_field", np.ones(1), channel="amps_c"), 1.0)
+    found = answer(with_(clear, competing=(other,)))
     assert (found.answer, found.fit_for_use) == ("Only once these doubts are settled.", "once_settled")
     assert CAUSES["current_field"].separated_by in reasons(found)[1]
-    assert answer(with_(clear, rivals=(twin,))).fit_for_use == "yes"
+    assert answer(with_(clear, competing=(twin,))).fit_for_use == "yes"
 
 
 def test_causes_that_cancel_are_a_doubt(clear: Diagnosis) -> None:
@@ -85,12 +85,12 @@ def test_causes_that_cancel_are_a_doubt(clear: Diagnosis) -> None:
 
 
 def test_each_other_doubt_is_told(clear: Diagnosis) -> None:
-    idle, large = Gain(1.0, 1.0, 1.0, (0.9, 1.1)), 10.0 * np.ones(3)
+    idle, large = Improvement(1.0, 1.0, 1.0, (0.9, 1.1)), 10.0 * np.ones(3)
     survey = clear.problem.survey
     own = replace(clear.problem, survey=replace(survey, fitted=np.ones(len(survey), bool)))
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
     doubtful = {
-        "No improvement of its own": with_(clear, gain=idle),
+        "No improvement of its own": with_(clear, improvement=idle),
         "10 times the usual size": with_(clear, coefficients=large),
         OWN: replace(clear, problem=own),
         "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),
@@ -115,8 +115,8 @@ def test_what_stays_in_the_field_is_reckoned_with(clear: Diagnosis) -> None:
     named = replace(clear.findings[0].hypothesis, candidate=sun)
     both: tuple[Finding, ...] = (clear.findings[0], replace(clear.findings[0], hypothesis=named))
     found = answer(replace(clear, findings=both))
-    (said,) = [reason for reason in reasons(found) if reason.startswith("By itself it takes")]
-    before, after = (float(x) for x in re.findall(r"from ([\d.]+) to ([\d.]+) nT RMS", said)[0])
+    (output,) = [reason for reason in reasons(found) if reason.startswith("By itself it takes")]
+    before, after = (float(x) for x in re.findall(r"from ([\d.]+) to ([\d.]+) nT RMS", output)[0])
     assert before == pytest.approx(clear.total.before, rel=0.01)
     assert after < before
 
@@ -137,9 +137,9 @@ def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
 
 
 def test_predicted_and_remaining_residual_stand_beside_each_other(clear: Diagnosis) -> None:
-    said = "".join(remaining(clear, CAUSES))
-    assert said.count("<tr><td>") == 4
-    assert "times worse than what was fitted" not in said
+    output = "".join(remaining(clear, CAUSES))
+    assert output.count("<tr><td>") == 4
+    assert "times worse than what was fitted" not in output
     worse = replace(clear, total=clear.total.__class__(5.0, 3.0, 0.6, (0.5, 0.7)))
     assert "times worse than what was fitted" in "".join(remaining(worse, CAUSES))
 
@@ -150,9 +150,9 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
     first, below = page.split("<h2", 1)
     assert "<b>A tone</b> of period 33 s is left (signal-to-noise ratio 9.0; it follows" in first
     assert "amps&lt;b&gt;" in first
-    left = clear.assessment.residual
-    last = number(left.correlation_time, 2)
-    assert f"in all {number(left.rms)}\N{NO-BREAK SPACE}nT RMS, which last {last} s" in first
+    residual = clear.assessment.residual
+    last = number(residual.correlation_time, 2)
+    assert f"in all {number(residual.rms)}\N{NO-BREAK SPACE}nT RMS, which last {last} s" in first
     assert f"None of {len(CAUSES)} causes is named." in below
 
 

@@ -49,9 +49,11 @@ def test_only_returns_at_several_times_tell_place_from_time() -> None:
     assert "never returns" in away.text
     assert back.share > 0.8
     assert back.longest == pytest.approx(14400.0, rel=0.05)
-    assert max(away.told, back.told) < 0.01  # what bends about the turning point is the same on both ways
+    assert (
+        max(away.separable, back.separable) < 0.01
+    )  # what bends about the turning point is the same on both ways
     assert "cannot be told apart" in back.text
-    assert fro.told > 0.5
+    assert fro.separable > 0.5
     assert fro.apart
     assert "can be told apart" in fro.text
 
@@ -66,9 +68,9 @@ def test_the_share_is_what_no_function_of_the_place_imitates(name: str) -> None:
     trend, bend = (x / np.std(x) - np.mean(x) / np.std(x) for x in (trend, bend))
     for angle in np.linspace(0.0, np.pi, 181):
         f = np.cos(angle) * trend + np.sin(angle) * bend
-        left = f - G @ np.linalg.lstsq(G, f, rcond=None)[0]
-        least = min(least, float(np.var(left) / np.var(f)))
-    assert flown(TRACKS[name]).told == pytest.approx(least, abs=2e-3)
+        residual = f - G @ np.linalg.lstsq(G, f, rcond=None)[0]
+        least = min(least, float(np.var(residual) / np.var(f)))
+    assert flown(TRACKS[name]).separable == pytest.approx(least, abs=2e-3)
 
 
 def logged(hidden: str, track: str) -> xr.Dataset:
@@ -118,8 +120,8 @@ def test_one_hidden_cause_gets_one_name_and_a_doubt_where_the_track_cannot_tell(
     found = diagnose([logged(hidden, track)], known)
     facts = findings(found, CAUSES)
     assert [one["cause"] for one in facts["findings"]] == [hidden]
-    said = facts["assessment"]["place_or_time"]
-    assert said["told_apart"] == (track == "to and fro, eight times")
+    output = facts["assessment"]["place_or_time"]
+    assert output["told_apart"] == (track == "to and fro, eight times")
     codes = [one["code"] for one in facts["assessment"]["reasons_against"]]
     assert ("place_or_time" in codes) == (hidden == "diurnal_variation" and track == "away")
-    assert any(said["text"] in part for part in visible(found))
+    assert any(output["text"] in part for part in visible(found))

@@ -63,11 +63,11 @@ def test_one_cause_gives_way_to_two_beside_a_third() -> None:
     one, two, third = rng.normal(size=(3, n))
     alike = fault("nonlinearity", one + two + 0.3 * rng.normal(size=n), 10.0)
     both = [fault("offset_drift", one, 10.0), fault("offset_step", two, 10.0)]
-    beside = fault("current_field", third, 10.0)
+    conditional_on = fault("current_field", third, 10.0)
     problem = replace(right(n), residual=5.0 * (one + two + third) + rng.normal(size=n))
-    state = State(problem, [alike, *both, beside], 1, 4)
+    state = State(problem, [alike, *both, conditional_on], 1, 4)
     state.round([], state.null)
-    model, _ = exchanged(state, [alike, beside], state.fit([alike, beside]))
+    model, _ = exchanged(state, [alike, conditional_on], state.fit([alike, conditional_on]))
     assert {c.cause for c in model} == {"offset_drift", "offset_step", "current_field"}
 
 
@@ -92,7 +92,9 @@ def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
     noise = rng.normal(size=600)
     [bias] = reference_bias(problem)
     small, large = (
-        State(replace(problem, residual=noise + size * problem.gain), [bias], 1, 1).fit([bias]).log_likelihood
+        State(replace(problem, residual=noise + size * problem.reference_jacobian), [bias], 1, 1)
+        .fit([bias])
+        .log_likelihood
         for size in (10.0, 140.0)
     )
     assert small - 2.0 < large < small

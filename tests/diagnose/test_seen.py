@@ -44,7 +44,11 @@ def flown() -> Problem:
 def test_series_lag_axis_and_size_of_a_signal_are_told(flown: Problem, lag: float, axis: str) -> None:
     survey = flown.survey
     q = lagged(survey.time, survey.channels["throttle"].values, lag)
-    u = np.ones(N) if axis == "field" else -flown.slopes[:, 6 + "xyz".index(axis)] / flown.gain
+    u = (
+        np.ones(N)
+        if axis == "field"
+        else -flown.jacobian[:, 6 + "xyz".index(axis)] / flown.reference_jacobian
+    )
     signal = 20.0 * q * u
     noise = np.random.default_rng(6).normal(size=N)
     found = seen(flown, signal + noise)
@@ -76,7 +80,11 @@ def test_the_axis_of_what_is_slow_is_told_though_it_follows_nothing(axis: str) -
     survey = surveyed(turned, np.sin(np.arange(N) / 30.0))
     hours = Channel(correlated(np.random.default_rng(4).normal(size=(N, 1)), 0.997)[:, 0], "h", ("position",))
     problem = pose(replace(survey, channels=survey.channels | {"hours": hours}), calibrated(np.zeros(18)))
-    u = np.ones(N) if axis == "field" else -problem.slopes[:, 6 + "xyz".index(axis)] / problem.gain
+    u = (
+        np.ones(N)
+        if axis == "field"
+        else -problem.jacobian[:, 6 + "xyz".index(axis)] / problem.reference_jacobian
+    )
     slow = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
     found = seen(problem, 34.0 * slow * u)
     assert (found.channel, found.axis) == (None, axis)
@@ -114,15 +122,15 @@ def test_a_residual_far_from_white_is_never_nothing() -> None:
     assert found.verdict == "unexplained"
     assert found.findings == ()
     facts = findings(found, CAUSES)
-    rest, left = facts["unexplained"], facts["assessment"]["residual"]
+    rest, residual = facts["unexplained"], facts["assessment"]["residual"]
     assert rest["kind"] == "drift"
-    assert left["rms_nT"] == pytest.approx(np.std(slow), rel=0.1)
-    assert left["white_nT"] == pytest.approx(np.std(np.diff(slow)) / np.sqrt(2.0), rel=0.2)
+    assert residual["rms_nT"] == pytest.approx(np.std(slow), rel=0.1)
+    assert residual["white_nT"] == pytest.approx(np.std(np.diff(slow)) / np.sqrt(2.0), rel=0.2)
     assert 60.0 < rest["correlation_time_s"] < 250.0
     assert rest["follows"]["channel"] is rest["best_channel"] is None
     assert "does not describe all" in facts["assessment"]["answer"]
-    said = "\n".join(causes_of(facts))
-    assert f"{left['rms_nT']:.1f} nT RMS that lasts {rest['correlation_time_s']:.3g} s" in said
+    output = "\n".join(causes_of(facts))
+    assert f"{residual['rms_nT']:.1f} nT RMS that lasts {rest['correlation_time_s']:.3g} s" in output
     assert found.unexplained is not None
     page = described(found.unexplained, found.assessment.residual)
-    assert f"in all {left['rms_nT']:.1f} nT RMS, which last" in page
+    assert f"in all {residual['rms_nT']:.1f} nT RMS, which last" in page

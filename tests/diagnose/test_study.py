@@ -20,8 +20,8 @@ from study.cases import PARTS, plan
 from study.deployment import CHARTS, charted, drawn, project
 from study.draws import SHOWN, Draws, Span, evidence, with_another
 from study.nameless import against, nameless
-from study.noise import LOSSES, MEMORY, left, whiten
-from study.rates import beside_ideal, efficiency, share
+from study.noise import LOSSES, MEMORY, kept_rows, whiten
+from study.rates import against_ideal, efficiency, share
 from study.table import lines
 from study.theory import SIZES
 
@@ -47,7 +47,7 @@ def test_whitened_noise_is_white() -> None:
     noise = correlated(rng.normal(size=(20_000, 1)), MEMORY)[:, 0]
     assert np.std(noise) == pytest.approx(1.0, abs=0.03)
     for losses in ("", *LOSSES):
-        rows = left(losses, len(noise), 3)
+        rows = kept_rows(losses, len(noise), 3)
         white = whiten(noise[rows], "ar", rows)
         assert np.std(white) == pytest.approx(1.0, abs=0.02)
         assert abs(np.mean(white[1:] * white[:-1])) < 0.02
@@ -79,7 +79,7 @@ def test_a_third_of_every_part_loses_samples() -> None:
 
 
 def test_a_dive_loses_as_much_as_the_next() -> None:
-    rows = left("surfacing", 5000, 5)
+    rows = kept_rows("surfacing", 5000, 5)
     gone = np.diff(rows)[np.diff(rows) > 1]
     assert set(gone) == {12}
     assert np.ptp(np.diff(np.flatnonzero(np.diff(rows) > 1))) <= 1
@@ -96,8 +96,8 @@ def test_a_map_is_off_and_less_so_at_its_depth() -> None:
     for reference in CHARTS:
         chart = drawn(twin, reference)
         wrong = charted(ds, chart)["reference_field"] - ds["truth_total_field"]
-        again = charted(shifted, chart)["reference_field"] - ds["truth_total_field"]
-        np.testing.assert_allclose(again, wrong - 30.0, atol=1e-6)
+        rebuilt = charted(shifted, chart)["reference_field"] - ds["truth_total_field"]
+        np.testing.assert_allclose(rebuilt, wrong - 30.0, atol=1e-6)
         off[reference] = float(np.std(wrong))
     assert 0.5 < off["map at its depth"] < 0.6 * off["map"]
 
@@ -122,27 +122,27 @@ def test_another_seed_shares_nothing() -> None:
 
 
 def test_two_rivals_imitate_what_neither_does_alone() -> None:
-    """Against least squares: what the best rival and its best companion of each cause leave of the truth."""
+    """Against least squares: what the best competing cause and its best companion leave of the truth."""
     rng = np.random.default_rng(5)
     A, B, other = rng.normal(size=(3, 60, 2))
     truth = A[:, 0] + B[:, 1] + 0.2 * rng.normal(size=60)
     X = np.column_stack([A, B, other, truth])
     spans = [Span("a", None, slice(0, 2), 0.0), Span("b", None, slice(2, 4), 0.0)]
-    left = with_another(Draws.of(X.T @ X), spans[0], spans)
+    residual = with_another(Draws.of(X.T @ X), spans[0], spans)
     for cause, columns in (("a", A), ("b", np.column_stack([A, B]))):
         naive = truth - columns @ np.linalg.lstsq(columns, truth, rcond=None)[0]
-        assert left[cause][0] == pytest.approx(np.linalg.norm(naive), rel=1e-6)
+        assert residual[cause][0] == pytest.approx(np.linalg.norm(naive), rel=1e-6)
 
 
 def test_likelihood_ratios_are_drawn_without_any_data() -> None:
-    """Against least squares on simulated data: mean and scatter of what two rivals together explain."""
+    """Against least squares on simulated data: mean and scatter of what two causes together explain."""
     rng = np.random.default_rng(6)
     A, B = rng.normal(size=(2, 60, 2))
     truth = A[:, 0] - B[:, 1] + rng.normal(size=60)
     X = np.column_stack([A, B, truth])
     spans = [Span("a", None, slice(0, 2)), Span("b", None, slice(2, 4))]
     draws = Draws.of(X.T @ X)
-    one, other = draws.ratio(spans[0], 0.5), draws.beside(spans[0]).ratio(spans[1], 0.5)
+    one, other = draws.ratio(spans[0], 0.5), draws.conditional_on(spans[0]).ratio(spans[1], 0.5)
     ratio, freedom = one[0] + other[0], one[1] + other[1]
     data = 0.5 * truth[:, None] + rng.normal(size=(60, 4000))
     Q = np.linalg.qr(np.column_stack([A, B]))[0]
@@ -155,12 +155,12 @@ def test_likelihood_ratios_are_drawn_without_any_data() -> None:
 def test_two_are_named_unless_another_whole_says_the_same() -> None:
     """By one cause that swallows both, or by two others; and the set holds what cannot be told from them."""
     one, two, both, else_ = 10.0 * np.linalg.qr(np.random.default_rng(8).normal(size=(60, 4)))[0].T
-    trials = dict.fromkeys("abcd", 1.0)
+    look_elsewhere = dict.fromkeys("abcd", 1.0)
 
     def chances(*columns: tuple[str, np.ndarray]) -> tuple[float, float]:
         X = np.column_stack([*(column for _, column in columns), one + two])
         spans = [Span(name, None, slice(k, k + 1)) for k, (name, _) in enumerate(columns)]
-        wholes = by_causes(weighed(Draws.of(X.T @ X), spans, spans, trials))
+        wholes = by_causes(weighed(Draws.of(X.T @ X), spans, spans, look_elsewhere))
         return named(wholes, frozenset("ab")), held(wholes, frozenset("ab"))
 
     truth = (("a", one), ("b", two))
@@ -222,7 +222,7 @@ def test_a_detector_that_needs_more_is_told_by_its_p_values() -> None:
         noise = rng.normal()
         here = [2.0 * norm.sf(size + noise) for size in SIZES]
         rows.append({"wanted": a, "p_value": 2.0 * norm.sf(a / 1.1 + noise), "theory": [{"here": here}]})
-    factor, low, high = beside_ideal(rows) or (0.0, 0.0, 0.0)
+    factor, low, high = against_ideal(rows) or (0.0, 0.0, 0.0)
     assert factor == pytest.approx(1.1, abs=0.005)
     assert low <= factor <= high < low + 0.02
 

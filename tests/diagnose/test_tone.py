@@ -18,6 +18,6 @@ def test_a_tone_between_two_frequencies_is_found_there(place: float) -> None:
     t = quiet.survey.time
     f = place / 4096 / 4.0
     noise = np.random.default_rng(3).normal(size=len(t))
-    residual = 10.0 * quiet.slopes[:, 6] * np.cos(2.0 * np.pi * f * (t - t[0])) + 0.1 * noise
+    residual = 10.0 * quiet.jacobian[:, 6] * np.cos(2.0 * np.pi * f * (t - t[0])) + 0.1 * noise
     first = interference_tone(replace(quiet, residual=residual))[0]
     assert 1.0 / first.shape["period"][0] == pytest.approx(f, abs=0.1 / 4096 / 4.0)

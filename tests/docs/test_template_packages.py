@@ -71,8 +71,8 @@ def test_the_driver_is_listed_and_reads_in_any_pieces(
     installed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(installed))
-    said = magbridge(installed, "drivers", "counts")
-    assert "nt_per_count" in said.stdout
+    output = magbridge(installed, "drivers", "counts")
+    assert "nt_per_count" in output.stdout
     data = b"204 -5 7\nM 16204 -5013 49187\r\nM 1 2\nM 60000 2 3\n"
     whole, pieces = (open_driver("counts", {"nt_per_count": 2.0, "full_scale": 60_000}) for _ in range(2))
     readings = whole.feed(data)
@@ -87,18 +87,18 @@ def test_the_driver_is_listed_and_reads_in_any_pieces(
 def test_the_format_is_read_by_every_command(installed: Path) -> None:
     sample = ROOT / "examples" / "format" / "sample.survey"
     magbridge(installed, "convert", sample, "-o", installed / "sample.csv")
-    head, *rows = [
+    header, *rows = [
         line for line in (installed / "sample.csv").read_text().splitlines() if not line.startswith("#")
     ]
-    assert "battpos [mm]" in head
+    assert "battpos [mm]" in header
     assert len(rows) == 120
 
 
 def test_a_record_that_is_none_is_named(installed: Path) -> None:
     bad = installed / "bad.survey"
     bad.write_text("2026-05-01T10:00:00Z; 48.31; -57.93; 16204.1; -5013.0; 49187.5; 12.4\nand so on\n")
-    said = magbridge(installed, "info", bad, code=1)
-    assert "bad.survey: row 2: expected a time and 6 numbers" in said.stdout + said.stderr
+    output = magbridge(installed, "info", bad, code=1)
+    assert "bad.survey: row 2: expected a time and 6 numbers" in output.stdout + output.stderr
 
 
 @pytest.mark.parametrize(
@@ -121,10 +121,10 @@ def test_a_faulty_format_is_one_line_and_harms_nothing_else(text: str, fault: st
     (info / "entry_points.txt").write_text("[magbridge.formats]\nodd = faulty\n")
     (tmp_path / "faulty.py").write_text(text)
     (tmp_path / "log.odd").write_text("x")
-    said = magbridge(tmp_path, "convert", tmp_path / "log.odd", "-o", tmp_path / "log.csv", code=1).stderr
-    assert said.startswith("magbridge: format 'odd' of the package faulty: ")
-    assert fault in said
-    assert said.count("\n") == 1
+    output = magbridge(tmp_path, "convert", tmp_path / "log.odd", "-o", tmp_path / "log.csv", code=1).stderr
+    assert output.startswith("magbridge: format 'odd' of the package faulty: ")
+    assert fault in output
+    assert output.count("\n") == 1
     assert not (tmp_path / "log.csv").exists()
     sound = ROOT / "examples" / "format" / "sample.survey"
     assert (

@@ -91,8 +91,8 @@ def test_longitude_goes_round(grid: AnomalyGrid, places: Places, start: float) -
 
 def test_longitude_reads_as_usual(grid: AnomalyGrid) -> None:
     """Across the antimeridian it is unwound inside; a map of the whole globe reads as its file does."""
-    for first, told in ((179.8, "179.8000 to -179.7000"), (190.0, "-170.0000 to -169.5000")):
-        assert repr(AnomalyGrid(LON - 10.0 + first, LAT, grid.anomaly)).endswith(f"longitude {told})")
+    for first, reported in ((179.8, "179.8000 to -179.7000"), (190.0, "-170.0000 to -169.5000")):
+        assert repr(AnomalyGrid(LON - 10.0 + first, LAT, grid.anomaly)).endswith(f"longitude {reported})")
     around = AnomalyGrid(np.arange(0.0, 360.0), np.arange(5.0), np.zeros((5, 360)))
     assert repr(around).endswith("longitude 0.0000 to 359.0000)")
 

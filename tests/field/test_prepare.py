@@ -88,10 +88,10 @@ def test_a_survey_of_unknown_height_is_not_continued_until_it_is_told() -> None:
     for grids, altitude in (([silent], 90.0), ([known, silent], None)):
         with pytest.raises(OutOfRange, match=r"90 m: a.grd does not say how high it was surveyed"):
             prepare(grids, altitude)
-    told = surveyed_at([known, silent], [60.0])
-    assert [grid.altitude for grid in told] == [90.0, 60.0]
+    reported = surveyed_at([known, silent], [60.0])
+    assert [grid.altitude for grid in reported] == [90.0, 60.0]
     assert surveyed_at([silent, silent], [60.0, 70.0])[1].altitude == 70.0
-    lifted, _ = prepare(told[1:], 90.0)
+    lifted, _ = prepare(reported[1:], 90.0)
     off = (lifted.anomaly - monopole(90.0))[10:-10, 10:-10]
     assert np.abs(off).max() < 0.1 * np.abs(monopole(60.0) - monopole(90.0)).max()
     with pytest.raises(WrongUse, match="2 altitudes for 1 grids"):

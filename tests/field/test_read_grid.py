@@ -30,8 +30,10 @@ def lines(values: np.ndarray, delimiter: str = " ") -> str:
 
 
 def surfer_text(path: Path) -> None:
-    head = f"DSAA\n{LON.size} {LAT.size}\n{LON[0]} {LON[-1]}\n{LAT[0]} {LAT[-1]}\n{MAP.min()} {MAP.max()}\n"
-    path.write_text(head + lines(MAP))
+    first_lines = (
+        f"DSAA\n{LON.size} {LAT.size}\n{LON[0]} {LON[-1]}\n{LAT[0]} {LAT[-1]}\n{MAP.min()} {MAP.max()}\n"
+    )
+    path.write_text(first_lines + lines(MAP))
 
 
 def surfer_6(path: Path) -> None:
@@ -47,8 +49,10 @@ def surfer_7(path: Path) -> None:
 
 
 def esri(path: Path) -> None:
-    head = f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\n"
-    path.write_text(head + "NODATA_value -9999\n" + lines(MAP[::-1]))
+    first_lines = (
+        f"ncols {LON.size}\nnrows {LAT.size}\nxllcenter {LON[0]}\nyllcenter {LAT[0]}\ncellsize 0.05\n"
+    )
+    path.write_text(first_lines + "NODATA_value -9999\n" + lines(MAP[::-1]))
 
 
 def esri_corner(path: Path) -> None:
@@ -249,13 +253,13 @@ def test_one_clear_line(
 
 
 def grid_or_one_line(path: Path) -> None:
-    said = f"{path}: "
+    output = f"{path}: "
     try:
         assert read_grid(path).anomaly.size >= 16
     except FormatError as error:
-        said = str(error)
-    assert said.startswith(f"{path}: ")
-    assert "\n" not in said
+        output = str(error)
+    assert output.startswith(f"{path}: ")
+    assert "\n" not in output
 
 
 WORDS = (

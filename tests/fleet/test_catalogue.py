@@ -116,9 +116,9 @@ def test_a_log_that_changed_is_another_version(empty: Catalogue, tmp_path: Path)
     assert add_logs(empty, "comet", MAY, [log]) == (0, [])
     first, kept = jobs(empty)[0].name, log.read_bytes()
     fly(log, 1, 1)
-    count, (said,) = add_logs(empty, "comet", MAY, [log])
+    count, (output,) = add_logs(empty, "comet", MAY, [log])
     assert count == 1
-    assert said.endswith("log.nc: has changed since it was catalogued; what it holds now counts")
+    assert output.endswith("log.nc: has changed since it was catalogued; what it holds now counts")
     (now,) = current_files(empty.rows("files"))
     assert now["version"] == 2
     assert jobs(empty)[0].name != first
@@ -140,9 +140,9 @@ def test_an_unknown_vehicle_and_a_missing_log(empty: Catalogue, tmp_path: Path) 
     with pytest.raises(WrongUse, match=r"nemo: not a vehicle of .* \(none yet\)"):
         add_logs(empty, "nemo", MAY, [])
     add_vehicle(empty, "comet", Vehicle())
-    count, (said,) = add_logs(empty, "comet", MAY, [tmp_path / "gone.nc"])
+    count, (output,) = add_logs(empty, "comet", MAY, [tmp_path / "gone.nc"])
     assert count == 0
-    assert "gone.nc: expected a file, there is none" in said
+    assert "gone.nc: expected a file, there is none" in output
 
 
 def test_a_fleet_toml_names_what_is_wrong(tmp_path: Path) -> None:

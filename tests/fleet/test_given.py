@@ -68,14 +68,14 @@ def test_what_does_not_fit_is_a_line(
 ) -> None:
     _, cal = made
 
-    def said(*more: str) -> str:
+    def output(*more: str) -> str:
         assert add(catalogue, cal, *more) == 2
         return capsys.readouterr().err
 
     when = "--date", "2026-05-01"
-    assert "a calibration says no date: when did its deployment begin (--date)?" in said()
-    told = said(*when, "--sensor", "HMR 9")
-    assert "a calibration of sensor 'HMR 1', but comet may carries 'HMR 9'" in told
+    assert "a calibration says no date: when did its deployment begin (--date)?" in output()
+    reported = output(*when, "--sensor", "HMR 9")
+    assert "a calibration of sensor 'HMR 1', but comet may carries 'HMR 9'" in reported
     add_vehicle(catalogue, "other", Vehicle(parameters=("ballast",)))
     of = "--vehicle", "other", "--deployment", "may", "--catalogue", catalogue.name
     assert main(["fleet", "add", str(cal), *of, *when]) == 2

@@ -61,21 +61,21 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
     finally:
         scheduler.kill()
         scheduler.communicate()
-    out, said = command.communicate(timeout=PATIENCE)
+    out, output = command.communicate(timeout=PATIENCE)
     worker.kill()
     worker.communicate()
     if len(catalogue.rows("done")) < 3:  # it was not too late to be killed
-        assert command.returncode == 1, (out, said)
-        assert f"magbridge: {address}: the dask scheduler was lost: run again to do what is left" in said
-        assert "Traceback" not in said
+        assert command.returncode == 1, (out, output)
+        assert f"magbridge: {address}: the dask scheduler was lost: run again to do what is left" in output
+        assert "Traceback" not in output
         command = start("fleet", "process", "--catalogue", folder, "--workers", "1")
         until(finished(2), command)
         command.send_signal(signal.SIGKILL)
         command.communicate()
     two = [start("fleet", "process", "--catalogue", folder, "--workers", "1") for _ in range(2)]
     for one in two:  # two people at once
-        out, said = one.communicate(timeout=PATIENCE)
-        assert (one.returncode, said) == (0, ""), out
+        out, output = one.communicate(timeout=PATIENCE)
+        assert (one.returncode, output) == (0, ""), out
     # but for what the fixture's run did not learn at its end
     mine, theirs = content(catalogue), content(done)
     assert len(mine.pop("populations")) == 1

@@ -164,10 +164,10 @@ def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.
             catalogue.add(table, rows)
     place, page = str(catalogue.folder), tmp_path / "page.html"
     assert main(["fleet", "show", "comet", "--catalogue", place, "--html", str(page)]) == 0
-    told = capsys.readouterr().out.splitlines()
-    assert told[0] == "comet: 5 deployments, 1 changes"
-    assert "d4 (refit spring): hard iron, y moved by +" in told[1]
-    assert told[1].endswith("iron that was magnetised, fitted or taken off, and no refit is on record")
+    reported = capsys.readouterr().out.splitlines()
+    assert reported[0] == "comet: 5 deployments, 1 changes"
+    assert "d4 (refit spring): hard iron, y moved by +" in reported[1]
+    assert reported[1].endswith("iron that was magnetised, fitted or taken off, and no refit is on record")
     pages = tmp_path / "pages"
     assert main(["fleet", "show", "--catalogue", place, "--html", str(pages)]) == 0
     assert {path.name for path in pages.iterdir()} == {"index.html", "comet.html", "fleet.json"}
@@ -209,7 +209,7 @@ def test_what_is_expected_is_a_calibration(done: Catalogue, tmp_path: Path) -> N
     assert main(["fleet", "export", "one", "--catalogue", str(done.folder), "-o", str(cal)]) == 0
     known = load(cal)
     assert known.method == "fleet"
-    assert known.doubts
+    assert known.warnings
     (own, _) = (row for row in done.rows("calibrations") if row["vehicle"] == "one")
     off = known.coefficients[6:9] - decode_calibration(own["calibration"].encode()).coefficients[6:9]
     assert (np.abs(off) < 4.0 * np.sqrt(np.diag(known.covariance)[6:9])).all()

@@ -34,7 +34,7 @@ def replays(rig: Rig) -> None:
     assert recorded.messages > 20
     assert first_difference(published, recorded.published) is None
     at = 0
-    for _, message in rig.heard:
+    for _, message in rig.received:
         at = published.find(message.frame, at)
         assert at >= 0, message.fields
         at += len(message.frame)

@@ -8,10 +8,10 @@ import pytest
 
 from magbridge.cli import main
 
-__all__ = ["Command", "Said"]
+__all__ = ["Command", "Output"]
 
 
-class Said(NamedTuple):
+class Output(NamedTuple):
     """What a command printed."""
 
     out: str
@@ -24,14 +24,14 @@ class Command:
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
 
-    def __call__(self, *arguments: object, code: int = 0) -> Said:
+    def __call__(self, *arguments: object, code: int = 0) -> Output:
         """Run a command that must end with `code`; return what it printed."""
         assert main([str(argument) for argument in arguments]) == code
-        return Said(*self._capsys.readouterr())
+        return Output(*self._capsys.readouterr())
 
     def refuses(self, *arguments: object, code: int = 1) -> str:
         """Run a command that must refuse with `code`; return its one line."""
-        said = self(*arguments, code=code).err
-        assert said.count("\n") == 1, said
-        assert said.startswith("magbridge: ")
-        return said.removeprefix("magbridge: ").rstrip()
+        texts = self(*arguments, code=code).err
+        assert texts.count("\n") == 1, texts
+        assert texts.startswith("magbridge: ")
+        return texts.removeprefix("magbridge: ").rstrip()

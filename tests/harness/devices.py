@@ -131,7 +131,7 @@ class Autopilot:
         """Of the battery at a time (s, monotonic)."""
         self.answers = True
         """Whether it answers TIMESYNC."""
-        self.told: list[float] = []
+        self.reported: list[float] = []
         """When it sent telemetry (s, monotonic)."""
         self._retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
         """What the link makes of a telemetry frame."""
@@ -208,7 +208,7 @@ class Autopilot:
         self.codec.now_us = time.time_ns() // 1000
         return self.codec.pack(name, **fields)
 
-    def say(self, name: str, /, **fields: object) -> None:
+    def send_message(self, name: str, /, **fields: object) -> None:
         """Send a message."""
         self.send(self.pack(name, **fields))
 
@@ -232,18 +232,18 @@ class Autopilot:
                 self._line.setblocking(False)
         if now >= self._beat:
             self._beat = now + 1 / BEAT_HZ
-            self.say("HEARTBEAT", type=12, autopilot=3, system_status=4, mavlink_version=3)
+            self.send_message("HEARTBEAT", type=12, autopilot=3, system_status=4, mavlink_version=3)
         if now >= self._due:
             self._due = now + 1 / TELEMETRY_HZ
-            self.told.append(now)
+            self.reported.append(now)
             for frame in self._retell(self.telemetry()):
                 self.send(frame)
-        for message in self._hear():
+        for message in self._receive():
             if self.answers and message.known and message.name == "TIMESYNC" and message["tc1"] == 0:
-                self.say("TIMESYNC", tc1=self.boot_us * 1000, ts1=message["ts1"])
+                self.send_message("TIMESYNC", tc1=self.boot_us * 1000, ts1=message["ts1"])
             yield message
 
-    def _hear(self) -> Iterator[Message]:
+    def _receive(self) -> Iterator[Message]:
         while self._line is not None:
             try:
                 data, peer = self._line.recvfrom(65536)

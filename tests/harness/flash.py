@@ -57,7 +57,7 @@ class Log:
         ]
         return b"\xa3\x95" + bytes([number]) + self.structs[name].pack(*raw)
 
-    def say(self, name: str, *values: Any) -> None:
+    def write_message(self, name: str, *values: Any) -> None:
         """Append a record."""
         self.data += self.record(name, *values)
         self.lines.append(", ".join([name, *map(str, values)]))
@@ -65,10 +65,12 @@ class Log:
     def fix(self, us: int, utc: float, status: int = 3) -> None:
         """Append a GPS fix; `utc` is s since 1970."""
         gps = utc + 18 - 315_964_800
-        self.say("GPS", us, status, round(gps % 604_800 * 1000), int(gps // 604_800), 9, 1.0, 45.0, -63.0)
+        self.write_message(
+            "GPS", us, status, round(gps % 604_800 * 1000), int(gps // 604_800), 9, 1.0, 45.0, -63.0
+        )
 
     def mag(
         self, us: int, number: int, field: Sequence[int], health: int = 1, offsets: Sequence[int] = ()
     ) -> None:
         """Append a sample (mG) of a compass; `offsets` are three offsets and three of the motors."""
-        self.say("MAG", us, number, *field, *(offsets or (0,) * 6), health, us & 0xFFFFFFFF)
+        self.write_message("MAG", us, number, *field, *(offsets or (0,) * 6), health, us & 0xFFFFFFFF)

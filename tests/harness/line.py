@@ -41,18 +41,18 @@ class Line:
         """Let time pass until `seconds` after the start; return what the station heard."""
         self.now = START + round(seconds * SECOND)
         self.component.advance(self.now)
-        return self.hear()
+        return self.receive()
 
-    def hear(self) -> list[Any]:
+    def receive(self) -> list[Any]:
         frames = self.component.outbox.drain()
         self.sent += frames
-        heard: list[Any] = []
+        received: list[Any] = []
         for _, frame in frames:
-            heard += self.station.parse_buffer(frame) or []
+            received += self.station.parse_buffer(frame) or []
         assert self.station.total_receive_errors == 0
-        return heard
+        return received
 
-    def say(self, name: str, /, *args: Any, **fields: Any) -> list[Any]:
+    def send_message(self, name: str, /, *args: Any, **fields: Any) -> list[Any]:
         """Send a message of the station; return what it hears back."""
         message = getattr(self.peer, f"MAVLink_{name.lower()}_message")(*args, **fields)
         return self.give(message.pack(self.station))
@@ -63,14 +63,14 @@ class Line:
 
     def give(self, data: bytes) -> list[Any]:
         self.telemetry = self.component.receive(data, self.now)
-        return self.hear()
+        return self.receive()
 
     def texts(self, messages: list[Any]) -> list[str]:
         return [message.text for message in self.only(messages, "STATUSTEXT")]
 
     def command(self, number: int, *params: float, target: tuple[int, int] = (1, 191)) -> list[Any]:
         self.asked = number
-        return self.say("command_long", *target, number, 0, *[*params, 0, 0, 0, 0, 0, 0, 0][:7])
+        return self.send_message("command_long", *target, number, 0, *[*params, 0, 0, 0, 0, 0, 0, 0][:7])
 
 
 MakeLine = Callable[..., Line]

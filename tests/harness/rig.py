@@ -68,7 +68,7 @@ PATIENCE = 60.0
 """s that an event is waited for: on a busy machine a bridge takes many to start."""
 
 
-class Heard(NamedTuple):
+class Received(NamedTuple):
     """A message of the bridge, and when it came (s, monotonic)."""
 
     when: float
@@ -109,7 +109,7 @@ class Rig:
     ) -> None:
         self.folder, self.normal = folder, 0
         self.machine = standstill()
-        self.heard: list[Heard] = []
+        self.received: list[Received] = []
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             place = f"127.0.0.1:{probe.getsockname()[1]}"
@@ -142,9 +142,9 @@ class Rig:
         if not list(self.fluxgate.folder.iterdir()):
             self.fluxgate.plug()
         self.autopilot.up()
-        return self.again()
+        return self.restart()
 
-    def again(self) -> float:
+    def restart(self) -> float:
         """Start the bridge; return the s until all is well."""
         begun, self.process = time.monotonic(), self.spawn(self.config)
         self.until_well()
@@ -169,14 +169,14 @@ class Rig:
 
     def step(self, seconds: float) -> None:
         """Set the clock that the bridge sees."""
-        beside = self.offset.with_suffix(".new")
-        beside.write_text(str(int(self.offset.read_text()) + round(seconds * 1e6)))
-        beside.replace(self.offset)
+        temporary = self.offset.with_suffix(".new")
+        temporary.write_text(str(int(self.offset.read_text()) + round(seconds * 1e6)))
+        temporary.replace(self.offset)
 
     @property
     def mark(self) -> int:
         """Here, in the stream of what is heard."""
-        return len(self.heard)
+        return len(self.received)
 
     def since(self, begun: float, end: float | None = None) -> float:
         """Return the s from `begun` to `end` or now (monotonic) in which this machine did not stand still."""
@@ -188,11 +188,11 @@ class Rig:
         begun = time.monotonic()
         while not condition():
             if self.since(begun) > timeout:
-                recent = "; ".join(self.said())[-1500:]
+                recent = "; ".join(self.texts())[-1500:]
                 raise AssertionError(f"not within {timeout} s; said: {recent}; {self.status}")
             self.fluxgate.turn()
             now = time.monotonic()
-            self.heard += [Heard(now, message) for message in self.autopilot.turn()]
+            self.received += [Received(now, message) for message in self.autopilot.turn()]
             time.sleep(TURN)
         return self.since(begun)
 
@@ -204,7 +204,9 @@ class Rig:
     def until_answered(self) -> None:
         """Ask the bridge for a parameter, and wait for the answer."""
         mark = self.mark
-        self.autopilot.say("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
+        self.autopilot.send_message(
+            "PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0
+        )
         self.until(lambda: self.of("PARAM_VALUE", mark))
 
     def until_well(self) -> float:
@@ -216,7 +218,7 @@ class Rig:
 
         def run() -> float | None:
             """Return when the first of five good samples on end came (s, monotonic)."""
-            fields = [one for one in self.heard[mark:] if one.message.name == "MAG_FIELD"]
+            fields = [one for one in self.received[mark:] if one.message.name == "MAG_FIELD"]
             good = [one.message["flags"] == self.normal for one in fields]
             return next(
                 (one.when for k, one in enumerate(fields) if len(good) > k + 4 and all(good[k : k + 5])), None
@@ -236,15 +238,15 @@ class Rig:
         self.until(lambda: any(map(condition, self.of("MAG_STATUS", mark))), timeout)
         return next(status for status in self.of("MAG_STATUS", mark) if condition(status))
 
-    def until_said(self, text: str, mark: int, timeout: float = PATIENCE) -> float:
+    def until_reported(self, text: str, mark: int, timeout: float = PATIENCE) -> float:
         """Wait until a STATUSTEXT since `mark` contains `text`; return the s that it took."""
-        return self.until(lambda: any(text in line for line in self.said(mark)), timeout)
+        return self.until(lambda: any(text in line for line in self.texts(mark)), timeout)
 
     def of(self, name: str, mark: int = 0) -> list[Message]:
         """Return the messages of one kind heard since `mark`."""
-        return [message for _, message in self.heard[mark:] if message.name == name]
+        return [message for _, message in self.received[mark:] if message.name == name]
 
-    def said(self, mark: int = 0) -> list[str]:
+    def texts(self, mark: int = 0) -> list[str]:
         """Return the STATUSTEXTs since `mark`, put together again."""
         lines: list[str] = []
         for message in self.of("STATUSTEXT", mark):
@@ -264,7 +266,7 @@ class Rig:
     def undue_flags(self, mark: int) -> str:
         """Return the same without those of late telemetry, where the machine or we stood still."""
         seen = 0
-        for when, message in self.heard[mark:]:
+        for when, message in self.received[mark:]:
             if message.name == "MAG_FIELD":
                 late = self.machine.seconds(when - 1.0, when) > STALE_BY or self.untold(when) > STALE_BY
                 seen |= message["flags"] & ~(Quality.STALE_TELEMETRY if late else 0)
@@ -273,7 +275,7 @@ class Rig:
 
     def untold(self, when: float) -> float:
         """Return the longest time (s) in which we sent no telemetry, of the second before `when`."""
-        sent = [t for t in self.autopilot.told if when - 1.0 < t < when]
+        sent = [t for t in self.autopilot.reported if when - 1.0 < t < when]
         return max(after - before for before, after in pairwise([when - 1.0, *sent, when]))
 
     @property

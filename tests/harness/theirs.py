@@ -10,7 +10,7 @@ import numpy as np
 from flash import Log
 from scipy.spatial.transform import Rotation
 from segments import segment
-from ulogs import Said, ulog_of
+from ulogs import Output, ulog_of
 
 from magbridge.arrays import FloatArray
 from magbridge.field.igrf import igrf
@@ -64,8 +64,8 @@ def ardupilot(path: Path) -> None:
         if k % 5 == 0:
             log.fix(us, T0 + us * 1e-6)
         roll, pitch, yaw = ANGLES[k]
-        log.say("ATT", us, 0, roll, 0, pitch, 0, yaw, 0, 0, 3)
-        log.say("BAT", us, 0, 16.0, CURRENT[k])
+        log.write_message("ATT", us, 0, roll, 0, pitch, 0, yaw, 0, 0, 3)
+        log.write_message("BAT", us, 0, 16.0, CURRENT[k])
         log.mag(us, 0, field.tolist())
         log.mag(us, 1, (field + 150).tolist())
     path.write_bytes(log.data)
@@ -84,13 +84,13 @@ def pixhawk(path: Path) -> None:
             "<QQ2dB",
         ),
     }
-    said: Said = []
+    texts: Output = []
     for k, field in enumerate(sensor() / 1e5):
         us = 1_000_000 + k * 100_000
-        said.append(("sensor_gps", 0, (us, T0 * 1_000_000 + us, *PLACE, 3)))
-        said.append(("vehicle_attitude", 0, (us, *BODY[k].as_quat()[[3, 0, 1, 2]])))
-        said.append(("sensor_mag", 0, (us, 4711, *field)))
-    path.write_bytes(ulog_of(topics, {}, said))
+        texts.append(("sensor_gps", 0, (us, T0 * 1_000_000 + us, *PLACE, 3)))
+        texts.append(("vehicle_attitude", 0, (us, *BODY[k].as_quat()[[3, 0, 1, 2]])))
+        texts.append(("sensor_mag", 0, (us, 4711, *field)))
+    path.write_bytes(ulog_of(topics, {}, texts))
 
 
 def bag(path: Path) -> None:
@@ -105,7 +105,7 @@ def bag(path: Path) -> None:
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics: dict[str, Any] = {}
 
-        def say(topic: str, kind: str, k: int, **values: Any) -> None:
+        def write_message(topic: str, kind: str, k: int, **values: Any) -> None:
             kind = f"sensor_msgs/msg/{kind}"
             stamp = types["builtin_interfaces/msg/Time"](sec=T0 + k // 10, nanosec=k % 10 * 100_000_000)
             header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
@@ -117,17 +117,17 @@ def bag(path: Path) -> None:
         status = types["sensor_msgs/msg/NavSatStatus"](status=0, service=1)
         for k, field in enumerate(sensor() * 1e-9):
             turned = Rotation.from_matrix(swap @ BODY[k].as_matrix() @ flip).as_quat()
-            say(
+            write_message(
                 "/imu", "Imu", k, orientation=types["geometry_msgs/msg/Quaternion"](*turned),
                 orientation_covariance=nine,
                 angular_velocity=vector(0, 0, 0), angular_velocity_covariance=nine,
                 linear_acceleration=vector(0, 0, 9.8), linear_acceleration_covariance=nine,
             )  # fmt: skip
-            say(
+            write_message(
                 "/gps", "NavSatFix", k, status=status, latitude=PLACE[0], longitude=PLACE[1], altitude=0.0,
                 position_covariance=nine, position_covariance_type=0,
             )  # fmt: skip
-            say(
+            write_message(
                 "/mag",
                 "MagneticField",
                 k,

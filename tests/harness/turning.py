@@ -17,7 +17,7 @@ from magbridge.config import load as load_config
 from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel
 
-__all__ = ["bridge", "events", "heard", "named"]
+__all__ = ["bridge", "events", "named", "received"]
 
 PLACE = (49.52, -57.87)
 SAMPLES = 700
@@ -41,10 +41,10 @@ def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pip
     save(cal, folder / "cal.json")
     config = folder / "bridge.toml"
     source = CONFIG if known else CONFIG.replace('[calibration]\nfile = "cal.json"\n', "")
-    head, _, _ = source.partition("[telemetry")
-    head = head.replace("options = {", f'options = {{unit = "counts", scale = {COUNT}, ')
+    header, _, _ = source.partition("[telemetry")
+    header = header.replace("options = {", f'options = {{unit = "counts", scale = {COUNT}, ')
     config.write_text(
-        f'{head}[log]\ndirectory = "logs"\n[publish]\nMAG_FIELD = 0\n{learning}', encoding="utf-8"
+        f'{header}[log]\ndirectory = "logs"\n[publish]\nMAG_FIELD = 0\n{learning}', encoding="utf-8"
     )
     return set_up(load_config(config), Start(START))
 
@@ -76,7 +76,7 @@ def events(folder: Path) -> list[Event]:
     return made
 
 
-def heard(frames: list[tuple[int, bytes]]) -> list[Message]:
+def received(frames: list[tuple[int, bytes]]) -> list[Message]:
     """Return the messages of frames."""
     return [message for _, frame in frames for message in Codec(255, 190).parse(frame)]
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from struct import pack
 from typing import Any
 
-__all__ = ["Said", "ulog_of"]
+__all__ = ["Output", "ulog_of"]
 
-Said = list[tuple[str, int, tuple[Any, ...]]]
+Output = list[tuple[str, int, tuple[Any, ...]]]
 """Topic, instance and values of each message."""
 
 
-def ulog_of(topics: dict[str, tuple[str, str]], parameters: dict[str, float], said: Said) -> bytes:
+def ulog_of(topics: dict[str, tuple[str, str]], parameters: dict[str, float], texts: Output) -> bytes:
     """Return a ULog of topics (definition, struct), each an instance, with parameters and messages."""
 
     def message(kind: str, body: bytes) -> bytes:
@@ -25,10 +25,10 @@ def ulog_of(topics: dict[str, tuple[str, str]], parameters: dict[str, float], sa
         key = f"{'int32_t' if whole else 'float'} {name}".encode()
         data += message("P", bytes([len(key)]) + key + pack("<i" if whole else "<f", value))
     numbers: dict[tuple[str, int], int] = {}
-    for name, instance, _ in said:
+    for name, instance, _ in texts:
         if (name, instance) not in numbers:
             numbers[name, instance] = len(numbers)
             data += message("A", pack("<BH", instance, numbers[name, instance]) + name.encode())
-    for name, instance, values in said:
+    for name, instance, values in texts:
         data += message("D", pack("<H", numbers[name, instance]) + pack(topics[name][1], *values))
     return data

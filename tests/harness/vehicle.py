@@ -36,11 +36,11 @@ class Bench:
         self.component.advance(self.now_us)
         return self._drain()
 
-    def hear(self, name: str, component: int = 1, **fields: Any) -> list[Message]:
+    def receive(self, name: str, component: int = 1, **fields: Any) -> list[Message]:
         """Hear a message now; return what was sent."""
         frame = self._autopilot[component].pack(name, **fields)
         for message in self.component.receive(frame, self.now_us):
-            self.navigation.hear(message, self.now_us)
+            self.navigation.receive(message, self.now_us)
         return self._drain()
 
     def fix(self, sigma: float = 5.0) -> list[Message]:
@@ -50,15 +50,15 @@ class Bench:
             self.navigation.motion.fixes_sent()
         return self._drain()
 
-    def said(self, word: str) -> list[str]:
+    def texts_with(self, word: str) -> list[str]:
         """Return the texts with a word in them, since asked last."""
         self._drain()
         found, self.texts = [text for text in self.texts if word in text], []
         return found
 
     def _drain(self) -> list[Message]:
-        self.texts += [text for _, text in self.component.announcer.said]
-        self.component.announcer.said.clear()
+        self.texts += [text for _, text in self.component.announcer.texts]
+        self.component.announcer.texts.clear()
         frames = b"".join(frame for _, frame in self.component.outbox.drain())
         wanted = ("COMMAND_INT", "COMMAND_LONG", "GLOBAL_POSITION_SENSOR", "ODOMETRY")
         return [message for message in Codec(255, 190).parse(frames) if message.name in wanted]

@@ -80,7 +80,7 @@ class Peer:
     def ask_until(self, line: str, text: str, timeout: float = 30.0) -> None:
         """Type a line again and again until the program says `text`: it may not have been ready before."""
         since, begun = len(self.lines), time.monotonic()
-        while not any(text in said for said in self.lines[since:]):
+        while not any(text in texts for texts in self.lines[since:]):
             assert time.monotonic() - begun < timeout, "\n".join(self.lines[-60:])
             self.ask(line)
             self._rig.run(0.5)

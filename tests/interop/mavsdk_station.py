@@ -18,7 +18,7 @@ url, xml = sys.argv[1], Path(sys.argv[2])
 BRIDGE = 191
 
 
-def tell(name: str, what: object) -> None:
+def notify(name: str, what: object) -> None:
     print(json.dumps({name: what}), flush=True)
 
 
@@ -29,7 +29,7 @@ while not systems or BRIDGE not in systems[0].component_ids():
     systems = station.get_systems()
     time.sleep(0.05)
 system = systems[0]
-tell(
+notify(
     "found",
     {
         "system": system.get_system_id(),
@@ -40,33 +40,33 @@ tell(
 
 direct = MavlinkDirect(system)
 direct.load_custom_xml(xml.read_text())
-heard: dict[str, Any] = {}
+received: dict[str, Any] = {}
 ready = threading.Event()
 
 
-def hear(message: Any, _: object) -> None:
-    heard[message.message_name] = json.loads(message.fields_json)
+def receive(message: Any, _: object) -> None:
+    received[message.message_name] = json.loads(message.fields_json)
     # where the machine stands still, the sensor is silent for a moment
-    speaks = heard.get("MAG_STATUS", {}).get("sensor_state") == 1
-    if speaks and {"MAG_FIELD", "MAG_RAW"} <= heard.keys():
+    speaks = received.get("MAG_STATUS", {}).get("sensor_state") == 1
+    if speaks and {"MAG_FIELD", "MAG_RAW"} <= received.keys():
         ready.set()
 
 
 for name in ("MAG_FIELD", "MAG_RAW", "MAG_STATUS"):
-    direct.subscribe_message(name, hear)
+    direct.subscribe_message(name, receive)
 ready.wait(20)
-tell("heard", heard)
+notify("heard", received)
 
 param = Param(system)
 with contextlib.suppress(ParamError):  # MAVSDK 4.1.0 says "unknown" when it has selected it
     param.select_component(BRIDGE, ProtocolVersion.V1)
-tell("parameters", {one.name: one.value for one in param.get_all_params().float_params})
+notify("parameters", {one.name: one.value for one in param.get_all_params().float_params})
 param.set_param_float("MB_GAP_FACTOR", 4.0)
-tell("read back", param.get_param_float("MB_GAP_FACTOR"))
+notify("read back", param.get_param_float("MB_GAP_FACTOR"))
 try:
     param.set_param_float("MB_GAP_FACTOR", 0.5)
-    tell("refused", None)
+    notify("refused", None)
 except ParamError as error:
-    tell("refused", str(error))
-tell("kept", param.get_param_float("MB_GAP_FACTOR"))
+    notify("refused", str(error))
+notify("kept", param.get_param_float("MB_GAP_FACTOR"))
 sys.stdin.read()

@@ -24,7 +24,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rig = Rig(tmp_path_factory.mktemp("rig"))
     try:
         rig.start()
-        rig.autopilot.say("PARAM_REQUEST_LIST", target_system=1, target_component=191)
+        rig.autopilot.send_message("PARAM_REQUEST_LIST", target_system=1, target_component=191)
         rig.until(lambda: len(rig.of("PARAM_VALUE")) == 15)
         rig.autopilot.send(b"noise" * 20)
         rig.run(0.5)

@@ -70,7 +70,7 @@ class Ear:
         self.line.bind(("127.0.0.1", 0))
         self.line.setblocking(False)
         self.peer: Any = None
-        self.heard: list[Message] = []
+        self.received: list[Message] = []
 
     @property
     def number(self) -> int:
@@ -80,17 +80,17 @@ class Ear:
         try:
             while True:
                 data, self.peer = self.line.recvfrom(65536)
-                self.heard += self.ear.parse(data)
+                self.received += self.ear.parse(data)
         except BlockingIOError:
             return
 
-    def say(self, name: str, **fields: object) -> None:
+    def send_message(self, name: str, **fields: object) -> None:
         if self.peer is not None:
             self.line.sendto(self.codec.pack(name, **fields), self.peer)
 
     def of(self, name: str) -> list[Message]:
         self.turn()
-        return [one for one in self.heard if one.name == name]
+        return [one for one in self.received if one.name == name]
 
 
 @pytest.fixture
@@ -102,8 +102,8 @@ def ears() -> Iterator[list[Ear]]:
 
 
 def ftp(opcode: int, data: bytes, sequence: int) -> dict[str, object]:
-    head = HEADER.pack(sequence, 0, opcode, len(data), 0, 0, 0)
-    return {"target_system": 1, "target_component": 191, "payload": (head + data).ljust(251, b"\0")}
+    header = HEADER.pack(sequence, 0, opcode, len(data), 0, 0, 0)
+    return {"target_system": 1, "target_component": 191, "payload": (header + data).ljust(251, b"\0")}
 
 
 def test_two_stations_and_a_vehicle_behind_a_router(
@@ -122,13 +122,13 @@ def test_two_stations_and_a_vehicle_behind_a_router(
     start_peer(rig, proxy(python, f"--master=udpin:127.0.0.1:{port(rig)}", *outs, *target))
     rig.until(lambda: all(one.of("MAG_FIELD") or one.of("HEARTBEAT") for one in ears), 60)
     for one in ears:
-        one.say("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)
+        one.send_message("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)
     names = 15
     rig.until(
         lambda: all(len({v["param_index"] for v in one.of("PARAM_VALUE")}) >= names for one in ears), 30
     )
     for k, one in enumerate(ears):
-        one.say("FILE_TRANSFER_PROTOCOL", **ftp(Opcode.LIST, b"logs", 10 + k))
+        one.send_message("FILE_TRANSFER_PROTOCOL", **ftp(Opcode.LIST, b"logs", 10 + k))
     rig.until(lambda: all(one.of("FILE_TRANSFER_PROTOCOL") for one in ears), 30)
     other = Codec(2, 1)
     for name, fields in (
@@ -148,10 +148,10 @@ def test_an_autopilot_that_speaks_mavlink_1(tmp_path: Path) -> None:
         rig.fluxgate.plug()
         rig.autopilot.up()
         rig.autopilot.pack = lambda name, /, **fields: old(station, name, fields)  # type: ignore[method-assign]
-        rig.again()
+        rig.restart()
         assert rig.status["autopilot_state"] == 1
         assert rig.stop() == 0
-        assert all(one.message.frame[0] == 0xFD for one in rig.heard)
+        assert all(one.message.frame[0] == 0xFD for one in rig.received)
     finally:
         rig.close()
 

@@ -78,10 +78,10 @@ def test_mavsdk(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     peer = start_peer(rig, [python, HERE / "mavsdk_station.py", f"udpin://127.0.0.1:{port(rig)}", XML])
     found = peer.answer("found")["found"]
     assert found == {"system": 1, "components": [191], "autopilot": False}
-    heard = peer.answer("heard")["heard"]
-    assert heard["MAG_FIELD"]["total_field"] == pytest.approx(TOTAL, abs=20)
-    assert heard["MAG_RAW"]["z"] == pytest.approx(TRUTH[2], abs=0.1)
-    assert heard["MAG_STATUS"]["sensor_state"] == 1
+    received = peer.answer("heard")["heard"]
+    assert received["MAG_FIELD"]["total_field"] == pytest.approx(TOTAL, abs=20)
+    assert received["MAG_RAW"]["z"] == pytest.approx(TRUTH[2], abs=0.1)
+    assert received["MAG_STATUS"]["sensor_state"] == 1
     parameters = peer.answer("parameters")["parameters"]
     assert parameters["MB_GAP_FACTOR"] == 2.5
     assert parameters["MB_R_HEARTBEAT"] == 5

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from commands import Command, Said
+from commands import Command, Output
 from pages import blocks, commands
 
 SHOWN = {tuple(words) for block in blocks("sh") for words in commands(block)}
@@ -18,7 +18,7 @@ class Walk:
     def __init__(self, command: Command) -> None:
         self._command = command
 
-    def __call__(self, line: str, code: int = 0) -> Said:
+    def __call__(self, line: str, code: int = 0) -> Output:
         """Run a line as a page has it, word for word, which must end with `code`."""
         words = tuple(shlex.split(line))
         assert words in SHOWN, f"no page shows: {line}"

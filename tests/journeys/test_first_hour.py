@@ -110,8 +110,8 @@ def test_an_integrator_attaches_a_bridge(walk: Walk, here: Path, calibration: Ca
     written = (here / "bridge.toml").read_text()
     assert "[telemetry.battpos]" in written
     assert "#" in written
-    said = walk("magbridge run --check --config bridge.toml")
-    assert "battpos" in said.out + said.err + written
+    output = walk("magbridge run --check --config bridge.toml")
+    assert "battpos" in output.out + output.err + written
     assert not list(here.glob("*.tlog"))
 
 
@@ -131,8 +131,8 @@ def test_an_operator_opens_the_page(here: Path) -> None:
         assert "magbridge" in text
     finally:
         page.terminate()
-        _, said = page.communicate(timeout=20)
-    assert "Traceback" not in said
+        _, output = page.communicate(timeout=20)
+    assert "Traceback" not in output
 
 
 def _shown(command: str) -> Iterator[list[str]]:
@@ -172,8 +172,8 @@ def test_a_surveyor_without_calibration_runs(walk: Walk, here: Path) -> None:
             for x, y, v in zip(east, north, rock, strict=True)
         ]
     (here / "lines.csv").write_text("\n".join(rows) + "\n")
-    said = walk("magbridge survey lines.csv -o map.nc --crossovers crossings.csv --json")
-    assert json.loads(said.out)["misties_after_nT"] < 0.3 * json.loads(said.out)["misties_before_nT"]
+    output = walk("magbridge survey lines.csv -o map.nc --crossovers crossings.csv --json")
+    assert json.loads(output.out)["misties_after_nT"] < 0.3 * json.loads(output.out)["misties_before_nT"]
     assert len(Path("crossings.csv").read_text().splitlines()) == 50
 
 

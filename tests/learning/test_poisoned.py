@@ -11,7 +11,7 @@ from worlds import World, calibration, error_of, grid_of, learn
 from magbridge.learning import Learner
 
 
-def told(learner: Learner) -> list[str]:
+def reported(learner: Learner) -> list[str]:
     """Return the texts of its notices."""
     return [notice.text for notice in learner.notices]
 
@@ -39,8 +39,8 @@ def test_a_month_without_a_fix_changes_nothing() -> None:
             faulty=False, reference=nan, where=None, watched=(nan,),
         )  # fmt: skip
     assert learner.calibration is before
-    told = [notice.text for notice in learner.notices if "hour" in notice.text]
-    assert told == ["learning: an hour without a sample to learn from"]
+    reported = [notice.text for notice in learner.notices if "hour" in notice.text]
+    assert reported == ["learning: an hour without a sample to learn from"]
 
 
 def test_a_spoofed_current_is_not_learned_from() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from magbridge.learning.doubt import Alarm
-from magbridge.learning.standing import PATIENCE, QUIET, RIVAL, SURE, Standing
+from magbridge.learning.standing import COMPETING, PATIENCE, QUIET, SURE, Standing
 from magbridge.records import Quality
 
 
@@ -27,7 +27,7 @@ def test_it_is_learned_sooner_the_fewer_causes_fit() -> None:
     two = "offset_drift", "temperature_offset"
     first = alarm(20.0, *two)
     assert not standing(first, alarm(20.1 + SURE, *two)).ripe
-    assert standing(first, alarm(20.1 + SURE + RIVAL, *two)).ripe
+    assert standing(first, alarm(20.1 + SURE + COMPETING, *two)).ripe
     assert standing(first, alarm(20.1 + SURE, "offset_drift")).ripe
     assert standing(first).raised(alarm(22.0, "offset_drift")) == "unexplained: it is offset drift"
 

@@ -24,11 +24,11 @@ GCS, QUADROTOR, ONBOARD = 6, 2, 18
 
 
 def spoken(link: Line, frames: bytes) -> tuple[list[Any], str]:
-    heard = link.give(frames)
-    return heard, "".join(link.texts(heard))
+    received = link.give(frames)
+    return received, "".join(link.texts(received))
 
 
-def said_by(system: int, component: int, kind: int | None, name: str, **fields: object) -> bytes:
+def texts_by(system: int, component: int, kind: int | None, name: str, **fields: object) -> bytes:
     """Return what a component says after a heartbeat of that kind, or without one."""
     codec = Codec(system, component)
     beat = b"" if kind is None else codec.pack("HEARTBEAT", type=kind)
@@ -51,14 +51,16 @@ def test_who_may_change_parameters_and_rates(
     link: Line, system: int, component: int, kind: int | None, may: bool
 ) -> None:
     fields = {"param_id": "MB_AGE_BATTPOS", "param_value": 1e6, "param_type": 9}
-    heard, text = spoken(link, said_by(system, component, kind, "PARAM_SET", **fields))
+    received, text = spoken(link, texts_by(system, component, kind, "PARAM_SET", **fields))
     age = 1e6 if may else 30.0
-    assert [v.param_value for v in link.only(heard, "PARAM_VALUE") if v.param_id == "MB_AGE_BATTPOS"] == [age]
+    assert [v.param_value for v in link.only(received, "PARAM_VALUE") if v.param_id == "MB_AGE_BATTPOS"] == [
+        age
+    ]
     assert link.component.parameters["MB_AGE_BATTPOS"] == age
     assert f"{system}:{component}" in text
     interval = {"command": MAV_CMD.SET_MESSAGE_INTERVAL, "param1": 60101, "param2": -1}
-    heard, text = spoken(link, said_by(system, component, kind, "COMMAND_LONG", **interval))
-    (ack,) = link.only(heard, "COMMAND_ACK")
+    received, text = spoken(link, texts_by(system, component, kind, "COMMAND_LONG", **interval))
+    (ack,) = link.only(received, "COMMAND_ACK")
     assert ack.result == (MAV_RESULT.ACCEPTED if may else MAV_RESULT.DENIED)
     assert link.component.rates["MAG_FIELD"].hertz == (-1.0 if may else 0.0)
     assert (f"{system}:{component} may not set a rate" in text) is not may
@@ -85,9 +87,9 @@ def test_two_sources_of_one_parameter(
 ) -> None:
     both, announcer = sources(component=wanted)
     assert [both.admit("battpos", who, s * 1_000_000) for s, who in order] == admitted
-    told = [text for _, text in announcer.said]
+    reported = [text for _, text in announcer.texts]
     refused = {who for (_, who), good in zip(order, admitted, strict=True) if not good}
-    assert {who for who in refused if f"battpos also from 1:{who}: not used" in told} == refused
+    assert {who for who in refused if f"battpos also from 1:{who}: not used" in reported} == refused
 
 
 def test_another_component_s_value_changes_no_sample(tmp_path: Path) -> None:
@@ -96,17 +98,17 @@ def test_another_component_s_value_changes_no_sample(tmp_path: Path) -> None:
         frame = Codec(1, component).pack("NAMED_VALUE_FLOAT", name="battpos", value=value)
         pipeline.feed(Event(START + component * 1000, Channel.LINK, frame))
     assert pipeline._correction.aligner.by_name["battpos"].last == 0.25
-    assert "battpos also from 1:99: not used" in [text for _, text in pipeline.component.announcer.said]
+    assert "battpos also from 1:99: not used" in [text for _, text in pipeline.component.announcer.texts]
 
 
 @pytest.mark.parametrize(
     "number", [MAV_CMD.DO_START_MAG_CAL, MAV_CMD.DO_CANCEL_MAG_CAL, MAV_CMD.FIXED_MAG_CAL_YAW]
 )
 def test_a_calibration_is_refused_in_words_and_left_to_the_autopilot(link: Line, number: MAV_CMD) -> None:
-    heard = link.command(number, 0.0)
-    (ack,) = link.only(heard, "COMMAND_ACK")
+    received = link.command(number, 0.0)
+    (ack,) = link.only(received, "COMMAND_ACK")
     assert ack.result == MAV_RESULT.UNSUPPORTED
-    assert "magbridge calibrate" in "".join(link.texts(heard))
+    assert "magbridge calibrate" in "".join(link.texts(received))
     assert link.command(number, 0.0, target=(1, 0)) == []
     assert link.command(number, 0.0, target=(1, 1)) == []
 
@@ -122,13 +124,13 @@ def values(link: Line, until: float) -> list[Any]:
 def test_a_station_that_never_asks_gets_the_parameters_twice(link: Line) -> None:
     names = link.component.parameters.names
     assert not values(link, 1.0)
-    heard = []
+    received = []
     for second in range(1, 60):
         beat(link)
-        heard += values(link, 1.0 + second)
+        received += values(link, 1.0 + second)
     times = [at for at, frame in link.sent if frame[7:10] == b"\x16\0\0"]
     assert times[len(names)] - times[0] == 10_000_000
-    for one in (heard[: len(names)], heard[len(names) :]):
+    for one in (received[: len(names)], received[len(names) :]):
         assert [value.param_id for value in one] == names
         assert [value.param_index for value in one] == list(range(len(names)))
         assert {value.param_count for value in one} == {len(names)}
@@ -149,8 +151,8 @@ def test_a_crowd_of_stations_is_no_flood(link: Line) -> None:
 
 
 def test_requests_without_end_do_not_keep_the_list_from_its_end(link: Line) -> None:
-    heard = []
+    received = []
     for k in range(40):
-        link.say("param_request_list", 1, 191)
-        heard += values(link, 1.0 + 0.1 * k)
-    assert {value.param_id for value in heard} == set(link.component.parameters.names)
+        link.send_message("param_request_list", 1, 191)
+        received += values(link, 1.0 + 0.1 * k)
+    assert {value.param_id for value in received} == set(link.component.parameters.names)

@@ -23,9 +23,9 @@ def result(link: Line, messages: list[Any]) -> int:
 
 
 def test_request_message(link: Line) -> None:
-    heard = link.command(REQUEST, STATUS)
-    assert result(link, heard) == ACCEPTED
-    assert len(link.only(heard, "MAG_STATUS")) == 1
+    received = link.command(REQUEST, STATUS)
+    assert result(link, received) == ACCEPTED
+    assert len(link.only(received, "MAG_STATUS")) == 1
     assert result(link, link.command(REQUEST, FIELD)) == TEMPORARILY_REJECTED  # no sample yet
     assert result(link, link.command(REQUEST, 24)) == DENIED
     assert result(link, link.command(REQUEST, nan)) == DENIED
@@ -34,20 +34,20 @@ def test_request_message(link: Line) -> None:
 
 def test_version(link: Line) -> None:
     for number, param in ((REQUEST, VERSION), (CAPABILITIES, 1)):
-        heard = link.command(number, param)
-        assert result(link, heard) == ACCEPTED
-        (version,) = link.only(heard, "AUTOPILOT_VERSION")
+        received = link.command(number, param)
+        assert result(link, received) == ACCEPTED
+        (version,) = link.only(received, "AUTOPILOT_VERSION")
         assert version.flight_sw_version == 0x010203FF
         assert version.capabilities == 2 | 8 | 32 | 8192 | 131072
 
 
 def test_intervals(link: Line) -> None:
-    heard = link.command(SET, HIGHRES_IMU, 100_000)
-    assert result(link, heard) == ACCEPTED
-    (value,) = link.only(heard, "PARAM_VALUE")  # a parameter changed: stations want to know
+    received = link.command(SET, HIGHRES_IMU, 100_000)
+    assert result(link, received) == ACCEPTED
+    (value,) = link.only(received, "PARAM_VALUE")  # a parameter changed: stations want to know
     assert (value.param_id, value.param_value) == ("MB_R_HIGHRES_IMU", 10.0)
-    heard = link.command(GET, HIGHRES_IMU)
-    assert link.only(heard, "MESSAGE_INTERVAL")[0].interval_us == 100_000
+    received = link.command(GET, HIGHRES_IMU)
+    assert link.only(received, "MESSAGE_INTERVAL")[0].interval_us == 100_000
     assert result(link, link.command(SET, HIGHRES_IMU, -1)) == ACCEPTED
     assert link.only(link.command(GET, HIGHRES_IMU), "MESSAGE_INTERVAL")[0].interval_us == -1
     assert result(link, link.command(SET, HEARTBEAT, 200_000)) == ACCEPTED
@@ -85,9 +85,9 @@ def test_an_interval_of_an_age_is_kept(link: Line, message: int) -> None:
 def test_an_interval_is_a_message_that_can_be_requested(link: Line) -> None:
     """MAVLink has deprecated GET_MESSAGE_INTERVAL in favour of this."""
     assert result(link, link.command(SET, HIGHRES_IMU, 100_000)) == ACCEPTED
-    heard = link.command(REQUEST, 244, HIGHRES_IMU)
-    assert result(link, heard) == ACCEPTED
-    assert link.only(heard, "MESSAGE_INTERVAL")[0].interval_us == 100_000
+    received = link.command(REQUEST, 244, HIGHRES_IMU)
+    assert result(link, received) == ACCEPTED
+    assert link.only(received, "MESSAGE_INTERVAL")[0].interval_us == 100_000
 
 
 def test_interval_of_a_message_we_do_not_send(link: Line) -> None:
@@ -105,15 +105,15 @@ def test_to_everybody_we_do_only_what_only_we_can(link: Line) -> None:
     assert link.command(START_MAG_CAL, 1, target=(1, 0)) == []
     assert link.command(REQUEST, VERSION, target=(1, 0)) == []
     assert link.command(SET, HIGHRES_IMU, 1000, target=(0, 0)) == []
-    heard = link.command(REQUEST, STATUS, target=(1, 0))
-    assert result(link, heard) == ACCEPTED
-    assert len(link.only(heard, "MAG_STATUS")) == 1
+    received = link.command(REQUEST, STATUS, target=(1, 0))
+    assert result(link, received) == ACCEPTED
+    assert len(link.only(received, "MAG_STATUS")) == 1
 
 
 def test_command_int(link: Line) -> None:
     link.asked = REQUEST
-    heard = link.say("command_int", 1, 191, 0, REQUEST, 0, 0, STATUS, 0, 0, 0, 0, 0, 0)
-    assert result(link, heard) == ACCEPTED
+    received = link.send_message("command_int", 1, 191, 0, REQUEST, 0, 0, STATUS, 0, 0, 0, 0, 0, 0)
+    assert result(link, received) == ACCEPTED
 
 
 def test_the_acknowledgement_is_addressed(link: Line) -> None:
@@ -129,9 +129,9 @@ def test_a_flood_is_rejected_and_told_once_and_costs_nobody_else(link: Line) -> 
     assert results == [ACCEPTED] * 100 + [TEMPORARILY_REJECTED] * 200
     others = Codec(255, 191)
     ask = {"target_system": 1, "target_component": 191, "command": REQUEST, "param1": METADATA}
-    heard = link.give(others.pack("COMMAND_LONG", **ask))
-    assert [one.result for one in link.only(heard, "COMMAND_ACK")] == [ACCEPTED]
-    told = [text for _, text in link.component.announcer.said if "commands a second" in text]
-    assert told == ["more than 100 commands a second from 255:190"]
+    received = link.give(others.pack("COMMAND_LONG", **ask))
+    assert [one.result for one in link.only(received, "COMMAND_ACK")] == [ACCEPTED]
+    reported = [text for _, text in link.component.announcer.texts if "commands a second" in text]
+    assert reported == ["more than 100 commands a second from 255:190"]
     link.to(2.0)
     assert result(link, link.command(REQUEST, METADATA)) == ACCEPTED

@@ -16,7 +16,7 @@ from magbridge.config import Align, Link
 from magbridge.errors import ConfigError
 from magbridge.link import Component, alignment, check_publish
 from magbridge.link.reports import Condition
-from magbridge.mavlink import Codec, Signing, TapeReader, spec
+from magbridge.mavlink import Codec, FrameLogReader, Signing, spec
 from magbridge.mavlink.dialect import MAG_PORT_STATE
 
 START = 1_700_000_000_000_000
@@ -58,12 +58,12 @@ def test_status(make_link: MakeLine) -> None:
     )
     link.to(0)
     link.give(b"garbage" + link.autopilot.pack("HEARTBEAT", type=12, autopilot=3))
-    heard = link.to(3)
-    status = link.only(heard, "MAG_STATUS")[-1]
+    received = link.to(3)
+    status = link.only(received, "MAG_STATUS")[-1]
     assert (status.samples, status.calibration_id, status.uptime, status.link_frames) == (5, 7, 3, 1)
     assert (status.link_bytes_skipped, status.log_records) == (7, 3)
     assert status.autopilot_state == MAG_PORT_STATE.OK
-    assert link.only(heard, "HEARTBEAT")[-1].system_status == 4
+    assert link.only(received, "HEARTBEAT")[-1].system_status == 4
 
 
 def test_telemetry_only_of_our_vehicle(link: Line) -> None:
@@ -79,8 +79,8 @@ def test_everything_heard_is_kept_for_the_log(link: Line) -> None:
     inside = link.autopilot.pack("MAG_LINK_BYTES", length=1, data=b"x")
     noise = bytes(range(250)) * 2
     link.give(frame + noise + inside + frame)
-    assert link.component.heard[0] == link.component.heard[-1] == frame
-    kept = Codec(1, 1).parse(b"".join(link.component.heard[1:-1]) + frame)[:-1]
+    assert link.component.received[0] == link.component.received[-1] == frame
+    kept = Codec(1, 1).parse(b"".join(link.component.received[1:-1]) + frame)[:-1]
     assert {message.name for message in kept} == {"MAG_LINK_BYTES"}
     assert b"".join(message["data"][: message["length"]] for message in kept) == noise + inside
 
@@ -106,13 +106,13 @@ def test_replaying_what_was_heard_gives_the_same_bytes(make_link: MakeLine) -> N
             ]
         )  # fmt: skip
         first.component.receive(data, first.now)
-        log += [(first.now, frame) for frame in first.component.heard]
-        first.component.heard.clear()
+        log += [(first.now, frame) for frame in first.component.received]
+        first.component.received.clear()
     first.to(40)
-    tape = TapeReader()
+    frame_log = FrameLogReader()
     for at, frame in log:
         second.component.advance(at)
-        second.component.receive(tape.data(frame), at)
+        second.component.receive(frame_log.data(frame), at)
     second.to(40)
     assert len(first.sent) > 200
     assert second.sent == first.sent
@@ -120,7 +120,7 @@ def test_replaying_what_was_heard_gives_the_same_bytes(make_link: MakeLine) -> N
 
 
 def test_timesync_is_answered_to_the_asker(link: Line) -> None:
-    (answer,) = link.only(link.say("timesync", 0, 123456789), "TIMESYNC")
+    (answer,) = link.only(link.send_message("timesync", 0, 123456789), "TIMESYNC")
     assert (answer.tc1, answer.ts1) == (NOW * 1000, 123456789)
     mine = link.fly("TIMESYNC", ts1=5, target_system=1, target_component=158)
     assert not link.only(mine, "TIMESYNC")
@@ -134,7 +134,7 @@ def test_signed_both_ways(make_link: MakeLine) -> None:
     link.station.signing.sign_outgoing = True
     link.station.signing.timestamp = (START - 1_420_070_400_000_000) // 10
     link.to(0.1)
-    values = link.say("param_request_read", 1, 191, b"", 0)
+    values = link.send_message("param_request_read", 1, 191, b"", 0)
     assert [message.get_signed() for message in values] == [True]
     link.fly("PARAM_REQUEST_READ", target_system=1, target_component=191, param_index=0)
     assert signing.refused == 1

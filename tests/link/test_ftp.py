@@ -40,11 +40,11 @@ class Station:
         """Return opcode, session, offset, whether the burst is complete, data of each reply."""
         text = data.encode() if isinstance(data, str) else data
         self._sequence += not again
-        head = HEADER.pack(
+        header = HEADER.pack(
             self._sequence & 0xFFFF, session, opcode, len(text) if size is None else size, 0, 0, offset
         )
         replies = []
-        for k, payload in enumerate(self._server.handle(self._who, (head + text).ljust(251, b"\0")), 1):
+        for k, payload in enumerate(self._server.handle(self._who, (header + text).ljust(251, b"\0")), 1):
             assert len(payload) == 251
             sequence, got, kind, length, asked, complete, at = HEADER.unpack_from(payload)
             assert (sequence, asked) == ((self._sequence + k) & 0xFFFF, opcode & 0xFF)
@@ -231,8 +231,8 @@ def test_a_crowd_cannot_take_all_sessions_for_ever(server: FtpServer, clock: lis
 def test_a_burst_ends_with_its_session(server: FtpServer) -> None:
     station = Station(server)
     session = station.open(f"logs/{NAMES[0]}")
-    head = HEADER.pack(50, session, Opcode.BURST, 80, 0, 0, 0)
-    burst = server.handle(ME, head.ljust(251, b"\0"))
+    header = HEADER.pack(50, session, Opcode.BURST, 80, 0, 0, 0)
+    burst = server.handle(ME, header.ljust(251, b"\0"))
     next(burst)
     station.ask(Opcode.TERMINATE, session=session)
     assert list(burst) == []

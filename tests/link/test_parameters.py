@@ -21,11 +21,11 @@ from magbridge.link.store import Kept, load, save
 
 
 def write(link: Line, name: str, value: float, kind: int = 9) -> list[Any]:
-    return link.say("param_set", 1, 191, name.encode(), value, kind)
+    return link.send_message("param_set", 1, 191, name.encode(), value, kind)
 
 
 def test_list_comes_whole_and_paced(link: Line) -> None:
-    assert not link.only(link.say("param_request_list", 1, 191), "PARAM_VALUE")
+    assert not link.only(link.send_message("param_request_list", 1, 191), "PARAM_VALUE")
     values = link.only(link.to(5), "PARAM_VALUE")
     table = link.component.parameters.table
     assert [value.param_id for value in values] == list(table)
@@ -46,17 +46,17 @@ def test_names_and_ranges_are_sound(link: Line) -> None:
 
 def test_read_by_name_and_index(link: Line) -> None:
     for request in ((b"MB_GAP_FACTOR", -1), (b"", link.component.parameters.names.index("MB_GAP_FACTOR"))):
-        (value,) = link.say("param_request_read", 1, 191, *request)
+        (value,) = link.send_message("param_request_read", 1, 191, *request)
         assert (value.param_id, value.param_value) == ("MB_GAP_FACTOR", 2.5)
     for request in ((b"NO_SUCH", -1), (b"", 999), (b"", -2)):
-        assert link.say("param_request_read", 1, 191, *request) == []
+        assert link.send_message("param_request_read", 1, 191, *request) == []
 
 
 def test_not_ours(link: Line) -> None:
-    assert link.say("param_request_read", 1, 1, b"MB_GAP_FACTOR", -1) == []
-    assert link.say("param_request_read", 2, 191, b"MB_GAP_FACTOR", -1) == []
-    assert link.say("param_request_read", 1, 0, b"", 0) == []  # an index means the autopilot's
-    assert link.say("param_set", 1, 0, b"NO_SUCH", 1.0, 9) == []
+    assert link.send_message("param_request_read", 1, 1, b"MB_GAP_FACTOR", -1) == []
+    assert link.send_message("param_request_read", 2, 191, b"MB_GAP_FACTOR", -1) == []
+    assert link.send_message("param_request_read", 1, 0, b"", 0) == []  # an index means the autopilot's
+    assert link.send_message("param_set", 1, 0, b"NO_SUCH", 1.0, 9) == []
 
 
 def test_set(link: Line) -> None:
@@ -71,9 +71,9 @@ def test_set(link: Line) -> None:
 
 @pytest.mark.parametrize("value", [0.5, -1.0, 1e6, nan, inf, -inf, 3.4e38])
 def test_out_of_range_is_refused_and_said(link: Line, value: float) -> None:
-    heard = write(link, "MB_GAP_FACTOR", value)
-    assert [v.param_value for v in link.only(heard, "PARAM_VALUE")] == [2.5]
-    text = "".join(link.texts(heard))
+    received = write(link, "MB_GAP_FACTOR", value)
+    assert [v.param_value for v in link.only(received, "PARAM_VALUE")] == [2.5]
+    text = "".join(link.texts(received))
     assert text.startswith("MB_GAP_FACTOR: ")
     assert text.endswith("is not within 1.01 to 1000")
     assert link.component.parameters.changed() == {}
@@ -81,11 +81,11 @@ def test_out_of_range_is_refused_and_said(link: Line, value: float) -> None:
 
 def test_refusals_are_said_once_a_second(link: Line) -> None:
     """Each is answered with the value; the same one, later, is said again."""
-    heard = [
+    received = [
         message for value in (0.5, 0.5, 0.25, 0.5, 0.75) for message in write(link, "MB_GAP_FACTOR", value)
     ]
-    assert len(link.only(heard, "PARAM_VALUE")) == 5
-    assert "".join(link.texts(heard)) == "MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000"
+    assert len(link.only(received, "PARAM_VALUE")) == 5
+    assert "".join(link.texts(received)) == "MB_GAP_FACTOR: 0.5 is not within 1.01 to 1000"
     assert "".join(link.texts(link.to(2))) == "MB_GAP_FACTOR: 0.75 is not within 1.01 to 1000"
     for later in (4, 6):
         link.to(later)
@@ -93,9 +93,9 @@ def test_refusals_are_said_once_a_second(link: Line) -> None:
 
 
 def test_only_real32(link: Line) -> None:
-    heard = write(link, "MB_GAP_FACTOR", 4.0, kind=6)
-    assert link.texts(heard) == ["MB_GAP_FACTOR: only REAL32 is taken"]
-    assert link.only(heard, "PARAM_VALUE")[0].param_value == 2.5
+    received = write(link, "MB_GAP_FACTOR", 4.0, kind=6)
+    assert link.texts(received) == ["MB_GAP_FACTOR: only REAL32 is taken"]
+    assert link.only(received, "PARAM_VALUE")[0].param_value == 2.5
 
 
 def test_a_rate_parameter_is_obeyed(link: Line) -> None:
@@ -109,10 +109,10 @@ def test_kept_parameters_come_back(make_link: MakeLine) -> None:
     link = make_link(kept={"MB_GAP_FACTOR": 3.5, "MB_R_RAW": 2.0, "GONE": 1.0})
     assert link.component.parameters["MB_GAP_FACTOR"] == 3.5
     assert link.component.rates["MAG_RAW"].hertz == 2.0
-    said = link.hear()
-    assert any("GONE" in text for text in link.texts(said))
+    texts = link.receive()
+    assert any("GONE" in text for text in link.texts(texts))
     # whoever has changed the configuration meanwhile learns why it has no effect
-    assert "kept from the link, not as configured: MB_R_RAW, MB_GAP_FACTOR" in "".join(link.texts(said))
+    assert "kept from the link, not as configured: MB_R_RAW, MB_GAP_FACTOR" in "".join(link.texts(texts))
 
 
 ROWS = [

@@ -33,7 +33,7 @@ def sample(t_us: int = START, reading: Reading = READING, age: float = nan) -> S
 
 def publish(link: Line, one: Sample, corrected: Corrected = CORRECTED, anomaly: float = nan) -> list[Any]:
     link.component.publisher.publish(one, corrected, anomaly)
-    return link.hear()
+    return link.receive()
 
 
 @pytest.fixture
@@ -72,13 +72,13 @@ def test_field(line: Line) -> None:
 
 
 def test_standard_messages(line: Line) -> None:
-    heard = publish(line, sample())
-    (imu,) = line.only(heard, "HIGHRES_IMU")
+    received = publish(line, sample())
+    (imu,) = line.only(received, "HIGHRES_IMU")
     assert (imu.xmag, imu.ymag, imu.zmag) == pytest.approx((0.2, -0.01, 0.45), rel=1e-6)
     assert (imu.fields_updated, imu.time_usec, imu.xacc) == (0x1C0, START, 0)
-    (vector,) = line.only(heard, "DEBUG_VECT")
+    (vector,) = line.only(received, "DEBUG_VECT")
     assert (vector.name, vector.x, vector.y, vector.z) == ("mag_field", *CORRECTED.field)
-    named = line.only(heard, "NAMED_VALUE_FLOAT")
+    named = line.only(received, "NAMED_VALUE_FLOAT")
     assert {one.name: one.value for one in named} == pytest.approx(
         {"mag_total": 50_123.456789, "mag_sigma": 1.5}
     )
@@ -89,25 +89,25 @@ def test_standard_messages(line: Line) -> None:
 
 def test_rates(make_link: MakeLine) -> None:
     line = make_link(publish={"MAG_FIELD": 0.0, "HIGHRES_IMU": 3.0})
-    heard = []
+    received = []
     for i in range(1000):  # 10 Hz
-        heard += publish(line, sample(START + i * 100_000))
-    assert len(line.only(heard, "MAG_FIELD")) == 1000
-    assert len(line.only(heard, "HIGHRES_IMU")) == pytest.approx(300, abs=1)
-    assert len(heard) == pytest.approx(1300, abs=1)
+        received += publish(line, sample(START + i * 100_000))
+    assert len(line.only(received, "MAG_FIELD")) == 1000
+    assert len(line.only(received, "HIGHRES_IMU")) == pytest.approx(300, abs=1)
+    assert len(received) == pytest.approx(1300, abs=1)
     line.command(511, 105, -1)
     line.command(511, 60101, 1_000_000)
-    heard = []
+    received = []
     for i in range(1000, 2000):
-        heard += publish(line, sample(START + i * 100_000))
-    assert {one.get_type() for one in heard} == {"MAG_FIELD"}
-    assert len(heard) == pytest.approx(100, abs=1)
+        received += publish(line, sample(START + i * 100_000))
+    assert {one.get_type() for one in received} == {"MAG_FIELD"}
+    assert len(received) == pytest.approx(100, abs=1)
 
 
 def test_the_latest_sample_on_request(line: Line) -> None:
     publish(line, sample())
-    heard = line.command(512, 105)
-    assert [one.get_type() for one in heard] == ["HIGHRES_IMU", "COMMAND_ACK"]
+    received = line.command(512, 105)
+    assert [one.get_type() for one in received] == ["HIGHRES_IMU", "COMMAND_ACK"]
 
 
 def test_nan_is_published_as_nan(line: Line) -> None:

@@ -93,7 +93,7 @@ def talker(peer: ModuleType) -> Talker:
 
 
 def test_short_text(talker: Talker) -> None:
-    talker.announcer.say("sensor found")
+    talker.announcer.send_statustext("sensor found")
     (message,) = talker.at(0)
     assert (message.text, message.id, message.severity) == ("sensor found", 0, 6)
 
@@ -102,7 +102,7 @@ def test_short_text(talker: Talker) -> None:
 def test_long_text_in_pieces(talker: Talker, length: int) -> None:
     text = "".join(chr(97 + i % 26) for i in range(length))
     for _ in range(2):
-        talker.announcer.say(text)
+        talker.announcer.send_statustext(text)
         messages = talker.at(0)
         assert "".join(message.text for message in messages) == text
         if length > 50:
@@ -110,7 +110,7 @@ def test_long_text_in_pieces(talker: Talker, length: int) -> None:
             assert messages[0].id > 0
             assert [message.chunk_seq for message in messages] == list(range(len(messages)))
             assert len(messages[-1].text) < 50  # else the receiver waits for more
-    talker.announcer.say("5 µT")
+    talker.announcer.send_statustext("5 µT")
     assert talker.at(0)[0].text == "5 ?T"
 
 
@@ -123,10 +123,10 @@ def test_only_changes_are_said(talker: Talker) -> None:
 
 
 def test_what_flaps_is_said_once_a_second_and_its_last_word_always(talker: Talker) -> None:
-    said = []
+    texts = []
     for i in range(201):  # 100 Hz for 2 s, ends on "up"
-        said += talker.at(i / 100)
+        texts += talker.at(i / 100)
         talker.announcer.state("link", "up" if i % 2 == 0 else "down")
-    said += talker.at(10)
-    assert 2 <= len(said) <= 4
-    assert said[-1].text == "up"
+    texts += talker.at(10)
+    assert 2 <= len(texts) <= 4
+    assert texts[-1].text == "up"

@@ -28,11 +28,11 @@ def test_found_vanished_found(link: Line) -> None:
 
 
 def boots(link: Line, codec: Codec, times: Iterable[int]) -> list[str]:
-    said = []
+    texts = []
     for i, boot_ms in enumerate(times):
-        said += link.texts(link.to(1 + i * 0.1))
-        said += link.texts(link.give(codec.pack("ATTITUDE", time_boot_ms=boot_ms)))
-    return said
+        texts += link.texts(link.to(1 + i * 0.1))
+        texts += link.texts(link.give(codec.pack("ATTITUDE", time_boot_ms=boot_ms)))
+    return texts
 
 
 def test_reboot(link: Line) -> None:
@@ -57,22 +57,22 @@ def test_a_reboot_soon_after_a_boot(link: Line) -> None:
 def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link: Line) -> None:
     """Three positions at once, 1.5 s old, as from a controller that sends them on; attitudes are fresh."""
     link.fly("TIMESYNC", tc1=50_000_000_000, ts1=link.only(link.to(0.6), "TIMESYNC")[0].ts1)
-    said = []
+    texts = []
     for i in range(100):
-        said += link.texts(link.to(1 + i * 0.1))
-        said += link.texts(link.fly("ATTITUDE", time_boot_ms=50_000 + 100 * i))
+        texts += link.texts(link.to(1 + i * 0.1))
+        texts += link.texts(link.fly("ATTITUDE", time_boot_ms=50_000 + 100 * i))
         if i % 5 == 0:
             late = link.autopilot.pack("NAMED_VALUE_FLOAT", time_boot_ms=48_500 + 100 * i, value=0.5)
-            said += link.texts(link.give(late * 3))
-    assert said == []
+            texts += link.texts(link.give(late * 3))
+    assert texts == []
     assert link.component.vehicle.reboots == 0
     assert link.component.vehicle.clock.known
 
 
 def test_two_autopilots_with_one_address(link: Line) -> None:
     times = [boot for i in range(20) for boot in (500_000 + 200 * i, 3_000 + 200 * i)]
-    said = boots(link, link.autopilot, times)
-    assert said[0] == "two autopilots speak as 1:1"
+    texts = boots(link, link.autopilot, times)
+    assert texts[0] == "two autopilots speak as 1:1"
     assert link.component.vehicle.reboots == 0
 
 
@@ -87,25 +87,25 @@ def test_two_autopilots_in_bursts(link: Line) -> None:
 
 def test_a_second_vehicle_is_told_once_and_ignored(link: Line) -> None:
     other = Codec(2, 1)
-    said = []
+    texts = []
     for i in range(5):
         link.to(1 + i)
-        said += link.texts(link.give(other.pack("HEARTBEAT", type=12, autopilot=3)))
+        texts += link.texts(link.give(other.pack("HEARTBEAT", type=12, autopilot=3)))
         link.give(other.pack("ATTITUDE", roll=1))
         assert link.telemetry == []
-    assert said == ["vehicle 2 is on the link too: ignored"]
+    assert texts == ["vehicle 2 is on the link too: ignored"]
 
 
 def test_a_ground_station_is_no_vehicle(link: Line) -> None:
-    assert link.texts(link.say("heartbeat", 6, 8, 0, 0, 0, 3)) == []
+    assert link.texts(link.send_message("heartbeat", 6, 8, 0, 0, 0, 3)) == []
 
 
 def test_another_program_with_our_address(link: Line) -> None:
     twin = Codec(1, 191)
-    said = [
+    texts = [
         text for _ in range(5) for text in link.texts(link.give(twin.pack("HEARTBEAT", type=18, autopilot=8)))
     ]
-    assert said == ["another program speaks as 1:191"]
+    assert texts == ["another program speaks as 1:191"]
 
 
 def test_lost_frames_are_counted(link: Line) -> None:
@@ -126,15 +126,24 @@ def test_whose_frames_are_lost_is_told(link: Line) -> None:
     payload, tenths = Codec(1, 25), count((link.now - START) // 100_000 + 1)
 
     def ten_seconds(lost: int) -> list[str]:
-        said = []
+        texts = []
         for k in range(100):
             frame = payload.pack("NAMED_VALUE_FLOAT", name="battpos", value=k)
-            said += link.texts(link.give(link.autopilot.pack("ATTITUDE") + (frame if k >= lost else b"")))
-            said += link.texts(link.to(0.1 * next(tenths)))
-        return [text for text in said if "frames missing" in text]
+            texts += link.texts(link.give(link.autopilot.pack("ATTITUDE") + (frame if k >= lost else b"")))
+            texts += link.texts(link.to(0.1 * next(tenths)))
+        return [text for text in texts if "frames missing" in text]
 
-    told = ["1:25: over 1% of its frames missing, or for others"]
-    assert [ten_seconds(lost) for lost in (0, 2, 3, 20, 1, 0, 5, 0)] == [[], [], told, [], [], [], told, []]
+    reported = ["1:25: over 1% of its frames missing, or for others"]
+    assert [ten_seconds(lost) for lost in (0, 2, 3, 20, 1, 0, 5, 0)] == [
+        [],
+        [],
+        reported,
+        [],
+        [],
+        [],
+        reported,
+        [],
+    ]
     assert link.component.vehicle.frames_lost == 0, "the autopilot's"
 
 

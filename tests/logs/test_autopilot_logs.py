@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from ulogs import Said, ulog_of
+from ulogs import Output, ulog_of
 
 from magbridge import logs
 from magbridge.errors import FormatError
@@ -43,7 +43,7 @@ def bin_log(*, gps: bool = True) -> bytes:
     for name, (number, letters, _, fields) in KINDS.items():
         data += fmt(number, SIZES[name] + 3, name, letters, fields)
 
-    def say(name: str, *values: object) -> bytes:
+    def write_message(name: str, *values: object) -> bytes:
         number, _, form, _ = KINDS[name]
         return b"\xa3\x95" + bytes([number]) + pack(form, *values)
 
@@ -51,15 +51,21 @@ def bin_log(*, gps: bool = True) -> bytes:
     for k in range(20):
         us = k * 100_000
         if k == 5:
-            data += say("ATT", us, 0, 1234, 0, -500, 0, 27_000, 0, 0, 3)
-            data += say("BAT", us, 0, 16.0, 1.5) + say("BAT", us, 1, 12.0, 0.5) + say("MSG", us, b"hello")
+            data += write_message("ATT", us, 0, 1234, 0, -500, 0, 27_000, 0, 0, 3)
+            data += (
+                write_message("BAT", us, 0, 16.0, 1.5)
+                + write_message("BAT", us, 1, 12.0, 0.5)
+                + write_message("MSG", us, b"hello")
+            )
         if k == 7 and gps:
             t = gps_s + us * 1e-6
-            data += say(
+            data += write_message(
                 "GPS", us, 3, round(t % 604_800 * 1000), int(t // 604_800), 9, 100, 450_000_000, -630_000_000
             )
         for instance in (0, 1):
-            data += say("MAG", us + instance, instance, 100 + k + 7, 20, -300, 7, 0, 0, 0, 0, 50, 1, 0)
+            data += write_message(
+                "MAG", us + instance, instance, 100 + k + 7, 20, -300, 7, 0, 0, 0, 0, 50, 1, 0
+            )
     return data
 
 
@@ -160,7 +166,7 @@ def ulog() -> bytes:
     for name, (number, _, _) in TOPICS.items():
         data += message("A", pack("<BH", 0, number) + name.encode())
 
-    def say(name: str, *values: object) -> bytes:
+    def write_message(name: str, *values: object) -> bytes:
         number, _, form = TOPICS[name]
         return message("D", pack("<H", number) + pack(form, *values))
 
@@ -168,11 +174,11 @@ def ulog() -> bytes:
         us = 1_000_000 + k * 100_000
         if k == 3:
             half = np.radians(-90) / 2  # heading 270
-            data += say("vehicle_attitude", us, np.cos(half), 0, 0, np.sin(half))
-            data += say("battery_status", us, 16, 2.5)
-            data += say("sensor_gps", us, UTC * 1_000_000 + us)
-        data += say("debug_key_value", us, k, b"battpos")
-        data += say("sensor_mag", us + 20, us, 0.2 + k / 100, 0.1, -0.4, 25)
+            data += write_message("vehicle_attitude", us, np.cos(half), 0, 0, np.sin(half))
+            data += write_message("battery_status", us, 16, 2.5)
+            data += write_message("sensor_gps", us, UTC * 1_000_000 + us)
+        data += write_message("debug_key_value", us, k, b"battpos")
+        data += write_message("sensor_mag", us + 20, us, 0.2 + k / 100, 0.1, -0.4, 25)
     return data
 
 
@@ -249,14 +255,14 @@ def test_the_compass_that_vehicle_magnetometer_names(tmp_path: Path) -> None:
         "CAL_MAG1_XOFF": 0.05,
         "CAL_MAG1_XSCALE": 1.25,
     }
-    said: Said = []
+    output: Output = []
     for k in range(20):
         us = 1_000_000 + k * 100_000
         if k % 10 == 0:
-            said += [("sensor_mag", 0, (us, 11, 9, 9, 9)), ("sensor_mag", 1, (us, 22, 0.2, 0.1, -0.4))]
-        said.append(("vehicle_magnetometer", 0, (us, 22, 1.25 * (0.2 - 0.05), 0.1, -0.4)))
+            output += [("sensor_mag", 0, (us, 11, 9, 9, 9)), ("sensor_mag", 1, (us, 22, 0.2, 0.1, -0.4))]
+        output.append(("vehicle_magnetometer", 0, (us, 22, 1.25 * (0.2 - 0.05), 0.1, -0.4)))
     path = tmp_path / "log.ulg"
-    path.write_bytes(ulog_of(topics, parameters, said))
+    path.write_bytes(ulog_of(topics, parameters, output))
     back = logs.read(path)
     assert back.sizes["time"] == 20
     np.testing.assert_allclose(back["mag_x"], 20_000, rtol=1e-6)
@@ -279,18 +285,18 @@ def test_an_old_log_has_its_field_in_sensor_combined(tmp_path: Path) -> None:
         "battery_status": ("uint64_t timestamp;float voltage_v;float current_a;", "<Qff"),
         "actuator_motors": ("uint64_t timestamp;float[2] control;", "<Q2f"),
     }
-    said: Said = []
+    output: Output = []
     for k in range(20):
         us = 1_000_000 + k * 100_000
         fix = (us, UTC * 1_000_000 + us + (k == 0) * 10**14, 450_000_000, -630_000_000, 3 if k > 5 else 1)
-        said += [
+        output += [
             ("vehicle_gps_position", 0, fix),
             ("battery_status", 0, (us, 16, 2.5 if k > 9 else -1)),
             ("actuator_motors", 0, (us, 0.1 * k, float("nan"))),
             ("sensor_combined", 0, (us, 0.2, 0.1, -0.4)),
         ]
     path = tmp_path / "log.ulg"
-    path.write_bytes(ulog_of(topics, {}, said))
+    path.write_bytes(ulog_of(topics, {}, output))
     back = logs.read(path)
     np.testing.assert_allclose(back["mag_x"], 20_000, rtol=1e-6)
     np.testing.assert_allclose(back["time"], UTC + 1 + 0.1 * np.arange(20), rtol=0, atol=1e-5)

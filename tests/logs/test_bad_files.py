@@ -87,12 +87,12 @@ def test_csv(text: str, rows: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("head", "words"),
+    ("header", "words"),
     [("", "expected this column"), ("time,mag_x\n1,2\n", "row 3: expected 2 fields, not 1")],
 )
-def test_csv_of_endless_zeros_is_not_held(head: str, words: str, tmp_path: Path) -> None:
+def test_csv_of_endless_zeros_is_not_held(header: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
-    path.write_text(head)
+    path.write_text(header)
     os.truncate(path, 300_000_000)
     tracemalloc.start()
     assert words in refused(path)
@@ -270,10 +270,10 @@ def test_a_damaged_file_is_a_deployment_or_one_line(
         one_line(error, path)
 
 
-@pytest.mark.parametrize("said", [b"\xff", b"{"])
-def test_parquet_of_other_metadata(said: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize("output", [b"\xff", b"{"])
+def test_parquet_of_other_metadata(output: bytes, tmp_path: Path) -> None:
     pa = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
     path = tmp_path / "log.parquet"
-    parquet.write_table(pa.table({"time": [1.0, 2.0]}).replace_schema_metadata({"magbridge": said}), path)
+    parquet.write_table(pa.table({"time": [1.0, 2.0]}).replace_schema_metadata({"magbridge": output}), path)
     assert refused(path).startswith("expected a whole Parquet file")

@@ -50,14 +50,14 @@ def test_a_damaged_list_of_sensors_is_named(real_data: Path, tmp_path: Path) -> 
 def test_files_that_once_failed(cases: Path, name: str) -> None:
     """A result, or one line: within 10 s of processor time."""
     path = cases / "files" / name
-    said = f"{path}: "
+    output = f"{path}: "
     try:
         assert read(path).sizes["time"] > 0
     except FormatError as error:
-        said = str(error)
-    assert said.startswith(f"{path}: ")
-    assert "\n" not in said
-    assert "cannot be read, damaged?" not in said, "nobody foresaw it"
+        output = str(error)
+    assert output.startswith(f"{path}: ")
+    assert "\n" not in output
+    assert "cannot be read, damaged?" not in output, "nobody foresaw it"
 
 
 def test_a_quotation_mark_that_is_never_closed_costs_its_row(tmp_path: Path) -> None:

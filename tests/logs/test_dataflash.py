@@ -23,14 +23,14 @@ def flight(rows: int = 40, seed: int = 0) -> Log:
     rng, log = np.random.default_rng(seed), Log()
     for k in range(rows):
         us = k * 100_000 + 7
-        log.say("PARM", us, f"COMPASS_X{k}", k / 3)
+        log.write_message("PARM", us, f"COMPASS_X{k}", k / 3)
         log.fix(us, 1.7e9 + us * 1e-6)
-        log.say("ATT", us, *rng.uniform(-180, 180, 4).round(2), *rng.uniform(0, 360, 4).round(2), 3)
-        log.say("BAT", us, k % 2, 16.5, k / 7)
+        log.write_message("ATT", us, *rng.uniform(-180, 180, 4).round(2), *rng.uniform(0, 360, 4).round(2), 3)
+        log.write_message("BAT", us, k % 2, 16.5, k / 7)
         log.mag(us, k % 2, rng.integers(-600, 600, 3).tolist(), 1, [0x95A3 - 65536, 14, -27, 1, 2, 3])
-        log.say("IMU", us, 0, *rng.normal(size=6))
-        log.say("BARO", us, 0, 1.5, 101_325.0)
-        log.say("XKFS", us, 0, k % 3, 0, 0, 0)
+        log.write_message("IMU", us, 0, *rng.normal(size=6))
+        log.write_message("BARO", us, 0, 1.5, 101_325.0)
+        log.write_message("XKFS", us, 0, k % 3, 0, 0, 0)
     return log
 
 
@@ -159,7 +159,7 @@ def test_a_kind_that_is_described_anew(tmp_path: Path) -> None:
     first, second = Log(), Log({**KINDS, "BARO": (16, "QBffH", "TimeUS,I,Alt,Press,More")})
     for log, alt in ((first, 1.0), (second, 2.0)):
         for k in range(5):
-            log.say("BARO", k, 0, alt, 1e5, *([7] if log is second else []))
+            log.write_message("BARO", k, 0, alt, 1e5, *([7] if log is second else []))
     path = tmp_path / "log.bin"
     path.write_bytes(first.data + second.data)
     ours = read_binary(path, EVERYTHING)

@@ -32,8 +32,8 @@ def flight(
         us = start * 1_000_000 + k * 100_000
         if gps and k % 5 == 0:
             log.fix(us, boot + us * 1e-6)
-        log.say("ATT", us, 0, 1.0, 0, -5.0, 0, float(k), 0, 0, 3)
-        log.say("BAT", us, 0, 16.0, 0.1 * k)
+        log.write_message("ATT", us, 0, 1.0, 0, -5.0, 0, float(k), 0, 0, 3)
+        log.write_message("BAT", us, 0, 16.0, 0.1 * k)
         for number in range(compasses):
             log.mag(us, number, (100 + k, 200 * (1 + number), -300), 1, [7, 0, 0, 0, 0, 50])
     return log
@@ -53,7 +53,7 @@ def test_the_motors_share_is_taken_off_by_either_name(compensation: str, tmp_pat
     )
     log = Log({"MAG": (14, "Qhhhhhhhhh", fields)})
     for k in range(5):
-        log.say("MAG", k * 100_000, 100 + 3 * k, 200, -300, 10, 20, 30, 3 * k, 0, -5)
+        log.write_message("MAG", k * 100_000, 100 + 3 * k, 200, -300, 10, 20, 30, 3 * k, 0, -5)
     back = logs.read(write(tmp_path, log))
     np.testing.assert_array_equal(back["mag_x"], 9_000.0)
     np.testing.assert_array_equal(back["mag_z"], -32_500.0)
@@ -106,7 +106,7 @@ def test_the_soft_iron_matrix_is_undone(tmp_path: Path) -> None:
         (1.1, 0.9, 1.05, 0.05, -0.02, 0.03),
         strict=True,
     ):
-        log.say("PARM", 0, f"COMPASS_{name}", value)
+        log.write_message("PARM", 0, f"COMPASS_{name}", value)
     raw = np.random.default_rng(0).uniform(-400, 400, (50, 3))
     for k, one in enumerate(raw):
         field = matrix @ (one + np.array([20, -30, 40])) + np.array([5, 0, -5])
@@ -120,7 +120,7 @@ def test_the_compass_that_flew_is_read(tmp_path: Path) -> None:
     """The first is disabled and unhealthy; the third is another."""
     log = Log()
     for name, value in (("USE", 0.0), ("USE2", 1.0), ("USE3", 1.0), ("DEV_ID2", 97539.0)):
-        log.say("PARM", 0, f"COMPASS_{name}", value)
+        log.write_message("PARM", 0, f"COMPASS_{name}", value)
     for k in range(20):
         for number in range(3):
             log.mag(k * 100_000, number, (number, 0, 0), health=number)
@@ -143,7 +143,7 @@ def test_the_compass_that_flew_is_read(tmp_path: Path) -> None:
 def test_the_estimators_word_goes_before_the_number(tmp_path: Path) -> None:
     log = Log()
     for k in range(9):
-        log.say("XKFS", 4_900_000 + k, 0, int(k > 2), 0, 0, 0)
+        log.write_message("XKFS", 4_900_000 + k, 0, int(k > 2), 0, 0, 0)
     back = logs.read(write(tmp_path, flight(compasses=2, log=log)))
     assert (back["mag_y"] == 40_000).all()
 
@@ -158,7 +158,7 @@ def test_one_damaged_fix_does_not_date_a_log(tmp_path: Path) -> None:
 def test_one_damaged_time_costs_its_row(tmp_path: Path) -> None:
     log = flight()
     log.mag(1 << 50, 0, (1, 2, 3))
-    log.say("BAT", 1 << 51, 0, 99.0, 99.0)
+    log.write_message("BAT", 1 << 51, 0, 99.0, 99.0)
     back = logs.read(write(tmp_path, flight(start=8, log=log)))
     assert back.sizes["time"] == 60
     assert passed_over(back.attrs) == {"rows_dropped": 1}
@@ -195,17 +195,17 @@ def test_units_that_the_log_declares(tmp_path: Path) -> None:
     """The pressure is in hPa: declared as Pa, with a multiplier of 100."""
     log = Log()
     for letter, label in (("P", "Pa"), ("m", "m"), ("s", "s")):
-        log.say("UNIT", 0, ord(letter), label)
+        log.write_message("UNIT", 0, ord(letter), label)
     for letter, factor in (("-", 0.0), ("2", 100.0), ("0", 1.0)):
-        log.say("MULT", 0, ord(letter), factor)
-    log.say("FMTU", 0, 16, "s-mP", "--02")
+        log.write_message("MULT", 0, ord(letter), factor)
+    log.write_message("FMTU", 0, 16, "s-mP", "--02")
     back = logs.read(write(tmp_path, flight(log=_with_baro(log))))
     np.testing.assert_allclose(back["pressure"], 1013.0)
     np.testing.assert_allclose(back["depth"], 3.0)
 
 
 def _with_baro(log: Log) -> Log:
-    log.say("BARO", 4_900_000, 0, -3.0, 1013.0)
+    log.write_message("BARO", 4_900_000, 0, -3.0, 1013.0)
     return log
 
 

@@ -294,9 +294,9 @@ def test_mcap_is_what_foxglove_opens(tmp_path: Path) -> None:
     assert counts == {**topics, "/position": 49}
     for schema, channel, stamp, body in found:
         assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
-        said = json.loads(schema.data)
-        assert (said["type"], said["title"]) == ("object", schema.name)
-        assert body.keys() <= said["properties"].keys()
+        output = json.loads(schema.data)
+        assert (output["type"], output["title"]) == ("object", schema.name)
+        assert body.keys() <= output["properties"].keys()
         assert stamp == body["timestamp"]["sec"] * 10**9 + body["timestamp"]["nsec"]
     first = {channel.topic: body for _, channel, _, body in reversed(found)}
     fix = first["/position"]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from flash import Log
-from ulogs import Said, ulog_of
+from ulogs import Output, ulog_of
 
 from magbridge import logs
 from magbridge.logs.resample import MAX_AGE
@@ -95,21 +95,21 @@ def _px4() -> bytes:
         "actuator_outputs": ("uint64_t timestamp;float[4] output;", "<Q4f"),
         "actuator_motors": ("uint64_t timestamp;float[4] control;", "<Q4f"),
     }
-    said: Said = []
+    output: Output = []
     for k in range(30):
         us = 2_000_000 + 100_000 * k
-        said.append(("sensor_mag", 0, (us, 11, 0.2 + 0.01 * k, 0.1, -0.4)))
+        output.append(("sensor_mag", 0, (us, 11, 0.2 + 0.01 * k, 0.1, -0.4)))
         if k % 2:
-            said.append(("actuator_outputs", 0, (us + 7, 1100.0 + k, 0.0, 1200.0, 0.0)))
-            said.append(("actuator_motors", 0, (us + 9, 0.01 * k, 0.0, 0.5, 0.0)))
+            output.append(("actuator_outputs", 0, (us + 7, 1100.0 + k, 0.0, 1200.0, 0.0)))
+            output.append(("actuator_motors", 0, (us + 9, 0.01 * k, 0.0, 0.5, 0.0)))
         if k % 3 == 0:
-            said.append(("vehicle_local_position", 0, (us - 5, 1.0, 2.0, -0.1 * k)))
-            said += [("battery_status", n, (us + 3, 16.0 - n, -1.0 if k == 6 else k + n)) for n in range(2)]
+            output.append(("vehicle_local_position", 0, (us - 5, 1.0, 2.0, -0.1 * k)))
+            output += [("battery_status", n, (us + 3, 16.0 - n, -1.0 if k == 6 else k + n)) for n in range(2)]
         if k % 5 == 1:
-            said.append(("vehicle_global_position", 0, (us, 47.0 + 1e-5 * k, 8.0)))
-            said.append(("vehicle_air_data", 0, (us, 1e5 + k)))
-            said.append(("vehicle_attitude", 0, (us, 1.0, 0.0, 0.0, 0.0)))
-    return ulog_of(topics, {"CAL_MAG0_ID": 11}, said)
+            output.append(("vehicle_global_position", 0, (us, 47.0 + 1e-5 * k, 8.0)))
+            output.append(("vehicle_air_data", 0, (us, 1e5 + k)))
+            output.append(("vehicle_attitude", 0, (us, 1.0, 0.0, 0.0, 0.0)))
+    return ulog_of(topics, {"CAL_MAG0_ID": 11}, output)
 
 
 def test_every_column_of_px4_is_as_pyulog_reads_it(tmp_path: Path) -> None:
@@ -161,25 +161,25 @@ def test_every_column_of_a_telemetry_log_is_as_pymavlink_reads_it(real_data: Pat
         kind = message.get_type()
         if kind == "BAD_DATA" or message.get_srcComponent() != 1:
             continue
-        said: dict[str, float] = {}
+        output: dict[str, float] = {}
         if kind == "ATTITUDE":
-            said = {"roll": degrees(message.roll), "pitch": degrees(message.pitch),
+            output = {"roll": degrees(message.roll), "pitch": degrees(message.pitch),
                     "heading": degrees(message.yaw) % 360.0}  # fmt: skip
         elif kind == "GLOBAL_POSITION_INT":
-            said = {"latitude": message.lat * 1e-7, "longitude": message.lon * 1e-7,
+            output = {"latitude": message.lat * 1e-7, "longitude": message.lon * 1e-7,
                     "depth": -message.relative_alt * 1e-3}  # fmt: skip
         elif kind == "SYS_STATUS":
-            said = {"battery_current": message.current_battery * 1e-2,
+            output = {"battery_current": message.current_battery * 1e-2,
                     "battery_voltage": message.voltage_battery * 1e-3}  # fmt: skip
         elif kind == "SCALED_PRESSURE2":
-            said = {"pressure2": message.press_abs, "pressure2_temperature": message.temperature * 1e-2}
+            output = {"pressure2": message.press_abs, "pressure2_temperature": message.temperature * 1e-2}
         elif kind == "SERVO_OUTPUT_RAW":
-            said = {f"servo{k}": float(getattr(message, f"servo{k}_raw")) for k in (1, 2, 3, 4, 5, 6)}
+            output = {f"servo{k}": float(getattr(message, f"servo{k}_raw")) for k in (1, 2, 3, 4, 5, 6)}
         elif kind == "SCALED_IMU2":
-            said = {f"mag2_{axis}": 100.0 * getattr(message, f"{axis}mag") for axis in "xyz"}
+            output = {f"mag2_{axis}": 100.0 * getattr(message, f"{axis}mag") for axis in "xyz"}
         elif kind == "NAMED_VALUE_FLOAT":
-            said = {message.name: message.value}
-        known |= {name: (when, value) for name, value in said.items()}
+            output = {message.name: message.value}
+        known |= {name: (when, value) for name, value in output.items()}
         if kind == "RAW_IMU":
             own = {f"mag_{axis}": 100.0 * getattr(message, f"{axis}mag") for axis in "xyz"}
             rows.append(
@@ -196,29 +196,29 @@ def test_every_column_of_ardupilot_is_carried_as_it_was_logged(tmp_path: Path) -
     """That each record is as pymavlink reads it has its own test; here columns are brought to rows."""
     log = Log()
     names = "roll", "heading", "battery_current", "battery2_current", "depth"
-    said: dict[str, Series] = {name: ([], []) for name in names}
+    output: dict[str, Series] = {name: ([], []) for name in names}
 
-    def say(name: str, us: int, value: float) -> None:
-        said[name][0].append(us * 1e-6)
-        said[name][1].append(value)
+    def write_message(name: str, us: int, value: float) -> None:
+        output[name][0].append(us * 1e-6)
+        output[name][1].append(value)
 
     for k in range(40):
         us = 1_000_000 + 100_000 * k
         if k % 3 == 0:
-            log.say("ATT", us + 5, 0, 0.5 * k, 0, 2.0, 0, 3.0 * k, 0, 0, 3)
-            say("roll", us + 5, 0.5 * k)
-            say("heading", us + 5, 3.0 * k)
+            log.write_message("ATT", us + 5, 0, 0.5 * k, 0, 2.0, 0, 3.0 * k, 0, 0, 3)
+            write_message("roll", us + 5, 0.5 * k)
+            write_message("heading", us + 5, 3.0 * k)
         if k % 4 == 1:
             for number, name in enumerate(("battery_current", "battery2_current")):
-                log.say("BAT", us - 5, number, 16.0, 2.0 * k + number)
-                say(name, us - 5, 2.0 * k + number)
+                log.write_message("BAT", us - 5, number, 16.0, 2.0 * k + number)
+                write_message(name, us - 5, 2.0 * k + number)
         if k % 7 == 2:
-            log.say("BARO", us, 0, -0.25 * k, 1e5)
-            say("depth", us, 0.25 * k)
+            log.write_message("BARO", us, 0, -0.25 * k, 1e5)
+            write_message("depth", us, 0.25 * k)
         log.mag(us, 0, (100 + k, 200, -300), 1, [7, 0, 0, 0, 0, 50])
     (tmp_path / "log.bin").write_bytes(log.data)
     back = logs.read(tmp_path / "log.bin")
-    for name, (times, values) in said.items():
+    for name, (times, values) in output.items():
         np.testing.assert_allclose(
             back[name], carried(back["time"].to_numpy(), (times, values)), err_msg=name
         )

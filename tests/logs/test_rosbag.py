@@ -57,7 +57,7 @@ def bag(
     with writer:
         topics: dict[str, Any] = {}
 
-        def say(topic: str, message: str, k: int, /, **fields: Any) -> None:
+        def write_message(topic: str, message: str, k: int, /, **fields: Any) -> None:
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, message, typestore=store)
             writer.write(
@@ -68,22 +68,22 @@ def bag(
 
         for k, (angles, field) in enumerate(zip(ANGLES, FIELD, strict=True)):
             if more is not None:
-                more(say, types, header, k, frame)
+                more(write_message, types, header, k, frame)
             # from FRD to NED, turned to FLU and ENU
             turned = Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix()
             enu = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]) @ turned @ np.diag([1, -1, -1.0])
             q = types["geometry_msgs/msg/Quaternion"](*Rotation.from_matrix(enu).as_quat())
-            say(
+            write_message(
                 "/imu/data", "sensor_msgs/msg/Imu", k, header=header(k, "imu"), orientation=q,
                 orientation_covariance=nine, angular_velocity=vector(1, 2, 3),
                 angular_velocity_covariance=nine, linear_acceleration=vector(4, 5, 6),
                 linear_acceleration_covariance=nine,
             )  # fmt: skip
-            say(
+            write_message(
                 "/joints", "sensor_msgs/msg/JointState", k, header=header(k, ""), name=["arm lift", "grip"],
                 position=np.array([0.01 * k, 1.0]), velocity=np.array([]), effort=np.array([]),
             )  # fmt: skip
-            say(
+            write_message(
                 "/imu/mag", "sensor_msgs/msg/MagneticField", k, header=header(k, "mag" * (1 + k % 2)),
                 magnetic_field=vector(*(scale * field)), magnetic_field_covariance=nine,
             )  # fmt: skip
@@ -144,7 +144,7 @@ def test_no_unit_fits(tmp_path: Path) -> None:
     assert not noted(back.attrs)
 
 
-def _odometry(say: Any, types: Any, header: Any, k: int, frame: str) -> None:
+def _odometry(write_message: Any, types: Any, header: Any, k: int, frame: str) -> None:
     """Sail east at 2 m/s, the bow to the east."""
     pose = types["geometry_msgs/msg/Pose"](
         position=types["geometry_msgs/msg/Point"](x=0.2 * k, y=5.0, z=-3.0),
@@ -152,7 +152,7 @@ def _odometry(say: Any, types: Any, header: Any, k: int, frame: str) -> None:
     )
     vector = types["geometry_msgs/msg/Vector3"]
     twist = types["geometry_msgs/msg/Twist"](linear=vector(2.0, 0.0, 0.0), angular=vector(0.0, 0.0, 0.0))
-    say(
+    write_message(
         "/odom", "nav_msgs/msg/Odometry", k, header=header(k, frame), child_frame_id="base_link",
         pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
         twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=np.zeros(36)),
@@ -173,10 +173,10 @@ def test_an_odometry_of_its_own_frame_is_no_position(tmp_path: Path) -> None:
     np.testing.assert_allclose(back["odom_x"], 0.2 * np.arange(40))
 
 
-def _robot(say: Any, types: Any, header: Any, k: int, _: str) -> None:
+def _robot(write_message: Any, types: Any, header: Any, k: int, _: str) -> None:
     """Say all that a robot with mavros does: a fix that is lost at times, a battery, servos, sensors."""
     status = types["sensor_msgs/msg/NavSatStatus"](status=-1 if k % 4 == 3 else 0, service=1)
-    say(
+    write_message(
         "/mavros/global_position/global", "sensor_msgs/msg/NavSatFix", k, header=header(k, ""), status=status,
         latitude=47.0 + 1e-4 * k, longitude=8.0 - 1e-4 * k, altitude=400.0 + k,
         position_covariance=np.zeros(9), position_covariance_type=0,
@@ -189,14 +189,16 @@ def _robot(say: Any, types: Any, header: Any, k: int, _: str) -> None:
     }  # fmt: skip
     for number in range(2):
         known = battery | {"voltage": 16.0 - number, "current": -0.5 * k - number}
-        say(f"/battery{number}", "sensor_msgs/msg/BatteryState", k, header=header(k, ""), **known)
+        write_message(f"/battery{number}", "sensor_msgs/msg/BatteryState", k, header=header(k, ""), **known)
     channels = np.array([1500 + k, 0, 1100], np.uint16)
-    say("/mavros/rc/out", "mavros_msgs/msg/RCOut", k, header=header(k, ""), channels=channels)
-    say("/board", "sensor_msgs/msg/Temperature", k, header=header(k, ""), temperature=20.0 + k, variance=0.0)
-    say(
+    write_message("/mavros/rc/out", "mavros_msgs/msg/RCOut", k, header=header(k, ""), channels=channels)
+    write_message(
+        "/board", "sensor_msgs/msg/Temperature", k, header=header(k, ""), temperature=20.0 + k, variance=0.0
+    )
+    write_message(
         "/air", "sensor_msgs/msg/FluidPressure", k, header=header(k, ""), fluid_pressure=1e5 + k, variance=0.0
     )
-    say("/keel/angle", "std_msgs/msg/Float64", k, data=0.1 * k)
+    write_message("/keel/angle", "std_msgs/msg/Float64", k, data=0.1 * k)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3"])
@@ -237,9 +239,9 @@ def test_whatever_a_robot_says_is_as_rosbags_reads_it(kind: str, tmp_path: Path)
 def test_an_imu_that_knows_no_orientation_gives_none(tmp_path: Path) -> None:
     """Its first covariance is -1; the quaternion says nothing."""
 
-    def other(say: Any, types: Any, header: Any, k: int, _: str) -> None:
+    def other(write_message: Any, types: Any, header: Any, k: int, _: str) -> None:
         vector, nine = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 9.8), np.zeros(9)
-        say(
+        write_message(
             "/a_raw", "sensor_msgs/msg/Imu", k, header=header(k, "imu"),
             orientation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
             orientation_covariance=np.array([-1.0, *[0.0] * 8]), angular_velocity=vector,

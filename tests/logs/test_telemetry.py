@@ -11,7 +11,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v10 import common as v1
 
 from magbridge import logs
-from magbridge.bridge.head import declarations
+from magbridge.bridge.log_header import declarations
 from magbridge.config import Telemetry
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import deployment, passed_over
@@ -30,14 +30,14 @@ class Log:
         self.data = b""
         self.codecs: dict[tuple[int, int], Codec] = {}
 
-    def say(
+    def write_message(
         self, t: float, message: str, /, *, by: tuple[int, int] = (1, 1), channel: int = 0, **fields: Any
     ) -> None:
         frame = self.codecs.setdefault(by, Codec(*by)).pack(message, **fields)
         self.data += pack_record(T0 + round(t * S), channel, frame)
 
     def mag(self, t: float, x: int, **fields: Any) -> None:
-        self.say(t, "RAW_IMU", xmag=x, ymag=10, zmag=-20, temperature=2550, **fields)
+        self.write_message(t, "RAW_IMU", xmag=x, ymag=10, zmag=-20, temperature=2550, **fields)
 
     def read(self, tmp_path: Path) -> Any:
         path = tmp_path / "log.tlog"
@@ -48,13 +48,13 @@ class Log:
 def test_a_row_holds_what_was_known_then(tmp_path: Path) -> None:
     log = Log()
     log.mag(0, 1)
-    log.say(1, "ATTITUDE", roll=0.1, pitch=-0.2, yaw=-np.pi / 2)
-    log.say(1.5, "NAMED_VALUE_FLOAT", name="battpos", value=0.5)
+    log.write_message(1, "ATTITUDE", roll=0.1, pitch=-0.2, yaw=-np.pi / 2)
+    log.write_message(1.5, "NAMED_VALUE_FLOAT", name="battpos", value=0.5)
     log.mag(2, 2)
-    log.say(3, "NAMED_VALUE_FLOAT", name="battpos", value=0.75)
-    log.say(3, "NAMED_VALUE_FLOAT", name="ballast", value=200)
-    log.say(3, "GLOBAL_POSITION_INT", lat=450_000_000, lon=-630_000_000, relative_alt=-12_000)
-    log.say(3, "SYS_STATUS", current_battery=123, voltage_battery=0xFFFF)
+    log.write_message(3, "NAMED_VALUE_FLOAT", name="battpos", value=0.75)
+    log.write_message(3, "NAMED_VALUE_FLOAT", name="ballast", value=200)
+    log.write_message(3, "GLOBAL_POSITION_INT", lat=450_000_000, lon=-630_000_000, relative_alt=-12_000)
+    log.write_message(3, "SYS_STATUS", current_battery=123, voltage_battery=0xFFFF)
     log.mag(4, 3)
     log.mag(31, 4)
     log.mag(33.5, 5)
@@ -79,12 +79,12 @@ def test_a_row_holds_what_was_known_then(tmp_path: Path) -> None:
 
 def test_only_the_vehicle_with_the_magnetometer_speaks(tmp_path: Path) -> None:
     log = Log()
-    log.say(0, "ATTITUDE", roll=0.1)
-    log.say(0, "NAMED_VALUE_FLOAT", name="battpos", value=1)
+    log.write_message(0, "ATTITUDE", roll=0.1)
+    log.write_message(0, "NAMED_VALUE_FLOAT", name="battpos", value=1)
     for by in ((2, 1), (255, 190)):
-        log.say(1, "ATTITUDE", by=by, roll=9)
-        log.say(1, "NAMED_VALUE_FLOAT", by=by, name="battpos", value=9)
-        log.say(1, "NAMED_VALUE_FLOAT", by=by, name="other", value=9)
+        log.write_message(1, "ATTITUDE", by=by, roll=9)
+        log.write_message(1, "NAMED_VALUE_FLOAT", by=by, name="battpos", value=9)
+        log.write_message(1, "NAMED_VALUE_FLOAT", by=by, name="other", value=9)
     log.mag(2, 1)
     log.mag(3, 2)
     log.mag(3.5, 7, by=(2, 1))
@@ -98,9 +98,9 @@ def test_only_the_vehicle_with_the_magnetometer_speaks(tmp_path: Path) -> None:
 def test_the_best_magnetometer_makes_the_rows(tmp_path: Path) -> None:
     log = Log()
     for k in range(3):
-        log.say(k, "SCALED_IMU2", xmag=5)
+        log.write_message(k, "SCALED_IMU2", xmag=5)
         log.mag(k + 0.1, 7)
-        log.say(k + 0.2, "HIGHRES_IMU", xmag=0.5, ymag=0.25, zmag=-0.125)
+        log.write_message(k + 0.2, "HIGHRES_IMU", xmag=0.5, ymag=0.25, zmag=-0.125)
     back = log.read(tmp_path)
     np.testing.assert_array_equal(back["mag_x"], [50_000] * 3)
     np.testing.assert_array_equal(back["mag1_x"], [700] * 3)
@@ -110,8 +110,8 @@ def test_the_best_magnetometer_makes_the_rows(tmp_path: Path) -> None:
 def test_without_a_magnetometer_attitude_makes_the_rows(tmp_path: Path) -> None:
     log = Log()
     for k in range(3):
-        log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=k)
-        log.say(k, "ATTITUDE", roll=0.1 * k)
+        log.write_message(k, "NAMED_VALUE_FLOAT", name="battpos", value=k)
+        log.write_message(k, "ATTITUDE", roll=0.1 * k)
     back = log.read(tmp_path)
     assert "mag_x" not in back
     np.testing.assert_array_equal(back["battpos"], [0, 1, 2])
@@ -121,24 +121,24 @@ def test_without_a_magnetometer_attitude_makes_the_rows(tmp_path: Path) -> None:
 def test_a_bridges_own_log(tmp_path: Path) -> None:
     """Its own reports are no telemetry, the correction stands in the row of its reading."""
     log, ours = Log(), (1, 191)
-    log.say(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
     for k in range(3):
         time_us = T0 + k * S
-        log.say(k, "NAMED_VALUE_FLOAT", channel=Channel.LINK, name="battpos", value=k)
+        log.write_message(k, "NAMED_VALUE_FLOAT", channel=Channel.LINK, name="battpos", value=k)
         log.mag(k, 9, channel=Channel.LINK)
-        log.say(k, "MAG_SENSOR_BYTES", by=ours, channel=Channel.SENSOR, length=1, data=b"x")
+        log.write_message(k, "MAG_SENSOR_BYTES", by=ours, channel=Channel.SENSOR, length=1, data=b"x")
         raw = {"x": 1.5, "y": 2.5, "z": k, "delay_y": 10, "delay_z": 20, "temperature": 4, "supply": np.nan}
-        log.say(
+        log.write_message(
             k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=time_us - 7, power_cycle=2, flags=8, **raw
         )
         if k != 1:
             field = {"total_field": 50_000.125 + k, "total_field_sigma": 2, "x": 1, "anomaly": np.nan}
             flags = int(Quality.GAP)
-            log.say(
+            log.write_message(
                 k, "MAG_FIELD", by=ours, channel=Channel.SENT, time_usec=time_us - 7, flags=flags, **field
             )
-        log.say(k, "NAMED_VALUE_FLOAT", by=ours, channel=Channel.SENT, name="mag", value=50_000)
-        log.say(k, "HIGHRES_IMU", by=ours, channel=Channel.SENT, xmag=0.5)
+        log.write_message(k, "NAMED_VALUE_FLOAT", by=ours, channel=Channel.SENT, name="mag", value=50_000)
+        log.write_message(k, "HIGHRES_IMU", by=ours, channel=Channel.SENT, xmag=0.5)
     back = log.read(tmp_path)
     np.testing.assert_allclose(back["time"], (T0 - 7) / S + np.arange(3.0), rtol=0, atol=1e-6)
     np.testing.assert_allclose(back["mag_time_z"] - back["time"], 20e-6, rtol=0, atol=0.5e-6)
@@ -158,21 +158,23 @@ def test_of_two_components_a_bridges_log_is_read_as_it_was_corrected(
 ) -> None:
     """The autopilot's value from the first on, unless the configuration names another component."""
     log, ours = Log(), (1, 191)
-    log.say(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
     for column, what in (
         ("battpos", {"message": "NAMED_VALUE_FLOAT", "field": "value", "match": "name=battpos"}),
         ("ballast", {"message": "DEBUG_FLOAT_ARRAY", "field": "data[0]", "match": "array_id=7"}),
     ):
-        log.say(
+        log.write_message(
             0, "MAG_COLUMN", by=ours, channel=Channel.STATE, column=column, scale=1, component=wanted, **what
         )
     for k in range(3):
         for component, value in ((99, 7 + k), (1, k)):
             by: dict[str, Any] = {"by": (1, component), "channel": Channel.LINK}
             if k or component != 1:
-                log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=value, **by)
-                log.say(k, "DEBUG_FLOAT_ARRAY", array_id=7, data=[value, *[0] * 57], **by)
-        log.say(k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S, x=1.0, y=2.0, z=3.0)
+                log.write_message(k, "NAMED_VALUE_FLOAT", name="battpos", value=value, **by)
+                log.write_message(k, "DEBUG_FLOAT_ARRAY", array_id=7, data=[value, *[0] * 57], **by)
+        log.write_message(
+            k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S, x=1.0, y=2.0, z=3.0
+        )
     back = log.read(tmp_path)
     np.testing.assert_array_equal(back["battpos"], expected)
     np.testing.assert_array_equal(back["ballast"], expected)
@@ -182,14 +184,16 @@ def test_of_two_components_a_bridges_log_is_read_as_it_was_corrected(
 def test_a_clock_that_is_set_costs_no_rows_and_dates_those_before(tmp_path: Path, step: int) -> None:
     """The records' stamps go on; what is published is dated by the clock as it is set."""
     log, ours = Log(), (1, 191)
-    log.say(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
+    log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
     for k in range(6):
         set_us = step if k >= 3 else 0
         if k == 3:
-            log.say(
+            log.write_message(
                 k, "MAG_CLOCK_STEP", by=(0, 0), channel=Channel.STATE, time_usec=T0 + k * S + step, step=step
             )
-        log.say(k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S + set_us, x=k, delay_z=20)
+        log.write_message(
+            k, "MAG_RAW", by=ours, channel=Channel.SENT, time_usec=T0 + k * S + set_us, x=k, delay_z=20
+        )
     back = log.read(tmp_path)
     np.testing.assert_array_equal(back["time"], [(T0 + step) / S + k for k in range(6)])
     np.testing.assert_array_equal(back["mag_x"], range(6))
@@ -199,7 +203,7 @@ def test_a_clock_that_is_set_costs_no_rows_and_dates_those_before(tmp_path: Path
 
 def test_a_bridges_log_without_readings_gives_no_compass_instead(tmp_path: Path) -> None:
     log = Log()
-    log.say(0, "MAG_BRIDGE_START", by=(1, 191), channel=Channel.STATE)
+    log.write_message(0, "MAG_BRIDGE_START", by=(1, 191), channel=Channel.STATE)
     log.mag(1, 9, channel=Channel.LINK)
     with pytest.raises(FormatError, match=r"log\.tlog: expected MAVLink records with one of MAG_RAW"):
         log.read(tmp_path)
@@ -215,16 +219,18 @@ def test_the_log_says_what_its_parameters_are(tmp_path: Path) -> None:
         "match": "name=masses,array_id=7",
     }
     servo: dict[str, Any] = {"message": "SERVO_OUTPUT_RAW", "field": "servo2_raw"}
-    log.say(0, "MAG_COLUMN", column="battery_position", unit="in", scale=0.5, offset=1, **name)
-    log.say(0, "MAG_COLUMN", column="ballast", unit="cc", scale=2, **array)
-    log.say(0, "MAG_COLUMN", column="servo2", unit="deg", scale=0.1, offset=-150, **servo)
-    log.say(0, "MAG_COLUMN", column="other", unit="1", scale=1, message="NOT_YET_INVENTED", field="x")
-    log.say(0, "MAG_COLUMN", column="heading_reference", unit="magnetic")
+    log.write_message(0, "MAG_COLUMN", column="battery_position", unit="in", scale=0.5, offset=1, **name)
+    log.write_message(0, "MAG_COLUMN", column="ballast", unit="cc", scale=2, **array)
+    log.write_message(0, "MAG_COLUMN", column="servo2", unit="deg", scale=0.1, offset=-150, **servo)
+    log.write_message(
+        0, "MAG_COLUMN", column="other", unit="1", scale=1, message="NOT_YET_INVENTED", field="x"
+    )
+    log.write_message(0, "MAG_COLUMN", column="heading_reference", unit="magnetic")
     for k in range(3):
-        log.say(k, "NAMED_VALUE_FLOAT", name="batt", value=k)
-        log.say(k, "DEBUG_FLOAT_ARRAY", name="masses", array_id=7, data=[0, 0, 0, k, *[0] * 54])
-        log.say(k, "DEBUG_FLOAT_ARRAY", name="masses", array_id=8, data=[9] * 58)
-        log.say(k, "SERVO_OUTPUT_RAW", servo1_raw=1500, servo2_raw=1600 + k)
+        log.write_message(k, "NAMED_VALUE_FLOAT", name="batt", value=k)
+        log.write_message(k, "DEBUG_FLOAT_ARRAY", name="masses", array_id=7, data=[0, 0, 0, k, *[0] * 54])
+        log.write_message(k, "DEBUG_FLOAT_ARRAY", name="masses", array_id=8, data=[9] * 58)
+        log.write_message(k, "SERVO_OUTPUT_RAW", servo1_raw=1500, servo2_raw=1600 + k)
         log.mag(k, k)
     back = log.read(tmp_path)
     np.testing.assert_array_equal(back["battery_position"], [1, 1.5, 2])
@@ -310,7 +316,7 @@ def test_every_file_of_a_live_log_says_what_its_parameters_are(tmp_path: Path) -
         unit="deg",
     )
     codec = Codec(1, 1)
-    with TlogWriter(tmp_path, max_size=0.01, head=declarations(1, 191, {"servo2": servo})) as log:
+    with TlogWriter(tmp_path, max_size=0.01, header=declarations(1, 191, {"servo2": servo})) as log:
         for k in range(500):
             log.write(T0 + k * S, Channel.LINK, codec.pack("SERVO_OUTPUT_RAW", servo2_raw=1600))
             log.write(T0 + k * S, Channel.LINK, codec.pack("RAW_IMU", xmag=1))
@@ -328,7 +334,7 @@ def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None
     counts = np.random.default_rng(1).integers(-(2**22), 2**22, (100, 3))
     field = counts * nt_per_count
     codec = Codec(1, 191)
-    with TlogWriter(tmp_path, head=declarations(1, 191, {}, nt_per_count)) as log:
+    with TlogWriter(tmp_path, header=declarations(1, 191, {}, nt_per_count)) as log:
         log.write(T0, Channel.STATE, codec.pack("MAG_BRIDGE_START"))
         for k, (channels, numbers) in enumerate(zip(field, counts.tolist(), strict=True)):
             values = dict(

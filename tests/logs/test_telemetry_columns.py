@@ -26,7 +26,7 @@ class Log:
         self.data = b""
         self.codecs: dict[int, Codec] = {}
 
-    def say(self, t: float, message: str, /, component: int = 1, **fields: Any) -> None:
+    def write_message(self, t: float, message: str, /, component: int = 1, **fields: Any) -> None:
         frame = self.codecs.setdefault(component, Codec(1, component)).pack(message, **fields)
         self.data += pack_record(T0 + round(t * S), 0, frame)
 
@@ -43,7 +43,7 @@ def one_by_one(path: Path) -> Any:
         rows.reader = LogReader(file)
         for record in rows.reader:
             rows.put(record)
-    return rows.take(len(rows.rows))
+    return rows.pop_rows(len(rows.rows))
 
 
 @pytest.mark.real
@@ -60,10 +60,10 @@ def test_both_readings_are_the_same(name: str, real_data: Path) -> None:
 def test_a_named_value_never_takes_a_column_with_a_source(tmp_path: Path) -> None:
     log = Log()
     for k in range(5):
-        log.say(k, "ATTITUDE", yaw=1.0)
-        log.say(k, "NAMED_VALUE_FLOAT", name="heading", value=7.0)
-        log.say(k, "NAMED_VALUE_FLOAT", name="mag_x", value=8.0)
-        log.say(k, "RAW_IMU", xmag=100 + k)
+        log.write_message(k, "ATTITUDE", yaw=1.0)
+        log.write_message(k, "NAMED_VALUE_FLOAT", name="heading", value=7.0)
+        log.write_message(k, "NAMED_VALUE_FLOAT", name="mag_x", value=8.0)
+        log.write_message(k, "RAW_IMU", xmag=100 + k)
     back = logs.read(log.write(tmp_path))
     np.testing.assert_allclose(back["heading"], np.degrees(1.0), rtol=1e-6)
     np.testing.assert_allclose(back["mag_x"], 100.0 * (100 + np.arange(5)))
@@ -74,10 +74,10 @@ def test_a_named_value_never_takes_a_column_with_a_source(tmp_path: Path) -> Non
 def test_a_named_value_is_the_autopilots_where_two_send_it(tmp_path: Path) -> None:
     log = Log()
     for k in range(5):
-        log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=k)
-        log.say(k, "NAMED_VALUE_FLOAT", name="battpos", value=-9.0, component=99)
-        log.say(k, "NAMED_VALUE_FLOAT", name="ballast", value=200.0 + k, component=99)
-        log.say(k, "RAW_IMU", xmag=100 + k)
+        log.write_message(k, "NAMED_VALUE_FLOAT", name="battpos", value=k)
+        log.write_message(k, "NAMED_VALUE_FLOAT", name="battpos", value=-9.0, component=99)
+        log.write_message(k, "NAMED_VALUE_FLOAT", name="ballast", value=200.0 + k, component=99)
+        log.write_message(k, "RAW_IMU", xmag=100 + k)
     back = logs.read(log.write(tmp_path))
     np.testing.assert_array_equal(back["battpos"], range(5))
     np.testing.assert_array_equal(back["ballast"], 200.0 + np.arange(5))
@@ -86,10 +86,10 @@ def test_a_named_value_is_the_autopilots_where_two_send_it(tmp_path: Path) -> No
 def test_a_gimbals_attitude_is_not_the_vehicles(tmp_path: Path) -> None:
     log = Log()
     for k in range(5):
-        log.say(k, "ATTITUDE", pitch=0.1)
+        log.write_message(k, "ATTITUDE", pitch=0.1)
         for _ in range(3):
-            log.say(k, "ATTITUDE", component=154, pitch=-1.2)
-        log.say(k, "RAW_IMU", xmag=k)
+            log.write_message(k, "ATTITUDE", component=154, pitch=-1.2)
+        log.write_message(k, "RAW_IMU", xmag=k)
     back = logs.read(log.write(tmp_path))
     np.testing.assert_allclose(back["pitch"], np.degrees(0.1), rtol=1e-6)
 
@@ -97,15 +97,15 @@ def test_a_gimbals_attitude_is_not_the_vehicles(tmp_path: Path) -> None:
 def test_a_temperature_of_0_is_none(tmp_path: Path) -> None:
     log = Log()
     for k in range(5):
-        log.say(k, "RAW_IMU", xmag=k, temperature=0)
+        log.write_message(k, "RAW_IMU", xmag=k, temperature=0)
     assert "imu_temperature" not in logs.read(log.write(tmp_path))
 
 
 def test_another_compass_makes_the_rows(tmp_path: Path) -> None:
     log = Log()
     for k in range(5):
-        log.say(k, "RAW_IMU", xmag=k)
-        log.say(k + 0.5, "SCALED_IMU2", xmag=50 + k)
+        log.write_message(k, "RAW_IMU", xmag=k)
+        log.write_message(k + 0.5, "SCALED_IMU2", xmag=50 + k)
     path = log.write(tmp_path)
     assert [one.number for one in compasses_of(logs.read(path).attrs)] == [0, 1]
     back = logs.read(path, options=Options(compass="1"))

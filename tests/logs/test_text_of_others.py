@@ -25,11 +25,11 @@ def read(tmp_path: Path, text: str | bytes, name: str = "log.csv", **options: An
     return logs.read(path, options=Options(**options))
 
 
-def table(head: str, separator: str = ",", decimal: str = ".", end: str = "\n", quote: str = "") -> str:
-    """Return `head`, and two rows of a time, 30.5 uT and 1.25 or -1.25 in."""
+def table(header: str, separator: str = ",", decimal: str = ".", end: str = "\n", quote: str = "") -> str:
+    """Return `header`, and two rows of a time, 30.5 uT and 1.25 or -1.25 in."""
     rows = [["1600000000", "30.5", "1.25"], ["1600000001", "30.5", "-1.25"]]
     written = [[f"{quote}{cell.replace('.', decimal)}{quote}" for cell in row] for row in rows]
-    return head + "\n" + "".join(separator.join(row) + end for row in written)
+    return header + "\n" + "".join(separator.join(row) + end for row in written)
 
 
 LAYOUTS = {
@@ -169,11 +169,13 @@ def test_columns_are_declared_one_by_one(tmp_path: Path) -> None:
 
 def test_a_blackbox_as_csv(tmp_path: Path) -> None:
     """What blackbox_decode writes: an index in brackets is no unit."""
-    head = "loopIteration,time (us),magADC[0],magADC[1],magADC[2],amperageLatest (A),motor[0]\n"
+    header = "loopIteration,time (us),magADC[0],magADC[1],magADC[2],amperageLatest (A),motor[0]\n"
     rows = "".join(
         f"{k},{1_000_000 + 2000 * k}, {200 + k}, -100, 350, {0.1 * k}, {1100 + k}\n" for k in range(9)
     )
-    log = read(tmp_path, head + rows, column=[f"mag_{axis}=magADC[{k}] [mG]" for k, axis in enumerate("xyz")])
+    log = read(
+        tmp_path, header + rows, column=[f"mag_{axis}=magADC[{k}] [mG]" for k, axis in enumerate("xyz")]
+    )
     np.testing.assert_allclose(log["time"], 1.0 + 0.002 * np.arange(9))
     np.testing.assert_allclose(log["mag_x"], 20_000.0 + 100.0 * np.arange(9))
     np.testing.assert_allclose(log["motor[0]"], 1100.0 + np.arange(9))
@@ -274,14 +276,14 @@ def test_motioncal_with_more_digits(tmp_path: Path) -> None:
 
 def test_magarrow(tmp_path: Path) -> None:
     """Its x is to the right, its y aft; sentences with commas of their own end some rows."""
-    head = (
+    header = (
         "Counter,Date,Time,Latitude,Longitude,Mag, MagValid,CompassX, CompassY, CompassZ,Track,GgaSentence,R"
     )
     rows = [
         "0,2022/05/04,12:00:00.000,47.6,-52.7,50800.5,1,30000,-5000,45000,90,$GPGGA,12,N,$GPRMC,1,2",
         "1,2022/05/04,12:00:00.100,47.6,-52.7,50801.5,0,30000,-5000,45000,90,,",
     ]
-    log = read(tmp_path, "\n".join([head, *rows]) + "\n")
+    log = read(tmp_path, "\n".join([header, *rows]) + "\n")
     np.testing.assert_allclose(log["time"], [NOON, NOON + 0.1], atol=1e-6)
     assert [float(log[name][0]) for name in ("mag_x", "mag_y", "mag_z")] == [5_000.0, 30_000.0, 45_000.0]
     np.testing.assert_array_equal(log["total_field"], [50_800.5, np.nan])

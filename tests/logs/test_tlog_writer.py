@@ -161,9 +161,9 @@ def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
 
 
 def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(tmp_path: Path) -> None:
-    head, begin = bytes([0xFD]) * len(FRAME), bytes([0xFE]) * len(FRAME)
+    header, begin = bytes([0xFD]) * len(FRAME), bytes([0xFE]) * len(FRAME)
     folder, aside = tmp_path / "logs", tmp_path / "aside"
-    with TlogWriter(folder, head=[head], beginning=[begin], max_age=1e-3) as log:
+    with TlogWriter(folder, header=[header], beginning=[begin], max_age=1e-3) as log:
         for k in (0, 1, 2):
             log.write(T0 + k * 4_000_000, 0, FRAME)
         while log.records < 3:
@@ -178,7 +178,7 @@ def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(
         for k in (4, 5):
             log.write(T0 + k * 4_000_000, 0, FRAME)
     written = [[frame for _, frame in records(path)] for path in sorted(folder.iterdir())]
-    assert written == [[FRAME, head]] * 3 + [[begin, head, FRAME], [FRAME, head]]
+    assert written == [[FRAME, header]] * 3 + [[begin, header, FRAME], [FRAME, header]]
 
 
 def test_stalled_disk_drops_and_counts_and_never_blocks(

@@ -135,11 +135,11 @@ MEANINGS = (
 )
 
 
-@pytest.mark.parametrize("said", [True, False])
+@pytest.mark.parametrize("output", [True, False])
 @pytest.mark.parametrize("kind", ["i1", "S1"])
-def test_a_value_that_a_flag_calls_bad_is_not_known(kind: str, said: bool, tmp_path: Path) -> None:
+def test_a_value_that_a_flag_calls_bad_is_not_known(kind: str, output: bool, tmp_path: Path) -> None:
     flags = np.array([1, 4, 2, 9, 8, 3]).astype(kind)
-    attrs = {"flag_meanings": MEANINGS, "flag_values": np.arange(10, dtype="i1")} if said else {}
+    attrs = {"flag_meanings": MEANINGS, "flag_values": np.arange(10, dtype="i1")} if output else {}
     variables = flown("N_MEASUREMENTS", **CAPITALS) | {"DEPTH_QC": ("N_MEASUREMENTS", flags, attrs)}
     back = logs.read(made(tmp_path / "log.nc", {"N_MEASUREMENTS": N}, variables))
     assert back["depth"].isnull().values.tolist() == [False, True, False, True, False, True]

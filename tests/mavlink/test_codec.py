@@ -85,9 +85,9 @@ def test_messages_outside_the_dialect_are_kept_when_another_frame_follows() -> N
     codec = Codec(1, 191)
     frame = foreign(b"abc")
     assert codec.parse(frame) == []
-    unknown, heard = codec.parse(stream(1)[0])
+    unknown, received = codec.parse(stream(1)[0])
     assert (unknown.name, unknown.frame, unknown.fields) == ("UNKNOWN_59999", frame, {})
-    assert heard.name == "ATTITUDE"
+    assert received.name == "ATTITUDE"
 
 
 def test_version_1_is_read(peer: ModuleType) -> None:

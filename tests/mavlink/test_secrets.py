@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from magbridge.mavlink import REFUSED, SECRET, Codec, Signing, TapeReader, TapeWriter, spec
+from magbridge.mavlink import REFUSED, SECRET, Codec, FrameLogReader, FrameLogWriter, Signing, spec
 
 KEY = bytes(range(1, 33))
 FIELDS = {
@@ -21,9 +21,9 @@ BEAT = Codec(1, 1).pack("HEARTBEAT", type=12)
 
 def logged(codec: Codec, *chunks: bytes) -> list[bytes]:
     """The frames that the log gets."""
-    tape, frames = TapeWriter(1, 191), []
+    frame_log, frames = FrameLogWriter(1, 191), []
     for data in chunks:
-        frames += tape.frames(codec.parse(data), codec.pending)
+        frames += frame_log.frames(codec.parse(data), codec.pending)
     return frames
 
 
@@ -55,5 +55,5 @@ def test_however_it_is_cut_or_damaged(cut: int, bad: int, noise: bool) -> None:
         chunks = (b"\xfd noise" * noise + data[:cut], data[cut:] + BEAT * 3, BEAT)
         frames = logged(Codec(1, 191), *chunks)
         assert not holds(frames)
-        reader = TapeReader()
+        reader = FrameLogReader()
         assert sum(len(reader.data(frame)) for frame in frames) == sum(map(len, chunks))

@@ -121,13 +121,13 @@ def test_signatures_follow_the_host_s_clock(peer: ModuleType) -> None:
 MINUTE, HOUR, YEAR = 60_000_000, 3_600_000_000, 31_557_600_000_000
 
 
-def hears(listener: Codec, speaker: Codec, now: int, ahead: int = 0) -> bool:
+def accepts(listener: Codec, speaker: Codec, now: int, ahead: int = 0) -> bool:
     """Say whether a frame that the speaker sends now, its clock `ahead` (µs), is accepted."""
     listener.now_us, speaker.now_us = now, now + ahead
     return bool(listener.parse(text(speaker))[0].known)
 
 
-def again(one: Codec, *, clean: bool) -> Codec:
+def restarted(one: Codec, *, clean: bool) -> Codec:
     """The same listener after a restart."""
     old = signing(one)
     last = old.last if clean else old.reserved(one.utc_us, 2 * MINUTE // 10)
@@ -142,9 +142,9 @@ def test_restarts_within_seconds_lock_nobody_out(clean: bool) -> None:
     bridge, autopilot = codec(), codec(component=1)
     for k in range(20):
         now = NOW + k * 500_000
-        assert hears(bridge, autopilot, now)
+        assert accepts(bridge, autopilot, now)
         text(bridge)
-        bridge = again(bridge, clean=clean)
+        bridge = restarted(bridge, clean=clean)
     assert signing(bridge).last - timestamp(NOW) <= (20 * 100_000 + 12_000_000 if not clean else 1_000_000)
 
 
@@ -152,27 +152,27 @@ def test_restarts_within_seconds_lock_nobody_out(clean: bool) -> None:
 @pytest.mark.parametrize("step", [-HOUR, HOUR, 10 * YEAR])
 def test_a_clock_that_was_wrong_refuses_nothing_once_it_is_right(step: int, ours: bool) -> None:
     bridge, autopilot = codec(), codec(component=1)
-    assert hears(bridge, autopilot, NOW)
-    heard = []
+    assert accepts(bridge, autopilot, NOW)
+    received = []
     for k in range(1, 6):
         now = NOW + k * 1_000_000 + (step if ours else 0)
-        heard.append(hears(bridge, autopilot, now, -step if ours else max(step, 0)))
+        received.append(accepts(bridge, autopilot, now, -step if ours else max(step, 0)))
     autopilot = codec(component=1)  # its own stamps begin anew with the right clock
-    after = [hears(again(bridge, clean=True), autopilot, NOW + k * 1_000_000) for k in range(7, 12)]
-    assert all(heard)
+    after = [accepts(restarted(bridge, clean=True), autopilot, NOW + k * 1_000_000) for k in range(7, 12)]
+    assert all(received)
     assert all(after)
 
 
 def test_a_liar_with_the_key_harms_only_its_own_stream() -> None:
     bridge, autopilot, liar = codec(), codec(component=1), codec(component=25)
-    assert hears(bridge, liar, NOW, 10 * YEAR)
+    assert accepts(bridge, liar, NOW, 10 * YEAR)
     lie = text(liar)
-    assert all(hears(bridge, autopilot, NOW + k * 1_000_000) for k in range(1, 5))
+    assert all(accepts(bridge, autopilot, NOW + k * 1_000_000) for k in range(1, 5))
     assert bridge.parse(lie)[0].known
     assert not bridge.parse(lie)[0].known  # nobody can send it again
     assert signing(bridge).last == 0
     newcomer = codec(component=42)
-    assert hears(bridge, newcomer, NOW + 6_000_000)
+    assert accepts(bridge, newcomer, NOW + 6_000_000)
 
 
 def test_our_stamps_follow_the_autopilot_s_but_not_for_years() -> None:
@@ -180,7 +180,7 @@ def test_our_stamps_follow_the_autopilot_s_but_not_for_years() -> None:
     day = 24 * HOUR
     for ahead, follows in ((day, True), (10 * YEAR, False)):
         bridge, autopilot = Codec(1, 191, Signing(KEY, follow=(1, 1))), codec(component=1)
-        assert hears(bridge, autopilot, NOW, ahead)
+        assert accepts(bridge, autopilot, NOW, ahead)
         text(bridge)
         assert signing(bridge).last - timestamp(NOW) == pytest.approx(ahead // 10 if follows else 0, abs=5)
 
@@ -190,7 +190,7 @@ def test_what_was_recorded_is_refused_after_a_restart() -> None:
     bridge.now_us = autopilot.now_us = NOW
     recorded = text(autopilot)
     assert bridge.parse(recorded)[0].known
-    bridge = again(bridge, clean=True)
+    bridge = restarted(bridge, clean=True)
     assert [one.id for one in bridge.parse(recorded)] == [REFUSED]
     bridge = Codec(1, 191, Signing(KEY))  # its file is lost: a minute is what the guide allows
     bridge.now_us = NOW + 2 * MINUTE
@@ -203,7 +203,7 @@ def test_floors_are_kept_of_so_many_streams() -> None:
     for system in range(1, 6):
         for component in range(1, 251):
             speaker = Codec(system, component, Signing(KEY))
-            assert hears(bridge, speaker, NOW)
+            assert accepts(bridge, speaker, NOW)
     assert len(signing(bridge).streams) == 1024
 
 
@@ -221,6 +221,6 @@ def test_a_count_of_frames_stands_for_the_frames() -> None:
 def test_who_may_read_the_key(tmp_path: Path) -> None:
     path = tmp_path / "key.bin"
     path.write_bytes(KEY)
-    for mode, told in ((0o600, False), (0o640, False), (0o644, True)):
+    for mode, reported in ((0o600, False), (0o640, False), (0o644, True)):
         path.chmod(mode)
-        assert readable_by_all(path) is told
+        assert readable_by_all(path) is reported

@@ -38,18 +38,18 @@ def test_what_alarms_of_what_is_heard() -> None:
     """A mass that moves alarms nobody; a stale parameter, a lost sensor, an error and silence do."""
     fleet, bridge = Fleet(), Codec(1, 191)
 
-    def say(now: float, name: str, **fields: object) -> None:
+    def feed(now: float, name: str, **fields: object) -> None:
         for message in Codec(255, 190).parse(bridge.pack(name, **fields)):
-            fleet.hear(message, now)
+            fleet.receive(message, now)
         fleet.due(now)
 
-    say(0.0, "MAG_FIELD", flags=int(Quality.MOVING | Quality.NO_BORESIGHT))
+    feed(0.0, "MAG_FIELD", flags=int(Quality.MOVING | Quality.NO_BORESIGHT))
     alarms = fleet.states[1, 191].alarms
     assert list(alarms) == []
-    say(1.0, "MAG_FIELD", flags=int(Quality.STALE_TELEMETRY))
-    say(2.0, "MAG_STATUS", sensor_state=3, autopilot_state=0, log_state=1)
-    say(3.0, "STATUSTEXT", severity=3, text="log failed: disk full")
-    say(3.1, "STATUSTEXT", severity=4, text="only a warning")
+    feed(1.0, "MAG_FIELD", flags=int(Quality.STALE_TELEMETRY))
+    feed(2.0, "MAG_STATUS", sensor_state=3, autopilot_state=0, log_state=1)
+    feed(3.0, "STATUSTEXT", severity=3, text="log failed: disk full")
+    feed(3.1, "STATUSTEXT", severity=4, text="only a warning")
     fleet.due(20.0)
     assert {alarm.key for alarm in alarms} == {
         "stale_telemetry",

@@ -89,7 +89,7 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         panel.get_by_text("learned", exact=True).wait_for()  # the state
         to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
         # nothing more is learned, so that a doubt stands
-        rig.autopilot.say("PARAM_SET", param_id="MB_LEARN_FREEZE", param_value=1.0, **to)
+        rig.autopilot.send_message("PARAM_SET", param_id="MB_LEARN_FREEZE", param_value=1.0, **to)
         panel.get_by_text("frozen", exact=True).wait_for()
         field.level = 60.0
         panel.get_by_text("map error").wait_for()
@@ -104,7 +104,7 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         page.get_by_text("learning: all forgotten").first.wait_for()
         panel.get_by_text(re.compile("the first$")).wait_for()
         browser.close()
-    said = [text.partition(" what")[0] for text in rig.said()]
+    texts = [text.partition(" what")[0] for text in rig.texts()]
     order = (
         "MB_LEARN_DO = 1, set by 255:190",
         "accepted:",
@@ -112,4 +112,4 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         "MB_LEARN_DO = 2, set by 255:190",
         "learning: all forgotten",
     )
-    assert [text for text in said if text in order] == [*order]
+    assert [text for text in texts if text in order] == [*order]

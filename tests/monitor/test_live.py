@@ -19,16 +19,16 @@ live = pytest.importorskip("sitl.live", reason="the analysis extra is not instal
 
 def test_a_glider_is_flown_into_the_page(tmp_path: Path) -> None:
     """Its field comes corrected, its masses and its track beside it, and its parameters can be read."""
-    said: list[str] = []
-    with live.flying(tmp_path, 1, said.append) as link:
+    texts: list[str] = []
+    with live.flying(tmp_path, 1, texts.append) as link:
         port, fleet, codec = open_link(link, 0, "test", "LINK"), Fleet(), Codec(255, 190)
         port.open()
         deadline = time.monotonic() + 60.0
         while not (state := fleet.states.get((1, 191))) or len(state.samples) < 3 or not state.parameters:
-            assert time.monotonic() < deadline, said
+            assert time.monotonic() < deadline, texts
             ready, _, _ = select.select(port.fds(), [], [], 0.1)
             for message in codec.parse(port.read()) if ready else []:
-                fleet.hear(message, time.monotonic())
+                fleet.receive(message, time.monotonic())
             for name, fields in fleet.due(time.monotonic()):
                 port.write(codec.pack(name, **fields))
             port.flush()

@@ -31,9 +31,9 @@ def test_page(page: Station) -> None:
         sender.settimeout(10)
         field = {"total_field": 52_134.268, "total_field_sigma": 0.6, "time_usec": 10**15, "flags": 4}
         sender.sendto(bridge.pack("MAG_FIELD", **field), link)
-        heard = Codec(1, 191).parse(sender.recv(4096))
-        assert heard[0].name in {"HEARTBEAT", "PARAM_REQUEST_LIST"}
-        assert (heard[0].system, heard[0].component) == (255, 190)
+        received_at = Codec(1, 191).parse(sender.recv(4096))
+        assert received_at[0].name in {"HEARTBEAT", "PARAM_REQUEST_LIST"}
+        assert (received_at[0].system, received_at[0].component) == (255, 190)
         for name, fields in (
             ("MAG_STATUS", {"sensor_state": 3, "uptime": 9}),
             ("MAG_NAVIGATION", {"state": 2, "lat": 495_000_000, "lon": -579_000_000}),
@@ -69,8 +69,8 @@ def test_a_clock_set_back_hides_no_silence(page: Station, clock: Path) -> None:
         sender.sendto(Codec(1, 191).pack("MAG_FIELD", total_field=52_134.268), link)
         sender.recv(4096)
         clock.write_text("-3600000000")
-        heard = b"".join([sender.recv(4096) for _ in range(10)])
-    names = [message.name for message in Codec(1, 191).parse(heard)]
+        received_at = b"".join([sender.recv(4096) for _ in range(10)])
+    names = [message.name for message in Codec(1, 191).parse(received_at)]
     assert names.count("HEARTBEAT") > 1
     deadline = time.monotonic() + 15.0
     while "nothing heard for" not in get(url):

@@ -40,16 +40,16 @@ class Air:
         """Of the bridge that speaks."""
         return self.fleet.states.get((self.bridge.system, self.bridge.component), State())
 
-    def say(self, now: float, name: str, /, **fields: object) -> None:
+    def feed(self, now: float, name: str, /, **fields: object) -> None:
         self.give(self.bridge.pack(name, **fields), now)
 
     def give(self, data: bytes, now: float) -> None:
         for message in self.codec.parse(data):
-            self.fleet.hear(message, now)
+            self.fleet.receive(message, now)
 
     def field(self, now: float, total: float = 52_000.0, flags: int = 0, **fields: object) -> None:
         fields = {"total_field_sigma": 1.0, "time_usec": round(now * 1e6), "anomaly": nan, **fields}
-        self.say(now, "MAG_FIELD", total_field=total, flags=flags, **fields)
+        self.feed(now, "MAG_FIELD", total_field=total, flags=flags, **fields)
 
 
 @pytest.fixture
@@ -59,13 +59,13 @@ def air() -> Air:
 
 def test_silence_is_told(air: Air) -> None:
     assert silence(air.state, NOW) == "nothing heard yet"
-    assert air.state.heard == -inf
-    air.say(NOW, "MAG_STATUS", uptime=5)
+    assert air.state.received_at == -inf
+    air.feed(NOW, "MAG_STATUS", uptime=5)
     assert silence(air.state, NOW) == "no field heard yet"
     air.field(NOW)
     assert silence(air.state, NOW + 3) == ""
     assert silence(air.state, NOW + 12) == "nothing heard for 12 s"
-    air.say(NOW + 12, "MAG_STATUS", uptime=17)
+    air.feed(NOW + 12, "MAG_STATUS", uptime=17)
     assert silence(air.state, NOW + 13) == "no field heard for 13 s"
     assert [ago(s) for s in (-1, 0, 119, 121, 7200)] == ["0 s", "0 s", "119 s", "2 min", "2 h"]
 
@@ -73,9 +73,9 @@ def test_silence_is_told(air: Air) -> None:
 def test_a_slow_sensor_is_not_silent(air: Air) -> None:
     for k in range(0, 40, 4):
         air.field(NOW + k)
-        air.say(NOW + k + 3.9, "MAG_STATUS", uptime=k)
+        air.feed(NOW + k + 3.9, "MAG_STATUS", uptime=k)
         assert silence(air.state, NOW + k + 3.9) == ("" if k else "no field heard for 4 s")
-    air.say(NOW + 49, "MAG_STATUS", uptime=50)
+    air.feed(NOW + 49, "MAG_STATUS", uptime=50)
     assert silence(air.state, NOW + 49) == "no field heard for 13 s"
 
 
@@ -84,20 +84,20 @@ def test_a_status_that_stops_is_not_the_present_one(air: Air) -> None:
     for k in range(10):
         air.field(NOW + k)
     assert silence(air.state, NOW + 9) == ""  # it never came: dashes are shown
-    air.say(NOW + 9, "MAG_STATUS", uptime=9)
+    air.feed(NOW + 9, "MAG_STATUS", uptime=9)
     air.field(NOW + 14)
     assert silence(air.state, NOW + 14) == "no status heard for 5 s"
-    air.say(NOW + 30, "HEARTBEAT")
+    air.feed(NOW + 30, "HEARTBEAT")
     assert silence(air.state, NOW + 31) == "no field heard for 17 s; no status heard for 22 s"
-    air.say(NOW + 31, "MAG_STATUS", uptime=31)
+    air.feed(NOW + 31, "MAG_STATUS", uptime=31)
     air.field(NOW + 50)
     assert silence(air.state, NOW + 50) == ""
 
 
 def test_figures_of_a_field_that_stopped_are_not_the_present_ones(air: Air) -> None:
     air.field(NOW, latency=0.0042, telemetry_age=0.3)
-    air.say(NOW, "MAG_STATUS", uptime=1)
-    air.say(NOW, "MAG_NAVIGATION", state=2)
+    air.feed(NOW, "MAG_STATUS", uptime=1)
+    air.feed(NOW, "MAG_NAVIGATION", state=2)
     assert [health(air.state, NOW)[name][0] for name in ("Latency", "Telemetry age")] == ["4.2 ms", "0.3 s"]
     assert [health(air.state, NOW + 4)[name][0] for name in ("Latency", "Telemetry age")] == ["–", "–"]
     assert whereabouts(air.state, NOW + 40)["Last update"][0] == "40 s ago"
@@ -108,12 +108,12 @@ def test_a_restart_loses_nothing(air: Air) -> None:
     for k in range(100):
         air.field(NOW + k * 0.1)
     air.bridge.sequence += 3
-    air.say(NOW + 11, "MAG_STATUS", uptime=11)
+    air.feed(NOW + 11, "MAG_STATUS", uptime=11)
     assert air.state.lost == 3
     air.bridge = Codec(1, 191)
     air.bridge.sequence = 200
     air.field(NOW + 12)
-    air.say(NOW + 12, "MAG_STATUS", uptime=1)
+    air.feed(NOW + 12, "MAG_STATUS", uptime=1)
     assert air.state.lost == 3
     air.bridge.sequence += 2
     air.field(NOW + 13)
@@ -127,7 +127,7 @@ def test_figures(air: Air) -> None:
     assert shown["Total field"] == ("52\u202f134.27", "± 2.00")
     assert shown["Forward"] == ("-4\u202f203.0", "± 2.2")
     assert shown["Anomaly"][0] == shown["Starboard"][0] == "–"
-    air.say(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
+    air.feed(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
     assert health(State(), NOW)["Calibration"] == ("–", True)
     items = health(air.state, NOW)
     assert items["Sensor"] == ("lost", False)
@@ -142,7 +142,7 @@ def test_the_position_by_the_field(air: Air) -> None:
     air.field(NOW)
     assert whereabouts(air.state, NOW)["State"] == ("off", True)
     place = {"lat": 495_000_000, "lon": -579_000_000, "covariance_nn": 400.0, "covariance_ee": 900.0}
-    air.say(NOW, "MAG_NAVIGATION", state=4, innovation=2.5, innovation_variance=1.0, bias=1.0, **place)
+    air.feed(NOW, "MAG_NAVIGATION", state=4, innovation=2.5, innovation_variance=1.0, bias=1.0, **place)
     items = whereabouts(air.state, NOW)
     assert items["State"] == ("lost", False)
     assert items["Position"][0] == "49.50000, -57.90000"
@@ -151,13 +151,13 @@ def test_the_position_by_the_field(air: Air) -> None:
 
 
 def test_what_a_newer_bridge_says_is_shown_as_far_as_it_is_known(air: Air) -> None:
-    air.say(NOW, "MAG_STATUS", sensor_state=200, log_state=201)
-    air.say(NOW, "MAG_NAVIGATION", state=202)
-    air.say(NOW, "STATUSTEXT", chunk_seq=1, text="the end of what was not heard")
+    air.feed(NOW, "MAG_STATUS", sensor_state=200, log_state=201)
+    air.feed(NOW, "MAG_NAVIGATION", state=202)
+    air.feed(NOW, "STATUSTEXT", chunk_seq=1, text="the end of what was not heard")
     assert health(air.state, NOW)["Sensor"] == ("state 200", False)
     assert health(air.state, NOW)["Log"] == ("state 201", False)
     assert whereabouts(air.state, NOW)["State"][0] == "state 202"
-    assert [said.text for said in air.state.texts] == ["the end of what was not heard"]
+    assert [texts.text for texts in air.state.texts] == ["the end of what was not heard"]
 
 
 def test_each_vehicle_has_a_state_of_its_own(air: Air) -> None:
@@ -205,7 +205,7 @@ def test_flags_stand_since_they_came(air: Air) -> None:
 
 def test_masses_and_temperature_of_the_same_vehicle_are_kept(air: Air) -> None:
     air.field(NOW)
-    air.say(NOW, "MAG_RAW", time_usec=round(NOW * 1e6), temperature=7.5)
+    air.feed(NOW, "MAG_RAW", time_usec=round(NOW * 1e6), temperature=7.5)
     for system, value in ((1, 0.4), (2, 9.0)):
         named = Codec(system, 1).pack("NAMED_VALUE_FLOAT", name="battpos", value=value)
         air.give(named, NOW + 1)
@@ -221,9 +221,9 @@ def test_masses_and_temperature_of_the_same_vehicle_are_kept(air: Air) -> None:
 def test_the_tracks_are_kept(air: Air) -> None:
     air.field(NOW)
     place = {"lat": 495_000_000, "lon": -579_000_000}
-    air.say(NOW, "MAG_NAVIGATION", state=1, **place)
+    air.feed(NOW, "MAG_NAVIGATION", state=1, **place)
     assert not list(air.state.estimated)  # it searches still
-    air.say(NOW, "MAG_NAVIGATION", state=2, covariance_nn=9.0, covariance_ee=4.0, **place)
+    air.feed(NOW, "MAG_NAVIGATION", state=2, covariance_nn=9.0, covariance_ee=4.0, **place)
     air.give(Codec(1, 1).pack("GPS_RAW_INT", fix_type=1, **place), NOW)
     air.give(Codec(1, 1).pack("GLOBAL_POSITION_INT", **place), NOW)
     assert air.state.estimated.latest.covariance == (9.0, 0.0, 4.0)
@@ -246,7 +246,7 @@ def test_nothing_that_is_heard_raises(air: Air) -> None:
             moment += 0.01
             component = 1 if name in ("NAMED_VALUE_FLOAT", "GLOBAL_POSITION_INT", "GPS_RAW_INT") else 191
             message = Message(spec(name).id, 1, component, 0, payload, b"", known=True)
-            air.fleet.hear(message, moment)
+            air.fleet.receive(message, moment)
             air.fleet.due(moment)
     state = air.state
     measured(state), health(state, moment), whereabouts(state, moment), silence(state, moment)
@@ -265,8 +265,8 @@ def test_nothing_that_is_heard_raises(air: Air) -> None:
 
 def test_a_bug_report_holds_what_was_seen(air: Air) -> None:
     air.field(NOW, 52_134.268)
-    air.say(NOW, "STATUSTEXT", severity=3, text='sensor lost: "unplugged", again')
-    air.say(NOW, "PARAM_VALUE", param_id="MB_SETTLE_TIME", param_value=4.0, param_count=1)
+    air.feed(NOW, "STATUSTEXT", severity=3, text='sensor lost: "unplugged", again')
+    air.feed(NOW, "PARAM_VALUE", param_id="MB_SETTLE_TIME", param_value=4.0, param_count=1)
     with ZipFile(BytesIO(bundle(air.state, NOW, "udpin:h:1"))) as archive:
         tables = {
             name: list(csv.reader(archive.read(name).decode().splitlines()))
@@ -285,9 +285,9 @@ def test_a_bug_report_holds_what_was_seen(air: Air) -> None:
 def test_a_long_text_is_put_together(air: Air) -> None:
     air.field(NOW)
     for piece, text in enumerate(("a" * 50, "b" * 50, "c")):
-        air.say(NOW + piece, "STATUSTEXT", severity=4, text=text, id=9, chunk_seq=piece)
-    air.say(NOW + 3, "STATUSTEXT", severity=6, text="short")
-    assert [said.text for said in air.state.texts] == ["short", "a" * 50 + "b" * 50 + "c"]
+        air.feed(NOW + piece, "STATUSTEXT", severity=4, text=text, id=9, chunk_seq=piece)
+    air.feed(NOW + 3, "STATUSTEXT", severity=6, text="short")
+    assert [texts.text for texts in air.state.texts] == ["short", "a" * 50 + "b" * 50 + "c"]
     assert air.state.texts[1].time == NOW + 2
 
 
@@ -359,7 +359,7 @@ def test_a_parameter_that_is_not_answered_is_asked_for_again(air: Air) -> None:
 def test_another_run_s_parameters_are_fetched_anew(air: Air) -> None:
     exchange = Exchange(air)
     exchange.run(8)
-    air.say(exchange.now, "MAG_STATUS", uptime=0)
+    air.feed(exchange.now, "MAG_STATUS", uptime=0)
     assert not air.state.parameters
     exchange.run(4)
     assert len(air.state.parameters) == len(exchange.bridge.parameters.names)
@@ -372,7 +372,7 @@ def test_what_is_learned_is_shown_in_words(air: Air) -> None:
     doubt = {"doubt_since": 1_780_000_000_000_000, "doubt_size": 12.4, "causes": 1 | 4}
     errors = {"rms_first": 15.25, "rms_published": 1.5, "rms_learned": 1.25, "samples": 4321}
     ids = {"calibration_id": 0xABC, "first_calibration_id": 0xDEF}
-    air.say(NOW, "MAG_LEARNING", state=3, **doubt, **errors, **ids)
+    air.feed(NOW, "MAG_LEARNING", state=3, **doubt, **errors, **ids)
     shown = {name: text for name, (text, _) in learnt(air.state).items()}
     assert shown["State"] == "learned"
     assert shown["Published"] == "00000abc; the first is 00000def"
@@ -382,16 +382,16 @@ def test_what_is_learned_is_shown_in_words(air: Air) -> None:
     )
     assert shown["Not explained"] == "12 nT since 28 May 20:26 UTC"
     assert shown["Causes that fit"] == "offset step, temperature offset"
-    air.say(NOW, "MAG_LEARNING", doubt_since=2**64 - 1, doubt_size=nan, causes=0xFFFF, state=9)
+    air.feed(NOW, "MAG_LEARNING", doubt_since=2**64 - 1, doubt_size=nan, causes=0xFFFF, state=9)
     assert learnt(air.state)["Not explained"][1] is False
 
 
 def test_an_order_that_goes_back_to_zero_was_taken(air: Air) -> None:
     """MB_LEARN_DO answers 0: what was asked is done."""
     air.field(NOW)
-    air.say(NOW, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
+    air.feed(NOW, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
     air.state.set("MB_LEARN_DO", 2.0)
     assert [name for name, _ in air.fleet.due(NOW + 1.0)].count("PARAM_SET") == 1
-    air.say(NOW + 1.1, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
+    air.feed(NOW + 1.1, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
     assert air.state.parameters["MB_LEARN_DO"].error == ""
     assert air.state.parameters["MB_LEARN_DO"].asked is None

@@ -1,9 +1,9 @@
-"""Maps and voyages, drawn by the same tool that prints the tables."""
+"""Maps and tracks, drawn by the same tool that prints the tables."""
 
 from __future__ import annotations
 
 import pytest
-from voyages.simulated import Map, synthetic
+from navigation_studies.simulated import Map, synthetic
 
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options

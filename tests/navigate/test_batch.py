@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from msgspec.structs import replace
-from voyages.others import flight
-from voyages.simulated import PLACE, Map, synthetic, voyage
+from navigation_studies.others import flight
+from navigation_studies.simulated import PLACE, Map, synthetic, track_over
 
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import metres_per_degree
@@ -24,7 +24,7 @@ from magbridge.navigate.draw import draw_navigation, measured_on_track
 
 @pytest.fixture(scope="module")
 def ds(grid: AnomalyGrid, options: Options) -> xr.Dataset:
-    return voyage(grid, options, 6, hours=4.0)
+    return track_over(grid, options, 6, hours=4.0)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_what_is_known_badly_says_nothing_about_the_map(
 
 def test_a_flat_map_is_recognised(options: Options) -> None:
     flat = synthetic(Map(0.2, 1500), 4)
-    result = navigate(voyage(flat, options, 5, hours=3.0), flat, options, start=PLACE)
+    result = navigate(track_over(flat, options, 5, hours=3.0), flat, options, start=PLACE)
     findings = result.attrs["findings"]
     assert "the field carries no information for" in findings
     assert (
@@ -202,7 +202,7 @@ def test_a_start_is_needed(ds: xr.Dataset, grid: AnomalyGrid, options: Options) 
 
 
 def test_ten_thousand_samples_in_two_seconds(grid: AnomalyGrid, options: Options) -> None:
-    long = voyage(grid, replace(options, start_sigma=50.0), 5, hours=10_000 / 3600, every=1.0)
+    long = track_over(grid, replace(options, start_sigma=50.0), 5, hours=10_000 / 3600, every=1.0)
     started = time.process_time()
     navigate(long, grid, replace(options, start_sigma=50.0), start=PLACE)
     assert time.process_time() - started < 4.0  # 0.8 s when nothing else runs

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
-from voyages.simulated import voyage
+from navigation_studies.simulated import track_over
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
@@ -32,7 +32,7 @@ CALIBRATED = ("--calibration", "cal.json")
 def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options: Options) -> Path:
     """A log of two hours whose channels are the field itself, its map, a calibration that changes nothing."""
     path = tmp_path_factory.mktemp("navigate")
-    ds = voyage(grid, options, 6, hours=2.0)
+    ds = track_over(grid, options, 6, hours=2.0)
     field = ds["total_field"].to_numpy()
     unit = {"units": "nT"}
     channels = {"mag_x": 0.6 * field, "mag_y": 0.0 * field, "mag_z": 0.8 * field}
@@ -62,9 +62,9 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_log_against_its_map(command: Command) -> None:
-    said = command(*TRACK, *CALIBRATED, "--config", "bridge.toml", "--picture", "track.png", "--json")
-    result = json.loads(said.out)
-    assert result["findings"] == said.err == ""
+    texts = command(*TRACK, *CALIBRATED, "--config", "bridge.toml", "--picture", "track.png", "--json")
+    result = json.loads(texts.out)
+    assert result["findings"] == texts.err == ""
     found = read("out.nc")
     error = np.hypot(found["error_north"], found["error_east"])
     assert result["error_m"] == pytest.approx(float((error**2).mean()) ** 0.5)
@@ -105,17 +105,17 @@ def test_wrong_use_is_one_line(command: Command) -> None:
         ("start_sigma = -1.0", "start_sigma: expected `float` > 0.0"),
     ):
         Path("other.toml").write_text(f"[navigation.options]\n{text}\n")
-        said = command.refuses(*TRACK, *CALIBRATED, "--config", "other.toml", code=2)
-        assert f"navigation.options.{line}" in said
+        texts = command.refuses(*TRACK, *CALIBRATED, "--config", "other.toml", code=2)
+        assert f"navigation.options.{line}" in texts
 
 
 def test_without_a_map_the_track_is_bent_to_its_own_survey(command: Command, here: Path) -> None:
     """One smoothed track with its covariance; what can only be done with a map is refused in a line."""
-    said = command("navigate", "log.nc", *CALIBRATED, "--config", "bridge.toml", "-o", "own.nc")
-    assert "dead reckoning alone" in said.err
+    texts = command("navigate", "log.nc", *CALIBRATED, "--config", "bridge.toml", "-o", "own.nc")
+    assert "dead reckoning alone" in texts.err
     track = read([Path("own.nc")])
     assert (track["covariance_nn"] > 0.0).all()
     for words in (("--bound", "log.nc"), ("log.nc", "--picture", "a.png")):
-        said = command("navigate", *words, *CALIBRATED, "-o", "none.nc", code=2)
-        assert "expected --map" in said.err
+        texts = command("navigate", *words, *CALIBRATED, "-o", "none.nc", code=2)
+        assert "expected --map" in texts.err
         assert not Path("none.nc").exists()

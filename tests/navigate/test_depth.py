@@ -7,8 +7,8 @@ from math import hypot
 import numpy as np
 import pytest
 import xarray as xr
-from voyages.dived import dived
-from voyages.simulated import Map, synthetic
+from navigation_studies.dived import dived
+from navigation_studies.simulated import Map, synthetic
 
 from magbridge.cli.navigate import _continued
 from magbridge.field.continuation import continued
@@ -30,15 +30,15 @@ def test_errors_of_the_map_add_up() -> None:
 
 
 @pytest.mark.parametrize(
-    ("depth", "said"), [(60.0, "60 m below the surface"), (-60.0, "60 m above the surface")]
+    ("depth", "texts"), [(60.0, "60 m below the surface"), (-60.0, "60 m above the surface")]
 )
 def test_a_level_is_said_on_its_side_of_the_surface(
-    depth: float, said: str, capsys: pytest.CaptureFixture[str]
+    depth: float, texts: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn = synthetic(Map(30, 1500), 3)
     flown = AnomalyGrid(drawn.longitude, drawn.latitude, drawn.anomaly, altitude=90.0)
     _continued(flown, Options(), xr.Dataset({"depth": ("time", [depth] * 9)}))
-    assert f"continued to {said}" in capsys.readouterr().err
+    assert f"continued to {texts}" in capsys.readouterr().err
 
 
 def test_a_glider_that_dives_under_it_is_found() -> None:

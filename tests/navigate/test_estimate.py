@@ -7,7 +7,7 @@ from math import hypot
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from voyages.simulated import Map, blocks, synthetic, voyage
+from navigation_studies.simulated import Map, blocks, synthetic, track_over
 
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.estimate import SPREADS, Estimate
@@ -27,7 +27,7 @@ def begun(grid: AnomalyGrid, options: Options, first: Block, sigma: float) -> Es
 
 @pytest.fixture(scope="module")
 def measured(grid: AnomalyGrid, options: Options) -> list[tuple[Block, float]]:
-    return list(blocks(voyage(grid, options, 3, hours=1.0), grid, options))
+    return list(blocks(track_over(grid, options, 3, hours=1.0), grid, options))
 
 
 def test_a_start_forgets_what_dead_reckoning_had_gathered(
@@ -72,7 +72,7 @@ def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
     """Over rock five times as rough as the map's, which the map does not explain at any place or level."""
     elsewhere = synthetic(Map(150, 1500), 9)
     estimate, widths = None, []
-    for block, metres in blocks(voyage(elsewhere, options, 5, hours=0.5), grid, options):
+    for block, metres in blocks(track_over(elsewhere, options, 5, hours=0.5), grid, options):
         estimate = estimate or begun(grid, options, block, 200.0)
         jumps = len(estimate.jumps)
         estimate.update(block, metres)

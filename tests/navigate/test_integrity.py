@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from voyages.lost import misled
-from voyages.simulated import OUTSIDE, PLACE, Map, sail, voyage
+from navigation_studies.lost import misled
+from navigation_studies.simulated import OUTSIDE, PLACE, Map, sail, track_over
 
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
@@ -33,7 +33,7 @@ def alike() -> AnomalyGrid:
 def test_what_nothing_can_tell_apart_is_never_valid(alike: AnomalyGrid, options: Options) -> None:
     """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
     claimed = replace(options, start_sigma=40.0)
-    run = sail(voyage(alike, claimed, 3, hours=2.0), alike, claimed)
+    run = sail(track_over(alike, claimed, 3, hours=2.0), alike, claimed)
     assert np.median(run.error) < 100.0
     assert not run.valid.any()
 
@@ -41,7 +41,7 @@ def test_what_nothing_can_tell_apart_is_never_valid(alike: AnomalyGrid, options:
 def test_a_start_as_wide_as_its_rivals_needs_none(grid: AnomalyGrid, options: Options) -> None:
     """What narrows it down is then the field alone: it is valid as soon as one place is left."""
     wide = replace(options, start_sigma=1500.0)
-    run = sail(voyage(grid, wide, 4, hours=3.0), grid, wide)
+    run = sail(track_over(grid, wide, 4, hours=3.0), grid, wide)
     tracking = run.state == State.TRACKING
     assert run.valid.any()
     assert run.valid.sum() > 0.9 * tracking.sum()
@@ -53,7 +53,7 @@ def test_a_calibration_that_is_off_is_not_answered_by_another_place(
     grid: AnomalyGrid, options: Options, level: float
 ) -> None:
     """60 nT where 1 nT is claimed: lost at once, and the level found with the place, not instead of it."""
-    ds = voyage(grid, options, 11, hours=3.0)
+    ds = track_over(grid, options, 11, hours=3.0)
     run = sail(ds.assign(total_field=ds["total_field"] + level), grid, options)
     assert State.LOST in run.state
     assert not (run.valid & (run.nees > OUTSIDE)).any()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from msgspec.structs import replace
-from voyages.lost import carried
-from voyages.simulated import PLACE, Map, sail, voyage
+from navigation_studies.lost import carried
+from navigation_studies.simulated import PLACE, Map, sail, track_over
 
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
@@ -21,7 +21,7 @@ Followed = tuple[list[Record], np.ndarray]
 
 
 def feed(navigator: Navigator, ds: xr.Dataset, rows: slice = slice(None)) -> Followed:
-    """Run a voyage through the navigator; return records and errors (m)."""
+    """Run a track through the navigator; return records and errors (m)."""
     records, errors = [], []
     time_us = np.round(ds["time"].to_numpy()[rows] * 1e6).astype(int).tolist()
     names = ("velocity_north", "velocity_east", "total_field", "away_north", "away_east")
@@ -37,7 +37,7 @@ def feed(navigator: Navigator, ds: xr.Dataset, rows: slice = slice(None)) -> Fol
 
 @pytest.fixture(scope="module")
 def ds(grid: AnomalyGrid, options: Options) -> xr.Dataset:
-    return voyage(grid, options, 11, hours=3.0)
+    return track_over(grid, options, 11, hours=3.0)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_it_holds_the_position(
 ) -> None:
     records, error = followed
     score = sail(ds, grid, options).score()
-    assert score.drms < 2.0 * score.bound  # one voyage: errors follow each other
+    assert score.drms < 2.0 * score.bound  # one track: errors follow each other
     assert score.drms < 0.5 * score.unaided
     assert sum(r.state is State.TRACKING for r in records) > 0.7 * len(records)
     sigma = np.array([np.sqrt(r.covariance_nn + r.covariance_ee) for r in records])
@@ -79,7 +79,7 @@ def _fresh(grid: AnomalyGrid, options: Options) -> Navigator:
 
 def test_a_wide_start_is_found(grid: AnomalyGrid, options: Options) -> None:
     wide = replace(options, start_sigma=1500.0)
-    run = sail(voyage(grid, wide, 4, hours=4.0), grid, wide)
+    run = sail(track_over(grid, wide, 4, hours=4.0), grid, wide)
     assert run.error[0] > 300.0
     assert run.score().drms < 200.0
     assert run.state[0] == State.SEARCHING or run.state[0] == State.DEAD_RECKONING
@@ -153,7 +153,7 @@ def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: Options, ds: xr.Dat
 
 
 def test_across_the_antimeridian(grid: AnomalyGrid, options: Options) -> None:
-    """The same map and voyage moved to 180 degrees: the field differs by the main field only."""
+    """The same map and track moved to 180 degrees: the field differs by the main field only."""
     moved = AnomalyGrid(grid.longitude - PLACE[1] + 180.0, grid.latitude, grid.anomaly)
     nav = Navigator(moved, replace(options, start_sigma=20.0))
     nav.fix(START_US, PLACE[0], 179.9999)

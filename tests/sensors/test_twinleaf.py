@@ -31,8 +31,8 @@ def generation_2(columns: list[tuple[int, str, str]], stream: int = 1, segment: 
     ]
     for index, (kind, name, unit) in enumerate(columns):
         # a byte more than we know
-        head = pack("<BBBBBBBB", 8, stream, index, kind, len(name), len(unit), 3, 99)
-        records.append((4, head + name.encode() + unit.encode() + b"any"))
+        header = pack("<BBBBBBBB", 8, stream, index, kind, len(name), len(unit), 3, 99)
+        records.append((4, header + name.encode() + unit.encode() + b"any"))
     return b"".join(on_the_line(11, bytes([kind, 1]) + record) for kind, record in records)
 
 
@@ -40,8 +40,8 @@ VECTOR = [(F32, "vector.x", "nT"), (F32, "vector.y", "nT"), (F32, "vector.z", "n
 
 
 def samples_2(number: int, *values: float, stream: int = 1, segment: int = 5) -> bytes:
-    head = number.to_bytes(3, "little") + bytes([segment])
-    return on_the_line(128 + stream, head + pack(f"<{len(values)}f", *values))
+    header = number.to_bytes(3, "little") + bytes([segment])
+    return on_the_line(128 + stream, header + pack(f"<{len(values)}f", *values))
 
 
 def driver(**options: Any) -> Driver:

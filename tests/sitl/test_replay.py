@@ -186,10 +186,10 @@ def test_a_velocity_is_told_as_a_track() -> None:
 
 def test_a_position_of_any_turn_and_a_depth_that_is_none_are_told(tmp_path: Path) -> None:
     row = {"latitude": 49.5, "longitude": 302.0, "depth": 1e300, "water_speed": 1e300}
-    said = Codec(255, 190).parse(b"".join(Autopilot(load_config(config(tmp_path)), 0).row(4, row)))
-    (sent,) = [message for message in said if message.name == "GLOBAL_POSITION_INT"]
+    texts = Codec(255, 190).parse(b"".join(Autopilot(load_config(config(tmp_path)), 0).row(4, row)))
+    (sent,) = [message for message in texts if message.name == "GLOBAL_POSITION_INT"]
     assert (sent["lat"], sent["lon"], sent["alt"]) == (495_000_000, -580_000_000, 0)
-    assert [message.name for message in said] == ["GLOBAL_POSITION_INT"]
+    assert [message.name for message in texts] == ["GLOBAL_POSITION_INT"]
 
 
 def test_speed_is_kept(survey: Path, tmp_path: Path) -> None:
@@ -257,10 +257,10 @@ def lines(count: int) -> Event:
 
 def test_more_than_a_pty_holds_is_read_at_once(tmp_path: Path) -> None:
     """A bridge that was stopped for a while finds so much in its line, and so does a replay of its log."""
-    heard = Listener()
-    stage = Stage(config(tmp_path, "ascii", 'columns = ["x", "y", "z"]'), heard.hear)
+    received = Listener()
+    stage = Stage(config(tmp_path, "ascii", 'columns = ["x", "y", "z"]'), received.receive)
     stage.play(Start(1_700_000_000_000_000), [lines(4000)])
-    assert heard.counts["MAG_FIELD"] == 4000
+    assert received.counts["MAG_FIELD"] == 4000
 
 
 def test_a_bridge_that_dies_holds_nobody_up(tmp_path: Path) -> None:
@@ -294,13 +294,13 @@ def test_short_names_differ() -> None:
 
 
 def test_the_demonstration_shows_what_calibration_is_worth(tmp_path: Path) -> None:
-    said: list[str] = []
-    result = demo(tmp_path / "demo", seed=2, say=said.append)
+    texts: list[str] = []
+    result = demo(tmp_path / "demo", seed=2, notify=texts.append)
     assert result["raw_rms_nT"] > 1000.0 > result["nominal_rms_nT"] > 5 * result["unflagged_rms_nT"]
     assert result["unflagged_rms_nT"] < 5.0
     assert result["unflagged_rms_nT"] < 2 * result["unflagged_sigma_nT"]
     assert all(Path(file).exists() for file in result["files"])
-    assert len(said) == 5
+    assert len(texts) == 5
 
 
 def test_a_log_of_few_samples_is_no_silent_sensor(flown: xr.Dataset, tmp_path: Path) -> None:
@@ -308,7 +308,7 @@ def test_a_log_of_few_samples_is_no_silent_sensor(flown: xr.Dataset, tmp_path: P
     write(flown.isel(time=slice(0, None, 5)), tmp_path / "log.nc")
     result = replay([tmp_path / "log.nc"])
     assert result["samples"] > 200
-    assert not any("silent" in said for said in result["said"])
+    assert not any("silent" in texts for texts in result["said"])
 
 
 @pytest.mark.real

@@ -144,11 +144,11 @@ def table(tmp_path: Path) -> Path:
 def test_command_makes_a_map_that_navigate_reads(command: Command, table: Path) -> None:
     """And GeoTIFF, tracks and crossovers beside it; the map says what the survey says."""
     out = table.parent
-    said = command(
+    output = command(
         "survey", table, "-o", out / "map.nc", "--geotiff", out / "map.tif", "--tracks", out / "t.geojson",
         "--crossovers", out / "x.csv", "--json",
     )  # fmt: skip
-    facts = json.loads(said.out)
+    facts = json.loads(output.out)
     assert facts["crossovers"] == 30
     assert facts["misties_after_nT"] < 0.2 * facts["misties_before_nT"]
     grid = read_grid(out / "map.nc")
@@ -184,7 +184,7 @@ def test_command_predicts_at_points(command: Command, table: Path) -> None:
 )
 def test_a_bad_table_is_one_line(command: Command, tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "bad.csv").write_text(text)
-    said = command("survey", tmp_path / "bad.csv", "-o", tmp_path / "map.nc", code=1)
-    assert words in said.err
-    assert said.err.count("\n") == 1
+    output = command("survey", tmp_path / "bad.csv", "-o", tmp_path / "map.nc", code=1)
+    assert words in output.err
+    assert output.err.count("\n") == 1
     assert not (tmp_path / "map.nc").exists()

@@ -108,15 +108,15 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
             for name, (job, samples) in jobs.items():
                 found[name].append(1e6 * processor_time(job) / samples)
 
-    def beside(what: str, floor: str, said: str, **target: Any) -> Row:
+    def compared(what: str, floor: str, label: str, **target: Any) -> Row:
         ratio = median(b / a for a, b in zip(found["moving"], found[floor], strict=True))
-        return Row(what, median(found["moving"]), "us", median(found[floor]), said, ratio=ratio, **target)
+        return Row(what, median(found["moving"]), "us", median(found[floor]), label, ratio=ratio, **target)
 
     bare = f"{rows} products of monomials @ {rows} x {columns} table, on whole arrays"
     return [
-        beside("correct, sigmas and all, positions new with every sample", "bare", bare, least=0.5),
-        beside("the same, the product in pieces that stay in the cache", "pieces", "as above, in pieces"),
-        beside(
+        compared("correct, sigmas and all, positions new with every sample", "bare", bare, least=0.5),
+        compared("the same, the product in pieces that stay in the cache", "pieces", "as above, in pieces"),
+        compared(
             "the same, beside all three products that it contains",
             "contained",
             "coarse and fine parts, in pieces",

@@ -39,8 +39,8 @@ class Download:
     def ask(self, opcode: int, data: bytes = b"") -> bytes:
         """Return a request."""
         self._sequence = self._sequence + 1000 & 0xFFFF
-        head = HEADER.pack(self._sequence, 0, opcode, len(data) or DATA, 0, 0, self.received)
-        payload = (head + data).ljust(HEADER.size + DATA, b"\0")
+        header = HEADER.pack(self._sequence, 0, opcode, len(data) or DATA, 0, 0, self.received)
+        payload = (header + data).ljust(HEADER.size + DATA, b"\0")
         return self._codec.pack(FTP.name, target_system=1, target_component=191, payload=payload)
 
     def set(self, name: str, value: float) -> bytes:
@@ -49,7 +49,7 @@ class Download:
         to = {"target_system": 1, "target_component": 191}
         return self._codec.pack("PARAM_SET", param_id=name, param_value=value, param_type=real, **to)
 
-    def hear(self, data: bytes) -> bytes:
+    def receive(self, data: bytes) -> bytes:
         """Take a datagram; return the next request at the end of a burst."""
         if data[7:10] != FTP.number:
             return b""
@@ -72,7 +72,7 @@ def files(folder: Path, repetitions: int) -> list[Row]:
     with (logs / NAME).open("wb") as file:
         file.truncate(SIZE)
     alone: list[Sent] = []
-    beside: list[Sent] = []
+    downloading: list[Sent] = []
     station = Download()
     with started(bridge_command(folder)) as live:
         feed = Feed()
@@ -81,17 +81,17 @@ def files(folder: Path, repetitions: int) -> list[Row]:
         live.link.sendto(station.set("MB_FILE_RATE", RATE), live.peer)
         live.link.sendto(station.ask(Opcode.OPEN_READ, f"logs/{NAME}".encode()), live.peer)
         begun = perf_counter()
-        while station.received < SIZE and len(beside) < PATIENCE:
-            beside.append(play(live, feed, HERTZ, sequences, station.hear))
+        while station.received < SIZE and len(downloading) < PATIENCE:
+            downloading.append(play(live, feed, HERTZ, sequences, station.receive))
         seconds = station.done - begun
         alone += [play(live, feed, HERTZ, sequences) for _ in range(repetitions)]
     rows = []
     for name, q, most in (("p50", 50.0, None), ("p99", 99.0, 2.0)):
-        with_it, without = late(beside, q), late(alone, q)
+        with_it, without = late(downloading, q), late(alone, q)
         what = f"latency beside a download, {name}"
         rows.append(Row(what, with_it, "ms", without, "without", with_it / without, most=most))
-    samples = sum(len(run.latency) for run in beside)
-    lost = sum(int(np.isnan(run.latency).sum()) for run in beside)
+    samples = sum(len(run.latency) for run in downloading)
+    lost = sum(int(np.isnan(run.latency).sum()) for run in downloading)
     return [
         *rows,
         Row(f"lost at {HERTZ:,} Hz, of {samples:,}", lost, "samples", most=0),

@@ -155,17 +155,17 @@ def play(
     A `station` is shown every datagram, and what it returns is sent.
     """
     clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
-    heard: list[tuple[float, bytes]] = []
+    received: list[tuple[float, bytes]] = []
     written: dict[int, float] = {}
     driver = open_driver("digitizer", OPTIONS)
 
     def listen(until: float) -> None:
         while (now := clock()) < until:
             try:
-                heard.append((now, recv(65536)))
+                received.append((now, recv(65536)))
             except BlockingIOError:
                 continue
-            if request := station(heard[-1][1]):
+            if request := station(received[-1][1]):
                 send(request, running.peer)
 
     cpu = processor_time(running.process.pid)
@@ -187,7 +187,7 @@ def play(
     listen(clock() + GRACE)
     cpu = processor_time(running.process.pid) - cpu
     came: dict[int, float] = {}
-    for when, data in heard:
+    for when, data in received:
         for sequence in sequences(data):
             came.setdefault(sequence, when)
     late = [1e3 * (came.get(sequence, np.nan) - when) for sequence, when in written.items()]

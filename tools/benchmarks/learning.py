@@ -68,7 +68,7 @@ def _drive(pipeline: Pipeline, edge: Edge, longest: list[float]) -> None:
     for event in edge.events(lambda: 0):
         begun = time.perf_counter()
         pipeline.feed(event)
-        pipeline.journal.drain()
+        pipeline.recorder.drain()
         worst = max(worst, 1e3 * (time.perf_counter() - begun))
         if event.time_us // 1_000_000 != second:
             if second:

@@ -91,7 +91,7 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> tuple[dict[str, l
     def live(edge: Edge) -> None:
         """Feed the bridge, and wait until the log's thread has written every record."""
         drive(pipeline, edge, log, lambda _: None)
-        while log.records + log.lost < pipeline.journal.count:
+        while log.records + log.lost < pipeline.recorder.count:
             time.sleep(0.01)
 
     gc.collect()
@@ -100,10 +100,10 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> tuple[dict[str, l
         events = list(feed.events(SECONDS, HERTZ, BEGIN_US + repetition * SECONDS * 1_000_000))
         edge = Edge(events)
         bridge = processor_time(partial(live, edge))
-        heard = [event.data for event in events if event.channel is Channel.LINK]
+        received = [event.data for event in events if event.channel is Channel.LINK]
         sent = peer.arguments(bytes(edge.sent))
         kept = [peer.sensor_bytes(event.data) for event in events if event.channel is Channel.SENSOR]
-        floors = (partial(peer.decode, heard), partial(peer.encode, sent), partial(peer.encode, kept))
+        floors = (partial(peer.decode, received), partial(peer.encode, sent), partial(peer.encode, kept))
         if repetition:  # the first one warms up
             messages += len(sent)
             for name, seconds in zip(times, (bridge, *map(processor_time, floors)), strict=True):

@@ -59,7 +59,7 @@ def _measure(folder: Path, repetitions: int, name: str, step: float, rows: int) 
     config = write_config(folder)
     log = deployment(step, rows)
     events = list(emulate(log, load(config)))
-    heard = [event.data for event in events if event.channel is Channel.LINK]
+    received = [event.data for event in events if event.channel is Channel.LINK]
     peer = Peer()
     walls, floors, bare, bridges = [], [], [], []
     for _ in range(repetitions):
@@ -68,7 +68,7 @@ def _measure(folder: Path, repetitions: int, name: str, step: float, rows: int) 
         bridges.append(bridge)
         messages = peer.arguments(published)
         begun, used = time.perf_counter(), time.process_time()
-        peer.decode(heard)
+        peer.decode(received)
         peer.encode(messages)
         floors.append(time.perf_counter() - begun)
         bare.append(time.process_time() - used)
@@ -76,7 +76,7 @@ def _measure(folder: Path, repetitions: int, name: str, step: float, rows: int) 
     codec = "pymavlink's codec"
     faster = [floor / wall for floor, wall in zip(floors, walls, strict=True)]
     lighter = [floor / bridge for floor, bridge in zip(bare, bridges, strict=True)]
-    detail = {"messages_in": len(heard) / rows, "messages_out": len(messages) / rows, "wall_s": walls}
+    detail = {"messages_in": len(received) / rows, "messages_out": len(messages) / rows, "wall_s": walls}
     month = MONTH / step * median(walls) / rows / 60.0
     return [
         Row(f"replay of {name} data, a row", median(walls) * each, "us", median(floors) * each, codec,
@@ -91,11 +91,11 @@ def _play(folder: Path, config: Path, log: xr.Dataset) -> tuple[float, float, by
     """Return wall clock (s) of the replay, processor time (s) of the bridge, and what it published."""
     listener, published = Listener(), bytearray()
 
-    def hear(data: bytes) -> None:
+    def receive(data: bytes) -> None:
         published.extend(data)
-        listener.hear(data)
+        listener.receive(data)
 
-    stage = Stage(config, hear, folder / "replayed")
+    stage = Stage(config, receive, folder / "replayed")
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     starting = processor_time(stage._bridge.pid)  # noqa: SLF001 - what it took to start is another figure
     begun = time.perf_counter()

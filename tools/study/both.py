@@ -45,27 +45,27 @@ def both(
             return dict.fromkeys(("both", "inside", "regressed"), 0.0)
         likely.append(own)
         shown.append(true_span(alone, own, one.hidden.name, k))
-    values = weighed(draws, [*spans, *shown], [*likely, *shown], setting.trials)
+    values = weighed(draws, [*spans, *shown], [*likely, *shown], setting.look_elsewhere)
     known = by_causes(values)
     regressed = by_causes({some: value for some, value in values.items() if table.issuperset(some)})
     return {"both": named(known, truth), "inside": held(known, truth), "regressed": named(regressed, truth)}
 
 
 def weighed(
-    draws: Draws, spans: Sequence[Span], firsts: Sequence[Span], trials: Mapping[str, float]
+    draws: Draws, spans: Sequence[Span], firsts: Sequence[Span], look_elsewhere: Mapping[str, float]
 ) -> dict[tuple[Span, ...], FloatArray]:
     """Log evidence of every span, and of each two of different causes whose first is in `firsts`."""
 
     def own(draws: Draws, span: Span) -> FloatArray:
-        return np.asarray(evidence(span, *draws.ratio(span)) - np.log(trials.get(span.cause, 1.0)))
+        return np.asarray(evidence(span, *draws.ratio(span)) - np.log(look_elsewhere.get(span.cause, 1.0)))
 
     values: dict[tuple[Span, ...], FloatArray] = {(span,): own(draws, span) for span in spans}
-    price = ODDS + np.log(max(len(trials), 1))
+    price = ODDS + np.log(max(len(look_elsewhere), 1))
     for first in firsts:
-        beside = draws.beside(first)
+        conditional_on = draws.conditional_on(first)
         for span in spans:
             if span.cause != first.cause:
-                values[first, span] = values[first,] + own(beside, span) - price
+                values[first, span] = values[first,] + own(conditional_on, span) - price
     return values
 
 

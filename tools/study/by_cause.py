@@ -9,8 +9,8 @@ import numpy as np
 from sitl.inject import EFFECTS
 from study.rates import (
     Row,
+    against_ideal,
     asserted,
-    beside_ideal,
     chance,
     count,
     found,
@@ -47,7 +47,7 @@ def _line(name: str, part: Mapping[str, Sequence[Row]]) -> list[str]:
         key: f"{chance(named, key):.2f}" if predicted(named) else "-" for key in ("alone", "inside", "size")
     }
     sizes = [len(sets(r)) for r in named if sets(r)] or [0]
-    gain = gained(own("gain"))
+    improvement = gained(own("gain"))
     return [
         name,
         count(named, found),
@@ -57,14 +57,14 @@ def _line(name: str, part: Mapping[str, Sequence[Row]]) -> list[str]:
         f"{np.mean(sizes):.1f} ({ideal['size']})",
         f"{count(loud, found)}, {count(loud, holds)}",
         _parameters(scores(own("named", "loud", "gain"))),
-        f"{100 * gain:.0f} %" if np.isfinite(gain) else "-",
+        f"{100 * improvement:.0f} %" if np.isfinite(improvement) else "-",
         ", ".join(_instead(name, named)),
     ]
 
 
 def _half(known: Sequence[Row]) -> str:
     """Return the signal-to-noise of half detection: theory's, the measured one, and by how much it is off."""
-    half, factor = [t["half"] for t in predicted(known)], beside_ideal(known)
+    half, factor = [t["half"] for t in predicted(known)], against_ideal(known)
     if not half or factor is None:
         return "-"
     return f"{np.mean(half):.1f} / {np.mean(half) * factor[0]:.1f} ({off(factor)})"

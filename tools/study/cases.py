@@ -20,7 +20,7 @@ from magbridge.diagnose.unexplained.descriptions import Description, description
 from sitl.inject import EFFECTS, FOREIGN, Hidden
 from study.both import both
 from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of
-from study.gain import DELAYS, gain, harm
+from study.improvement import DELAYS, harm, improvement
 from study.noise import GLIDER, LOSSES, NOISES
 from study.theory import Setting, ideal
 
@@ -169,7 +169,7 @@ def case(entry: Row) -> Row:
     whole = hidden[0].ds if len(hidden) == 1 else background.measure(*(one.hidden for one in hidden))
     ds = background.log(whole)
     table = {name: cause for name, cause in CAUSES.items() if name != without}
-    result = diagnose([ds], deployment.calibration, learned_from=deployment.learned, causes=table)
+    result = diagnose([ds], deployment.calibration, training_logs=deployment.learned, causes=table)
     found = findings(result, table)
     row = entry | {
         "sizes": [one.hidden.size for one in hidden],
@@ -184,7 +184,7 @@ def case(entry: Row) -> Row:
         "theory": _theory(entry["part"], hidden, background, ds, result),
     }
     if entry["part"] == "gain":
-        row["gain"] = gain(hidden[0].hidden, background, ds, result)
+        row["gain"] = improvement(hidden[0].hidden, background, ds, result)
     if entry["part"] == "charted":
         row["gain"] = harm(tuple(one.hidden for one in hidden), background, ds, result)
     return row | {"seconds": time.process_time() - began, "worker": os.getpid()}
@@ -220,7 +220,7 @@ def _theory(
     if part in NAMELESS:
         tones = CAUSES[names[0]].candidates(result.problem) if names[0] == "interference_tone" else []
         free = descriptions(result.problem, result.outcome.null, *tones[:1])
-    setting = Setting(CAUSES, result.outcome.trials, free, others)
+    setting = Setting(CAUSES, result.outcome.look_elsewhere, free, others)
     if len(hidden) > 1:
         return [both(hidden, background, ds, setting)]
     return [ideal(hidden[0], background, ds, setting)]

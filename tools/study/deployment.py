@@ -27,7 +27,7 @@ from sitl.mission import CrissCross, Spirals
 from sitl.signals import first_order
 from sitl.trajectory import Track
 from sitl.world import Water, World
-from study.noise import GLIDER, Rows, add_noise, left, statistics, whiten
+from study.noise import GLIDER, Rows, add_noise, kept_rows, statistics, whiten
 
 HOURS = 6.0
 """Length of a deployment; the tests' are shorter."""
@@ -133,7 +133,7 @@ def calibrated(spirals: xr.Dataset) -> Calibration:
     return fit(observations(spirals, ["battpos", "ballast"]), "auto").calibration
 
 
-def again(deployment: Deployment, later: timedelta = timedelta()) -> Deployment:
+def rebuilt(deployment: Deployment, later: timedelta = timedelta()) -> Deployment:
     """Return another deployment of the same vehicle in the same waters, with the true field as reference."""
     scenario = msgspec.structs.replace(deployment.twin.scenario, start=deployment.twin.scenario.start + later)
     twin = replace(deployment.twin, scenario=scenario, seed=deployment.twin.seed + 1000)
@@ -220,7 +220,7 @@ class Background(NamedTuple):
     def of(cls, deployment: Deployment, number: int, noise: str, losses: str = "") -> Background:
         """Set up; `number` seeds the unneeded telemetry, and which samples are lost."""
         clean = deployment.measure((), number)
-        rows = left(losses, len(deployment.when), number)
+        rows = kept_rows(losses, len(deployment.when), number)
         e, J = compare(clean, deployment.calibration)
         return cls(deployment, number, noise, rows, e, whiten(J[rows], noise, rows))
 

@@ -85,7 +85,7 @@ class Draws(NamedTuple):
             value = np.where(scores[0] > 0.0, value, 0.0)
         return value, float(statistic.freedom + span.more)
 
-    def beside(self, span: Span) -> Draws:
+    def conditional_on(self, span: Span) -> Draws:
         """Return the draws with one hypothesis projected out."""
         taken = self.S[:, span.own] @ root_of(self.S, span)
         own = root_of(self.S, span).T @ self.noise[span.own]
@@ -109,7 +109,7 @@ def evidence(span: Span, ratio: FloatArray, freedom: float) -> FloatArray:
 
 def with_another(draws: Draws, first: Span, spans: Sequence[Span]) -> dict[str, tuple[float, Span]]:
     """For each cause, the truth's signal-to-noise left by `first` and its best hypothesis, and the latter."""
-    S = draws.beside(first).S
+    S = draws.conditional_on(first).S
     left: dict[str, tuple[float, Span]] = {}
     for span in spans:
         value = float(np.sqrt(max(S[-1, -1] - explained(S, span), 0.0)))

@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 
 from magbridge.arrays import FloatArray
 from study.cases import KNOWN
-from study.rates import Row, beside_ideal, curve, found, predicted
+from study.rates import Row, against_ideal, curve, found, predicted
 
 NEITHER = "no name"
 
@@ -88,7 +88,7 @@ def plot_detection(rows: Sequence[Row], path: Path) -> None:
 def _halves(axis: Axes, rows: Sequence[Row]) -> None:
     """Draw the signal-to-noise that each cause needs relative to theory, with its 68 % interval."""
     own = {
-        name: beside_ideal([r for r in rows if list(r["names"]) == [name] and r["theory"]]) for name in KNOWN
+        name: against_ideal([r for r in rows if list(r["names"]) == [name] and r["theory"]]) for name in KNOWN
     }
     off = {name: 100.0 * (np.array(each) - 1.0) for name, each in own.items() if each}
     for place, (middle, low, high) in enumerate(off.values()):

@@ -37,16 +37,16 @@ def against(
     draws: Draws,
     names: Mapping[str, FloatArray],
     pairs: Sequence[tuple[Span, Span]],
-    trials: Mapping[str, float],
+    look_elsewhere: Mapping[str, float],
 ) -> FloatArray:
     """Log evidence T that a description must exceed; the price of grids is included in `names` only."""
     found = [*names.values()]
     for first, second in pairs:
-        one, other = draws.ratio(first), draws.beside(first).ratio(second)
-        grids = sum(np.log(trials.get(span.cause, 1.0)) for span in (first, second))
+        one, other = draws.ratio(first), draws.conditional_on(first).ratio(second)
+        grids = sum(np.log(look_elsewhere.get(span.cause, 1.0)) for span in (first, second))
         ratio = one[0] + other[0]
-        found.append(log_bayes(ratio, one[1] + other[1]) - grids - ODDS - np.log(max(len(trials), 1)))
-    return np.asarray(np.max(found, axis=0) - np.log(max(len(trials), 1)))
+        found.append(log_bayes(ratio, one[1] + other[1]) - grids - ODDS - np.log(max(len(look_elsewhere), 1)))
+    return np.asarray(np.max(found, axis=0) - np.log(max(len(look_elsewhere), 1)))
 
 
 def nameless(
@@ -59,7 +59,7 @@ def nameless(
         own = slice(start, start := start + one.widths[0][1].size)
         for _, width in one.widths:
             ratio, _ = draws.ratio(Span("", None, own, spectra=width[None] ** 2))
-            best = np.maximum(best, 0.5 * ratio - np.log(one.trials))
+            best = np.maximum(best, 0.5 * ratio - np.log(one.look_elsewhere))
     return {
         "unnamed": float(np.mean(truth - np.log(count) > needed)),
         "described": float(np.mean(best - np.log(count) > needed)),

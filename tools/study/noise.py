@@ -47,8 +47,8 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
     return out
 
 
-def left(losses: str, n: int, seed: int) -> Rows:
-    """Rows of a log that are left; all of its n rows where `losses` is empty."""
+def kept_rows(losses: str, n: int, seed: int) -> Rows:
+    """Rows of a log that are kept; all of its n rows where `losses` is empty."""
     rng = np.random.default_rng([seed, 98])
     there = np.ones(n, bool)
     if losses == "single":

@@ -46,15 +46,15 @@ def asserted(row: Row) -> set[str]:
     return one_of(entry[0] for entry in row["found"])
 
 
-def beside(row: Row) -> set[str]:
+def in_named_set(row: Row) -> set[str]:
     """Causes that the diagnosis names, and those that it cannot tell from them."""
     return asserted(row).union(*(one_of(entry[3]) for entry in row["found"]))
 
 
 def sets(row: Row) -> set[str]:
-    """Causes as in :func:`beside`, and those that are not ruled out for what is 'unexplained'."""
+    """Causes as in :func:`in_named_set`, and those that are not ruled out for what is 'unexplained'."""
     kept = (row["unexplained"] or {}).get("alternatives", ())
-    return beside(row) | one_of(a["cause"] for a in kept)
+    return in_named_set(row) | one_of(a["cause"] for a in kept)
 
 
 def right(row: Row) -> bool:
@@ -80,22 +80,24 @@ def nameable(row: Row) -> bool:
     return all(t.get("both", t.get("alone")) >= ALLOWED for t in row["theory"])
 
 
-def unlike(row: Row) -> bool:
+def beyond_any_name(row: Row) -> bool:
     """By theory, what is hidden can be told from every cause of the table."""
     return all(t["unnamed"] >= ALLOWED for t in row["theory"])
 
 
 def reached(row: Row) -> bool:
     """A diagnosis gains 80 % of what an oracle does, in mean square on another deployment."""
-    gain = row["gain"]
-    return bool(gain["before"] - gain["after"] >= 0.8 * (gain["before"] - gain["oracle"]))
+    improvement = row["gain"]
+    return bool(
+        improvement["before"] - improvement["after"] >= 0.8 * (improvement["before"] - improvement["oracle"])
+    )
 
 
 def worse(row: Row) -> bool:
     """An extension does harm: on the log that it was made from, or on another."""
-    gain = row["gain"]
-    there = [where for where in ("", " elsewhere") if "after" + where in gain]
-    return any(gain["after" + where] > 1.02 * gain["before" + where] for where in there)
+    improvement = row["gain"]
+    there = [where for where in ("", " elsewhere") if "after" + where in improvement]
+    return any(improvement["after" + where] > 1.02 * improvement["before" + where] for where in there)
 
 
 def gained(rows: Sequence[Row]) -> float:
@@ -157,7 +159,7 @@ def equal(row: Row) -> float:
     return float(np.interp(-np.log(row["p_value"]), surprise, SIZES))
 
 
-def beside_ideal(rows: Sequence[Row]) -> tuple[float, float, float] | None:
+def against_ideal(rows: Sequence[Row]) -> tuple[float, float, float] | None:
     """Ratio of the signal-to-noise that the detector needs to the ideal one's, with its 68 % interval.
 
     Both see the same noise, which cancels: one log compared like this tells as much as dozens that are merely

@@ -15,8 +15,8 @@ from study.deployment import CHARTS
 from study.noise import LOSSES, NOISES
 from study.rates import (
     Row,
-    beside,
-    beside_ideal,
+    against_ideal,
+    beyond_any_name,
     chance,
     curve,
     efficiency,
@@ -25,6 +25,7 @@ from study.rates import (
     gained,
     hidden,
     holds,
+    in_named_set,
     nameable,
     off,
     percent,
@@ -36,7 +37,6 @@ from study.rates import (
     sets,
     share,
     unexplained,
-    unlike,
     worse,
 )
 
@@ -94,11 +94,11 @@ def _detection(part: Parts) -> list[Line]:
             out.append((label, "at least 95 %", rare, share(least, found)))
     for label, factor in (
         ("point of half detection, against theory's (68 % interval): by what is found", efficiency(known)),
-        ("... by p-values, theory's with the same noise", beside_ideal(known)),
+        ("... by p-values, theory's with the same noise", against_ideal(known)),
     ):
         if factor:
             out.append((label, "within 15 %", "0 %", f"{off(factor)} | {len(known)}"))
-    factors = [beside_ideal([r for r in known if list(r["names"]) == [name]]) for name in EFFECTS]
+    factors = [against_ideal([r for r in known if list(r["names"]) == [name]]) for name in EFFECTS]
     if within := [abs(factor[0] - 1.0) <= OFF for factor in factors if factor]:
         share_within = f"{sum(within)} of {len(within)} | {len(known)}"
         out.append(("... cause by cause: within 15 %", "all", "all", share_within))
@@ -119,8 +119,8 @@ def _sets(named: Sequence[Row]) -> list[Line]:
             ("... the set holds the truth", targets[1], inside, share(rows, holds)),
             ("... mean size of the set", targets[2], size, _mean_size(rows, sets)),
             ("... without what an 'unexplained' keeps: holds the truth", "", inside,
-             share(rows, lambda r: hidden(r) <= beside(r))),
-            ("... mean size of that", "", size, _mean_size(rows, beside)),
+             share(rows, lambda r: hidden(r) <= in_named_set(r))),
+            ("... mean size of that", "", size, _mean_size(rows, in_named_set)),
         ]  # fmt: skip
     return out
 
@@ -155,8 +155,8 @@ def _gains(rows: Sequence[Row]) -> list[Line]:
 
 def _harm(part: Parts) -> list[Line]:
     """Lines on harm: errors against the true field, or on another deployment against the true reference."""
-    gain, charted = part.get("gain", []), part.get("charted", [])
-    groups = {"harm: extension makes the corrected field worse": gain + charted}
+    extended, charted = part.get("gain", []), part.get("charted", [])
+    groups = {"harm: extension makes the corrected field worse": extended + charted}
     groups |= {f"... against a {kind}": [r for r in charted if r["reference"] == kind] for kind in CHARTS}
     return [(label, "0", "0 %", share(rows, worse)) for label, rows in groups.items()]
 
@@ -166,7 +166,7 @@ def _nameless(part: Parts) -> list[Line]:
     unknown = part.get("unknown", [])
     out: list[Line] = []
     for label, rows in (
-        ("unknown cause, where theory gives no name", [*filter(unlike, unknown)]),
+        ("unknown cause, where theory gives no name", [*filter(beyond_any_name, unknown)]),
         ("foreign, seen before", part.get("seen", [])),
         ("foreign, sealed until now", part.get("foreign", [])),
     ):

@@ -27,8 +27,8 @@ from scipy.special import chdtrc
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import slices
+from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import pose
-from magbridge.diagnose.compare.take import take
 from magbridge.diagnose.inference.evidence import LEVEL, ODDS, log_bayes
 from magbridge.diagnose.unexplained.descriptions import Description
 from study.deployment import Background, Injected, compare, project
@@ -47,16 +47,16 @@ class Setting(NamedTuple):
     ----------
     causes : mapping
         The whole table.
-    trials : mapping
+    look_elsewhere : mapping
         Cause -> number of independent hypotheses behind it.
     free : sequence of Description
         The detector's descriptions without a name, in the parts where the hidden effect has none.
     others : mapping of array (n,)
-        Whitened true signatures of other causes, which are rivals beside the table's columns.
+        Whitened true signatures of other causes, which compete beside the table's columns.
     """
 
     causes: Mapping[str, Cause]
-    trials: Mapping[str, float]
+    look_elsewhere: Mapping[str, float]
     free: Sequence[Description]
     others: Mapping[str, FloatArray]
 
@@ -87,8 +87,8 @@ def ideal(one: Injected, background: Background, ds: xr.Dataset, setting: Settin
     """
     name = one.hidden.name
     spans, S, noise = information([one], background, ds, setting)
-    draws, rivals = Draws.of(S), [span for span in spans if span.cause != name]
-    best = best_of(S, rivals)
+    draws, competing = Draws.of(S), [span for span in spans if span.cause != name]
+    best = best_of(S, competing)
     own = own_span(S, spans, name)
     true = true_span(S, own, name, len(S) - 1)
     given = {span: draws.ratio(span) for span in (*spans, true)}
@@ -97,7 +97,7 @@ def ideal(one: Injected, background: Background, ds: xr.Dataset, setting: Settin
     names, table = list(weighed), np.array([*weighed.values()])
     inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), names.index(name)
     left = {
-        c: with_another(draws, span, rivals if setting.free else [r for r in rivals if r.cause == c])
+        c: with_another(draws, span, competing if setting.free else [r for r in competing if r.cause == c])
         for c, span in best.items()
         if explained(S, span)
     }
@@ -106,15 +106,15 @@ def ideal(one: Injected, background: Background, ds: xr.Dataset, setting: Settin
         "inside": float(np.mean(inside[me])) * bool(own),
         "size": float(np.mean(inside.sum(axis=0))),
         "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
-        **_found(p_values(draws, [true, *rivals], setting)),
-        "here": np.median(p_values(Draws(S, noise), [true, *rivals], setting), axis=1).tolist(),
+        **_found(p_values(draws, [true, *competing], setting)),
+        "here": np.median(p_values(Draws(S, noise), [true, *competing], setting), axis=1).tolist(),
         "apart": {c: left[c][c][0] if c in left else draws.wanted for c in best},
     }
     if not setting.free:
         return answers
     pairs = [(best[c], min(found.values(), key=lambda entry: entry[0])[1]) for c, found in left.items()]
-    rival = by_cause({span: evidence(span, *given[span]) for span in rivals})
-    needed = against(draws, rival, pairs, setting.trials)
+    competing_evidence = by_cause({span: evidence(span, *given[span]) for span in competing})
+    needed = against(draws, competing_evidence, pairs, setting.look_elsewhere)
     two = min(value for found in left.values() for value, _ in found.values())
     return answers | {"two": two} | nameless(draws, truth, needed, setting.free)
 
@@ -127,7 +127,7 @@ def information(
     The hidden signatures are the last columns: each one and, if there are several, their sum.
     """
     noise, rows, calibration = background.noise, background.rows, background.deployment.calibration
-    problem = pose(take([ds], calibration), calibration)
+    problem = pose(load_survey([ds], calibration), calibration)
     candidates = [c for cause in setting.causes.values() for c in cause.candidates(problem)]
     table = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), noise, rows)
     free = [whiten(description.columns(slice(0, len(problem))), noise, rows) for description in setting.free]
@@ -136,7 +136,7 @@ def information(
     X = np.column_stack([*free, table, *setting.others.values(), *truth, *every])
     first = sum(columns.shape[1] for columns in free)
     spans = [
-        Span(c.cause, c.channel, own, float(np.log(c.trials)), c.positive, c.spectra)
+        Span(c.cause, c.channel, own, float(np.log(c.look_elsewhere)), c.positive, c.spectra)
         for c, own in zip(candidates, slices(candidates, first), strict=True)
     ]
     spans += [
@@ -183,7 +183,7 @@ def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> FloatArra
     for span in spans:
         ratio, freedom = draws.ratio(span, scale)
         if freedom:
-            tests = span.tail * len(setting.causes) * setting.trials.get(span.cause, 1.0)
+            tests = span.tail * len(setting.causes) * setting.look_elsewhere.get(span.cause, 1.0)
             least = np.minimum(least, tests * chdtrc(freedom, np.maximum(ratio, 0.0)))
     return least
 

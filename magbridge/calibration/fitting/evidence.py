@@ -122,5 +122,5 @@ def is_maximum(quadratic: Quadratic, family: PriorFamily, widths: Widths) -> boo
 
     bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
     values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))
-    gain = 0.5 * np.sum((vectors.T @ slope(x)) ** 2 / np.maximum(values, 1e-300))
-    return bool(values[0] > 0.0 and gain < STILL)
+    rise = 0.5 * np.sum((vectors.T @ slope(x)) ** 2 / np.maximum(values, 1e-300))
+    return bool(values[0] > 0.0 and rise < STILL)

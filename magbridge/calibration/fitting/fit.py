@@ -81,8 +81,8 @@ class Fit:
     information: Information | None = None
 
     def __repr__(self) -> str:
-        doubts = f", {len(self.calibration.doubts)} doubts" if self.calibration.doubts else ""
-        return f"<Fit: {self.rms:.2f} nT RMS of {len(self.residual)} samples{doubts}; {self.calibration!r}>"
+        count = f", {len(self.calibration.warnings)} warnings" if self.calibration.warnings else ""
+        return f"<Fit: {self.rms:.2f} nT RMS of {len(self.residual)} samples{count}; {self.calibration!r}>"
 
     def _repr_html_(self) -> str:
         """Return the same for a notebook, with the warnings."""
@@ -95,7 +95,7 @@ class Fit:
 
         The error expected elsewhere is not large against the noise, and the headings have no wide gap.
         """
-        return not self.calibration.doubts
+        return not self.calibration.warnings
 
     @property
     def scales(self) -> tuple[float, float]:
@@ -209,8 +209,8 @@ def _biased(found: Fit, sigma: float) -> Fit:
     v[:, 6:] = 0.0
     P = calibration.covariance + sigma**2 * np.outer(v, v)
     wider = replace(calibration, covariance=P)
-    told = found.information and found.information.blurred(v.ravel(), sigma)
-    return replace(found, calibration=with_level(wider, found.samples, 0.0, sigma), information=told)
+    updated = found.information and found.information.blurred(v.ravel(), sigma)
+    return replace(found, calibration=with_level(wider, found.samples, 0.0, sigma), information=updated)
 
 
 def _refuse_one_attitude(data: Observations) -> None:

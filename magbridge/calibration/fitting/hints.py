@@ -45,14 +45,16 @@ def undeclared(calibration: Calibration, data: Observations, columns: Mapping[st
     may have taken some of its part; what c adds is measured on parts left out.
     """
     lines: list[str] = []
-    beside: tuple[str, ...] = ()
+    conditional_on: tuple[str, ...] = ()
     first = 0.0
-    while len(beside) < NAMED and (found := worths(calibration, data, columns, beside=beside)):
+    while len(conditional_on) < NAMED and (
+        found := worths(calibration, data, columns, conditional_on=conditional_on)
+    ):
         name = max(found, key=lambda one: found[one])
         if found[name] < WORTHY * first:
             break
         first = first or found[name]
-        beside = (*beside, name)
+        conditional_on = (*conditional_on, name)
         lines.append(
             f"column {name!r} is not declared and moves the field, by about {found[name]:.0f} nT here: "
             f"--parameter {name}"
@@ -65,12 +67,12 @@ def worths(
     data: Observations,
     columns: Mapping[str, FloatArray],
     better: float = BETTER,
-    beside: tuple[str, ...] = (),
+    conditional_on: tuple[str, ...] = (),
 ) -> dict[str, float]:
     """Return what each column (n,) explains of a residual on parts left out, nT; see :func:`undeclared`.
 
     `columns` are (n,), at the n samples. Those that leave more than the share `better` of it are left out,
-    and so are those `beside` which the others are looked at.
+    and so are those that the others are `conditional_on`.
     """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
         return {}
@@ -81,10 +83,10 @@ def worths(
     for name, column in columns.items():
         known = np.isfinite(column) & np.isfinite(residual)
         c = column[known]
-        if name in beside or known.sum() < 10 * PARTS or not np.ptp(c) > 0.0:
+        if name in conditional_on or known.sum() < 10 * PARTS or not np.ptp(c) > 0.0:
             continue
         declared = [_moved(one, direction[known], 3) for one in data.parameters[known].T]
-        given = [_moved(np.nan_to_num(columns[one][known]), direction[known], 2) for one in beside]
+        given = [_moved(np.nan_to_num(columns[one][known]), direction[known], 2) for one in conditional_on]
         plain = np.column_stack([direction[known], np.ones(len(c)), *declared, *given])
         without = _left_out(plain, residual[known])
         # a mass that was in two places has no second power to tell

@@ -47,17 +47,17 @@ def judged(found: Fit, data: Observations) -> Fit:
     ratio = expected_ratio(apart_from_level(calibration), data)
     lasting = found.details.get("autocorrelation", 0.0)
     noise = calibration.noise.sensor
-    doubts = (
-        *_doubts(ratio, noise, heading_gap(data), lasting),
+    warnings = (
+        *_warnings(ratio, noise, heading_gap(data), lasting),
         *rough_rock(data, found.details.get("rock"), noise),
     )
     if ratio > UNSUPPORTED:
-        doubts = (*doubts, *found.open)
-    unsupported = [f"the data do not support this fit: {'; '.join(doubts)}"] if doubts else []
+        warnings = (*warnings, *found.open)
+    unsupported = [f"the data do not support this fit: {'; '.join(warnings)}"] if warnings else []
     seen = combinations(found.samples, calibration.coefficients, max(noise, 1e-9))
     return replace(
         found,
-        calibration=replace(calibration, doubts=doubts),
+        calibration=replace(calibration, warnings=warnings),
         warnings=(
             *unsupported,
             *(found.open if ratio <= UNSUPPORTED else ()),
@@ -74,7 +74,7 @@ def judged(found: Fit, data: Observations) -> Fit:
     )
 
 
-def _doubts(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[str]:
+def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[str]:
     """Say why data do not support a fit: error over `noise` (nT), widest gap of the headings (deg), memory.
 
     `lasting` is the residual's autocorrelation where rock has been taken out of it.

@@ -107,8 +107,10 @@ class Known:
         mine = [(one.name, one.unit) for one in self.parameters]
         theirs = list(zip(data.names, data.units, strict=True))
         if mine != theirs:
-            told = [", ".join(f"{name} [{unit}]" for name, unit in both) or "none" for both in (mine, theirs)]
-            raise CalibrationError(f"known are coefficients for {told[0]}, and the log has {told[1]}")
+            listed = [
+                ", ".join(f"{name} [{unit}]" for name, unit in both) or "none" for both in (mine, theirs)
+            ]
+            raise CalibrationError(f"known are coefficients for {listed[0]}, and the log has {listed[1]}")
         return tuple(
             _widened(one, column) for one, column in zip(self.parameters, data.parameters.T, strict=True)
         )

@@ -113,7 +113,7 @@ def memory(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> NoiseModel:
 
     def unlikely(rho: float, white: float) -> float:
         whitening = Whitening(steps, rho, white)
-        v = whitening.take(e)
+        v = whitening.apply(e)
         return float(0.5 * len(e) * np.log(v @ v) + 0.5 * np.log(whitening.variance).sum())
 
     def shape(x: FloatArray) -> tuple[float, float]:

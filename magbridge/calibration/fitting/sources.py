@@ -18,7 +18,7 @@ from magbridge.errors import CalibrationError
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["idle", "source_of", "unlike"]
+__all__ = ["heterogeneous_logs", "source_of", "unused_logs"]
 
 APART = 3.0
 """RMS of a fit to all logs over that of fits to each: sampling and slow errors alone do not reach it."""
@@ -37,7 +37,7 @@ def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
     return which
 
 
-def idle(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]:
+def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]:
     """Yield a line for each of `logs` that adds no sample to `data`, which were made from all of them."""
     which = source_of(logs, data.time)
     for k, log in enumerate(logs):
@@ -55,8 +55,8 @@ def idle(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]:
         yield f"{log.attrs['source']}: adds no sample to the fit: {why}"
 
 
-def unlike(
-    logs: Sequence[xr.Dataset], data: Observations, found: Fit | None, again: Callable[[Observations], Fit]
+def heterogeneous_logs(
+    logs: Sequence[xr.Dataset], data: Observations, found: Fit | None, refit: Callable[[Observations], Fit]
 ) -> str:
     """Return why logs are not of one vehicle in one state; empty where nothing says so.
 
@@ -68,7 +68,7 @@ def unlike(
         What was fitted.
     found : Fit or None
         The fit to all; None if it collapsed.
-    again : callable
+    refit : callable
         Fits a part of the data in the same way.
     """
     if len(logs) < 2 or (found and found.rms < APART * _scatter(found.residual)):
@@ -78,7 +78,7 @@ def unlike(
     alone: list[tuple[int, float]] = []
     for k in np.argsort(-count, kind="stable")[:JUDGED].tolist():
         try:
-            alone.append((k, again(_moving(data.part(which == k))).rms))
+            alone.append((k, refit(_moving(data.part(which == k))).rms))
         except CalibrationError:  # too little in it for a fit of its own
             continue
     judged = [k for k, _ in alone]

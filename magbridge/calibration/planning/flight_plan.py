@@ -101,10 +101,10 @@ def facts(found: Plan, calibration: Calibration) -> dict[str, Any]:
 def summary(found: Plan, calibration: Calibration) -> str:
     """Return a plan as a table: the runs in order of worth, and the error expected after each."""
     names = [f"{one.name} [{one.unit}]" if one.unit else one.name for one in calibration.parameters]
-    head = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"
+    header = f"{'run':>4} {'pitch':>7} {'roll':>7} {' '.join(f'{name:>14}' for name in names)}"
     lines = [
-        f"{head}  {'error over the mission afterwards, nT: RMS':>40} {'worst':>8}",
-        f"{'none yet':>{len(head)}}  {found.rms[0]:40.2f} {found.worst[0]:8.2f}",
+        f"{header}  {'error over the mission afterwards, nT: RMS':>40} {'worst':>8}",
+        f"{'none yet':>{len(header)}}  {found.rms[0]:40.2f} {found.worst[0]:8.2f}",
     ]
     for number, run in enumerate(found.runs, 1):
         positions = " ".join(f"{value:14.3f}" for value in run.parameters)

@@ -141,8 +141,8 @@ class Design:
         found = []
         for F in factors:
             U = PC @ F
-            gain = np.einsum("ij,ji->i", U, np.linalg.solve(np.eye(F.shape[1]) + F.T @ C @ F, U.T))
-            found.append(np.mean(np.maximum(before - gain, 0.0) ** POWER))
+            reduction = np.einsum("ij,ji->i", U, np.linalg.solve(np.eye(F.shape[1]) + F.T @ C @ F, U.T))
+            found.append(np.mean(np.maximum(before - reduction, 0.0) ** POWER))
         return np.array(found)
 
 

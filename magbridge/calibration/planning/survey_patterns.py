@@ -179,7 +179,7 @@ def facts(found: list[Proposal]) -> dict[str, Any]:
 
 def summary(found: list[Proposal]) -> str:
     """Return the proposals as a table."""
-    head = (
+    header = (
         f"{'survey':52} {'met again':>9} {'error about the mean over the mission, nT: RMS':>48} {'worst':>7}"
     )
     lines = [f"{one.name:52} {one.crossings:9} {one.rms:48.2f} {one.worst:7.2f}" for one in found]
@@ -187,4 +187,4 @@ def summary(found: list[Proposal]) -> str:
         f"over rock of {ROCK:.0f} nT and {LENGTH:.0f} m, nothing known of the vehicle, no calibration run, "
         "no map; the level stays as uncertain as the main field's"
     )
-    return "\n".join([head, *lines, note])
+    return "\n".join([header, *lines, note])

@@ -10,13 +10,13 @@ import numpy as np
 from magbridge.diagnose.assessment.numbers import motion, times_usual
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.words import names_of, number, series_of
 
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
-__all__ = ["IMPLAUSIBLE", "Note", "contested", "notes", "rivalled"]
+__all__ = ["IMPLAUSIBLE", "Note", "contested", "not_separated", "notes"]
 
 IMPLAUSIBLE = 5.0
 """Multiple of its plausible size above which a cause is doubted."""
@@ -36,7 +36,7 @@ def notes(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[Note]:
         *_of_shape(finding),
         *_of_size(finding),
         *_of_motion(diagnosis, finding),
-        *rivalled(finding.candidate, cause, finding.rivals, finding.chance_alone),
+        *not_separated(finding.candidate, cause, finding.competing, finding.chance_alone),
         *_of_use(diagnosis, finding),
     ]
 
@@ -99,7 +99,7 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
             "It is not in the extended calibration: live, a rate of change is a backward difference, whose "
             "noise would exceed what the correction improves.",
         )
-    if not finding.gain.shown:
+    if not finding.improvement.shown:
         yield Note(
             "no_improvement",
             "It shows no improvement on what was left out of the fit: it may be a remnant of another effect.",
@@ -113,20 +113,22 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
 
 def contested(finding: Finding) -> bool:
     """Say whether another cause, not only another series, remains possible."""
-    return any(rival.candidate.cause != finding.candidate.cause for rival in finding.rivals)
+    return any(hypothesis.candidate.cause != finding.candidate.cause for hypothesis in finding.competing)
 
 
-def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance: float) -> Iterator[Note]:
+def not_separated(
+    candidate: Candidate, cause: Cause, competing: Sequence[CompetingHypothesis], chance: float
+) -> Iterator[Note]:
     """Say which causes could take its place, what would tell them apart, and what theory expects."""
     theory = (
         "By theory, an effect of this size in such a log would be told from all other known causes in "
         f"{'more than 99' if chance > 0.995 else f'{100 * chance:.0f}'} of 100 cases"
     )
     alone = "No other known cause explains the data nearly as well (none comes within odds of 20:1)."
-    if not rivals:
+    if not competing:
         yield Note("alone", f"Alternatives: none. {alone} {theory}.", {"chance_alone": chance})
-    elif all(rival.candidate.cause == candidate.cause for rival in rivals):
-        series = ", ".join(str(series_of(rival.candidate)) for rival in rivals)
+    elif all(hypothesis.candidate.cause == candidate.cause for hypothesis in competing):
+        series = ", ".join(str(series_of(hypothesis.candidate)) for hypothesis in competing)
         yield Note(
             "series_uncertain",
             f"Alternatives: only in the series. {alone} Which series it follows is less sure: {series} would "
@@ -136,7 +138,7 @@ def rivalled(candidate: Candidate, cause: Cause, rivals: Sequence[Rival], chance
     else:
         yield Note(
             "contested",
-            f"Alternatives: the data cannot tell it from {names_of(rivals, ' or ')} (odds below 20:1). "
+            f"Alternatives: the data cannot tell it from {names_of(competing, ' or ')} (odds below 20:1). "
             f"{theory}; here it was not. To tell them apart: {cause.separated_by}.",
             {"chance_alone": chance},
         )

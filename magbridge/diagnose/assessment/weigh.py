@@ -98,7 +98,7 @@ class Assessment:
 
 def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
     """Weigh a diagnosis; `causes` is the table that was asked about."""
-    problem, left = diagnosis.problem, diagnosis.fit.left / diagnosis.problem.gain
+    problem, residual = diagnosis.problem, diagnosis.fit.residual / diagnosis.problem.reference_jacobian
     shift = level(problem, diagnosis.possible, diagnosis.calibration)
     track = returns(problem.survey)
     against = _against(diagnosis, causes, shift, track) if diagnosis.named else []
@@ -115,8 +115,8 @@ def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
         level=shift,
         delays=delays(problem, diagnosis.fit),
         budget=budget(diagnosis),
-        residual=memory(problem, left),
-        follows=seen(problem, left),
+        residual=memory(problem, residual),
+        follows=seen(problem, residual),
         returns=track,
     )
 
@@ -199,7 +199,7 @@ def _against(
         if times >= IMPLAUSIBLE:
             text = f"{_name(one)} is {number(times, 2)} times the usual size."
             found.append(Note("implausible_size", text, {"times_usual": times}))
-    if idle := [one for one in made if not one.gain.shown]:
+    if idle := [one for one in made if not one.improvement.shown]:
         text = f"No improvement of its own on what was left out: {', '.join(map(_name, idle))}."
         found.append(Note("no_improvement", text))
     if rest:

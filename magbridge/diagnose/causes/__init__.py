@@ -42,7 +42,7 @@ class Cause(NamedTuple):
     needs : str
         What a log must contain for it to be tested.
     separated_by : str
-        The manoeuvre that tells it from its rivals.
+        The manoeuvre that tells it from its competing hypotheses.
     meaning : str
         What it means, as a clause.
     """

@@ -43,7 +43,7 @@ class Candidate:
         Nonlinear parameters: name -> (value, unit).
     rebuild : callable or None
         Shape's values -> the same candidate with those: for profiling.
-    trials : float
+    look_elsewhere : float
         Number of independent hypotheses that this one was picked from (frequencies searched).
     positive : bool
         Its coefficients cannot be negative.
@@ -73,7 +73,7 @@ class Candidate:
     effects: tuple[Effect, ...] = ()
     shape: dict[str, tuple[float, str]] = field(default_factory=dict)
     rebuild: Callable[..., Candidate] | None = None
-    trials: float = 1.0
+    look_elsewhere: float = 1.0
     positive: bool = False
     likelier: float = 0.0
     narrow: float = 0.0
@@ -196,5 +196,5 @@ def of_reference(
 
     `basis` gives (m, k) of m rows; `width` (k,) is the usual size of each coefficient, nT.
     """
-    columns = lambda rows: problem.gain[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
+    columns = lambda rows: problem.reference_jacobian[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
     return Candidate(cause, None, columns, width, names, ("nT",) * len(width), about=about)

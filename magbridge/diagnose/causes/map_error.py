@@ -56,7 +56,7 @@ def map_error(problem: Problem) -> list[Candidate]:
         return []
     Z, cell = _cells(place)
     weights, corners = _between(place, cell)
-    seen = diags_array(problem.gain) @ weights
+    seen = diags_array(problem.reference_jacobian) @ weights
     depths, lengths = place[:, 2].max() + cell * SCALES, 2.0 * cell * SCALES
     lacking = _expanded([partial(_lacking, d=d) for d in depths], Z, corners)
     drawn = _expanded([partial(_matern, length=length) for length in lengths], Z, corners)

@@ -71,7 +71,7 @@ def interference_tone(problem: Problem) -> list[Candidate]:
         return []
     flat = np.append(0.0, np.diff(problem.residual) * survey.follows()[1:])
     size = 1 << int(np.ceil(np.log2(slots[-1] + 1)) + 1)
-    body = problem.slopes[:, 6:]
+    body = problem.jacobian[:, 6:]
     lines = np.array([np.fft.rfft(np.bincount(slots, flat * slope, minlength=size)) for slope in body.T])
     # power in all three axes together; the inverse keeps what they share from counting twice
     power = np.einsum("if,ij,jf->f", lines.conj(), np.linalg.inv(body.T @ body), lines).real
@@ -86,7 +86,7 @@ def interference_tone(problem: Problem) -> list[Candidate]:
         names = tuple(f"{f} {axis}" for f in ("cos", "sin") for axis in AXES)
         return of_effect(
             problem, effect, 10.0, "nT", names=names, shape={"period": (period, "s")}, rebuild=rebuild,
-            trials=0.5 * len(t),
+            look_elsewhere=0.5 * len(t),
         )  # fmt: skip
 
     for _ in range(5):

@@ -87,7 +87,7 @@ def _shortened(problem: Problem) -> Candidate:
     :attr:`~.compare.problem.Problem.reading`, because it would correlate with the noise of its own sample.
     """
     bend = rates(problem.survey, problem.reading.T, 2).T
-    columns = -0.5 * np.einsum("ij,ij->i", problem.slopes[:, 6:], bend)[:, None]
+    columns = -0.5 * np.einsum("ij,ij->i", problem.jacobian[:, 6:], bend)[:, None]
     return Candidate(
         "filter_lag", None, columns.__getitem__, np.ones(1), ("variance",), ("s^2",), positive=True
     )

@@ -12,7 +12,15 @@ from scipy.sparse import csr_array
 from magbridge.arrays import BoolArray, FloatArray
 
 __all__ = [
-    "Columns", "Interpolated", "Mixture", "Since", "beside", "parts", "places", "size_of", "times",
+    "Columns",
+    "Interpolated",
+    "Mixture",
+    "Since",
+    "parts",
+    "places",
+    "side_by_side",
+    "size_of",
+    "times",
     "together",
 ]  # fmt: skip
 
@@ -114,7 +122,7 @@ def together(columns: Sequence[Columns]) -> Mixture:
     return Mixture(tuple(found.items()))
 
 
-def beside(blocks: Sequence[FloatArray]) -> FloatArray:
+def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
     """(m, k) blocks of columns side by side, stored column by column."""
     out = np.empty((sum(block.shape[1] for block in blocks), len(blocks[0])))
     return np.concatenate([block.T for block in blocks], out=out).T

@@ -95,13 +95,13 @@ def _without_repeats(
     """
     L = _factor(calibration.covariance)
     centre = np.zeros(L.shape[1])
-    again = np.flatnonzero(survey.fitted)
-    if not again.size:
+    repeated = np.flatnonzero(survey.fitted)
+    if not repeated.size:
         return L, centre
-    J = derivatives(calibration, samples.part(again), g[again], L)
+    J = derivatives(calibration, samples.part(repeated), g[repeated], L)
     noise = calibration.noise
-    steps = np.asarray(survey.steps[again] * (survey.interval / noise.interval if noise.interval else 1.0))
-    white = np.column_stack([J, e[again]])
+    steps = np.asarray(survey.steps[repeated] * (survey.interval / noise.interval if noise.interval else 1.0))
+    white = np.column_stack([J, e[repeated]])
     white = whiten(white, steps, noise.autocorrelation, noise.white) / noise_sigma(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)

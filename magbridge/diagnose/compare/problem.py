@@ -68,11 +68,11 @@ class Problem:
         nT, ``H_r - e w / |w|^2``: for effects that depend on the reading, which must not contain its noise.
     residual : (n,) array
         e, in the sensor's nanotesla.
-    slopes : (n, 9) array
+    jacobian : (n, 9) array
         g.
-    gain : (n,) array
+    reference_jacobian : (n,) array
         1/s of :mod:`magbridge.calibration.residual`: e per nT by which the true field exceeds the reference.
-    late : (n, 3) array
+    delay_jacobian : (n, 3) array
         ``-de/dz`` of the delays, in units of :data:`DELAY`.
     directions : (K, q) array
         L; zero for the delays.
@@ -86,9 +86,9 @@ class Problem:
     calibration: Calibration
     reading: FloatArray
     residual: FloatArray
-    slopes: FloatArray
-    gain: FloatArray
-    late: FloatArray
+    jacobian: FloatArray
+    reference_jacobian: FloatArray
+    delay_jacobian: FloatArray
     directions: FloatArray
     centre: FloatArray
     unseen: FloatArray
@@ -108,26 +108,26 @@ class Problem:
         return Series(self.survey.time[rows], self.reading[rows], values, self.calibration.kernel)
 
     @cached_property
-    def free(self) -> FloatArray:
-        """(n, q) ``-de/dz``; the delays' are :attr:`late`."""
+    def calibration_jacobian(self) -> FloatArray:
+        """(n, q) ``-de/dz``; the delays' are :attr:`delay_jacobian`."""
         samples, _ = samples_of(self.survey, self.calibration)
-        free = derivatives(self.calibration, samples, self.slopes, -self.directions)
-        free[:, DELAYS] = self.late
-        return free
+        found = derivatives(self.calibration, samples, self.jacobian, -self.directions)
+        found[:, DELAYS] = self.delay_jacobian
+        return found
 
     def let_go(self) -> None:
-        """Release the memory of :attr:`free` (300 MB for a month); it is computed again when needed."""
-        self.__dict__.pop("free", None)
+        """Release :attr:`calibration_jacobian` (300 MB for a month); it is computed again when needed."""
+        self.__dict__.pop("calibration_jacobian", None)
 
     @property
     def stated(self) -> FloatArray:
         """(n,) nT², variance that the calibration states: of the noise, and of its coefficients."""
-        noise, free = self.calibration.noise, self.free[:, : DELAYS.start]
-        return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", free, free))
+        noise, J = self.calibration.noise, self.calibration_jacobian[:, : DELAYS.start]
+        return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", J, J))
 
     def straight(self, z: FloatArray) -> FloatArray:
         """(n,) residual without what the channels' delays in z (q,) add to it."""
-        return np.asarray(self.residual - self.late @ z[DELAYS])
+        return np.asarray(self.residual - self.delay_jacobian @ z[DELAYS])
 
 
 def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
@@ -163,11 +163,11 @@ class Products:
     def __call__(self, rows: slice) -> FloatArray:
         """(m, pairs) these rows."""
         functions, slots = zip(*self.pairs, strict=True)
-        slopes = self.problem.slopes.T[_run(slots), rows]
+        jacobian = self.problem.jacobian.T[_run(slots), rows]
         if self.phi is None:
-            return np.asarray(slopes).T
+            return np.asarray(jacobian).T
         shared = len(set(functions)) == 1
-        return np.asarray(self.phi(rows)[_run(functions[:1] if shared else functions)] * slopes).T
+        return np.asarray(self.phi(rows)[_run(functions[:1] if shared else functions)] * jacobian).T
 
 
 def _run(places: Sequence[int]) -> slice | list[int]:
@@ -219,7 +219,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     """Linearise the comparison about `calibration`."""
     samples, coefficients = samples_of(survey, calibration)
     n = len(survey)
-    e, g, gain, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))
+    e, g, reference_jacobian, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))
     for start in range(0, n, CHUNK):
         rows = slice(start, start + CHUNK)
         part = samples.part(rows)
@@ -228,7 +228,7 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
         reading[rows] = part.field + (e[rows] / (away * away).sum(axis=1))[:, None] * away
         _, g[rows] = residuals(replace(part, field=reading[rows]), coefficients)
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
-        gain[rows] = e[rows] - above
+        reference_jacobian[rows] = e[rows] - above
     L, centre = prior(survey, calibration, samples, e, g)
     seen = np.zeros((L.shape[1],) * 2)
     for start in range(0, n, CHUNK):
@@ -238,6 +238,17 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     values, vectors = np.linalg.eigh(seen / noise_sigma(calibration, e) ** 2)
     keep = values > SEEN
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
-    late = -DELAY * g[:, 6:] * interpolation_error(survey, reading.T).T
+    delay_jacobian = -DELAY * g[:, 6:] * interpolation_error(survey, reading.T).T
     directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
-    return Problem(survey, calibration, reading, e, g, gain, late, directions, centre, rest @ rest.T)
+    return Problem(
+        survey,
+        calibration,
+        reading,
+        e,
+        g,
+        reference_jacobian,
+        delay_jacobian,
+        directions,
+        centre,
+        rest @ rest.T,
+    )

@@ -25,7 +25,7 @@ CELL = 250.0
 """m, side of the cells: rock is seldom nearer, and a map's own grid seldom finer."""
 AWAY = 900.0
 """s after which passing a place again is a return."""
-TOLD = 0.1
+SEPARABLE = 0.1
 """Least share from which place and time are told apart: at S/N 10 that is worth 5 nats, odds of 150:1."""
 
 
@@ -38,33 +38,33 @@ class Returns(NamedTuple):
         Of the samples, that lie where the track passes again.
     longest : float
         s, the longest time between two passes of one place.
-    told : float
+    separable : float
         Least share of the power of a slow change with time that no function of the place imitates.
     """
 
     share: float
     longest: float
-    told: float
+    separable: float
 
     @property
     def apart(self) -> bool:
         """Whether the log tells place from time."""
-        return self.told >= TOLD
+        return self.separable >= SEPARABLE
 
     @property
     def text(self) -> str:
         """The same in words."""
-        told = "an error of the map and a slow change with time (a daily variation)"
+        both = "an error of the map and a slow change with time (a daily variation)"
         if not self.share:
-            return f"The track never returns to a place: {told} cannot be told apart."
+            return f"The track never returns to a place: {both} cannot be told apart."
         again = (
             f"The track passes {100.0 * self.share:.0f} % of its places again, up to "
             f"{self.longest / 3600.0:.1f} h later"
         )
         if self.apart:
-            return f"{again}: {told} can be told apart."
-        like = f"imitates {100.0 * (1.0 - self.told):.0f} % of the other's power"
-        return f"{again}, but at times at which one {like}: {told} cannot be told apart."
+            return f"{again}: {both} can be told apart."
+        like = f"imitates {100.0 * (1.0 - self.separable):.0f} % of the other's power"
+        return f"{again}, but at times at which one {like}: {both} cannot be told apart."
 
 
 def returns(survey: Survey) -> Returns | None:
@@ -87,6 +87,6 @@ def returns(survey: Survey) -> Returns | None:
     count = np.bincount(of)[:, None]
     means = np.stack([np.bincount(of, column) for column in f.T], axis=1) / count
     within = f - means[of]
-    told = float(eigh(within.T @ within, f.T @ f, eigvals_only=True)[0])
+    separable = float(eigh(within.T @ within, f.T @ f, eigvals_only=True)[0])
     longest = float(np.max(np.where(passed, time[last] - time[first], 0.0)))
-    return Returns(float(np.mean(passed[of])), longest, float(np.clip(told, 0.0, 1.0)))
+    return Returns(float(np.mean(passed[of])), longest, float(np.clip(separable, 0.0, 1.0)))

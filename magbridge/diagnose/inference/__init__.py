@@ -8,7 +8,7 @@ columns of a hypothesis, and :mod:`.joint` fits them together with calibration a
 
 *The search.* :mod:`.search` adds cause after cause, each in a round of the :mod:`.state`.
 :mod:`.profile_likelihood` refines nonlinear parameters, :mod:`.exchange` replaces causes by their
-:mod:`.rivals`, also in :mod:`.pairs`.
+:mod:`.competing`, also in :mod:`.pairs`.
 
 *What it is worth.* :mod:`.nonlinear_uncertainty` widens the covariance, :mod:`.outliers` tests for isolated
 wrong samples, and :mod:`.isolability` and :mod:`.naming` say what such a log could have shown at all.

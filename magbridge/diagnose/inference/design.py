@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.compare.design_columns import Columns, beside, places, size_of, times
+from magbridge.diagnose.compare.design_columns import Columns, places, side_by_side, size_of, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
@@ -57,26 +57,26 @@ class Design:
     """
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
-        self.free, self.columns = problem.free, columns
+        self.calibration_jacobian, self.columns = problem.calibration_jacobian, columns
         self.pieces = pieces(len(problem))
         sizes = [size_of(column) for column in columns]
-        self.at, self.effects = places(sizes, self.free.shape[1]), sum(sizes)
+        self.at, self.effects = places(sizes, self.calibration_jacobian.shape[1]), sum(sizes)
 
     def rows(self, rows: slice) -> FloatArray:
         """(m, q + k) rows of all columns."""
-        return beside([self.free[rows], *(column(rows) for column in self.columns)])
+        return side_by_side([self.calibration_jacobian[rows], *(column(rows) for column in self.columns)])
 
     def times(self, c: FloatArray) -> FloatArray:
         """(n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
         asked = [(own, column) for own, column in zip(self.at, self.columns, strict=True) if c[own].any()]
 
         def piece(rows: slice) -> FloatArray:
-            out = np.asarray(self.free[rows] @ c[: self.free.shape[1]])
+            out = np.asarray(self.calibration_jacobian[rows] @ c[: self.calibration_jacobian.shape[1]])
             for own, column in asked:
                 out += times(column, rows, c[own])
             return out
 
-        return np.concatenate(in_threads(len(self.free), piece, self.pieces))
+        return np.concatenate(in_threads(len(self.calibration_jacobian), piece, self.pieces))
 
 
 def normal(

@@ -39,19 +39,19 @@ from magbridge.diagnose.inference.statistic import Statistic
 __all__ = [
     "IDEAL",
     "LEVEL",
-    "MOST_LEFT",
+    "MOST_REMAINING",
     "ODDS",
     "REMNANT",
     "SMOOTH",
     "Score",
+    "bayes_factor_threshold",
     "evidence_of",
     "log_bayes",
     "log_odds",
-    "margin",
+    "look_elsewhere_factors",
     "one_sided",
     "regressor_error",
     "score",
-    "trials",
 ]
 
 LEVEL = 0.01
@@ -60,14 +60,14 @@ ODDS = float(np.log(20.0))
 """Log evidence by which a cause with an exact regressor must win to be named alone."""
 IDEAL = 0.2
 """Error of an idealised regressor, as a share of its norm: a cause that explains less by no more than that
-is a rival."""
+competes with it."""
 REMNANT = 0.3
 """Share of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor,
 not another cause.
 
 The price: a second cause that weak is not named beside it.
 """
-SMOOTH, MOST_LEFT = 0.1, 8.0
+SMOOTH, MOST_REMAINING = 0.1, 8.0
 """The same of a Gaussian process, and the most that it leaves: it takes any shape, but not any equally, and
 what a map's error leaves of itself is slow in time, too."""
 SIMULATIONS = 400
@@ -118,7 +118,7 @@ def one_sided(ratio: float | FloatArray) -> FloatArray:
     return np.asarray(np.log(2.0) + log_ndtr(np.sqrt(ratio)))
 
 
-def margin(ratio: float) -> float:
+def bayes_factor_threshold(ratio: float) -> float:
     """Log evidence by which a cause of this likelihood ratio must win to be named alone.
 
     The error of its regressor is allowed for.
@@ -131,7 +131,9 @@ def regressor_error(ratio: float) -> float:
     return 0.5 * IDEAL**2 * ratio
 
 
-def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slice]) -> dict[str, float]:
+def look_elsewhere_factors(
+    info: Information, candidates: Sequence[Candidate], at: Sequence[slice]
+) -> dict[str, float]:
     """Return the number of independent hypotheses behind each cause."""
     causes = dict.fromkeys(candidate.cause for candidate in candidates)
     found = {}
@@ -142,7 +144,7 @@ def trials(info: Information, candidates: Sequence[Candidate], at: Sequence[slic
         count = _independent(info.matrix[np.ix_(index, index)], free, LEVEL / len(causes))
         # candidates of one common size count as independent: an upper bound
         count += len(members) - len(free)
-        found[cause] = max(1.0, count) * max(candidates[k].trials for k in members)
+        found[cause] = max(1.0, count) * max(candidates[k].look_elsewhere for k in members)
     return found
 
 
@@ -172,7 +174,9 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
     return len(seen) * float(np.mean(1.0 / np.sum(passed, axis=0)))
 
 
-def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, float], shaped: float) -> float:
+def log_odds(
+    ratio: float, model: Sequence[Candidate], look_elsewhere: Mapping[str, float], shaped: float
+) -> float:
     """Log posterior odds of a whole model of this likelihood ratio against no effect.
 
     `shaped` is the part of it that is left beside causes that take any shape (:func:`~.state.shaped_ratio`).
@@ -184,8 +188,8 @@ def log_odds(ratio: float, model: Sequence[Candidate], trials: Mapping[str, floa
     profiled, too, and do not pay for it.
     """
     regressors, free = sum(len(c.pieces) for c in model), sum(c.size for c in model if c.spectra is None)
-    further = max(regressors - 1, 0) * (ODDS + float(np.log(len(trials))))
-    prices = sum(len(c.pieces) * float(np.log(trials[c.cause])) for c in model)
+    further = max(regressors - 1, 0) * (ODDS + float(np.log(len(look_elsewhere))))
+    prices = sum(len(c.pieces) * float(np.log(look_elsewhere[c.cause])) for c in model)
     prices += sum(float(np.log(len(c.spectra))) for c in model if c.spectra is not None)
     known = sum(c.likelier + float(np.log(2.0)) * c.positive for c in model)
     worth = float(log_bayes(shaped, free)) if free else 0.5 * shaped

@@ -1,4 +1,4 @@
-"""Exchange causes for their rivals, or drop them: those found first were chosen without those found later."""
+"""Exchange causes for competing hypotheses, or drop them: the first were found without the later."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from itertools import combinations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.inference.competing import competing_hypotheses
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.profile_likelihood import refined
-from magbridge.diagnose.inference.rivals import rivals_of
 from magbridge.diagnose.inference.state import State
 
 __all__ = ["exchanged"]
@@ -40,10 +40,10 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
 
 def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], list[int]]]:
     """List replacements and the places they would take: first none in each place, then the likeliest."""
-    info = state.beside(pieces, base)
+    info = state.conditional_on(pieces, base)
     found = []
     if len(pieces) == 1:
-        found = [(r.behind, [r.candidate], [0]) for r in rivals_of(state, info, pieces, base, 0)]
+        found = [(r.behind, [r.candidate], [0]) for r in competing_hypotheses(state, info, pieces, base, 0)]
     everywhere = range(len(pieces))
     for places in [*combinations(everywhere, 1), *combinations(everywhere, 2)]:
         for pair in pairs_of(state, info, pieces, base, *places):

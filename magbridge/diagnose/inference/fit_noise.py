@@ -151,13 +151,13 @@ def fit_noise(
     for _ in range(ROUNDS):
         if whole.sum() > 2 * order:
             ar = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
-        beside_gaps = Predictors(past, ar)
-        v = beside_gaps.innovations(residual)
+        near_gaps = Predictors(past, ar)
+        v = near_gaps.innovations(residual)
         if blocks is None:
             blocks = _uneven(v, count)
         before = log_likelihood
         nu, scale, log_likelihood = _tails(v, count if blocks else np.array([n]), nu)
-        log_likelihood += float(np.log(beside_gaps.f)[past.pattern].sum())
+        log_likelihood += float(np.log(near_gaps.f)[past.pattern].sum())
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
         if abs(log_likelihood - before) < SETTLED:
             break

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.diagnose.compare.design_columns import Columns, beside, parts, places, together
+from magbridge.diagnose.compare.design_columns import Columns, parts, places, side_by_side, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import ALL, normal
 from magbridge.diagnose.inference.joint import Joint
@@ -87,13 +87,13 @@ def information(
     The first `strangers` of them share no parts with any other, and their products with each other are not
     computed.
     """
-    q, shared = problem.free.shape[1], together(columns).parts
+    q, shared = problem.calibration_jacobian.shape[1], together(columns).parts
     alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:strangers]), q)
     others = slice(alone[-1].stop if alone else q, None)
     asked = [(slice(q), slice(None)), *zip(alone, alone, strict=True), (others, slice(q, None))]
     G, b = normal(
-        lambda rows: beside([problem.free[rows], *(X(rows) for X, _ in shared)]),
-        noise.response(base.left),
+        lambda rows: side_by_side([problem.calibration_jacobian[rows], *(X(rows) for X, _ in shared)]),
+        noise.response(base.residual),
         noise,
         asked if strangers else ALL,
     )

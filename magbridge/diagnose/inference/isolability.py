@@ -85,7 +85,7 @@ def _threshold(freedom: int, hypotheses: float, chance: float) -> float:
 def isolability(
     candidates: Sequence[Candidate],
     info: Information,
-    trials: Mapping[str, float],
+    look_elsewhere: Mapping[str, float],
     causes: int,
     untestable: Mapping[str, str],
 ) -> Isolability:
@@ -94,7 +94,10 @@ def isolability(
     picked = _most_visible(candidates, info, at)
     visible = [
         _visible(
-            candidates[k], info, at[k], candidates[k].tail * causes * trials.get(candidates[k].cause, 1.0)
+            candidates[k],
+            info,
+            at[k],
+            candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0),
         )
         for k in picked
     ]

@@ -46,7 +46,7 @@ class Joint:
         Of the effects, in units of their prior width.
     covariance : (q + k, q + k) array
     noise : Noise
-    left : (n,) array
+    residual : (n,) array
         nT, what is left of the residual.
     prior : (q + k,) array
         Prior precision of every coefficient, effects in units of their widths.
@@ -57,7 +57,7 @@ class Joint:
     coefficients: FloatArray
     covariance: FloatArray
     noise: Noise
-    left: FloatArray
+    residual: FloatArray
     prior: FloatArray
 
     @property
@@ -99,7 +99,7 @@ def fit_joint(
     plain : bool
         Try the result of plain least squares as a starting point, too.
     spectra : sequence of (l, k) array or None
-        For each of `columns` whose coefficients have one common free size (:mod:`.statistic`): l alternatives
+        For each of `columns` whose coefficients have one common size (:mod:`.statistic`): l alternatives
         for their prior variances.
     like : Joint, optional
         A fit of similar noise, from which this one's begins: saves time.
@@ -111,7 +111,7 @@ def fit_joint(
         At most.
     """
     X = Design(problem, precomputed(len(problem), columns))
-    q, k = X.free.shape[1], X.effects
+    q, k = X.calibration_jacobian.shape[1], X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]
     common += [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
@@ -119,9 +119,9 @@ def fit_joint(
     past = problem.survey.past(order)
 
     def at(c: FloatArray) -> tuple[FloatArray, Noise]:
-        left = problem.residual - X.times(c)
+        residual = problem.residual - X.times(c)
         known = None if like is None else like.noise
-        return left, fit_noise(left, past, blocks=blocks, like=known, brief=brief)
+        return residual, fit_noise(residual, past, blocks=blocks, like=known, brief=brief)
 
     def value(c: FloatArray, noise: Noise) -> float:
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)
@@ -134,10 +134,10 @@ def fit_joint(
     for own, _ in common:
         prior[own] = FLAT  # no size is known yet
     tries = in_threads(len(problem), lambda c: (c, *at(c)), first)
-    c, left, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
+    c, residual, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
     del tries  # of a month each is 15 MB
     for step in range(rounds + 1):
-        P, b = normal(X.rows, noise.response(left), noise)
+        P, b = normal(X.rows, noise.response(residual), noise)
         for own, spectrum in common:
             prior[own] = _sized(P, b + P @ c + prior * centre, prior, own, spectrum)
         P += np.diag(prior)
@@ -147,12 +147,12 @@ def fit_joint(
         tried = at(moved)
         gained = value(moved, tried[1]) - value(c, noise)
         if gained > 0.0:
-            c, (left, noise) = moved, tried
+            c, (residual, noise) = moved, tried
         if gained < 0.02:  # converged: P need not be computed again
             break
     covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
     volume = sum(volume_of(covariance[own, own], prior[own]) for own, _ in common)
-    return Joint(value(c, noise) - volume, c[:q], c[q:], covariance, noise, left, prior)
+    return Joint(value(c, noise) - volume, c[:q], c[q:], covariance, noise, residual, prior)
 
 
 def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
@@ -176,8 +176,8 @@ def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArra
     level = robust_scale(residual - np.median(residual)) + 1e-12
     P, b = normal(X.rows, residual)
     c = centre + np.linalg.solve(P / level**2 + np.diag(prior), (b - P @ centre) / level**2)
-    left = residual - X.times(c)
-    level = robust_scale(left) + 1e-12
-    cut = np.clip(left, *(np.median(left) + np.array([-8.0, 8.0]) * level))
+    residual = residual - X.times(c)
+    level = robust_scale(residual) + 1e-12
+    cut = np.clip(residual, *(np.median(residual) + np.array([-8.0, 8.0]) * level))
     b = normal(X.rows, cut, asked=())[1]
     return np.asarray(c + np.linalg.solve(P / level**2 + np.diag(prior), b / level**2 - prior * (c - centre)))

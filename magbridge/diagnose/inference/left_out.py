@@ -37,7 +37,7 @@ FOLDS = 8
 class HeldOut(NamedTuple):
     """(n,) residual, nT, of every sample under a fit that never saw its dive; and the model's score."""
 
-    left: FloatArray
+    residual: FloatArray
     score: float
 
 
@@ -68,10 +68,10 @@ def held_out(
     whole_P, whole_b = P.sum(axis=0) + np.diag(prior), b.sum(axis=0) + prior * centre
     others = whole_P - P
     without = np.linalg.solve(others, (whole_b - b)[:, :, None])[:, :, 0]
-    left = np.empty(len(problem))
+    residual = np.empty(len(problem))
     for rows in X.pieces:
-        left[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), without[of[rows]])
+        residual[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), without[of[rows]])
     away = c - without
     learned = np.einsum("fi,fij,fj->", away, others, away)
     learned += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
-    return HeldOut(left, noise.log_likelihood - 0.5 * float(learned))
+    return HeldOut(residual, noise.log_likelihood - 0.5 * float(learned))

@@ -5,11 +5,11 @@ It depends on telemetry, attitude and noise, not on the residual.
 Notes
 -----
 With the information S of all candidates, a cause j whose coefficients b have the signal-to-noise
-``a^2 = b^T S_jj b`` gives a rival i the likelihood ratio ``R_i = s^T S_ii^-1 s``, ``s = S_ij b``: the part
-that the rival can imitate. The difference of the two ratios is normal about ``a^2 - R_i = delta^2`` with
-standard deviation ``2 delta`` (two subspaces in Gaussian noise), so the log evidence by which the truth wins
-has the standard deviation delta, and the chance that it exceeds :func:`~.evidence.margin` is a normal
-integral. Rivals are taken as independent.
+``a^2 = b^T S_jj b`` gives a competing hypothesis i the likelihood ratio ``R_i = s^T S_ii^-1 s``,
+``s = S_ij b``: the part that it can imitate. The difference of the two ratios is normal about
+``a^2 - R_i = delta^2`` with standard deviation ``2 delta`` (two subspaces in Gaussian noise), so the log
+evidence by which the truth wins has the standard deviation delta, and the chance that it exceeds
+:func:`~.evidence.bayes_factor_threshold` is a normal integral. Competing hypotheses are taken as independent.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import chi2, ncx2, norm
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.inference.evidence import LEVEL, log_bayes, margin
+from magbridge.diagnose.inference.evidence import LEVEL, bayes_factor_threshold, log_bayes
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.inference.statistic import Statistic
@@ -32,7 +32,7 @@ def chances_alone(
     candidates: Sequence[Candidate],
     info: Information,
     named: Sequence[Hypothesis],
-    trials: Mapping[str, float],
+    look_elsewhere: Mapping[str, float],
     causes: int,
 ) -> list[float]:
     """Return the chance of each cause, of this size and direction, to be named alone in such a log.
@@ -45,7 +45,7 @@ def chances_alone(
         Of their columns and, last, of those that are named.
     named : sequence of Hypothesis
         The causes in question.
-    trials : mapping
+    look_elsewhere : mapping
         Cause -> number of independent hypotheses behind it.
     causes : int
         Number of causes in the table.
@@ -68,8 +68,10 @@ def chances_alone(
                 continue
             ratio = float(statistic.ratio(part[:, None])[0])
             delta = max(np.sqrt(max(a2 - ratio, 0.0)), 1e-3)
-            wins = float(norm.cdf((truth - log_bayes(ratio + free, free) - margin(a2)) / delta))
-            limit = chi2.isf(LEVEL / (other.tail * trials.get(other.cause, 1.0) * causes), free)
+            wins = float(
+                norm.cdf((truth - log_bayes(ratio + free, free) - bayes_factor_threshold(a2)) / delta)
+            )
+            limit = chi2.isf(LEVEL / (other.tail * look_elsewhere.get(other.cause, 1.0) * causes), free)
             detected = float(ncx2.sf(limit, free, max(ratio, 1e-9)))
             chances[other.cause] = min(chances.get(other.cause, 1.0), 1.0 - (1.0 - wins) * detected)
         found.append(float(np.prod(list(chances.values()))) if a2 > 0.0 else 0.0)

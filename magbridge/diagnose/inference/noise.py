@@ -90,7 +90,7 @@ class Noise:
         return 1.0 / (1.0 - float(size))
 
     @cached_property
-    def beside_gaps(self) -> Predictors:
+    def near_gaps(self) -> Predictors:
         """Predictors of the samples shortly after a gap."""
         return Predictors(self.past, self.ar)
 
@@ -138,7 +138,7 @@ class Noise:
 
     def _weights(self, rows: slice) -> FloatArray:
         """(m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
-        past, gaps = self.past, self.beside_gaps
+        past, gaps = self.past, self.near_gaps
         weights = np.tile(np.append(1.0, -self.ar), (rows.stop - rows.start, 1))
         some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
         weights[past.rows[some] - rows.start] = gaps.weights[past.pattern[some]]
@@ -147,12 +147,12 @@ class Noise:
 
     def whiten(self, y: FloatArray) -> FloatArray:
         """(n,) whitened y (n,): :meth:`filter` of a single whole column."""
-        return np.asarray(np.sqrt(self.kappa) * self.beside_gaps.innovations(y) / self.scale)
+        return np.asarray(np.sqrt(self.kappa) * self.near_gaps.innovations(y) / self.scale)
 
     def back(self, y: FloatArray) -> FloatArray:
         """(n,) y (n,) filtered backwards: the product with the transpose of :meth:`filter`'s matrix."""
         y = np.sqrt(self.kappa) * y / self.scale
-        early, gaps = self.past.rows, self.beside_gaps
+        early, gaps = self.past.rows, self.near_gaps
         whole = np.where(self.past.whole, y, 0.0)
         out = whole.copy()
         out[early] = gaps.f[self.past.pattern] * y[early]

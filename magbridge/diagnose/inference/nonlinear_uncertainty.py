@@ -76,19 +76,19 @@ def _within(
     problem: Problem, pieces: Sequence[Candidate], columns: Sequence[Columns], fit: Joint
 ) -> FloatArray:
     """(q + k, q + k) covariance added by the parameters' uncertainty within their cells."""
-    slopes = [
+    jacobian = [
         slope
         for piece, at in zip(pieces, slices(pieces), strict=True)
-        for slope in _slopes(piece, fit.coefficients[at])
+        for slope in _jacobian(piece, fit.coefficients[at])
     ]
-    if not slopes:
+    if not jacobian:
         return np.zeros_like(fit.covariance)
-    info = information(problem, fit.noise, fit, [*slopes, *columns]).fitted(fit)
+    info = information(problem, fit.noise, fit, [*jacobian, *columns]).fitted(fit)
     K = info.shift
-    return np.asarray(K @ np.linalg.solve(info.matrix + np.eye(len(slopes)), K.T))
+    return np.asarray(K @ np.linalg.solve(info.matrix + np.eye(len(jacobian)), K.T))
 
 
-def _slopes(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
+def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
     """Yield the derivative of the residual by each nonlinear parameter, in units of its cell."""
     if piece.rebuild is None:
         return

@@ -84,7 +84,7 @@ def _neighbours(fit: Joint, rows: IndexArray) -> float:
     h = np.concatenate([[1.0], -noise.ar, np.zeros(2)])
     b, v = (
         sliding_window_view(x, 3).T
-        for x in (noise.back(noise.whiten(fit.left)) * noise.scale, noise.innovations)
+        for x in (noise.back(noise.whiten(fit.residual)) * noise.scale, noise.innovations)
     )
     c = solve_toeplitz([float(h[: len(h) - k] @ h[k:]) for k in range(3)], b)
     before = np.arange(b.shape[1])
@@ -94,8 +94,8 @@ def _neighbours(fit: Joint, rows: IndexArray) -> float:
     if not asked.any():
         return 1.0
     # (kind, side, sample)
-    beside = -np.abs(np.stack([c[::2, whole], v[::2, whole]]))
-    p_values = rankdata(beside, "max", axis=2)[:, :, asked] / asked.size
+    ranked = -np.abs(np.stack([c[::2, whole], v[::2, whole]]))
+    p_values = rankdata(ranked, "max", axis=2)[:, :, asked] / asked.size
     return float(chi2.sf(-2.0 * np.log(p_values).sum(axis=1).max(axis=0).sum(), 4 * asked.sum()))
 
 

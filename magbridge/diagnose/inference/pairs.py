@@ -22,7 +22,14 @@ from scipy.special import logsumexp
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
-from magbridge.diagnose.inference.evidence import LEVEL, REMNANT, log_bayes, margin, one_sided, score
+from magbridge.diagnose.inference.evidence import (
+    LEVEL,
+    REMNANT,
+    bayes_factor_threshold,
+    log_bayes,
+    one_sided,
+    score,
+)
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.state import State
@@ -64,7 +71,7 @@ class _Stack:
         self.S = info.matrix[self.index[:, :, None], self.index[:, None, :]]
         self.b = info.score[self.index]
 
-    def beside(
+    def conditional_on(
         self, rows: FloatArray, K: FloatArray, taken: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(n, m) log evidences, likelihood ratios and freedoms (:func:`~.evidence.score`) beside n others.
@@ -96,7 +103,7 @@ def pairs_of(
     state : State
         Of the search.
     info : Information
-        Of all candidates and of `model`, whose columns are the last: :meth:`~.state.State.beside`.
+        Of all candidates and of `model`, whose columns are the last: :meth:`~.state.State.conditional_on`.
     model : sequence of Candidate
         The causes found so far.
     base : Joint
@@ -127,8 +134,8 @@ class _Table:
         for n, candidate in enumerate(self.standing):
             self.members[candidate.group].append(len(state.candidates) + n)
         self._fill()
-        self.best, self.margin = self._current()
-        self.paid = float(np.sum(np.log([candidate.trials for candidate in self.standing])))
+        self.best, self.threshold = self._current()
+        self.paid = float(np.sum(np.log([candidate.look_elsewhere for candidate in self.standing])))
 
     def _fill(self) -> None:
         """Score every candidate alone, and beside each other one."""
@@ -136,16 +143,16 @@ class _Table:
         free = [n for n, candidate in enumerate(self.candidates) if candidate.spectra is None]
         stacks = [_Stack(places, self.at, self.candidates, info) for places in self._by_size(free)]
         self.scores = [score(info, own, c) for own, c in zip(self.at, self.candidates, strict=True)]
-        beside, self.ratio = np.full((m, m), -np.inf), np.zeros((m, m))
+        conditional_on, self.ratio = np.full((m, m), -np.inf), np.zeros((m, m))
         self.freedom = np.ones((m, m), int)
         for places, rows, solved in self._pieces():
             alone = np.array([self.scores[n].evidence for n in places])
             for stack in stacks:
-                evidence, ratio, freedom = stack.beside(rows, solved[:, :, :-1], solved[:, :, -1])
+                evidence, ratio, freedom = stack.conditional_on(rows, solved[:, :, :-1], solved[:, :, -1])
                 at = np.ix_(np.array(places), stack.places)
-                beside[at] = alone[:, None] + evidence
+                conditional_on[at] = alone[:, None] + evidence
                 self.ratio[at], self.freedom[at] = ratio, freedom
-        self.evidence = np.maximum(beside, beside.T)
+        self.evidence = np.maximum(conditional_on, conditional_on.T)
         np.fill_diagonal(self.evidence, -np.inf)
 
     def _by_size(self, places: Iterable[int]) -> list[list[int]]:
@@ -178,9 +185,9 @@ class _Table:
         whole = self.state.ratio(self.base)
         if len(groups) == 1:
             standing, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
-            needed = margin(min(standing.ratio, whole))
+            needed = bayes_factor_threshold(min(standing.ratio, whole))
             # the pair pays for one more cause, which must not be what the single one's regressor leaves
-            price = needed + float(np.log(len(self.state.trials)))
+            price = needed + float(np.log(len(self.state.look_elsewhere)))
             return standing.evidence + _average(np.array(grid)) + price, needed
         found = []
         for a, b in ((m, m + 1), (m + 1, m)):
@@ -188,14 +195,14 @@ class _Table:
             second = score(self.info.without(np.r_[self.at[a]], first.prior), self.at[b], self.candidates[b])
             found.append((first.evidence + second.evidence, first.ratio + second.ratio))
         best, ratio = max(found)
-        return best + self._price(*groups), margin(min(ratio, whole))
+        return best + self._price(*groups), bayes_factor_threshold(min(ratio, whole))
 
     def _price(self, A: Group, B: Group) -> float:
         """Log of the evidence's average over two grids, relative to the best there."""
         return _average(self.evidence[np.ix_(self.state.groups[A], self.state.groups[B])])
 
     def pair(self, A: Group, B: Group) -> Pair | None:
-        """Return the best of two grids, unless what stands beats it by :func:`~.evidence.margin`."""
+        """Return the best of two grids, unless what stands beats it by the Bayes-factor threshold."""
         current = [candidate.group for candidate in self.standing]
         block = self.evidence[np.ix_(self.members[A], self.members[B])]
         top = float(block.max())
@@ -208,11 +215,11 @@ class _Table:
         rows, columns = np.unravel_index(int(np.argmax(block)), block.shape)
         a, b = self.members[A][int(rows)], self.members[B][int(columns)]
         one, two = self.candidates[a], self.candidates[b]
-        paid = float(np.log(one.trials * two.trials)) - self.paid
-        if self.best - top + paid > self.margin:  # before the price, which can only add to it
+        paid = float(np.log(one.look_elsewhere * two.look_elsewhere)) - self.paid
+        if self.best - top + paid > self.threshold:  # before the price, which can only add to it
             return None
         behind = self.best - top - self._price(A, B) + paid
-        if behind > self.margin or not self._significant(a, b):
+        if behind > self.threshold or not self._significant(a, b):
             return None
         return Pair(two, one, behind) if self._swapped(a, b) else Pair(one, two, behind)
 

@@ -33,9 +33,9 @@ def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: 
         candidate, start, narrower = _profiled(state, model, best, base, position, name)
         narrow += narrower
         fit = state.fit([*model, candidate], start, plain=False, like=best.fit, rounds=2)
-        gain = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
-        if gain > 0.0:
-            ratio, evidence = best.ratio + gain, best.evidence + 0.5 * gain
+        improvement = 2.0 * (fit.log_likelihood - base.log_likelihood) - best.ratio
+        if improvement > 0.0:
+            ratio, evidence = best.ratio + improvement, best.evidence + 0.5 * improvement
             best = replace(best, candidate=candidate, fit=fit, ratio=ratio, evidence=evidence)
     brackets = [_bracket(state, best.candidate, name) for name in best.candidate.shape]
     cells = tuple(0.5 * (high - low) for low, high in brackets)

@@ -6,14 +6,14 @@ Candidates are scored (:mod:`.evidence`) under two noises: that of the model so 
 when the best candidate of every cause is fitted, because the former may have absorbed an effect. The best of
 each cause are then fitted jointly with noise and calibration. The best that passes the test is added, and so
 on while one does. A cause that is found again needs more than one regressor: these become one candidate. Then
-causes are exchanged for their rivals (:mod:`.exchange`). Last, causes that later findings have made needless
-are dropped.
+causes are exchanged for competing hypotheses (:mod:`.exchange`). Last, causes that later findings have made
+needless are dropped.
 
 Noise that ends up as slow as it may be may have absorbed what several causes do together: then none alone
 stands out from it. So a second start finds causes beside noise of a short correlation. What they are worth is
 judged beside noise of any.
 
-The rivals of each cause are read off one matrix at the end: the information of all candidates under the noise
+The competing hypotheses are read off one matrix at the end: the information of all candidates under the noise
 that is left, the other causes projected out.
 """
 
@@ -27,9 +27,10 @@ import numpy as np
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.competing import CompetingHypothesis, sets_of
 from magbridge.diagnose.inference.evidence import (
     LEVEL,
-    MOST_LEFT,
+    MOST_REMAINING,
     REMNANT,
     SMOOTH,
     evidence_of,
@@ -41,7 +42,6 @@ from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
-from magbridge.diagnose.inference.rivals import Rival, sets_of
 from magbridge.diagnose.inference.state import Hypothesis, State, shaped_ratio
 
 __all__ = ["Outcome", "search"]
@@ -58,7 +58,7 @@ class Outcome:
     ----------
     chosen : tuple of Hypothesis
         In the order found; each against the model without it.
-    rivals : tuple of tuple of Rival
+    competing : tuple of tuple of CompetingHypothesis
         For each chosen one, all others that it does not beat by :func:`~.evidence.margin`, the best first.
     null, fit : Joint
         Fits without any cause, and with the chosen ones.
@@ -66,17 +66,17 @@ class Outcome:
         Cause -> (smallest p-value, ratio) of the first round.
     info : Information
         Of all candidates under the noise that is left, only the calibration projected out.
-    trials : dict
+    look_elsewhere : dict
         Cause -> number of independent hypotheses behind it.
     """
 
     chosen: tuple[Hypothesis, ...]
-    rivals: tuple[tuple[Rival, ...], ...]
+    competing: tuple[tuple[CompetingHypothesis, ...], ...]
     null: Joint
     fit: Joint
     tested: dict[str, tuple[float, float]]
     info: Information
-    trials: dict[str, float]
+    look_elsewhere: dict[str, float]
 
 
 def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:
@@ -92,7 +92,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
         How many causes were asked about.
     """
     rough = fit_joint(problem, [], 1, rounds=2)
-    order = autoregressive_order(rough.left, problem.survey.slots)
+    order = autoregressive_order(rough.residual, problem.survey.slots)
     state = State(problem, candidates, order, causes)
     first = state.round([], state.null) if candidates else []
     tested: dict[str, tuple[float, float]] = {}
@@ -102,9 +102,9 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     model, base = _likeliest(state, first) if first else ([], state.null)
     chosen, base = _backward_elimination(state, model, base)
     model = [h.candidate for h in chosen]
-    info = state.beside(model, base)
-    rivals = sets_of(state, info, model, base) if model else ()
-    return Outcome(tuple(chosen), rivals, state.null, base, tested, info, state.trials)
+    info = state.conditional_on(model, base)
+    competing = sets_of(state, info, model, base) if model else ()
+    return Outcome(tuple(chosen), competing, state.null, base, tested, info, state.look_elsewhere)
 
 
 def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
@@ -113,7 +113,7 @@ def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], 
     if model:
         model, base = exchanged(state, model, base)
     if base.noise.slowest > BRIEFEST:  # it may have absorbed causes
-        brief = state.beside_brief_noise()
+        brief = state.with_brief_noise()
         slow, _ = _forward_selection(brief, brief.round([], brief.null))
         if slow:
             start = refined(state, slow, state.fit(slow, rounds=6))
@@ -146,7 +146,7 @@ def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Cand
 def _remnant(found: Hypothesis) -> float:
     """Return the signal-to-noise of what a cause's idealised regressor may leave of it."""
     size = found.signal_to_noise
-    return min(SMOOTH * size, MOST_LEFT) if found.candidate.nonparametric else REMNANT * size
+    return min(SMOOTH * size, MOST_REMAINING) if found.candidate.nonparametric else REMNANT * size
 
 
 def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float) -> Hypothesis | None:
@@ -219,8 +219,8 @@ def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | N
     others = model[:k] + model[k + 1 :]
     if chosen[k].signal_to_noise < smooth:
         return k
-    left = [
-        held_out(state.problem, [candidate.columns for candidate in some], fit).left
+    residual = [
+        held_out(state.problem, [candidate.columns for candidate in some], fit).residual
         for some, fit in ((others, state.fit(others)), (model, base))
     ]
-    return k if rms(left[0]) < rms(left[1]) else None
+    return k if rms(residual[0]) < rms(residual[1]) else None

@@ -16,7 +16,14 @@ from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, parts, together
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, precomputed
-from magbridge.diagnose.inference.evidence import Score, evidence_of, log_odds, regressor_error, score, trials
+from magbridge.diagnose.inference.evidence import (
+    Score,
+    evidence_of,
+    log_odds,
+    look_elsewhere_factors,
+    regressor_error,
+    score,
+)
 from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
@@ -96,14 +103,14 @@ class State:
     ----------
     null : Joint
         The fit without any cause.
-    trials : dict
+    look_elsewhere : dict
         Cause -> number of independent hypotheses behind it.
     certain : dict
         Group -> degrees of freedom of the noise's level.
     groups : dict
         Cause and channel -> places of its candidates.
     brief : bool
-        Whether noise may be correlated for a short time only: :meth:`beside_brief_noise`.
+        Whether noise may be correlated for a short time only: :meth:`with_brief_noise`.
     """
 
     def __init__(self, problem: Problem, candidates: Sequence[Candidate], order: int, causes: int) -> None:
@@ -111,7 +118,7 @@ class State:
         self.brief = False
         self.at = slices(self.candidates)
         self.columns = _made_once(len(problem), [candidate.columns for candidate in self.candidates])
-        self.trials: dict[str, float] = {}
+        self.look_elsewhere: dict[str, float] = {}
         self.certain: dict[Group, float] = {}
         self.last: tuple[Joint | None, Information | None] = None, None
         self.groups: dict[Group, list[int]] = {}
@@ -121,7 +128,7 @@ class State:
         self.null = self.fit([])
         self.blocks = self.null.noise.uneven
 
-    def beside_brief_noise(self) -> State:
+    def with_brief_noise(self) -> State:
         """Return the same search, with noise whose correlation is too short to pass for a slow cause."""
         brief = copy(self)
         brief.brief, brief.last = True, (None, None)
@@ -151,7 +158,11 @@ class State:
         """Log evidence of a model; each cause must also outweigh what idealised regressors may leave."""
         ratio, causes = self.ratio(fit), {candidate.cause for candidate in model}
         narrow, shaped = sum(candidate.narrow for candidate in model), shaped_ratio(ratio, model, fit)
-        return log_odds(ratio, model, self.trials, shaped) - narrow - len(causes) * regressor_error(shaped)
+        return (
+            log_odds(ratio, model, self.look_elsewhere, shaped)
+            - narrow
+            - len(causes) * regressor_error(shaped)
+        )
 
     def best(self, info: Information) -> dict[Group, Best]:
         """Best member of each group."""
@@ -166,9 +177,9 @@ class State:
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Fit the best causes beside `model`, each on its own, and list them, the likeliest first."""
-        as_fitted = self.beside(model, base).fitted(base)
-        if not self.trials:
-            self.trials = trials(as_fitted, self.candidates, self.at)
+        as_fitted = self.conditional_on(model, base).fitted(base)
+        if not self.look_elsewhere:
+            self.look_elsewhere = look_elsewhere_factors(as_fitted, self.candidates, self.at)
         under: dict[Group, list[Best]] = {}
         for info in (as_fitted, self._cleared(model, base, as_fitted)):
             for group, best in self.best(info).items():
@@ -179,7 +190,7 @@ class State:
         found = in_threads(len(self.problem), partial(self._joint, model, base), tried)
         return sorted(found, key=lambda h: -h.evidence)
 
-    def beside(self, model: Sequence[Candidate], base: Joint) -> Information:
+    def conditional_on(self, model: Sequence[Candidate], base: Joint) -> Information:
         """Information of all candidates, then of `model`, under its noise, the calibration projected out."""
         known, info = self.last
         if known is not base:
@@ -209,7 +220,7 @@ class State:
         )
         if not model:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
-            certain = certainty(everything.left, everything.noise, middle)
+            certain = certainty(everything.residual, everything.noise, middle)
             self.certain = dict(zip(self.groups, certain, strict=True))
         return self._under(everything.noise, model, base).fitted(base)
 
@@ -234,7 +245,9 @@ class State:
             freedom = here[0].score.freedom
             p_value = self.p_value(candidate, ratio, freedom)
             evidence = (
-                evidence_of(candidate, ratio, freedom) + here[0].price - float(np.log(candidate.trials))
+                evidence_of(candidate, ratio, freedom)
+                + here[0].price
+                - float(np.log(candidate.look_elsewhere))
             )
             found.append(Hypothesis(candidate, ratio, evidence, p_value, fit))
         return max(found, key=lambda h: h.evidence)
@@ -244,7 +257,7 @@ class State:
 
         The noise's level is estimated, too, so the distribution is Fisher's F.
         """
-        hypotheses = self.trials.get(candidate.cause, 1.0) * float(np.exp(-candidate.likelier))
+        hypotheses = self.look_elsewhere.get(candidate.cause, 1.0) * float(np.exp(-candidate.likelier))
         tests = candidate.tail * hypotheses * self.causes
         freedom, certain = max(freedom, 1), self.certain.get(candidate.group, np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))

@@ -56,13 +56,14 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     parts = [figure(figures.terms(diagnosis), "What each cause adds, through what all others leave.")]
     for finding, notes in zip(diagnosis.findings, diagnosis.assessment.notes, strict=False):
         numbers = parameters(finding, len(diagnosis.problem))
-        gain, of = finding.gain, finding.candidate
+        of = finding.candidate
+        ratio, (low, high) = finding.improvement.ratio, finding.improvement.interval
         rows = (row(name, **one) for name, one in numbers.items())
         evidence = (
             f"<p>Signal-to-noise ratio {finding.signal_to_noise:.1f}; by noise alone with a chance of "
             f"{chance(finding.hypothesis.p_value)}; without it the held-out RMS is "
-            f"{1 / max(gain.ratio, 1e-9):.2f} times as large (95 %: {1 / max(gain.interval[1], 1e-9):.2f} to "
-            f"{1 / max(gain.interval[0], 1e-9):.2f}).</p>"
+            f"{1 / max(ratio, 1e-9):.2f} times as large (95 %: {1 / max(high, 1e-9):.2f} to "
+            f"{1 / max(low, 1e-9):.2f}).</p>"
         )
         parts += [
             f"<h3>{bold(of)}</h3>",
@@ -98,7 +99,7 @@ def _folded(terms: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
 
 def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     """Return what is left: how large, how slow, what it goes with, and beside what was predicted."""
-    rest, left = diagnosis.unexplained, diagnosis.assessment.residual
+    rest, residual = diagnosis.unexplained, diagnosis.assessment.residual
     budget, parts = diagnosis.assessment.budget, diagnosis.problem.survey.parts
     rows = {
         "predicted by the calibration as given: noise and its own uncertainty": budget.predicted,
@@ -117,12 +118,12 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         "part to part.</p>"
     )
     how = (
-        f"<p>It is {number(left.rms)} nT RMS, {number(left.white)} nT from one sample to the next, remembers "
-        f"{number(left.correlation_time, 2)} s, {_goes(diagnosis.assessment.follows)}. "
+        f"<p>It is {number(residual.rms)} nT RMS, {number(residual.white)} nT from one sample to the next, "
+        f"remembers {number(residual.correlation_time, 2)} s, {_goes(diagnosis.assessment.follows)}. "
         f"{_noise(diagnosis)}</p>"
     )
     return [
-        f"<p>{described(rest, left)}. {nameless(rest, causes)}</p>" if rest else "",
+        f"<p>{described(rest, residual)}. {nameless(rest, causes)}</p>" if rest else "",
         how,
         table(("difference between measured and reference", "RMS"), lines),
         worse * ((budget.after or 0.0) > WORSE * budget.fitted),
@@ -131,10 +132,10 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
 
 def _goes(what: Seen) -> str:
     """Say what the rest goes with, and along which axis it lies."""
-    said = goes_with(what, share=True)
+    reported = goes_with(what, share=True)
     if what.channel:
-        return f"and follows {said}"
-    return f"lies {said}, and follows nothing logged" if said else "and follows nothing logged"
+        return f"and follows {reported}"
+    return f"lies {reported}, and follows nothing logged" if reported else "and follows nothing logged"
 
 
 def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
@@ -147,12 +148,12 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
     )
 
 
-def described(rest: Leftover, left: Memory) -> str:
+def described(rest: Leftover, residual: Memory) -> str:
     """Return what is left, its size and how long it lasts, as a sentence without its full stop, as HTML."""
     goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     size = f"signal-to-noise ratio {rest.signal_to_noise:.1f}"
-    all_of_it = f"in all {number(left.rms)} nT RMS, which last {number(left.correlation_time, 2)} s"
+    all_of_it = f"in all {number(residual.rms)} nT RMS, which last {number(residual.correlation_time, 2)} s"
     return f"<b>{KINDS[rest.kind]}</b>{period} is left ({size}{goes}; {all_of_it})"
 
 

@@ -45,14 +45,14 @@ def measured(diagnosis: Diagnosis) -> str:
     unit, hours = clock(diagnosis)
     since, stated = curves(diagnosis, 2.0 * np.sqrt(diagnosis.problem.stated))
     both = sides(diagnosis)
-    limits = ends(*(left for left, _ in both.values()), low=0.15, high=0.15)
+    limits = ends(*(residual for residual, _ in both.values()), low=0.15, high=0.15)
     starts = survey.time[np.flatnonzero(np.diff(survey.dive)) + 1]
-    for axis, (name, (left, colour)) in zip(axes[:, 0], both.items(), strict=True):
+    for axis, (name, (residual, colour)) in zip(axes[:, 0], both.items(), strict=True):
         axis.fill_between(
             since, -stated, stated, color=FAINT, alpha=0.25, linewidth=0, label="±2 sigma as calibrated"
         )
-        axis.plot(since, left[part], color=colour, label=name, **DOTS)
-        axis.plot(*rolling(diagnosis, left), color=INK, linewidth=1.0, label="its running mean")
+        axis.plot(since, residual[part], color=colour, label=name, **DOTS)
+        axis.plot(*rolling(diagnosis, residual), color=INK, linewidth=1.0, label="its running mean")
         axis.axhline(0.0, color=INK, linewidth=0.5)
         for start in starts if starts.size < MANY else ():
             axis.axvline((start - survey.time[0]) / unit, color=FAINT, linewidth=0.4)
@@ -75,7 +75,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
     figure, axes = canvas(10, 0.4 + 2.1 * count, count, 1, sharex=True)
     for axis, finding in zip(axes[:, 0], diagnosis.findings, strict=True):
         added = finding.field(diagnosis.problem)
-        alone = added + diagnosis.fit.left / diagnosis.problem.gain
+        alone = added + diagnosis.fit.residual / diagnosis.problem.reference_jacobian
         since, line = curves(diagnosis, added)
         axis.plot(since, alone[part], color=FAINT, label="all else removed", **DOTS)
         axis.plot(*rolling(diagnosis, alone), color=INK, linewidth=0.9, label="its running mean")
@@ -156,7 +156,7 @@ def channels(diagnosis: Diagnosis) -> str:
         angles = ("roll", "pitch", "heading")
         units |= dict.fromkeys(angles, "deg")
         values |= dict(zip(angles, survey.attitude.T, strict=True))
-    binned = {name: [_binned(values[name], left) for left, _ in both.values()] for name in units}
+    binned = {name: [_binned(values[name], residual) for residual, _ in both.values()] for name in units}
     power = {name: float(np.nansum(count * mean**2)) for name, [(count, mean, _), _] in binned.items()}
     names = sorted(power, key=power.__getitem__, reverse=True)[:CHANNELS]
     columns = min(3, max(len(names), 1))
@@ -184,14 +184,14 @@ def channels(diagnosis: Diagnosis) -> str:
     return png(figure)
 
 
-def _binned(values: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return count, mean and scatter of `left` in bins of a channel; NaN where it hardly was."""
+def _binned(values: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return count, mean and scatter of `residual` in bins of a channel; NaN where it hardly was."""
     edges = np.linspace(values.min(), values.max(), BINS + 1)
     bins = np.clip(np.searchsorted(edges, values) - 1, 0, BINS - 1)
     number = np.bincount(bins, minlength=BINS)
     count = np.where(number > 3, number, np.nan)
-    mean = np.bincount(bins, left, BINS) / count
-    return count, mean, np.sqrt(np.maximum(np.bincount(bins, left**2, BINS) / count - mean**2, 0.0))
+    mean = np.bincount(bins, residual, BINS) / count
+    return count, mean, np.sqrt(np.maximum(np.bincount(bins, residual**2, BINS) / count - mean**2, 0.0))
 
 
 def track(diagnosis: Diagnosis) -> str | None:

@@ -14,14 +14,14 @@ from magbridge.diagnose.assessment.weigh import Assessment
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.gain import LEVEL, Gain
+from magbridge.diagnose.improvement import LEVEL, Improvement
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.design import normal
-from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.seen import Seen
 
 __all__ = ["FORMAT", "findings", "findings_json", "parameters"]
 
-FORMAT = 1
+FORMAT = 2
 """Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""
 
 
@@ -38,7 +38,7 @@ def findings(
         "verdict": diagnosis.verdict,
         "rms_before_nT": _round(diagnosis.total.before),
         "rms_after_nT": _round(diagnosis.total.after),
-        "gain": _gain(diagnosis.total, diagnosis),
+        **_improvement(diagnosis.total, diagnosis),
         "findings": listed,
         "unexplained": None
         if rest is None
@@ -67,24 +67,24 @@ def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Se
 
 
 def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]) -> dict[str, Any]:
-    candidate, rivals = finding.candidate, finding.rivals
+    candidate, competing = finding.candidate, finding.competing
     return {
         "cause": candidate.cause,
         "channel": candidate.channel,
         "follows": follows(finding.follows(diagnosis.problem, diagnosis.fit)),
         "signal_to_noise": _round(finding.signal_to_noise),
         "p_value": _round(finding.hypothesis.p_value),
-        "alternatives": alternatives(rivals),
+        "alternatives": alternatives(competing),
         "isolability": _round(finding.chance_alone),
-        "separated_by": causes[candidate.cause].separated_by if rivals else None,
+        "separated_by": causes[candidate.cause].separated_by if competing else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
-        "gain": _gain(finding.gain, diagnosis),
+        **_improvement(finding.improvement, diagnosis),
     }
 
 
-def alternatives(rivals: tuple[Rival, ...]) -> list[dict[str, Any]]:
+def alternatives(competing: tuple[CompetingHypothesis, ...]) -> list[dict[str, Any]]:
     """List the others within 20:1, the likeliest first."""
-    return [{"cause": one.candidate.cause, "channel": one.candidate.channel} for one in rivals]
+    return [{"cause": one.candidate.cause, "channel": one.candidate.channel} for one in competing]
 
 
 def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
@@ -139,7 +139,7 @@ def _adds_up(candidate: Candidate) -> bool:
 
 def assessment(found: Assessment) -> dict[str, Any]:
     """Return all that the report shows beside the findings, rounded."""
-    delays, budget, left, track = found.delays, found.budget, found.residual, found.returns
+    delays, budget, residual, track = found.delays, found.budget, found.residual, found.returns
     return {
         "fit_for_use": found.fit_for_use,
         "answer": found.answer,
@@ -157,12 +157,12 @@ def assessment(found: Assessment) -> dict[str, Any]:
         },
         "rms_nT": {name: None if x is None else _round(x) for name, x in budget._asdict().items()},
         "residual": {
-            "rms_nT": _round(left.rms), "white_nT": _round(left.white),
-            "correlation_time_s": _round(left.correlation_time), "slow_share": _round(left.slow),
+            "rms_nT": _round(residual.rms), "white_nT": _round(residual.white),
+            "correlation_time_s": _round(residual.correlation_time), "slow_share": _round(residual.slow),
             "follows": follows(found.follows),
         },
         "place_or_time": track and {
-            "told_apart": track.apart, "least_share": _round(track.told),
+            "told_apart": track.apart, "least_share": _round(track.separable),
             "returning_share": _round(track.share), "longest_s": _round(track.longest), "text": track.text,
         },
     }  # fmt: skip
@@ -190,7 +190,7 @@ def follows(what: Seen) -> dict[str, Any]:
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
     wrong = diagnosis.wrong
     assert wrong is not None
-    size = np.abs(diagnosis.fit.left[wrong.rows])
+    size = np.abs(diagnosis.fit.residual[wrong.rows])
     return {
         "cause": "outliers",
         "channel": None,
@@ -204,17 +204,20 @@ def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
             "count": {"value": int(wrong.rows.size), "sigma": None, "unit": "1"},
             "median_size": {"value": _round(float(np.median(size))), "sigma": None, "unit": "nT"},
         },
+        "improvement": None,
         "gain": None,
     }
 
 
-def _gain(gain: Gain, diagnosis: Diagnosis) -> dict[str, Any]:
-    return {
-        "rms_ratio": _round(gain.ratio),
-        "interval": [_round(gain.interval[0]), _round(gain.interval[1])],
+def _improvement(improvement: Improvement, diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return it under its name, and for one release under its old one, ``gain``."""
+    found = {
+        "rms_ratio": _round(improvement.ratio),
+        "interval": [_round(improvement.interval[0]), _round(improvement.interval[1])],
         "level": LEVEL,
         "held_out": diagnosis.problem.survey.parts,
     }
+    return {"improvement": found, "gain": found}
 
 
 def _round(value: float) -> float:

@@ -12,7 +12,7 @@ from magbridge.diagnose.assessment.numbers import Delays
 from magbridge.diagnose.assessment.weigh import Assessment, Fitness
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.gain import Gain
+from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import described, found, remaining, visible
 from magbridge.diagnose.report.words import bold, figure, goes_with, listed, measured, number, table
@@ -63,8 +63,8 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
         figure(figures.measured(diagnosis), caption),
         late(diagnosis.assessment.delays),
         *(
-            f"<details><summary><h2>{head}</h2></summary>{''.join(parts)}</details>"
-            for head, parts in folded.items()
+            f"<details><summary><h2>{header}</h2></summary>{''.join(parts)}</details>"
+            for header, parts in folded.items()
         ),
     ]
     content = "\n".join(part for part in body if part)
@@ -85,30 +85,30 @@ def _log(diagnosis: Diagnosis) -> str:
     span = float(new[-1] - new[0])
     length = f"{span / 3600.0:.1f} h" if span > LONG else f"{span / 60.0:.0f} min"
     dives = f" in {survey.dives} dives" if survey.dives else ""
-    beside = f", beside {int(survey.learned.sum())} that the calibration was fitted to"
+    training = f", beside {int(survey.learned.sum())} that the calibration was fitted to"
     return (
         f'<p class="faint">{first} to {last} UTC ({length}) · {new.size} samples{dives}'
-        f"{beside if survey.learned.any() else ''} · calibration by method "
+        f"{training if survey.learned.any() else ''} · calibration by method "
         f"{escape(calibration.method or 'unnamed')}, {calibration.coefficients.size} coefficients</p>"
     )
 
 
 def _sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict: what was found, what it improves, and what is left."""
-    total, rest, left = diagnosis.total, diagnosis.unexplained, diagnosis.assessment.residual
+    total, rest, residual = diagnosis.total, diagnosis.unexplained, diagnosis.assessment.residual
     if diagnosis.verdict == "nothing_found":
         return (
             f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
-            f"({number(rms(diagnosis.fit.left))} nT) and the calibration's stated uncertainty."
+            f"({number(rms(diagnosis.fit.residual))} nT) and the calibration's stated uncertainty."
         )
     if diagnosis.verdict == "unexplained" and rest:
         within = f"no name is asserted; it resembles {listed(rest.within)}"
         name = within if rest.within else "none of the known causes explains it"
         more = f"The difference of {number(total.before)} nT RMS is more than noise"
-        return f"{more}, but {name}. {described(rest, left)}."
+        return f"{more}, but {name}. {described(rest, residual)}."
     names = [
         bold(one.candidate)
-        + (f" <span class=faint>or {listed(one.rivals[:2], ' or ')}</span>" * bool(one.rivals))
+        + (f" <span class=faint>or {listed(one.competing[:2], ' or ')}</span>" * bool(one.competing))
         for one in diagnosis.findings
     ]
     if diagnosis.wrong is not None:
@@ -122,19 +122,19 @@ def _sentence(diagnosis: Diagnosis) -> str:
     other = (
         f"Something {'stronger' if louder else 'else'} is left that no known cause explains."
         if rest
-        else f"What is left, {number(left.rms)} nT RMS, fits no description of the list better than noise "
-        f"that remembers {number(left.correlation_time, 2)} s."
+        else f"What is left, {number(residual.rms)} nT RMS, fits no description of the list better than "
+        f"noise that remembers {number(residual.correlation_time, 2)} s."
     )
     return f"Found: {'; '.join(names)}. {worth} {other}"
 
 
-def improved(gain: Gain, parts: str) -> str:
+def improved(improvement: Improvement, parts: str) -> str:
     """Say what all findings together improve on what was left out, or that nothing shows."""
-    low, high = gain.interval
+    low, high = improvement.interval
     return (
-        f"On {parts} left out of the fit, {number(gain.before)} nT RMS became {number(gain.after)} nT "
-        f"(ratio {gain.ratio:.2f}, 95 % interval {low:.2f} to "
-        f"{high:.2f}{'' if gain.shown else ': no gain is shown'})."
+        f"On {parts} left out of the fit, {number(improvement.before)} nT RMS became "
+        f"{number(improvement.after)} nT (ratio {improvement.ratio:.2f}, 95 % interval {low:.2f} to "
+        f"{high:.2f}{'' if improvement.shown else ': no improvement is shown'})."
     )
 
 
@@ -159,7 +159,8 @@ def _overview(diagnosis: Diagnosis) -> str:
         f"<td>{goes_with(one.follows(diagnosis.problem, diagnosis.fit))}</td>"
         f'<td class="n">{number(rms(one.field(diagnosis.problem)))} nT</td>'
         f'<td class="n">{one.signal_to_noise:.1f}</td>'
-        f'<td class="n">× {1 / max(one.gain.ratio, 1e-9):.2f}</td><td>{listed(one.rivals)}</td></tr>'
+        f'<td class="n">× {1 / max(one.improvement.ratio, 1e-9):.2f}</td>'
+        f"<td>{listed(one.competing)}</td></tr>"
         for one in diagnosis.findings
     ]
     heads = ("may be", "is seen to follow", "its field, RMS", "S/N", "held-out RMS without it", "or possibly")

@@ -12,7 +12,7 @@ from operator import itemgetter
 
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.rivals import Rival
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.seen import Seen
 from magbridge.diagnose.words import label, measured, names_of, number, series_of
 
@@ -43,9 +43,9 @@ def bold(candidate: Candidate) -> str:
     return f"<b>{label(candidate.cause, None)}</b>" + (f" ({escape(channel)})" if channel else "")
 
 
-def listed(rivals: Sequence[Rival], joint: str = ", ") -> str:
+def listed(competing: Sequence[CompetingHypothesis], joint: str = ", ") -> str:
     """Return causes as a list in words, the likeliest first."""
-    return escape(names_of(rivals, joint))
+    return escape(names_of(competing, joint))
 
 
 def goes_with(seen: Seen, *, share: bool = False) -> str:
@@ -80,8 +80,8 @@ def row(name: str, value: float, sigma: float | None, unit: str) -> str:
 
 def table(heads: Sequence[str], rows: Iterable[str]) -> str:
     """Return a table of rows under their heads; nothing where there are no rows."""
-    head, body = "".join(f"<th>{one}</th>" for one in heads), "".join(rows)
-    return f'<div class="wide" tabindex="0"><table><tr>{head}</tr>{body}</table></div>' * bool(body)
+    header, body = "".join(f"<th>{one}</th>" for one in heads), "".join(rows)
+    return f'<div class="wide" tabindex="0"><table><tr>{header}</tr>{body}</table></div>' * bool(body)
 
 
 def chance(p_value: float) -> str:

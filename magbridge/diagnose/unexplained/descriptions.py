@@ -45,7 +45,7 @@ class Description(NamedTuple):
         Kind, and the prior widths (1-sigma) of the coefficients up to a common factor; each is tried.
     channel : str or None
         The telemetry that it is a function of.
-    trials : float
+    look_elsewhere : float
         Number of independent descriptions that it was chosen from.
     period : float or None
         s, of a tone.
@@ -66,7 +66,7 @@ class Description(NamedTuple):
     columns: Columns
     widths: tuple[tuple[str, FloatArray], ...]
     channel: str | None = None
-    trials: float = 1.0
+    look_elsewhere: float = 1.0
     period: float | None = None
     holds: Callable[[Candidate], bool] = _is()
     turned: bool = False
@@ -152,11 +152,11 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
     return [
         Description(_along_axes(problem, waves(BODY)), shapes.spectra(BODY, 3), turned=True),
         Description(
-            lambda rows: problem.gain[rows, None] * waves(EARTH)(rows),
+            lambda rows: problem.reference_jacobian[rows, None] * waves(EARTH)(rows),
             (*shapes.spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
-        _of("drift", lambda rows: (problem.gain * fresh)[rows, None], 1.0, holds=_is_constant),
-        _of("transient", passing, trials=times),
+        _of("drift", lambda rows: (problem.reference_jacobian * fresh)[rows, None], 1.0, holds=_is_constant),
+        _of("transient", passing, look_elsewhere=times),
     ]
 
 
@@ -234,15 +234,17 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
         listed.append(_of("broadband", _along_axes(problem, shapes.repeated(problem)), turned=True))
     rings = packets(problem, fit)
     if rings is not None:
-        listed.append(_of("tone", rings.columns, trials=rings.trials, period=rings.period))
+        listed.append(_of("tone", rings.columns, look_elsewhere=rings.look_elsewhere, period=rings.period))
     if tone is not None:
-        listed.append(_of("tone", tone.columns, 1.0, trials=tone.trials, period=tone.shape["period"][0]))
+        listed.append(
+            _of("tone", tone.columns, 1.0, look_elsewhere=tone.look_elsewhere, period=tone.shape["period"][0])
+        )
     return listed
 
 
 def _body(problem: Problem) -> Columns:
     """(m, 3) what an offset of one nT along each axis of the body adds to the residual."""
-    return lambda rows: -problem.slopes[rows, 6:]
+    return lambda rows: -problem.jacobian[rows, 6:]
 
 
 def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:
@@ -250,7 +252,7 @@ def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Co
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)
-        axes = -problem.slopes.T[6:, rows]
+        axes = -problem.jacobian.T[6:, rows]
         if scales:
             axes = axes * problem.reading.T[:, rows] / problem.calibration.reference.field
         return (part.T[:, None] * axes).reshape(-1, len(part)).T

@@ -22,13 +22,13 @@ from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.design_columns import Columns, places
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
-from magbridge.diagnose.inference.rivals import Rival
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
 from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 
@@ -61,7 +61,7 @@ class Fitted(NamedTuple):
     evidence: float
     columns: Columns
     fit: Joint
-    trials: float
+    look_elsewhere: float
 
 
 class Leftover(NamedTuple):
@@ -82,7 +82,7 @@ class Leftover(NamedTuple):
         The description that found it.
     choice : int
         Number of descriptions that it was chosen from.
-    within : tuple of Rival
+    within : tuple of CompetingHypothesis
         The causes that remain possible: it is likelier than they are, but by less
         than their margin.
     fitted : tuple of Fitted
@@ -97,7 +97,7 @@ class Leftover(NamedTuple):
     best_channel: str | None
     description: Description | None = None
     choice: int = 1
-    within: tuple[Rival, ...] = ()
+    within: tuple[CompetingHypothesis, ...] = ()
     fitted: tuple[Fitted, ...] = ()
 
     @property
@@ -189,21 +189,23 @@ def _scored(
             best = Statistic(S, width[None] ** 2).best(b)
             if one.turned:
                 best = max(best, along_one_direction(S, b, width, best), key=lambda found: found.ratio)
-            yield Scored(0.5 * best.ratio - float(np.log(one.trials)), kind, one, best, info.shift[:, at])
+            yield Scored(
+                0.5 * best.ratio - float(np.log(one.look_elsewhere)), kind, one, best, info.shift[:, at]
+            )
 
 
 def _calm(problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence[Description]) -> Noise:
     """Return the noise that is left when slow curves are fitted, beginning with white noise."""
-    level = np.full(len(problem), robust_scale(np.diff(fit.left)) / np.sqrt(2.0) + 1e-12)
-    ar, innovations = np.zeros_like(fit.noise.ar), fit.left / level
+    level = np.full(len(problem), robust_scale(np.diff(fit.residual)) / np.sqrt(2.0) + 1e-12)
+    ar, innovations = np.zeros_like(fit.noise.ar), fit.residual / level
     noise = replace(fit.noise, ar=ar, scale=level, nu=1e6, innovations=innovations)
     width = np.concatenate([one.widths[1][1] for one in slow])
     for _ in range(CALM):
         info = information(problem, noise, fit, [*(one.columns for one in slow), *model]).fitted(fit)
         c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
         X = Design(problem, [*model, *(one.columns for one in slow)])
-        left = fit.left - X.times(np.append(-info.shift @ c, c))
-        noise = fit_noise(left, fit.noise.past, blocks=fit.noise.uneven)
+        residual = fit.residual - X.times(np.append(-info.shift @ c, c))
+        noise = fit_noise(residual, fit.noise.past, blocks=fit.noise.uneven)
     return noise
 
 
@@ -212,8 +214,8 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
     one, best, q = scored.description, scored.best, len(fit.z)
     c, columns = best.estimate, one.columns
     moved = -scored.shift @ c
-    left = fit.left - Design(problem, [*model, columns]).times(np.append(moved, c))
-    noise = fit_noise(left, fit.noise.past, blocks=fit.noise.uneven, like=fit.noise)
+    residual = fit.residual - Design(problem, [*model, columns]).times(np.append(moved, c))
+    noise = fit_noise(residual, fit.noise.past, blocks=fit.noise.uneven, like=fit.noise)
     z = fit.z + moved[:q]
     pull = float(fit.prior[:q] @ ((z - problem.centre) ** 2 - (fit.z - problem.centre) ** 2))
     gained = noise.log_likelihood - fit.noise.log_likelihood - 0.5 * pull
@@ -225,11 +227,17 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
     prior = np.append(fit.prior, 1.0 / best.variance)
     likelihood = fit.log_likelihood + gained
     # no more than the description itself can gain: the rest is of a noise that found another optimum
-    evidence = min(scored.evidence, gained - best.price - float(np.log(one.trials)))
+    evidence = min(scored.evidence, gained - best.price - float(np.log(one.look_elsewhere)))
     made = replace(
-        fit, log_likelihood=likelihood, z=z, coefficients=coefficients, prior=prior, noise=noise, left=left
+        fit,
+        log_likelihood=likelihood,
+        z=z,
+        coefficients=coefficients,
+        prior=prior,
+        noise=noise,
+        residual=residual,
     )
-    return Fitted(evidence, columns, made, one.trials)
+    return Fitted(evidence, columns, made, one.look_elsewhere)
 
 
 def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
@@ -240,12 +248,12 @@ def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
 def _best_channel(problem: Problem, fit: Joint) -> str | None:
     """Return the channel whose means in ten bins explain most of what is left; None below 2 %."""
     best: tuple[float, str | None] = (0.02, None)
-    total = float(fit.left @ fit.left)
+    total = float(fit.residual @ fit.residual)
     for name, channel in problem.survey.channels.items():
         edges = np.unique(np.quantile(channel.values, np.linspace(0.1, 0.9, 9)))
         bins = np.searchsorted(edges, channel.values)
         count = np.maximum(np.bincount(bins), 1)
-        explained = float(np.sum(np.bincount(bins, fit.left) ** 2 / count)) / total
+        explained = float(np.sum(np.bincount(bins, fit.residual) ** 2 / count)) / total
         if explained > best[0]:
             best = (explained, name)
     return best[1]

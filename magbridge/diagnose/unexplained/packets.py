@@ -74,7 +74,7 @@ class Packets(NamedTuple):
     """
 
     columns: Columns
-    trials: float
+    look_elsewhere: float
     period: float
 
 
@@ -122,7 +122,7 @@ def _columns(problem: Problem, found: list[tuple[float, Places]]) -> Columns:
             # divided by the root of the length, so that in white noise all packets have about one norm
             under = np.exp(-0.5 * since[here] ** 2) / np.sqrt(places.length)
             out[here, 2 * k], out[here, 2 * k + 1] = under * np.cos(turns), under * np.sin(turns)
-        return np.asarray(problem.gain[rows, None] * out)
+        return np.asarray(problem.reference_jacobian[rows, None] * out)
 
     return columns
 
@@ -135,9 +135,9 @@ class _Spectra:
         self.noise, self.n = noise, int(slots[-1]) + 1
         self.finest = 2 ** max(int(np.log2(self.n)) - 6, 0)
         self.whole = self.finest * next_fast_len(int((1.0 + 3.0 * LONGEST) * self.n / self.finest) + 1)
-        g = problem.gain * noise.back(noise.response(fit.left))
+        g = problem.reference_jacobian * noise.back(noise.response(fit.residual))
         self.G = rfft(np.bincount(slots, g), self.whole)
-        h = problem.gain**2 * noise.kappa / noise.scale**2
+        h = problem.reference_jacobian**2 * noise.kappa / noise.scale**2
         parts = (noise.past.whole, ~noise.past.whole)
         self.H = np.array([rfft(np.bincount(slots, h * some), self.whole) for some in parts])
 
@@ -177,7 +177,7 @@ class _Spectra:
 
 def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:
     """(2, k) power gain of whitening at frequencies (k,), per sample: away from gaps, and after them."""
-    past, gaps = noise.past, noise.beside_gaps
+    past, gaps = noise.past, noise.near_gaps
     lags = np.arange(1, past.order + 1)
     whole = np.abs(1.0 - np.exp(-2j * np.pi * np.outer(frequency, lags)) @ noise.ar) ** 2
     waves = np.exp(-2j * np.pi * frequency[:, None, None] * past.lags)

@@ -28,7 +28,7 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     -------
     Columns
         Of three numbers.
-    trials : float
+    look_elsewhere : float
         Moments that were tried at this duration, times the durations.
 
     Notes
@@ -38,11 +38,11 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     Frumkis & Kaplan 2002, Sens. Actuators A 102:67).
     """
     t = problem.survey.time - problem.survey.time[0]
-    gain = fit.noise.whiten(problem.gain)
-    matched, power = gain * fit.noise.response(fit.left), gain * gain
+    improvement = fit.noise.whiten(problem.reference_jacobian)
+    matched, power = improvement * fit.noise.response(fit.residual), improvement * improvement
     shape = _passing(QUARTERS / 4.0)
     pairs = np.einsum("ik,jk->ijk", shape, shape).reshape(9, -1)
-    best, nearest, scale, trials = -np.inf, 0.0, 1.0, 1.0
+    best, nearest, scale, look_elsewhere = -np.inf, 0.0, 1.0, 1.0
     for duration in np.geomspace(SHORTEST / len(t), LONGEST, DURATIONS) * float(t[-1]):
         quarters = (4.0 * t / duration).astype(int)
         b, S = (_around(np.bincount(quarters, x)) @ f.T for x, f in ((matched, shape), (power, pairs)))
@@ -50,8 +50,11 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
         at, count = int(np.argmax(ratio)), float(ratio.size * DURATIONS)
         evidence = 0.5 * float(ratio[at]) - float(np.log(count))
         if evidence > best:
-            best, nearest, scale, trials = evidence, (2 * at + 0.5) * duration / 4.0, duration, count
-    return lambda rows: problem.gain[rows, None] * _passing((t[rows] - nearest) / scale).T, trials
+            best, nearest, scale, look_elsewhere = evidence, (2 * at + 0.5) * duration / 4.0, duration, count
+    return (
+        lambda rows: problem.reference_jacobian[rows, None] * _passing((t[rows] - nearest) / scale).T,
+        look_elsewhere,
+    )
 
 
 def _passing(s: FloatArray) -> FloatArray:

@@ -47,7 +47,7 @@ REPEATED = 8
 """Half waves per dive of what repeats with every dive."""
 ZERO = (500.0, 1000.0, 2000.0)
 """Widths, nT, of errors where a channel reads zero."""
-SLOPES = (0.0, 0.1, 0.2)
+JACOBIAN = (0.0, 0.1, 0.2)
 """Sines of the angles at which a loose object in the hull starts to slide."""
 
 
@@ -74,10 +74,10 @@ def direction(body: Columns) -> Columns:
     return columns
 
 
-def response(reading: FloatArray, slopes: Columns) -> Columns:
+def response(reading: FloatArray, jacobian: Columns) -> Columns:
     """Each channel's error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
 
-    `slopes` (m, 3) are what one nT in each channel adds to the residual.
+    `jacobian` (m, 3) are what one nT in each channel adds to the residual.
     """
     channels = [_scaled(channel) for channel in reading.T]
 
@@ -85,7 +85,7 @@ def response(reading: FloatArray, slopes: Columns) -> Columns:
         x = np.clip([channel(rows) for channel in channels], -1.0, 1.0)
         turning = x + 1j * np.sqrt(1.0 - x**2)  # cos k theta = T_k(x), with x = cos theta
         waves = np.stack(powers(turning, BEND), 1).real
-        return np.asarray((slopes(rows).T[:, None] * waves).reshape(3 * BEND, -1).T)
+        return np.asarray((jacobian(rows).T[:, None] * waves).reshape(3 * BEND, -1).T)
 
     return columns
 
@@ -98,7 +98,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
     )
 
 
-def crossing(reading: FloatArray, slopes: Columns) -> Columns:
+def crossing(reading: FloatArray, jacobian: Columns) -> Columns:
     """Each channel's error where it passes zero (Hermite's functions); arguments as of :func:`response`.
 
     There the feedback current changes sign, or a converter's first bit flips.
@@ -107,7 +107,7 @@ def crossing(reading: FloatArray, slopes: Columns) -> Columns:
     def columns(rows: slice) -> FloatArray:
         x = reading[rows].T[:, None] / np.array(ZERO)[:, None]
         odd = x * np.exp(-0.5 * x * x)
-        return np.asarray((slopes(rows).T[:, None] * odd).reshape(3 * len(ZERO), -1).T)
+        return np.asarray((jacobian(rows).T[:, None] * odd).reshape(3 * len(ZERO), -1).T)
 
     return columns
 
@@ -167,11 +167,11 @@ def repeated(problem: Problem) -> Columns:
 def lower_end(down: FloatArray) -> Columns:
     """Return the end of the hull at which a loose object lies: the lower one, once tilted by so much.
 
-    `down` (n,) is the sine of the tilt; :data:`SLOPES` are those at which it starts to slide.
+    `down` (n,) is the sine of the tilt; :data:`JACOBIAN` are those at which it starts to slide.
     """
     place = np.arange(len(down))
     sides = []
-    for slope in SLOPES:
+    for slope in JACOBIAN:
         last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
         sides.append(np.sign(down[last]).astype(np.int8))
     return _centred(lambda rows: np.stack([side[rows] for side in sides]).T.astype(float), len(down))

@@ -18,7 +18,9 @@ MOST = 6
 """Coefficients of a cause of which this is asked: with more, it takes almost any shape."""
 
 
-def varying(problem: Problem, candidate: Candidate, trials: Mapping[str, float]) -> Description | None:
+def varying(
+    problem: Problem, candidate: Candidate, look_elsewhere: Mapping[str, float]
+) -> Description | None:
     """Describe a named cause whose size follows other telemetry, the attitude, or time.
 
     A cause of the table has one size in a log: its true name leaves nothing of this kind. A name that stands
@@ -31,7 +33,7 @@ def varying(problem: Problem, candidate: Candidate, trials: Mapping[str, float])
         The survey.
     candidate : Candidate
         The cause; None is returned for one that takes almost any shape.
-    trials : mapping
+    look_elsewhere : mapping
         Cause -> number of independent hypotheses behind it.
     """
     if candidate.spectra is not None or candidate.size > MOST:
@@ -51,7 +53,7 @@ def varying(problem: Problem, candidate: Candidate, trials: Mapping[str, float])
 
     width = np.full((1 + len(values)) * candidate.size, 30.0)
     return Description(
-        columns, (("broadband", width),), candidate.channel, trials[candidate.cause],
+        columns, (("broadband", width),), candidate.channel, look_elsewhere[candidate.cause],
         holds=lambda other: other.cause == candidate.cause, turned=candidate.size == 3, wider=True,
     )  # fmt: skip
 

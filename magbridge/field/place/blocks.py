@@ -61,7 +61,7 @@ class NearInverse:
 
     edges: IndexArray
     own: tuple[FloatArray, ...]
-    beside: tuple[FloatArray, ...]
+    off_diagonal: tuple[FloatArray, ...]
 
     def variances(self, rows: csr_array) -> FloatArray:
         """Return the variance of each combination in `rows` (m, n), which reach two blocks at most: (m,)."""
@@ -79,7 +79,9 @@ class NearInverse:
             out[of] = np.einsum("mi,mi->m", here @ self.own[i], here)
             if i + 1 < len(self.own):
                 there = mine[:, self.edges[i + 1] : self.edges[i + 2]].toarray()
-                out[of] += np.einsum("mi,mi->m", 2.0 * here @ self.beside[i] + there @ self.own[i + 1], there)
+                out[of] += np.einsum(
+                    "mi,mi->m", 2.0 * here @ self.off_diagonal[i] + there @ self.own[i + 1], there
+                )
         return out
 
 
@@ -105,7 +107,7 @@ def near_inverse(matrix: csr_array, edges: IndexArray) -> NearInverse:
             raise np.linalg.LinAlgError("not positive definite")
         diagonal.append(L)
     own: list[FloatArray] = [np.empty(0)] * len(diagonal)
-    beside: list[FloatArray] = [np.empty(0)] * len(below)
+    off_diagonal: list[FloatArray] = [np.empty(0)] * len(below)
     for i in reversed(range(len(diagonal))):
         inverse = _lower(diagonal[i], np.eye(len(diagonal[i])))
         own[i] = inverse.T @ inverse
@@ -113,9 +115,9 @@ def near_inverse(matrix: csr_array, edges: IndexArray) -> NearInverse:
         if i < len(below):
             G = inverse.T @ below[i].T
             below[i] = np.empty(0)  # large, and not needed again
-            beside[i] = -G @ own[i + 1]
-            own[i] -= beside[i] @ G.T
-    return NearInverse(np.asarray(edges), tuple(own), tuple(beside))
+            off_diagonal[i] = -G @ own[i + 1]
+            own[i] -= off_diagonal[i] @ G.T
+    return NearInverse(np.asarray(edges), tuple(own), tuple(off_diagonal))
 
 
 def _lower(L: FloatArray, right: FloatArray) -> FloatArray:

@@ -73,7 +73,7 @@ def synthetic(kind: Map, seed: int, extent: float = 16_000.0) -> AnomalyGrid:
     )
 
 
-def voyage(
+def track_over(
     grid: AnomalyGrid,
     options: Options,
     seed: int,
@@ -130,7 +130,7 @@ def adrift(
     Parameters
     ----------
     grid, options
-        As for :func:`voyage`.
+        As for :func:`track_over`.
     rng : Generator
         Of current, drift, start and the map's error.
     velocity : FloatArray, (n, 2)
@@ -138,7 +138,7 @@ def adrift(
     errors, sigma : FloatArray, (n,)
         nT: errors of the corrected total field, and the 1-sigma that the calibration claims.
     every, jump
-        As for :func:`voyage`.
+        As for :func:`track_over`.
     """
     o, n = options, len(velocity)
     time = START + every * np.arange(1, n + 1)
@@ -170,7 +170,7 @@ def adrift(
 
 @dataclass(frozen=True)
 class Run:
-    """The result of one voyage; arrays over the records."""
+    """The result of one track; arrays over the records."""
 
     hours: FloatArray
     error: FloatArray  # m
@@ -228,7 +228,7 @@ def longest(flags: BoolArray, hours: FloatArray) -> float:
 
 
 def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
-    """Run the navigator over a voyage."""
+    """Run the navigator over a track."""
     navigator = Navigator(grid, options)
     every = float(ds["time"][1] - ds["time"][0])
     navigator.fix(round(1e6 * (float(ds["time"][0]) - every)), *PLACE)
@@ -273,7 +273,7 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
 
 
 def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Iterator[tuple[Block, float]]:
-    """Yield the measurements that the navigator makes of a voyage, and the metres travelled until each."""
+    """Yield the measurements that the navigator makes of a track, and the metres travelled until each."""
     where = DeadReckoning()
     where.place(*PLACE)
     collector = Collector(options, block_length(grid))

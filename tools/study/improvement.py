@@ -13,21 +13,23 @@ from magbridge.diagnose.extend import extend, relinearised, with_misfit
 from magbridge.diagnose.inference.search import search
 from sitl.dataset import corrected
 from sitl.inject import Hidden
-from study.deployment import DAY, Background, again
+from study.deployment import DAY, Background, rebuilt
 from study.noise import add_noise
 
 DELAYS = ("filter_lag", "clock_offset")
 """In a uniform field these two look the same: a late field shows only where masses have moved meanwhile."""
 
 
-def gain(hidden: Hidden, background: Background, ds: xr.Dataset, result: Diagnosis) -> dict[str, float]:
+def improvement(
+    hidden: Hidden, background: Background, ds: xr.Dataset, result: Diagnosis
+) -> dict[str, float]:
     """Mean square error (nT²) on another deployment: as calibrated, extended, and extended by an oracle.
 
     Counted are the samples whose masses stand within the range of the first deployment: beyond it a
     polynomial extrapolates. ``everywhere`` is the error of the extended calibration on all samples.
     """
     calibration, number = background.deployment.calibration, background.number + 1
-    other = add_noise(again(background.deployment).measure((hidden,), number), "white", number)
+    other = add_noise(rebuilt(background.deployment).measure((hidden,), number), "white", number)
     tried = {"before": calibration, "after": result.calibration, "oracle": _oracle(hidden.name, result)}
     errors = {name: error(other, c) for name, c in tried.items()}
     whole = np.all([np.isfinite(e) for e in errors.values()], axis=0)
@@ -44,7 +46,7 @@ def harm(
     Both on this log, and on one of another day (keys with " elsewhere").
     """
     calibration, number = background.deployment.calibration, background.number + 1
-    other = again(background.deployment, DAY).measure(hidden, number)
+    other = rebuilt(background.deployment, DAY).measure(hidden, number)
     found: dict[str, float] = {}
     for log, where in ((ds, ""), (add_noise(other, background.noise, number), " elsewhere")):
         truth = log["truth_total_field"].to_numpy()

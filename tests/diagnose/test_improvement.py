@@ -41,9 +41,9 @@ def test_the_score_is_the_density_of_each_dive_given_the_others(problem: Problem
     )
     posed = replace(problem, residual=problem.residual + 2.0 * shape[:, 0])
     c = np.append(fit.z, fit.coefficients)
-    A = fit.noise.filter(np.hstack([posed.free, 3.0 * shape]))
+    A = fit.noise.filter(np.hstack([posed.calibration_jacobian, 3.0 * shape]))
     y = fit.noise.response(posed.residual)
-    white = fit.noise.response(fit.left)
+    white = fit.noise.response(fit.residual)
     assert np.abs(A.T @ white - fit.prior * (c - np.append(posed.centre, 0.0))).max() < 0.05 * np.abs(A).max()
     expected = fit.noise.log_likelihood + 0.5 * float(white @ white)
     for dive in range(DIVES):
@@ -72,4 +72,4 @@ def test_what_acts_in_one_dive_only_is_no_surprise_that_counts_against_it(proble
     posed = replace(problem, residual=problem.residual + 6.0 * once[:, 0])
     with_it, without = (held_out(posed, some, fit_joint(posed, some, 1)) for some in (columns, []))
     assert with_it.score > without.score
-    assert np.std(with_it.left[once[:, 0] > 0]) < 3.0
+    assert np.std(with_it.residual[once[:, 0] > 0]) < 3.0

@@ -8,17 +8,17 @@ from typing import Final
 from magbridge.mavlink import Codec, spec
 from magbridge.records import Channel
 
-__all__ = ["Journal"]
+__all__ = ["Recorder"]
 
 BYTES: Final = spec("MAG_SENSOR_BYTES")
 RAW: Final = spec("MAG_RAW")
-HEAD: Final = Struct("<BB")
+HEADER: Final = Struct("<BB")
 """The fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
 SIZE: Final = BYTES.fields["data"].count
 SENT, LINK, SENSOR, STATE = Channel
 
 
-class Journal:
+class Recorder:
     """Collects records until :meth:`drain`.
 
     Attributes
@@ -52,7 +52,7 @@ class Journal:
             return
         while data:
             piece, data = data[:SIZE], data[SIZE:]
-            frame = self._scribe.frame(BYTES, HEAD.pack(0, len(piece)) + piece)
+            frame = self._scribe.frame(BYTES, HEADER.pack(0, len(piece)) + piece)
             self._add(time_us, SENSOR, frame)
 
     def state(self, time_us: int, frame: bytes) -> None:

@@ -20,14 +20,14 @@ from magbridge.navigate.batch import navigate
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.model import prior, transition
 from magbridge.navigate.options import Options
-from voyages.simulated import PLACE, START, Map, blocks, sail, synthetic, voyage
+from navigation_studies.simulated import PLACE, START, Map, blocks, sail, synthetic, track_over
 
 
 def stone_soup(python: str, kind: Map, glider: Options, share: float, seed: int) -> tuple[float, ...]:
     """Return one row of the table: the bound, ours, and both of Stone Soup's filters."""
     grid = synthetic(kind, seed % 10)
     options = with_options(glider, start_sigma=share * grid.correlation_length)
-    ds = voyage(grid, options, 1000 + seed)
+    ds = track_over(grid, options, 1000 + seed)
     ours = sail(ds, grid, options).score()
     found = list(blocks(ds, grid, options))
     moved, before = [], (int(START * 1e6), 0.0)

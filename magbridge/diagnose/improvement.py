@@ -8,7 +8,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["LEVEL", "Gain", "paired"]
+__all__ = ["LEVEL", "Improvement", "paired"]
 
 DRAWS = 2000
 """Bootstrap samples: an end of the interval then scatters by 1.5 % of its width."""
@@ -19,7 +19,7 @@ LEVEL = QUANTILES[1] - QUANTILES[0]
 
 
 @dataclass(frozen=True)
-class Gain:
+class Improvement:
     """RMS before and after (nT, held out), their ratio and its interval over dives (:data:`LEVEL`)."""
 
     before: float
@@ -33,7 +33,7 @@ class Gain:
         return self.interval[1] < 1.0
 
 
-def paired(before: FloatArray, after: FloatArray, dive: IntArray, counts: BoolArray) -> Gain:
+def paired(before: FloatArray, after: FloatArray, dive: IntArray, counts: BoolArray) -> Improvement:
     """Compare two residuals on the same samples.
 
     The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.
@@ -54,7 +54,7 @@ def paired(before: FloatArray, after: FloatArray, dive: IntArray, counts: BoolAr
     ratios = np.sqrt(a[drawn].sum(axis=1) / (b[drawn].sum(axis=1) + 1e-300))
     low, high = np.quantile(ratios, QUANTILES)
     n = int(counts.sum())
-    return Gain(
+    return Improvement(
         float(np.sqrt(b.sum() / n)),
         float(np.sqrt(a.sum() / n)),
         float(np.sqrt(a.sum() / (b.sum() + 1e-300))),

@@ -15,13 +15,13 @@ from magbridge.mavlink.framing import message
 from magbridge.mavlink.messages import BAD_DATA, Message, spec
 from magbridge.mavlink.secrets import without_secrets
 
-__all__ = ["TapeReader", "TapeWriter"]
+__all__ = ["FrameLogReader", "FrameLogWriter"]
 
 WRAPPER = spec("MAG_LINK_BYTES")
 SIZE = WRAPPER.fields["data"].count
 
 
-class TapeWriter:
+class FrameLogWriter:
     """Turns the messages that a codec returned into frames for the log."""
 
     def __init__(self, system: int, component: int) -> None:
@@ -47,8 +47,8 @@ class TapeWriter:
         ]
 
 
-class TapeReader:
-    """The inverse of :class:`TapeWriter`: turns frames of a log into the bytes received at that moment."""
+class FrameLogReader:
+    """The inverse of :class:`FrameLogWriter`: frames of a log to the bytes received at that moment."""
 
     def __init__(self) -> None:
         self._fed = 0  # bytes given out beyond the last record that was not ahead

@@ -7,7 +7,17 @@ from msgspec.structs import replace as with_options
 
 from magbridge.arrays import BoolArray
 from magbridge.field.grid import AnomalyGrid
-from voyages.simulated import GLIDER, OUTSIDE, SPEEDS, Map, Run, longest, sail, synthetic, voyage
+from navigation_studies.simulated import (
+    GLIDER,
+    OUTSIDE,
+    SPEEDS,
+    Map,
+    Run,
+    longest,
+    sail,
+    synthetic,
+    track_over,
+)
 
 LEVEL = 60.0
 """nT by which the field is measured too large."""
@@ -19,14 +29,16 @@ def carried(kind: Map, seed: int) -> tuple[float, float]:
     length, angle = 1.5 * grid.correlation_length, np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
     options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
     away = (2.0, float(length * np.cos(angle)), float(length * np.sin(angle)))
-    return silence(sail(voyage(grid, options, 5000 + seed, speed=SPEEDS[seed % 3], jump=away), grid, options))
+    return silence(
+        sail(track_over(grid, options, 5000 + seed, speed=SPEEDS[seed % 3], jump=away), grid, options)
+    )
 
 
 def misled(kind: Map, seed: int) -> tuple[float, float]:
     """Start a filter with a tenth of its true start error, 1-sigma one length; return as :func:`silence`."""
     grid = synthetic(kind, seed % 10)
     options = with_options(GLIDER, start_sigma=grid.correlation_length)
-    ds = voyage(grid, options, 7000 + seed, speed=SPEEDS[seed % 3])
+    ds = track_over(grid, options, 7000 + seed, speed=SPEEDS[seed % 3])
     return silence(sail(ds, grid, with_options(options, start_sigma=0.1 * grid.correlation_length)))
 
 
@@ -34,7 +46,7 @@ def level(kind: Map, seed: int) -> tuple[float, float]:
     """Measure 60 nT too much all along, where 0.5 nT is claimed; return as :func:`standing`."""
     grid = synthetic(kind, seed % 10)
     options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
-    ds = voyage(grid, options, 9000 + seed, speed=SPEEDS[seed % 3])
+    ds = track_over(grid, options, 9000 + seed, speed=SPEEDS[seed % 3])
     return standing(sail(ds.assign(total_field=ds["total_field"] + LEVEL), grid, options))
 
 
@@ -43,7 +55,7 @@ def half(kind: Map, seed: int) -> tuple[float, float]:
     grid, other = synthetic(kind, seed % 10), synthetic(kind, 10 + seed % 10)
     field = AnomalyGrid(grid.longitude, grid.latitude, (grid.anomaly + other.anomaly) / 2**0.5)
     options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
-    return standing(sail(voyage(field, options, 9000 + seed, speed=SPEEDS[seed % 3]), grid, options))
+    return standing(sail(track_over(field, options, 9000 + seed, speed=SPEEDS[seed % 3]), grid, options))
 
 
 def outside(run: Run) -> BoolArray:

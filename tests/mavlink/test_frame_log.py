@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from magbridge.mavlink import Codec, TapeReader, TapeWriter
+from magbridge.mavlink import Codec, FrameLogReader, FrameLogWriter
 
 GENUINE = [
     Codec(1, 1).pack("ATTITUDE", time_boot_ms=1, roll=0.1, yawspeed=1.0),
@@ -36,7 +36,7 @@ CHUNKS = st.lists(
 )
 def test_the_log_brings_about_the_same_messages_at_the_same_moments(chunks: list[bytes]) -> None:
     live, again = Codec(1, 191), Codec(1, 191)
-    writer, reader = TapeWriter(1, 191), TapeReader()
+    writer, reader = FrameLogWriter(1, 191), FrameLogReader()
     for chunk in chunks:
         messages = live.parse(chunk)
         frames = writer.frames(messages, live.pending)

@@ -20,7 +20,7 @@ from magbridge.records import BEYOND
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["take"]
+__all__ = ["load_survey"]
 
 TRUSTED = 0.5
 """Largest cubic term in the interpolation of a channel to the time of its row, as a multiple of the noise;
@@ -30,10 +30,10 @@ FAR = 10.0
 not the position of a mass but a code for "not known"."""
 
 
-def take(
+def load_survey(
     datasets: Sequence[xr.Dataset],
     calibration: Calibration,
-    learned_from: Sequence[xr.Dataset] = (),
+    training_logs: Sequence[xr.Dataset] = (),
     grid: AnomalyGrid | None = None,
 ) -> Survey:
     """Gather deployments.
@@ -44,7 +44,7 @@ def take(
         To be diagnosed.
     calibration : Calibration
         Decides which channels a deployment must have.
-    learned_from : sequence of Dataset
+    training_logs : sequence of Dataset
         The logs that the calibration was fitted to, if available; those of them that are among `datasets`,
         too, are diagnosed.
     grid : AnomalyGrid, optional
@@ -56,8 +56,8 @@ def take(
         A column is missing, too few samples are complete, or a parameter is out of all range: one line
         that says which.
     """
-    own = [any(ds is one for one in learned_from) for ds in datasets]
-    apart = [ds for ds in learned_from if not any(ds is one for one in datasets)]
+    own = [any(ds is one for one in training_logs) for ds in datasets]
+    apart = [ds for ds in training_logs if not any(ds is one for one in datasets)]
     logs = (*datasets, *apart)
     source = _sources(logs)
     table = _joined(

@@ -14,8 +14,8 @@ from magbridge.calibration.residual import rms
 from magbridge.navigate.options import Options
 from magbridge.navigate.own_survey import localise
 from magbridge.navigate.reference_track import errors
+from navigation_studies.simulated import HOUR, PLACE, Map, adrift, synthetic
 from sitl.signals import autoregressive
-from voyages.simulated import HOUR, PLACE, Map, adrift, synthetic
 
 __all__ = ["AIRCRAFT", "GLIDER", "Located", "Vehicle", "located", "survey"]
 

@@ -14,10 +14,10 @@ from magbridge.calibration.residual import rms
 from magbridge.correction import Correction, correct_rows
 from magbridge.field.geodesy import separation
 from magbridge.navigate.options import informed
+from navigation_studies.simulated import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 from sitl import load, segments, simulate
 from sitl.bonne_bay import MASSES, METHODS
 from sitl.dataset import at_rest
-from voyages.simulated import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 
 
 class Flown(NamedTuple):
