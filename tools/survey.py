@@ -150,8 +150,9 @@ def run(hours: float, rock: float, length: float, noise: str, seed: int) -> Row:
 def errors(calibration: Calibration, part: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the corrected field's error, its sigma, and the level's share of that, (n,) nT each."""
     seen = observations(part, MASSES)
-    got = correct(calibration, seen.field, seen.parameters, seen.time)
-    level = level_of(calibration, seen.field, seen.parameters, seen.time)
+    channels = seen.channels(calibration)
+    got = correct(calibration, seen.field, channels, seen.time)
+    level = level_of(calibration, seen.field, channels, seen.time)
     return got.total - part["truth_total_field"].to_numpy(), got.sigma, level
 
 

@@ -192,8 +192,9 @@ class Calibration:
         """Return the position terms alone, with their part of coefficients and covariance."""
         own = slice(sum(term.size for term in self.terms))
         return replace(
-            self, effects=(), coefficients=self.coefficients[own], covariance=self.covariance[own, own]
-        )
+            self, effects=(), coefficients=self.coefficients[own], covariance=self.covariance[own, own],
+            level=self.level[own],
+        )  # fmt: skip
 
     def at_level(self) -> Calibration:
         """Return the calibration with its reference's level, and all that follows from it, 1-sigma up."""

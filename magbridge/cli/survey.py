@@ -32,7 +32,7 @@ from magbridge.progress import waiting
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magbridge.calibration.model import Calibration
+    from magbridge.calibration.fitting.fit import Fit
     from magbridge.survey.run import Result
     from magbridge.survey.samples import Samples
 
@@ -147,7 +147,7 @@ def _samples(
     from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS
     from magbridge.logs import read_each
-    from magbridge.survey.read import is_table, joined, read_table
+    from magbridge.survey.read import is_table, joined, read_table, without_creep
     from magbridge.survey.run import samples_of
 
     tables = [path for path in files if is_table(path)]
@@ -164,7 +164,9 @@ def _samples(
         for doubt in warnings_of(one, path):
             complain(doubt)
     if raw and not known:
-        known = [_calibrated(raw, parameters, order, save, options, strict=reading.strict)]
+        found = _calibrated(raw, parameters, order, save, options, strict=reading.strict)
+        known = [found.calibration if found.creep is None else found.creep.calibration]
+        deployments = [without_creep(one, found.creep) for one in deployments]
     return joined([*parts, samples_of(deployments, known)])
 
 
@@ -176,8 +178,8 @@ def _calibrated(
     options: dict[str, Any],
     *,
     strict: bool,
-) -> Calibration:
-    """Return the calibration that the raw logs give themselves; write it where that is asked for."""
+) -> Fit:
+    """Return the fit that the raw logs give themselves; write it where that is asked for."""
     from magbridge.calibration.file import save as write
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.observe import observations
@@ -196,7 +198,7 @@ def _calibrated(
         )
     if save:
         write(found.calibration, save)
-    return found.calibration
+    return found
 
 
 def _predict(done: Result, points: Path, output: Path) -> None:

@@ -26,7 +26,17 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = ["corrected_by_others", "from_vector", "is_table", "joined", "read_points", "read_table"]
+    from magbridge.calibration.fitting.offset_terms import Creep
+
+__all__ = [
+    "corrected_by_others",
+    "from_vector",
+    "is_table",
+    "joined",
+    "read_points",
+    "read_table",
+    "without_creep",
+]
 
 ANOMALY = (
     "anomaly",
@@ -138,6 +148,14 @@ def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples
     read = np.stack(channels, axis=1)[known] if channels else np.empty((len(field), 0))
     modes = _modes(apart_from_level(calibration), field, read, ds["time"].to_numpy()[known])
     return replace(samples, rho=calibration.noise.autocorrelation, modes=modes)
+
+
+def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:
+    """Return a log without the creep of its sensor's offset that was found together with the calibration."""
+    if creep is None or not set(CHANNELS) <= set(ds):
+        return ds
+    offset = creep.at(ds["time"].to_numpy().astype(float))
+    return ds.assign({name: ds[name] - one for name, one in zip(CHANNELS, offset.T, strict=True)})
 
 
 def joined(parts: Sequence[Samples]) -> Samples:

@@ -9,6 +9,7 @@ import pytest
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
+from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import too_rough
@@ -18,6 +19,8 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.field.place.blocks import Factor, near_inverse
 from magbridge.field.place.matern import Matern
 from magbridge.field.place.nodes import nodes_near
+from magbridge.survey.gridding import gridded
+from magbridge.survey.samples import Samples
 
 MAIN = np.array([18_000.0, -5_000.0, 48_000.0])
 IRON = np.eye(3) + np.array([[0.012, 0.003, -0.004], [0.003, -0.008, 0.002], [-0.004, 0.002, 0.005]])
@@ -196,6 +199,79 @@ def test_a_track_that_drifts_is_bent_to_where_the_rock_repeats() -> None:
         got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
         error.append(float(np.std(got.total - true)))
     assert error[1] < 1.1 * NOISE < 1.2 * NOISE < error[0]
+
+
+def slowly(data: Observations) -> Observations:
+    """Return the same survey flown in 6 h, a sample every 12 s: time for an offset to creep."""
+    return replace(data, time=1e9 + 3.0 * (data.time - data.time[0]))
+
+
+def error_of(found: Fit, data: Observations, true: FloatArray) -> tuple[float, float]:
+    """Return the corrected field's error and its sigma, about the mean, nT."""
+    channels = data.channels(found.calibration)
+    got = correct(found.calibration, data.field, channels, data.time)
+    level = level_of(found.calibration, data.field, channels, data.time)
+    return float(np.std(got.total - true)), float(np.sqrt(np.median(got.sigma**2 - level**2)))
+
+
+@pytest.mark.parametrize("lag", [0.0, 600.0])
+def test_offset_that_follows_the_temperature_is_found_and_written(lag: float) -> None:
+    """2 nT/degC, and 10 degC between surface and depth: it is in the calibration, and not in the rock."""
+    data, true = flown()
+    dive = np.arange(len(data)) % 220 / 110.0
+    water = 20.0 - 10.0 * np.minimum(dive, 2.0 - dive)
+    slope = np.array([2.0, -1.0, 1.5])
+    warm = lagged(data.time, water, lag) - 15.0
+    seen = replace(data, field=data.field + np.outer(warm, slope), temperature=water)
+    found = fit(seen)
+    assert found.calibration.channels == ("sensor_temperature",)
+    (effect,) = found.calibration.effects
+    assert isinstance(effect, ChannelEffect)
+    assert effect.lag == lag
+    np.testing.assert_allclose(found.calibration.coefficients[-3:], slope, atol=0.3)
+    error, sigma = error_of(found, seen, true)
+    assert error < 1.15 * NOISE
+    assert 0.8 < error / sigma < 1.25
+    assert any("follows its temperature" in line for line in found.warnings)
+    again = decode_calibration(encode_calibration(found.calibration))
+    assert again.effects == found.calibration.effects
+
+
+def test_temperature_that_moves_nothing_is_left_out(survey: Survey) -> None:
+    """A clean survey's calibration needs no temperature and knows of no creep, whatever the log holds."""
+    data, true, plain = survey
+    water = 20.0 - 10.0 * np.abs(np.sin(data.time / 140.0))
+    found = fit(slowly(replace(data, temperature=water)))
+    assert found.calibration.channels == ()
+    assert found.creep is None
+    assert error_of(found, data, true)[0] < 1.05 * error_of(plain, data, true)[0]
+
+
+def test_creep_of_the_offset_goes_neither_into_rock_nor_into_the_map() -> None:
+    """20 nT in 6 h: the map is as without it; the calibration holds the mean, its sigma the rest."""
+    data, true = flown()
+    data = slowly(data)
+    t = np.linspace(-0.5, 0.5, len(data))[:, None]
+    creep = 20.0 * t * [0.8, -0.5, 0.4] + 3.0 * np.sin(5.0 * t + [0.0, 1.0, 2.0])
+    creep -= creep.mean(axis=0)
+    seen = replace(data, field=data.field + creep)
+    found = fit(seen)
+    assert found.creep is not None
+    assert np.sqrt(np.mean((found.creep.at(data.time) - creep) ** 2)) < 0.4 * np.sqrt(np.mean(creep**2))
+    still = found.creep.calibration
+    value = correct(still, seen.field - found.creep.at(data.time), data.parameters, data.time).total
+    n = len(data)
+    assert data.place is not None
+    samples = Samples(
+        data.place[:, :2], np.zeros(n), data.time, value - true.mean(), np.zeros(n, int), np.zeros(n, bool),
+        (0.0, 0.0),
+    )  # fmt: skip
+    drawn, _ = gridded(samples).at(samples.place)
+    assert np.std(drawn - true) < 1.5 * NOISE
+    error, sigma = error_of(found, seen, true)
+    assert error > 2.0 * NOISE
+    assert 0.4 < error / sigma < 1.5
+    assert any("crept by" in line for line in found.warnings)
 
 
 @pytest.mark.parametrize("alpha", [2, 3, 4])

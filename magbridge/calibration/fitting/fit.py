@@ -19,6 +19,7 @@ from magbridge.calibration.fitting.left_out import LeftOut
 from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.offset_terms import Creep
 from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
 from magbridge.calibration.residual import Samples, residuals_of, rms, robust_scale, scales_and_offsets
@@ -70,6 +71,8 @@ class Fit:
         What the track leaves open, which is a reason for an error that is large.
     information : Information or None
         What the data alone say of the coefficients; None where the method's prior is none of all of them.
+    creep : Creep or None
+        How the sensor's offset crept meanwhile, where the data show that it did.
     """
 
     calibration: Calibration
@@ -79,6 +82,7 @@ class Fit:
     samples: Samples
     open: tuple[str, ...] = ()
     information: Information | None = None
+    creep: Creep | None = None
 
     def __repr__(self) -> str:
         count = f", {len(self.calibration.warnings)} warnings" if self.calibration.warnings else ""
@@ -102,7 +106,7 @@ class Fit:
         """Smallest and largest scale of A at the samples: a fit can reduce its residual by shrinking them."""
         step = max(len(self.samples.phi) // 1000, 1)
         scales, _ = scales_and_offsets(
-            self.samples.part(slice(None, None, step)), self.calibration.coefficients
+            self.samples.part(slice(None, None, step)), self.calibration.without_effects().coefficients
         )
         return float(scales.min()), float(scales.max())
 
@@ -159,13 +163,14 @@ def fit(
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
         away: tuple[str, ...] = ()
-        if method == "auto" and data.place is not None:
-            known = np.isfinite(data.place[:, :2]).all(axis=1)
+        if method in ("auto", "survey") and data.place is not None:
+            known = np.isfinite(data.place[:, :2]).all(axis=1) | (method == "survey")
             away = tuple(jumped(data.place[known, :2], data.time[known]))
             data = data.part(~(far_off(data.place[:, :2]) & known))
         found = chosen(data, order, **options)
         if method == "auto":
-            found = replace(found, open=(*away, *left_open(data, UNKNOWN_LENGTH)))
+            found = replace(found, open=tuple(left_open(data, UNKNOWN_LENGTH)))
+        found = replace(found, open=(*away, *found.open))
         if (kept := found.details.pop("flown", None)) is not None:
             data = data.part(kept)
             found.details["ends"] = int((~kept).sum())

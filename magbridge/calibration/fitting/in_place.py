@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.fitting.crossings import far_off, jumped, left_open
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_doubt import plausible
 from magbridge.calibration.fitting.field_search import (
@@ -41,20 +41,27 @@ from magbridge.calibration.fitting.field_search import (
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
 from magbridge.calibration.fitting.known import Known
-from magbridge.calibration.fitting.latent import Group, slow_functions, with_groups
+from magbridge.calibration.fitting.latent import Group, Offset, slow_functions, with_groups
 from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.nominal import check_scales, starts
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.offset_terms import (
+    Creep,
+    likeliest,
+    offered,
+    with_creep,
+    with_temperature,
+)
 from magbridge.calibration.fitting.pose import Vehicle, pose
 from magbridge.calibration.fitting.prior import Prior, PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
-from magbridge.calibration.residual import Samples, residuals_of, robust_scale
+from magbridge.calibration.residual import Samples, residuals_of, rms, robust_scale
 from magbridge.errors import CalibrationError
 from magbridge.field.place.matern import Matern
 
-__all__ = ["InPlace", "fit_in_place", "fit_survey"]
+__all__ = ["fit_in_place"]
 
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """nT over a stretch, and the 1-sigma of its logarithm: a quiet day's currents aloft, a sensor's drift."""
@@ -78,54 +85,7 @@ SEARCHED = 12_000
 """Samples that the field's size and length are searched with, at most."""
 
 
-@dataclass(frozen=True, eq=False)
-class InPlace:
-    """What a survey says of the field in place, beside its calibration.
-
-    Attributes
-    ----------
-    field : Matern
-        The field's prior for a standard deviation of 1.
-    size : float
-        nT, its standard deviation.
-    w : (nodes,) array
-        nT, posterior mean of its coefficients.
-    reduced : Reduced
-        Where `w` comes from, with its precision in units of the noise's.
-    sigma, rho : float
-        nT, the noise of a sample, and its autocorrelation.
-    z, covariance : (q,), (q, q) arrays
-        The dense unknowns and their posterior.
-    level : int
-        Which of them is the level, nT.
-    middle : float
-        m, the depth at which the field is given.
-    slow : (n,) array
-        nT, the slow part in time at every sample.
-    kept : (n,) array
-        Which samples are no outliers.
-    """
-
-    field: Matern
-    size: float
-    w: FloatArray
-    reduced: Reduced
-    sigma: float
-    rho: float
-    z: FloatArray
-    covariance: FloatArray
-    level: int
-    middle: float
-    slow: FloatArray
-    kept: BoolArray
-
-
-def fit_in_place(data: Observations, order: int = 3, **options: Any) -> Fit:
-    """Return the fit of :func:`fit_survey` alone."""
-    return fit_survey(data, order, **options)[0]
-
-
-def fit_survey(
+def fit_in_place(
     data: Observations,
     order: int = 3,
     *,
@@ -133,13 +93,13 @@ def fit_survey(
     vehicle: Vehicle | None = None,
     position_sigma: float = 0.0,
     known: Known | None = None,
-) -> tuple[Fit, InPlace]:
-    """Fit coefficients, level, slow changes and the field in place.
+) -> Fit:
+    """Fit coefficients, level, slow changes, what the offset follows, and the field in place.
 
     Parameters
     ----------
     data : Observations
-        With places.
+        With places, none of them far from all others.
     order : int
         Highest total degree of the polynomials in the masses' positions.
     level : float
@@ -158,38 +118,33 @@ def fit_survey(
         raise CalibrationError(
             "method survey: expected latitude and longitude, and a field that is not known"
         )
-    away = tuple(jumped(data.place[:, :2], data.time))
-    far = far_off(data.place[:, :2])
-    if far.any():
-        data = data.part(~far)
     posed = pose(data, order, vehicle, known)
-    samples, own = posed.samples, posed.family
-    q = own.E.shape[1]
+    samples, q = posed.samples, posed.family.E.shape[1]
     survey = SurveySamples(data, samples, _groups(data, level), _drift(data, position_sigma))
-    rounds = _Rounds(survey, with_groups(own, survey.groups), q)
+    rounds = _Rounds(survey, posed.family, offered(data))
     found = rounds.settle()
-    prior = found.family.at(found.widths.eta)
-    coefficients = prior.coefficients(found.z)
+    prior, z = found.family.at(found.widths.eta), found.z
+    coefficients = prior.coefficients(z)
     check_scales(samples, coefficients)
-    sigma, choice = found.widths.sigma, found.choice
     covariance = rounds.covariance(found)
-    P = prior.E @ covariance @ prior.E.T
-    lifted = replace(samples, reference=samples.reference + found.lacking)
+    creep = survey.offset(z[q:], [one for one in survey.offsets if one.lag is None])
+    lifted = replace(
+        samples, reference=samples.reference + found.lacking, field=samples.field - survey.offset(z[q:])
+    )
     fit = assemble(
-        data, lifted, posed.ranges, posed.exponents, coefficients, P, NoiseModel(sigma, choice.rho), "survey",
+        data, lifted, posed.ranges, posed.exponents, coefficients, prior.E @ covariance @ prior.E.T,
+        NoiseModel(found.widths.sigma, found.choice.rho), "survey",
         prior=Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset), details=_details(found, survey),
     )  # fmt: skip
-    stated = with_level(fit.calibration, lifted, float(found.z[q]), level) if level else fit.calibration
-    fit = replace(
-        fit,
-        calibration=stated,
-        open=(*away, *left_open(data, choice.field.length)),
+    calibration = with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
+    if level:
+        calibration = with_level(calibration, lifted, float(z[q]), level)
+    fit = replace(fit, calibration=calibration, open=tuple(left_open(data, found.choice.field.length)))
+    if not creep.any():
+        return fit
+    return replace(
+        fit, calibration=with_creep(calibration, creep), creep=Creep(data.time, creep, calibration)
     )
-    slow = survey.steady[:, 1:] @ found.z[q + 1 : q + survey.steady.shape[1]]
-    return fit, InPlace(
-        choice.field, choice.ratio * sigma, found.w, found.reduced, sigma, choice.rho, found.z, covariance,
-        q, survey.middle, slow, survey.kept,
-    )  # fmt: skip
 
 
 def _groups(data: Observations, level: float) -> tuple[Group, ...]:
@@ -209,12 +164,14 @@ def _drift(data: Observations, sigma: float) -> Drift | None:
 
 def _details(found: _Answer, survey: SurveySamples) -> dict[str, Any]:
     choice, field, names = found.choice, found.choice.field, found.family.names
+    latent = found.z[len(found.z) - sum(len(group.shape) for group in survey.groups) :]
     return {
         "log_evidence": found.score,
         "determined": found.widths.determined,
         "autocorrelation": choice.rho,
         "outliers": int((~survey.kept).sum()),
         "widths_nT": dict(zip(names, np.exp(found.widths.eta).tolist(), strict=True)),
+        "offsets_nT": {one.name: rms(survey.offset(latent, [one])) for one in survey.offsets},
         "rock": {
             "size_nT": choice.ratio * found.widths.sigma,
             "length_m": field.length,
@@ -243,14 +200,16 @@ class _Answer:
 class _Rounds:
     """Alternate coefficients, widths and the field until no residual moves."""
 
-    def __init__(self, survey: SurveySamples, family: PriorFamily, q: int) -> None:
-        self.survey, self.family, self.q = survey, family, q
+    def __init__(self, survey: SurveySamples, own: PriorFamily, offers: tuple[Offset, ...]) -> None:
+        self.survey, self.own, self.q = survey, own, own.E.shape[1]
+        self.offers, self.until = offers, GUESSED + SEARCHES
+        self.family = with_groups(own, survey.groups)
         self.step = max(len(survey.samples.field) // SEARCHED, 1)
         self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
         self.middle = float(np.median(ladder(survey.place)))
         self.choice = first_guess(survey.place)
-        self.z, self.sigma = _start(survey, family)
-        self.eta, self.w = family.centre, np.zeros(self.choice.field.nodes.size)
+        self.z, self.sigma = _start(survey, self.family)
+        self.eta, self.w = self.family.centre, np.zeros(self.choice.field.nodes.size)
         self.nodes = self.choice.field.nodes
 
     def settle(self) -> _Answer:
@@ -263,16 +222,19 @@ class _Rounds:
         """
         survey, last, moved = self.survey, None, np.inf
         for turn in range(ROUNDS):
-            if self.family.renew is not None and turn:
-                self.family = self.family.renew(self.z)
+            if self.own.renew is not None and turn:
+                self.own = self.own.renew(self.z[: self.q])
+                self.family = with_groups(self.own, survey.groups)
+            if self.offers and turn == self.until + 1:
+                self._offer()
             answer = self._round(turn)
             e = self._residuals(answer.z, answer.lacking)
             if last is not None:
                 moved = float(np.sqrt(np.mean((e - last) ** 2)))
             last = e
-            if turn > GUESSED + SEARCHES and moved < STILL * self.sigma:
+            if turn > self.until and moved < STILL * self.sigma:
                 return answer
-            if GUESSED <= turn <= GUESSED + SEARCHES:
+            if GUESSED <= turn <= self.until:
                 survey.kept = np.abs(e) <= OUTLIER * robust_scale(e)
         if moved > self.sigma:
             raise CalibrationError("the fit to the survey did not settle: the data contradict themselves")
@@ -282,9 +244,9 @@ class _Rounds:
         """Search the field where it is time to, and solve for all that is linear about the last answer."""
         place, weighed = self.survey.place, Weighed(self.family, self.eta, self.sigma, self.middle)
         few = self.step > 1
-        if turn == GUESSED:
+        if turn == self.until - SEARCHES:
             self.choice = choose(self._few, place, weighed, self.choice.ratio, harmonic=self.harmonic)
-        elif GUESSED < turn <= GUESSED + SEARCHES:
+        elif self.until - SEARCHES < turn <= self.until:
             start = replace(self.choice, rho=self.choice.rho**self.step)
             self.choice = refined(self._few, place, start, weighed)
         else:
@@ -305,9 +267,36 @@ class _Rounds:
         if self.survey.drift is not None:
             self.survey.bend(choice.field, self.w, self.z[self.q :])
             B = self.survey.basis(choice.field)
-        lacking = self._slow() + B @ self.w
+        lacking = self._slow(self.z) + B @ self.w
         score = widths.log_evidence + reduced.log_evidence
         return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
+
+    def _offer(self) -> None:
+        """Keep the offsets that the log needs; where it needs any, the field is searched anew, once."""
+        survey, choice = self.survey, self.choice
+        steady = tuple(one for one in survey.groups if not isinstance(one, Offset))
+        again = len(steady) < len(survey.groups)
+        first = len([one for one in steady if not one.name.startswith("position")])
+        self._regroup((*steady[:first], *self.offers, *steady[first:]))
+        reduced = eliminate(self._sums(choice.field, 1), choice.field, choice.ratio, choice.rho)
+        self._regroup(likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma))
+        if survey.offsets and not again:
+            self.until += SEARCHES + 1
+        else:
+            self.offers = ()
+
+    def _regroup(self, groups: tuple[Group, ...]) -> None:
+        """Go on with other groups of unknowns; those that were there stay where they are."""
+        at, width, row, column = {}, {}, self.q, len(self.own.centre)
+        for one in self.survey.groups:
+            at[one.name], width[one.name] = self.z[row : row + len(one.shape)], self.eta[column : column + 1]
+            row, column = row + len(one.shape), column + bool(one.spread)
+        z = [at.get(one.name, np.zeros(len(one.shape))) for one in groups]
+        eta = [width.get(one.name, np.log([one.width])) for one in groups if one.spread]
+        self.z = np.concatenate([self.z[: self.q], *z])
+        self.eta = np.concatenate([self.eta[: len(self.own.centre)], *eta])
+        self.survey.keep(groups)
+        self.family = with_groups(self.own, groups)
 
     def covariance(self, answer: _Answer) -> FloatArray:
         """Return that of z (q, q), with what the data leave open of the field's size and length."""
@@ -346,10 +335,9 @@ class _Rounds:
 
         A track that bends from the last answer's to that of z meets the field's slopes on its way.
         """
-        functions, many = self.survey.functions, self.survey.steady.shape[1]
-        latent = z[self.q :].copy()
-        latent[many:] -= self.z[self.q + many :]
-        return np.asarray(functions @ latent + B @ reduced.field(z))
+        bent = self.q + self.survey.bent
+        moved = self.survey.slopes @ (z[bent:] - self.z[bent:])
+        return np.asarray(self._slow(z) + moved + B @ reduced.field(z))
 
     def _few(self, field: Matern) -> Sums:
         return self._sums(field, self.step)
@@ -359,16 +347,20 @@ class _Rounds:
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
         self.survey.bend(field, w, self.z[self.q :])
         B = self.survey.basis(field)
-        return add_up(self.survey.linear(self.family, self.z, self._slow() + B @ w, w, B, step))
+        return add_up(self.survey.linear(self.family, self.z, self._slow(self.z) + B @ w, w, B, step))
 
-    def _slow(self) -> FloatArray:
-        """Return level and slow changes at every sample, nT."""
+    def _slow(self, z: FloatArray) -> FloatArray:
+        """Return level and slow changes at every sample with z (q,), nT."""
         steady = self.survey.steady
-        return np.asarray(steady @ self.z[self.q : self.q + steady.shape[1]])
+        return np.asarray(steady @ z[self.q : self.q + steady.shape[1]])
 
     def _residuals(self, z: FloatArray, lacking: FloatArray) -> FloatArray:
         samples = self.survey.samples
-        known: Samples = replace(samples, reference=samples.reference + lacking)
+        known: Samples = replace(
+            samples,
+            reference=samples.reference + lacking,
+            field=samples.field - self.survey.offset(z[self.q :]),
+        )
         return residuals_of(known, self.family.E @ z + self.family.offset)
 
 

@@ -11,6 +11,7 @@ from magbridge.calibration.fitting.crossings import rough_rock
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
 from magbridge.calibration.fitting.level import apart_from_level
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.offset_terms import in_words
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -35,7 +36,10 @@ UNSEEN = 270.0
 
 def judged(found: Fit, data: Observations) -> Fit:
     """Return the fit with its boresight, and with warnings of what the data could not determine."""
-    calibration, mismatch = found.calibration, []
+    whole, mismatch = found.calibration, []
+    calibration = whole.without_effects()
+    if whole.effects or found.creep:  # they have been taken off
+        data = replace(data, field=found.samples.field)
     if calibration.boresight is None:
         try:
             calibration = replace(calibration, boresight=find_boresight(calibration, data))
@@ -57,7 +61,7 @@ def judged(found: Fit, data: Observations) -> Fit:
     seen = combinations(found.samples, calibration.coefficients, max(noise, 1e-9))
     return replace(
         found,
-        calibration=replace(calibration, warnings=warnings),
+        calibration=replace(whole, boresight=calibration.boresight, warnings=warnings),
         warnings=(
             *unsupported,
             *(found.open if ratio <= UNSUPPORTED else ()),
@@ -101,6 +105,7 @@ def _suspicions(found: Fit) -> Iterator[str]:
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
+    yield from in_words(found.calibration, found.creep)
     if ends := found.details.get("ends", 0):
         yield (
             f"{ends} samples at the ends of the log do not fit the others (a crash, handling?), "

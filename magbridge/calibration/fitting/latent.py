@@ -1,4 +1,4 @@
-"""What a joint fit finds beside the coefficients: the level, what changes slowly with time, a bent track.
+"""What a joint fit finds beside the coefficients: level, slow changes with time, offsets, a bent track.
 
 Each is a few functions of time with a Gaussian prior whose width the evidence chooses, and enters the fit as
 further unknowns behind the coefficients' own.
@@ -13,7 +13,7 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.prior import PriorFamily
 
-__all__ = ["NOTHING", "Group", "slow_functions", "with_groups"]
+__all__ = ["NOTHING", "Group", "Offset", "slow_functions", "with_groups"]
 
 APART = 3.0 * 3600.0
 """s without a sample, after which what changes slowly starts anew."""
@@ -47,6 +47,17 @@ class Group:
     shape: FloatArray
     width: float
     spread: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Offset(Group):
+    """Unknowns that add to the sensor's offset along each axis, and not to the reference.
+
+    `functions` are (n, r), the unknowns (3 r,), axis by axis. With a temperature `lag` is that through which
+    it acts, s; None: the offset creeps with time.
+    """
+
+    lag: float | None = None
 
 
 def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[FloatArray, FloatArray]:

@@ -32,13 +32,15 @@ def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sig
     calibration : Calibration
         As fitted.
     samples : Samples
-        Those it was fitted to.
+        Those it was fitted to, without what its effects explain.
     bias, bias_sigma : float
         nT, of the reference's level, as found and as expected.
     """
     part = samples.part(slice(None, None, max(len(samples.field) // ROWS, 1)))
-    _, g = residuals(part, calibration.coefficients)
-    j = (jacobian(part.phi, g) * sizes(part, calibration.coefficients)[:, None]).mean(axis=0)
+    own = calibration.coefficients[: 9 * part.phi.shape[1]]
+    _, g = residuals(part, own)
+    j = np.zeros(len(calibration.coefficients))
+    j[: len(own)] = (jacobian(part.phi, g) * sizes(part, own)[:, None]).mean(axis=0)
     Pj = calibration.covariance @ j
     sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
     known = calibration.reference

@@ -11,19 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.model import Parameter
+from magbridge.calibration.model import Calibration, Parameter
 from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 from magbridge.records import BEYOND
 
-__all__ = ["Observations", "monomials", "polynomial_samples"]
+__all__ = ["TEMPERATURE", "Observations", "monomials", "polynomial_samples"]
+
+TEMPERATURE = "sensor_temperature"
+"""The column of the fluxgate's temperature."""
 
 COMMON, FAR = 0.005, 10.0
 """A position is implausible if it is farther from the median than FAR times the span between the quantiles
 COMMON and 1 - COMMON."""
 _PER_SAMPLE = (
-    "field", "reference", "parameters", "runs", "time", "attitude", "reference_ned", "place", "unmapped"
+    "field", "reference", "parameters", "runs", "time", "attitude", "reference_ned", "place", "unmapped",
+    "temperature",
 )  # fmt: skip
 
 
@@ -57,6 +61,8 @@ class Observations:
         m north, east, down of `origin`.
     unmapped : (n,) array, optional
         1 where the reference lacks the rock below or what a map lacks of it, 0 where it is the true field.
+    temperature : (n,) array, optional
+        degC, of the fluxgate; NaN where it is not known.
     map_sigma : float or None
         nT, 1-sigma of the map in the reference; None without a map.
     origin : tuple of 2 float
@@ -79,6 +85,7 @@ class Observations:
     reference_ned: FloatArray | None = None
     place: FloatArray | None = None
     unmapped: FloatArray | None = None
+    temperature: FloatArray | None = None
     map_sigma: float | None = None
     origin: tuple[float, float] = (0.0, 0.0)
     sensor: str = ""
@@ -114,7 +121,7 @@ class Observations:
         put(self, "parameters", parameters[whole])
         put(self, "runs", runs[whole])
         put(self, "time", time[whole])
-        for name in ("attitude", "reference_ned", "place", "unmapped"):
+        for name in ("attitude", "reference_ned", "place", "unmapped", "temperature"):
             if getattr(self, name) is not None:
                 put(self, name, np.asarray(getattr(self, name), float)[whole])
 
@@ -126,6 +133,16 @@ class Observations:
         columns = ((name, getattr(self, name)) for name in _PER_SAMPLE)
         picked: dict[str, Any] = {name: None if v is None else v[rows] for name, v in columns}
         return replace(self, **picked)
+
+    def channels(self, calibration: Calibration) -> FloatArray:
+        """Return what correcting with a calibration of these data needs: (n, c), its channels in order.
+
+        The first columns are the positions; of effects, the temperature is known.
+        """
+        positions = self.parameters[:, : len(calibration.parameters)]
+        if TEMPERATURE not in calibration.channels[positions.shape[1] :] or self.temperature is None:
+            return positions
+        return np.column_stack([positions, self.temperature])
 
     def directed(self) -> tuple[BoolArray, FloatArray, FloatArray]:
         """Return which samples (n,) have both attitude and the reference's direction, and those m of them.

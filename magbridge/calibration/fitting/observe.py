@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.observations import TEMPERATURE, Observations
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading
@@ -25,7 +25,7 @@ __all__ = ["observations"]
 
 MAP_ERROR = 20.0
 """nT, 1-sigma of a map that does not state its own."""
-FOLLOWED = ("sensor_temperature", "depth")
+FOLLOWED = (TEMPERATURE, "depth")
 """Columns that move no mass but may be fitted as if they did."""
 
 
@@ -79,6 +79,7 @@ def observations(
         reference_ned=vector,
         place=place,
         unmapped=unmapped,
+        temperature=_column(ds, TEMPERATURE) if TEMPERATURE in ds else None,
         map_sigma=None if grid is None else grid_sigma(grid),
         origin=origin,
         sensor=str(ds.attrs.get("sensor", "")),

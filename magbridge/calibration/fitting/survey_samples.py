@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.joint import Linear
-from magbridge.calibration.fitting.latent import Group
+from magbridge.calibration.fitting.latent import Group, Offset
 from magbridge.calibration.fitting.level import sizes
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.prior import PriorFamily
@@ -57,16 +57,37 @@ class SurveySamples:
         self.place = self.as_logged = data.place[:, :2]
         self.middle = float(np.nanmedian(data.place[:, 2]))
         self.deeper = np.nan_to_num(data.place[:, 2] - self.middle)
-        steady = np.concatenate([group.functions for group in groups], axis=1)
-        self.steady = self.functions = steady * self.unmapped[:, None]
-        self.groups = groups
+        self.kept = np.ones(len(samples.field), bool)
         if drift is not None:
-            nothing = np.zeros_like(drift.waves)
-            self.groups = (
+            nothing = np.zeros((len(samples.field), 0))
+            groups = (
                 *groups, *(Group(f"position {way}", nothing, drift.shape, drift.sigma) for way in ("n", "e"))
             )  # fmt: skip
-            self.functions = np.hstack([self.steady, nothing, nothing])
-        self.kept = np.ones(len(samples.field), bool)
+        self.keep(groups)
+
+    def keep(self, groups: tuple[Group, ...]) -> None:
+        """Go on with these groups of unknowns: those that add to the reference come first, then offsets."""
+        self.groups = groups
+        steady = [group.functions for group in groups if not isinstance(group, Offset)]
+        self.steady = np.concatenate(steady, axis=1) * self.unmapped[:, None]
+        self.offsets = [group for group in groups if isinstance(group, Offset)]
+        self.bent = self.steady.shape[1] + sum(len(group.shape) for group in self.offsets)
+        """Where the unknowns of the positions begin."""
+        many = 0 if self.drift is None else len(self.drift.shape)
+        self.slopes = np.zeros((len(self.kept), 2 * many))
+
+    def offset(self, latent: FloatArray, of: Sequence[Offset] | None = None) -> FloatArray:
+        """Return the sensor's offset (n, 3), nT, beside what depends on the positions.
+
+        `latent` (p,) are the unknowns of all groups; `of` are the offsets that count, by default all.
+        """
+        out, start = np.zeros((len(self.kept), 3)), self.steady.shape[1]
+        for group in self.offsets:
+            d = latent[start : start + len(group.shape)]
+            start += len(d)
+            if of is None or group in of:
+                out += group.functions @ d.reshape(3, -1).T
+        return out
 
     def basis(self, field: Matern) -> csr_array:
         """Return what the field's coefficients add to the reference (n, nodes)."""
@@ -79,12 +100,11 @@ class SurveySamples:
         """
         if self.drift is None:
             return
-        r, many = len(self.drift.shape), self.steady.shape[1]
-        north, east = latent[many : many + r], latent[many + r :]
+        north, east = latent[self.bent :].reshape(2, -1)
         waves = self.drift.waves
         self.place = self.as_logged + np.stack([waves @ north, waves @ east], axis=1)
         slopes = [(slope @ w * self.unmapped)[:, None] * waves for slope in field.nodes.slopes(self.place)]
-        self.functions = np.hstack([self.steady, *slopes])
+        self.slopes = np.hstack(slopes)
 
     def linear(
         self,
@@ -101,21 +121,29 @@ class SurveySamples:
         """
         rows = np.flatnonzero(self.kept)[::step]
         samples = self.samples.part(rows)
-        samples = replace(samples, reference=samples.reference + lacking[rows])
+        q = family.E.shape[1] - sum(len(group.shape) for group in self.groups)
+        samples = replace(
+            samples,
+            reference=samples.reference + lacking[rows],
+            field=samples.field - self.offset(z[q:])[rows],
+        )
         follows = np.zeros(len(rows), bool)
         apart = self._apart(rows)
         follows[1:] = apart == step
         c = family.E @ z + family.offset
-        many = self.functions.shape[1]
-        E = family.E[:, : family.E.shape[1] - many]
+        E = family.E[:, :q]
         for start in range(0, len(rows), CHUNK):
             first = max(start - 1, 0)
             part = slice(first, start + CHUNK)
             piece = samples.part(part)
             e, g = residuals(piece, c)
             s = sizes(piece, c)
-            D = np.hstack([jacobian(piece.phi, g) @ E, -self.functions[rows[part]] / s[:, None]])
-            here = csr_array(diags_array(-1.0 / s) @ B[rows[part]])
+            mine, size = rows[part], s[:, None]
+            offsets = [g[:, 6 + k, None] * one.functions[mine] for one in self.offsets for k in range(3)]
+            D = np.hstack(
+                [jacobian(piece.phi, g) @ E, -self.steady[mine] / size, *offsets, -self.slopes[mine] / size]
+            )
+            here = csr_array(diags_array(-1.0 / s) @ B[mine])
             y = e - D @ z - here @ w
             yield Linear(np.column_stack([y, D]), here, follows[part], overlap=start > 0)
 

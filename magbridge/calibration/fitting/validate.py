@@ -17,10 +17,8 @@ def in_sensor_units(calibration: Calibration, data: Observations) -> tuple[Float
 
     A fit that shrinks A shrinks every error of the corrected field, but gains nothing in the sensor's units.
     """
-    k = len(calibration.parameters)
-    positions = data.parameters[:, :k]
-    got = correct(calibration, data.field, positions, data.time)
-    A, T = calibration.matrices(positions)
+    got = correct(calibration, data.field, data.channels(calibration), data.time)
+    A, T = calibration.matrices(data.parameters[:, : len(calibration.parameters)])
     b = np.matmul(A, (data.field - T)[:, :, None])
     size = np.linalg.norm(np.matmul(A, b)[:, :, 0], axis=1) / got.total
     error = got.total - data.reference

@@ -1,0 +1,193 @@
+r"""What a sensor's offset follows during a survey: its temperature, at once or lagged, and time.
+
+.. math:: T(t) = T + c\,(\Theta_\tau(t) - \bar\Theta) + \sum_k d_k \cos(\pi k t / t_s)
+
+c along each axis, nT/degC, with the temperature through a lag tau; the rest a random walk along each axis. An
+offset of the body is another field on each heading: without these terms it would go into the rock. All are in
+the fit while the rock is searched; then those stay that make the log likelier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.effects import ChannelEffect, held, lagged
+from magbridge.calibration.fitting.evidence import Quadratic, maximise
+from magbridge.calibration.fitting.latent import Group, Offset, slow_functions, with_groups
+from magbridge.calibration.fitting.observations import TEMPERATURE, Observations
+from magbridge.calibration.fitting.prior import PriorFamily
+from magbridge.calibration.model import Calibration
+
+__all__ = ["Creep", "in_words", "likeliest", "offered", "with_creep", "with_temperature"]
+
+LAGS = (0.0, 600.0, 2400.0)
+"""s, by which the offset may follow the temperature: a sensor by itself, in its housing, in a hull."""
+VARIES = 0.5
+"""degC, standard deviation of a temperature, from which on it can tell anything."""
+PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
+"""nT/degC and nT along an axis (fluxgates' data sheets: 0.1 to 3 nT/degC), 1-sigma of their logarithms."""
+LIKELIER = 3.0
+"""Nats that a term must gain (20:1)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Creep:
+    """How the offset crept while a survey lasted.
+
+    Attributes
+    ----------
+    time : (n,) array
+        s since 1970 UTC.
+    offset : (n, 3) array
+        nT, sensor axes, about the mean.
+    calibration : Calibration
+        What holds once that is taken off the readings; beyond the survey the offset may be any of these.
+    """
+
+    time: FloatArray
+    offset: FloatArray
+    calibration: Calibration
+
+    def at(self, time: FloatArray) -> FloatArray:
+        """Return the offset (m, 3), nT, at times (m,), s since 1970 UTC."""
+        return np.stack([np.interp(time, self.time, one) for one in self.offset.T], axis=1)
+
+
+def offered(data: Observations) -> tuple[Offset, ...]:
+    """Return the terms that may be in a log: the temperature at every lag, where there is any, and creep."""
+    groups = []
+    if data.temperature is not None and TEMPERATURE not in data.names:
+        for lag in LAGS:
+            warm = _temperature(data, lag)
+            if np.std(warm) > VARIES:
+                column = (warm - warm.mean())[:, None]
+                name = f"offset by temperature, lag {lag:.0f} s"
+                groups.append(Offset(name, column, np.ones(3), PER_DEGREE, SPREAD, lag))
+    waves, shape = slow_functions(data.time)
+    if len(shape):
+        groups.append(Offset("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD))
+    return tuple(groups)
+
+
+def likeliest(
+    quadratic: Quadratic,
+    own: PriorFamily,
+    groups: tuple[Group, ...],
+    eta: FloatArray,
+    sigma: float,
+) -> tuple[Group, ...]:
+    """Return the groups without the offsets that the log does not need: one lag at most, and creep or none.
+
+    Parameters
+    ----------
+    quadratic : Quadratic
+        In the unknowns of all groups, behind those of `own`.
+    own : PriorFamily
+        Of the coefficients.
+    groups : tuple of Group
+        All that are in the fit.
+    eta, sigma : (h,) array, float
+        Widths and noise (nT), from which to climb.
+    """
+    first, free = _starts(own, groups)
+
+    def score(kept: tuple[Group, ...]) -> float:
+        rows = [np.arange(own.E.shape[1])]
+        rows += [first[one.name] + np.arange(len(one.shape)) for one in kept]
+        i = np.concatenate(rows)
+        part = Quadratic(quadratic.H[np.ix_(i, i)], quadratic.b[i], quadratic.c_0, quadratic.n)
+        widths = [*range(len(own.centre)), *(free[one.name] for one in kept if one.spread)]
+        terms = sum(isinstance(one, Offset) for one in kept)
+        return maximise(part, with_groups(own, kept), eta[widths], sigma).log_evidence - LIKELIER * terms
+
+    return max(_choices(groups), key=score)
+
+
+def _choices(groups: tuple[Group, ...]) -> Iterator[tuple[Group, ...]]:
+    """Yield all choices: none first, so that it is taken where nothing is likelier."""
+    offsets = [one for one in groups if isinstance(one, Offset)]
+    lags: list[Offset | None] = [None, *(one for one in offsets if one.lag is not None)]
+    creep: list[Offset | None] = [None, *(one for one in offsets if one.lag is None)]
+    for chosen in product(lags, creep):
+        yield tuple(one for one in groups if not isinstance(one, Offset) or one in chosen)
+
+
+def _starts(own: PriorFamily, groups: tuple[Group, ...]) -> tuple[dict[str, int], dict[str, int]]:
+    """Return where the unknowns of each group begin, and where its width stands."""
+    first, free, row, column = {}, {}, own.E.shape[1], len(own.centre)
+    for one in groups:
+        first[one.name], free[one.name] = row, column
+        row, column = row + len(one.shape), column + bool(one.spread)
+    return first, free
+
+
+def _temperature(data: Observations, lag: float) -> FloatArray:
+    """Return the temperature (n,), degC, through a lag; its mean before any is known."""
+    assert data.temperature is not None
+    known = data.temperature[np.isfinite(data.temperature)]
+    return lagged(data.time, held(data.temperature, float(known.mean()) if len(known) else 0.0), lag)
+
+
+def with_temperature(
+    calibration: Calibration,
+    data: Observations,
+    groups: tuple[Group, ...],
+    found: tuple[FloatArray, FloatArray, FloatArray],
+) -> Calibration:
+    """Return the calibration with the effect of the temperature that was found, if any.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Its position terms.
+    data : Observations
+        Of the fit.
+    groups : tuple of Group
+        That are in the fit, in order.
+    found : tuple of (q,), (q, q), (9 m, q) arrays
+        The unknowns, their covariance, and what they do to the coefficients.
+    """
+    z, covariance, E = found
+    row = E.shape[1] - sum(len(one.shape) for one in groups)
+    for one in groups:
+        if isinstance(one, Offset) and one.lag is not None:
+            origin = float(_temperature(data, one.lag).mean())
+            both = np.vstack([E, np.eye(3, len(z), row)])
+            return replace(
+                calibration,
+                effects=(ChannelEffect(channel=TEMPERATURE, origin=origin, lag=one.lag),),
+                coefficients=np.append(calibration.coefficients, z[row : row + 3]),
+                covariance=both @ covariance @ both.T,
+            )
+        row += len(one.shape)
+    return calibration
+
+
+def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
+    """Return the calibration whose offset may be any of those (n, 3), nT, that it was in the survey."""
+    covariance = calibration.covariance.copy()
+    covariance[6:9, 6:9] += creep.T @ creep / len(creep)
+    return replace(calibration, covariance=covariance)
+
+
+def in_words(calibration: Calibration, creep: Creep | None) -> Iterator[str]:
+    """Say what the offset was found to follow."""
+    for effect in calibration.effects:
+        if isinstance(effect, ChannelEffect):
+            slope = float(np.linalg.norm(calibration.coefficients[-effect.size :]))
+            late = f", {effect.lag / 60:.0f} minutes late" if effect.lag else ""
+            yield (
+                f"the sensor's offset follows its temperature by {slope:.1f} nT/degC{late}: the calibration "
+                f"takes that off, and needs {effect.channel}"
+            )
+    if creep is not None:
+        size = float(np.sqrt(np.mean((creep.offset**2).sum(axis=1))))
+        yield (
+            f"the sensor's offset crept by {size:.1f} nT (RMS) during the survey: its mean stands in the "
+            "calibration, and the sigma counts the rest"
+        )
