@@ -8,6 +8,7 @@ nominal       the same, with the remaining errors of a nominal calibration
 watch         how long a wrong position counts as valid
 misinformed   whether a position counts as valid when the level is wrong, or half of the map is
 unmapped      surveys without a map: a glider's of 6 and 12 h, an aircraft's of 100 minutes, beside the bound
+smoothed      the same flights on a rough map and on that map without its short waves
 dived         gliders that dive under a map flown 90 m above the sea, without and with its continuation
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
 speed         one update, 100,000 samples, the start
@@ -67,6 +68,7 @@ from navigation_studies.simulated import (
     synthetic,
     track_over,
 )
+from navigation_studies.smoothed import ROUGH, WAVELENGTHS, on_smoothed
 from navigation_studies.unmapped import AIRCRAFT, Located, located
 from navigation_studies.unmapped import GLIDER as UNMAPPED
 from scipy.stats import chi2
@@ -240,6 +242,16 @@ def dives(runs: Runs, _asked: argparse.Namespace) -> None:
         show(table)
 
 
+def on_smoothed_maps(runs: Runs, asked: argparse.Namespace) -> None:
+    """What smoothing a map costs, and whether the position's sigma knows."""
+    print(f"\n## On a smoothed map: {runs.number} runs of 6 h, {ROUGH}; start within 0.2 lengths\n")
+    found: list[tuple[Score, ...]] = runs(partial(on_smoothed), asked.first)
+    table: Table = [HEADER]
+    for name, made in zip(WAVELENGTHS, zip(*found, strict=True), strict=True):
+        table.append(row(f"without waves below {name:.0f} m" if name else "as it is", made))
+        show(table)
+
+
 def unmapped(runs: Runs, asked: argparse.Namespace) -> None:
     """Localise surveys in their own field, beside the bound of localisation and mapping at once."""
     print(
@@ -353,6 +365,7 @@ PARTS: dict[str, Callable[[Runs, argparse.Namespace], None]] = {
     "watch": watch,
     "misinformed": misinformed,
     "unmapped": unmapped,
+    "smoothed": on_smoothed_maps,
     "dived": dives,
     "calibrations": calibrations,
     "nominal": partial(accuracy, left="nominal"),
@@ -364,7 +377,7 @@ PARTS: dict[str, Callable[[Runs, argparse.Namespace], None]] = {
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0, help="the first survey's number, of unmapped")
+    parser.add_argument("--first", type=int, default=0, help="number of the first run (unmapped, smoothed)")
     parser.add_argument("--part", choices=sorted(PARTS), action="append")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="folder in which rows that are done are kept")

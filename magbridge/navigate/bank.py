@@ -139,7 +139,7 @@ class Bank:
         bent, spread = curvature(local, self.P[0, 0], self.P[0, 1], self.P[1, 1])
         self.curvature_variance = float(self.w @ spread)
         anomaly = local.anomaly + (block.slope_north * north + block.slope_east * east + bent)
-        v = block.alike * local.variance + block.variance + spread
+        v = local.variance + block.variance + spread
         slopes = np.where(off, 0.0, (local.north + block.slope_north, local.east + block.slope_east))
         gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + self.P[5]
         s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + gain[5]

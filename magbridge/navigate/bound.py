@@ -13,7 +13,8 @@ from magbridge.errors import OutOfRange
 from magbridge.field.geodesy import metres_per_degree, separation, wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate.model import N_STATES, block_length, measurement_row, prior, repeated, transition
+from magbridge.navigate.depth import lasting_errors
+from magbridge.navigate.model import N_STATES, block_length, measurement_row, prior, transition
 from magbridge.navigate.options import Options
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def position_bound(
     it is the covariance of a Kalman filter that knows where to linearise,
     ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map there is no measurement.
     """
-    o = options or Options()
+    grid, o = lasting_errors(grid, options or Options())
     corners = np.asarray(time, float)
     lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
     along = _along(corners, lat, lon)
@@ -99,7 +100,7 @@ def position_bound(
         )
     lat, lon = np.interp(at, corners, lat), wrap(np.interp(at, corners, lon))
     metres = np.diff(np.interp(at, corners, along), prepend=0.0)
-    local, alike = grid.evaluate(lon, lat), repeated(grid, metres)
+    local = grid.evaluate(lon, lat)
     main = total_field(lon, lat, depth, at)
     per_latitude, per_longitude = metres_per_degree(lat)
     slope_north = (total_field(lon, lat + STEP, depth, at) - main) / (STEP * per_latitude)
@@ -117,7 +118,7 @@ def position_bound(
         if np.isfinite(local.anomaly[i]):
             row = measurement_row(local.north[i] + slope_north[i], local.east[i] + slope_east[i])
             gain = P @ row.T
-            P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + alike[i] * local.variance[i])
+            P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + local.variance[i])
         covariance[i], unaided[i] = P, np.sqrt(alone[0, 0] + alone[1, 1])
     reached = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
     return Bound(at, lat, lon, covariance, reached, unaided)

@@ -78,7 +78,7 @@ class Collector:
         self._last = there
         anomaly, variance = total_field - main, max(sigma, LEAST) ** 2
         place = where.latitude, where.longitude
-        self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, where.depth, 1.0))
+        self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, where.depth))
         full = (
             time_us - self._start_us + wait > self._interval_us
             or where.travelled - self._begun + step > self._step

@@ -12,7 +12,7 @@ from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options
 
-__all__ = ["at_depth"]
+__all__ = ["at_depth", "lasting_errors"]
 
 NEGLIGIBLE = 0.1
 """Share of the map error below which what lies between the nodes changes it by less than 1 %."""
@@ -41,9 +41,28 @@ def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[Ano
     errors = [(there.sigma, there.length)] if there.sigma else []
     if grid.interpolation_sigma > NEGLIGIBLE * options.map_sigma:
         errors.append((grid.interpolation_sigma, 0.5 * grid.spacing))
-    if not errors:
-        return there.grid, options
-    errors.append((options.map_sigma, options.map_length))
-    sigma = hypot(*(sigma for sigma, _ in errors))
-    steepness = hypot(*(sigma / length for sigma, length in errors))
-    return there.grid, replace(options, map_sigma=sigma, map_length=sigma / steepness)
+    return lasting_errors(there.grid, _added(options, errors) if errors else options)
+
+
+def lasting_errors(grid: AnomalyGrid, options: Options) -> tuple[AnomalyGrid, Options]:
+    """Return the map without a sigma that lasts from sample to sample, and options whose map error has it.
+
+    A sigma with a ``sigma_length`` becomes a part of the filter's map error, of its RMS over the map: that
+    state is correlated along the track, and the noise of a measurement is not.
+    """
+    if not grid.sigma_length:
+        return grid, options
+    known = np.isfinite(grid.anomaly)
+    sigma = float(np.sqrt(np.mean(grid.sigma[known] ** 2)))
+    plain = AnomalyGrid(
+        grid.longitude, grid.latitude, grid.anomaly, 0.0, grid.altitude, grid.name, grid.vertical
+    )
+    return plain, _added(options, [(sigma, grid.sigma_length)]) if sigma else options
+
+
+def _added(options: Options, errors: list[tuple[float, float]]) -> Options:
+    """Return options whose map error includes others, of a sigma, nT, and a length, m."""
+    whole = [*errors, (options.map_sigma, options.map_length)]
+    sigma = hypot(*(sigma for sigma, _ in whole))
+    steepness = hypot(*(sigma / length for sigma, length in whole))
+    return replace(options, map_sigma=sigma, map_length=sigma / steepness)

@@ -11,7 +11,7 @@ from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
-from magbridge.navigate.model import Block, prior, repeated, resolution, transition
+from magbridge.navigate.model import Block, prior, resolution, transition
 from magbridge.navigate.options import Options, any_level
 from magbridge.navigate.record import Jump, State
 from magbridge.navigate.tracker import Innovation, Tracker
@@ -123,7 +123,6 @@ class Estimate:
     def update(self, block: Block, travelled: float) -> Innovation:
         """Take in a measurement, `travelled` m after the start; return its innovation, NaN off the map."""
         seconds, metres = self.predict(block.time_us, travelled)
-        block = block._replace(alike=float(repeated(self.grid, metres)))
         finer = resolution(self.grid, self.options, block.variance)
         if finer < FINER * self._resolution:  # never coarser: a first block may have been a poor one
             self._resolution = finer

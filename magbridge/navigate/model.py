@@ -33,7 +33,6 @@ __all__ = [
     "block_length",
     "measurement_row",
     "prior",
-    "repeated",
     "resolution",
     "transition",
 ]
@@ -60,9 +59,6 @@ class Block(NamedTuple):
         nT/m, of the main field.
     depth : float
         m, their mean; NaN stands for the map's own height.
-    alike : float
-        How many times the map's own variance counts here: where successive measurements lie within its
-        ``sigma_length``, they meet the same error.
     """
 
     time_us: int
@@ -73,24 +69,10 @@ class Block(NamedTuple):
     slope_north: float
     slope_east: float
     depth: float = nan
-    alike: float = 1.0
-
-
-def repeated(grid: AnomalyGrid, metres: float | FloatArray) -> FloatArray:
-    """Return how often measurements `metres` (n,) apart meet one and the same error of the map.
-
-    Notes
-    -----
-    Errors ``s² exp(-d/L)``, measured every d: their mean over many has the variance of independent ones of
-    ``s² (1 + r)/(1 - r) = s² coth(d/2L)``, ``r = exp(-d/L)``; L is the map's ``sigma_length``.
-    """
-    if not grid.sigma_length:
-        return np.ones_like(metres, float)
-    return np.asarray(1.0 / np.tanh(0.5 * np.maximum(metres, 1e-3 * grid.sigma_length) / grid.sigma_length))
 
 
 def average(blocks: Sequence[Block] | FloatArray) -> Block:
-    """Return several blocks, or rows (n, 9) of their fields, as one: their mean, weighted by precision.
+    """Return several blocks, or rows (n, 8) of their fields, as one: their mean, weighted by precision.
 
     Its variance is that of independent ones.
     """

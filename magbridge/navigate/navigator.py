@@ -20,6 +20,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import widest
 from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
+from magbridge.navigate.depth import lasting_errors
 from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.model import Block, block_length, transition
 from magbridge.navigate.options import Options
@@ -52,7 +53,7 @@ class Navigator:
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options | None = None) -> None:
-        options = options or Options()
+        grid, options = lasting_errors(grid, options or Options())
         self.estimate = Estimate(grid, options)
         self.dropped = self.utc_offset_us = 0
         self._reckoning = DeadReckoning()

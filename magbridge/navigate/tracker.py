@@ -79,7 +79,7 @@ class Tracker:
         (pnn, pne), (_, pee) = self.P[:2, :2].tolist()
         bent, self.curvature_variance = curvature(local, pnn, pne, pee)
         expected = local.anomaly + block.slope_north * north + block.slope_east * east + bent
-        variance = block.variance + block.alike * local.variance + self.curvature_variance
+        variance = block.variance + local.variance + self.curvature_variance
         row = measurement_row(local.north + block.slope_north, local.east + block.slope_east)
         innovation = self._observe(block.anomaly, expected + float(self.x[4] + self.x[5]), row, variance)
         return innovation._replace(anomaly=local.anomaly)

@@ -7,13 +7,14 @@ from math import hypot
 import numpy as np
 import pytest
 import xarray as xr
+from msgspec.structs import replace
 from navigation_studies.dived import dived
-from navigation_studies.simulated import Map, synthetic
+from navigation_studies.simulated import GLIDER, Map, sail, synthetic, track_over
 
 from magbridge.cli.navigate import _continued
-from magbridge.field.continuation import continued
+from magbridge.field.continuation import continued, smoothed
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.depth import at_depth
+from magbridge.navigate.depth import at_depth, lasting_errors
 from magbridge.navigate.options import Options
 
 
@@ -61,3 +62,21 @@ def test_what_lies_between_nodes_counts_as_map_error() -> None:
     assert known.map_sigma == pytest.approx(coarse.interpolation_sigma)
     assert known.map_sigma > 1.0
     assert known.map_length == pytest.approx(0.5 * coarse.spacing)
+
+
+def test_what_was_smoothed_away_is_a_map_error_that_lasts_and_a_flight_holds_its_position() -> None:
+    """Rough rock without its waves below 1 km: near the bound, and honest; counted with every measurement
+    instead, a field that has nothing to do with the map explained the flight better, and it was lost.
+    """
+    raw = synthetic(Map(40, 1000, rough=True), 0)
+    less = smoothed(raw, 1_000.0)
+    plain, known = lasting_errors(less, Options(map_sigma=0.0))
+    assert known.map_sigma == pytest.approx(float(np.std(less.anomaly - raw.anomaly)), rel=0.3)
+    assert known.map_length == pytest.approx(less.sigma_length)
+    assert not plain.sigma.any()
+    assert lasting_errors(raw, known) == (raw, known)
+    options = replace(GLIDER, start_sigma=150.0)
+    flown = sail(track_over(raw, options, 1000, hours=3.0), less, options).score()
+    assert not flown.lost
+    assert flown.drms < 2.0 * flown.bound < flown.unaided
+    assert flown.nees < 3.0

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from magbridge.calibration.model import Calibration, Noise, identity
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.model import block_length, prior, repeated, resolution, transition
+from magbridge.navigate.model import block_length, prior, resolution, transition
 from magbridge.navigate.options import Options, informed
 
 
@@ -31,17 +31,6 @@ def test_gauss_markov_states_keep_their_variance() -> None:
     _, P = prior(options)
     f, q = transition(options, 600.0, 200.0)
     np.testing.assert_allclose((f @ P @ f.T + q)[2:, 2:], P[2:, 2:], rtol=1e-12)
-
-
-def test_errors_of_a_map_that_are_alike_count_as_often_as_they_are_met(grid: AnomalyGrid) -> None:
-    """Against the variance of the mean of a thousand, whose errors have that length."""
-    alike = AnomalyGrid(grid.longitude, grid.latitude, grid.anomaly, 2.0, sigma_length=300.0)
-    apart = np.abs(np.subtract.outer(np.arange(1000.0), np.arange(1000.0)))
-    for metres in (20.0, 200.0, 2000.0):
-        mean = np.exp(-apart * metres / 300.0).mean()
-        assert repeated(alike, metres) == pytest.approx(1000.0 * mean, rel=0.02)
-        assert repeated(grid, metres) == 1.0
-    assert np.isfinite(repeated(alike, np.array([0.0, 5.0]))).all()
 
 
 def test_no_time_is_no_motion() -> None:
