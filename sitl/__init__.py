@@ -2,10 +2,9 @@
 
 A :mod:`.scenario` says what is simulated. In its :mod:`.world` a vehicle (:mod:`.platform`) with an
 :mod:`.instrument` flies a :mod:`.mission` along a :mod:`.trajectory`; the :mod:`.twin` is all of them
-together, and its log a :mod:`.dataset`. :mod:`.like` flies the way of a real log instead, :mod:`.inject`
-hides effects, and :mod:`.bound` says how well a calibration could do. :mod:`.fluxgate` speaks the sensors'
-protocols, and :mod:`.replay` plays deployments to the bridge. :mod:`.demo` does the main job, and
-:mod:`.bonne_bay` is the paper's trials.
+together, and its log a :mod:`.dataset`. :mod:`.like` flies the way of a real log instead, and :mod:`.inject`
+hides effects. :mod:`.fluxgate` speaks the sensors' protocols, and :mod:`.replay` plays deployments to the
+bridge. :mod:`.demo` does the main job.
 """
 
 from __future__ import annotations

@@ -27,6 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from bonne_bay_trials import METHODS
+from bound import BestFit, oracle
 from engine import add_engine, in_order
 from rich.console import Console
 from scipy.optimize import least_squares
@@ -38,8 +40,6 @@ from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
 from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
-from sitl.bonne_bay import METHODS
-from sitl.bound import BestFit, oracle
 from sitl.dataset import at_rest, channels, corrected, side_by_side
 from sitl.instrument import rotation
 from sitl.platform import Vehicle

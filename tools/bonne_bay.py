@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from bonne_bay_figures import draw
+from bonne_bay_trials import METHODS, PAPER, TRIALS, Trials, fly
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from terminal import command_line, table
 
 from magbridge.calibration.residual import rms
-from sitl.bonne_bay import METHODS, PAPER, TRIALS, Trials, fly
 from sitl.mission import TABLE_1
 
 SEED = 29

@@ -13,6 +13,7 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "2")
 
 import xarray as xr
+from bonne_bay_trials import MASSES, PAPER, measure
 from study.deployment import CHARTS
 from terminal import command_line
 
@@ -20,7 +21,6 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.run import diagnose
-from sitl.bonne_bay import MASSES, PAPER, measure
 from sitl.dataset import corrected
 from sitl.scenario import load
 from sitl.twin import Twin

@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import xarray as xr
+from bonne_bay_trials import METHODS, TRIALS, Trials
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -15,7 +16,6 @@ from matplotlib.figure import Figure
 from magbridge.columns import CHANNELS
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
-from sitl.bonne_bay import METHODS, TRIALS, Trials
 
 INK = {"nominal": "#c9a227", "cubic": "#1f77a4", "auto": "#b3315c", "local": "#1b1b1b", "igrf": "#8a8a8a"}
 

@@ -4,7 +4,7 @@
 
 Gliders of tools/navigation.py's study, on its maps: GPS for ten minutes, then none, and for the last five
 again. Each is sailed twice for every kind of fix and every kind of telemetry that an autopilot may send: with
-one that ignores fixes, and with one that takes them by the rules of ArduPilot or PX4 (``sitl/referee``).
+one that ignores fixes, and with one that takes them by the rules of ArduPilot or PX4 (``tools/referee``).
 
 follows       what the bridge's dead reckoning followed while GPS was lost
 obeying m     root mean square error of the bridge's position without GPS, with the autopilot that takes fixes
@@ -29,10 +29,9 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 from navigation_studies.simulated import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
+from referee import ArduPilot, Autopilot, Px4
+from referee.loop import Passage, Run, sail
 from terminal import command_line
-
-from sitl.referee import ArduPilot, Autopilot, Px4
-from sitl.referee.loop import Passage, Run, sail
 
 LOST, BACK = 600.0, 300.0
 """s: GPS is lost after the first, and back the second before the end."""

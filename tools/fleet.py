@@ -18,6 +18,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import xarray as xr
+from bound import BestFit, oracle
 from engine import add_engine, in_order
 from rich.console import Console
 from terminal import command_line, table
@@ -34,7 +35,6 @@ from magbridge.errors import CalibrationError
 from magbridge.fleet.learn import Lesson, learn_fleet
 from magbridge.fleet.variances import LEVELS
 from sitl import Twin, load, segments, simulate
-from sitl.bound import BestFit, oracle
 from sitl.dataset import at_rest, corrected
 from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle
 

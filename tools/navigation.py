@@ -50,6 +50,7 @@ from pickle import dumps, loads
 from typing import Any, NamedTuple
 
 import numpy as np
+from bonne_bay_trials import METHODS
 from msgspec.structs import replace as with_options
 from navigation_studies.calibrated import Flown, flown
 from navigation_studies.dived import dived
@@ -77,7 +78,6 @@ from terminal import command_line
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.tracker import Tracker
-from sitl.bonne_bay import METHODS
 
 Table = list[Sequence[str]]
 MAPS = (Map(60, 2000), Map(60, 800), Map(20, 1000), Map(20, 1000, rough=True), Map(5, 1000), Map(1, 2000))

@@ -15,6 +15,7 @@ import dataclasses
 import numpy as np
 import xarray as xr
 from accuracy import total
+from bound import oracle
 from msgspec.structs import replace
 from rich.console import Console
 from rich.progress import track
@@ -29,7 +30,6 @@ from magbridge.calibration.planning.plan import Plan, evaluate_runs, expected_ca
 from magbridge.calibration.residual import rms
 from magbridge.field.reference import main_field
 from sitl import Twin, load, segments, simulate
-from sitl.bound import oracle
 from sitl.dataset import at_rest, corrected
 from sitl.mission import TABLE_1, Run, Spirals
 from sitl.platform import Vehicle

@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from bound import oracle
 from engine import add_engine, in_order
 from rich.console import Console
 from survey_real import REAL
@@ -45,7 +46,6 @@ from magbridge.field.place.matern import Matern
 from magbridge.survey.read import from_vector
 from magbridge.survey.run import survey
 from sitl import Twin, load, segments
-from sitl.bound import oracle
 from sitl.dataset import at_rest
 from sitl.mission import CrissCross
 from sitl.platform import Vehicle

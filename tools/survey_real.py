@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import xarray as xr
+from bonne_bay_trials import MASSES, measure
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import Fit, fit
@@ -18,7 +19,6 @@ from magbridge.calibration.residual import rms
 from magbridge.logs import read
 from magbridge.survey.read import read_table
 from magbridge.survey.run import survey
-from sitl.bonne_bay import MASSES, measure
 from sitl.scenario import load
 from sitl.twin import Twin
 

@@ -11,8 +11,7 @@ the seed of :class:`~.scene.Hidden` alone, so they are the same on every deploym
 from __future__ import annotations
 
 from sitl.inject.catalogue import EFFECTS
-from sitl.inject.foreign import FOREIGN
 from sitl.inject.measure import disturb
 from sitl.inject.scene import Hidden, Scene, furnish
 
-__all__ = ["EFFECTS", "FOREIGN", "Hidden", "Scene", "disturb", "furnish"]
+__all__ = ["EFFECTS", "Hidden", "Scene", "disturb", "furnish"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import msgspec
@@ -10,8 +11,7 @@ import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from sitl.inject.catalogue import EFFECTS
-from sitl.inject.foreign import FOREIGN
-from sitl.inject.scene import Array, Hidden, Scene, furnish
+from sitl.inject.scene import Array, Effect, Hidden, Scene, furnish
 from sitl.instrument import Samples, rotation
 from sitl.trajectory import Track
 from sitl.twin import Twin
@@ -53,7 +53,14 @@ def _samples(scene: Scene, rng: np.random.Generator) -> Samples:
     return samples
 
 
-def disturb(twin: Twin, hidden: tuple[Hidden, ...], track: Track, when: Array, seed: int = 0) -> xr.Dataset:
+def disturb(
+    twin: Twin,
+    hidden: tuple[Hidden, ...],
+    track: Track,
+    when: Array,
+    seed: int = 0,
+    effects: Mapping[str, Effect] = EFFECTS,
+) -> xr.Dataset:
     """Measure along `track` with `hidden` effects; without any, the furnished deployment alone.
 
     Parameters
@@ -61,13 +68,15 @@ def disturb(twin: Twin, hidden: tuple[Hidden, ...], track: Track, when: Array, s
     twin : Twin
         The world, the vehicle and its instrument.
     hidden : tuple of Hidden
-        By their names in :data:`EFFECTS` or :data:`FOREIGN`.
+        By their names in `effects`.
     track : Track
         As :meth:`~sitl.twin.Twin.fly` returns it.
     when : array (m,)
         s after the track's start; a few seconds short of its end.
     seed : int
         Of the telemetry that has nothing to do with the effects.
+    effects : mapping
+        Name -> what it does to a scene.
 
     Returns
     -------
@@ -86,7 +95,6 @@ def disturb(twin: Twin, hidden: tuple[Hidden, ...], track: Track, when: Array, s
         reference=np.zeros(len(when)),
     )
     furnish(scene, np.random.default_rng([seed, 77]))
-    effects = EFFECTS | FOREIGN
     for one in hidden:
         effects[one.name](scene, one.size, np.random.default_rng([one.seed, 78]))
     out = twin.log(track, when, ambient.earth, _samples(scene, twin.instrument_rng()))

@@ -78,7 +78,7 @@ Effect = Callable[[Scene, float, Generator], None]
 
 
 class Hidden(msgspec.Struct, frozen=True):
-    """One hidden effect: its name in :data:`~.catalogue.EFFECTS` or :data:`~.foreign.FOREIGN`, size, seed."""
+    """One hidden effect: its name, as in :data:`~.catalogue.EFFECTS`, size, seed."""
 
     name: str
     size: float

@@ -5,12 +5,12 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from referee.loop import Passage
 
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate import Options
-from sitl.referee.loop import Passage
 
 PLACE = (49.5, -57.9)
 START = 1_780_000_000.0

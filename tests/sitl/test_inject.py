@@ -7,14 +7,16 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import foreign
 import numpy as np
 import pytest
 import xarray as xr
+from foreign import FOREIGN
 
 import sitl.inject
 from sitl import Twin, load
 from sitl.dataset import channels
-from sitl.inject import EFFECTS, FOREIGN, Hidden, disturb
+from sitl.inject import EFFECTS, Hidden, disturb
 from sitl.inject.scene import soaked
 from sitl.mission import CrissCross
 from sitl.trajectory import Track
@@ -74,7 +76,7 @@ def clean(flight: Flight) -> xr.Dataset:
 
 
 def seen(flight: Flight, *hidden: Hidden) -> xr.Dataset:
-    return disturb(flight[0], hidden, *flight[1:], seed=3)
+    return disturb(flight[0], hidden, *flight[1:], seed=3, effects=EFFECTS | FOREIGN)
 
 
 def effect(flight: Flight, clean: xr.Dataset, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:
@@ -96,9 +98,9 @@ def imported(path: Path) -> list[str]:
 
 def test_it_knows_nothing_of_the_detector() -> None:
     """The injector nothing of the whole package, the simulation below it nothing of a diagnosis."""
-    own = Path(sitl.inject.__file__).parent
-    for path in own.parent.rglob("*.py"):
-        forbidden = "magbridge" if own in path.parents else "magbridge.diagnose"
+    own, others = Path(sitl.inject.__file__).parent, Path(foreign.__file__).parent
+    for path in (*own.parent.rglob("*.py"), *others.rglob("*.py")):
+        forbidden = "magbridge" if {own, others} & {*path.parents} else "magbridge.diagnose"
         assert not [name for name in imported(path) if name.startswith(forbidden)], path
 
 

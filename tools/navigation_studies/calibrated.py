@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from accuracy import total
+from bonne_bay_trials import MASSES, METHODS
 from msgspec.structs import replace as with_options
 
 from magbridge.calibration.fitting.fit import fit
@@ -16,7 +17,6 @@ from magbridge.field.geodesy import separation
 from magbridge.navigate.options import informed
 from navigation_studies.simulated import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 from sitl import load, segments, simulate
-from sitl.bonne_bay import MASSES, METHODS
 from sitl.dataset import at_rest
 
 

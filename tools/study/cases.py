@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from foreign import FOREIGN
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import CAUSES
@@ -17,7 +18,7 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.unexplained.descriptions import Description, descriptions
-from sitl.inject import EFFECTS, FOREIGN, Hidden
+from sitl.inject import EFFECTS, Hidden
 from study.both import both
 from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of
 from study.improvement import DELAYS, harm, improvement

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import xarray as xr
+from foreign import FOREIGN
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
@@ -22,7 +23,7 @@ from magbridge.diagnose.compare.prior import floor
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
 from sitl import Twin, load, simulate
-from sitl.inject import Hidden, disturb
+from sitl.inject import EFFECTS, Hidden, disturb
 from sitl.mission import CrissCross, Spirals
 from sitl.signals import first_order
 from sitl.trajectory import Track
@@ -79,7 +80,7 @@ class Deployment(NamedTuple):
 
     def measure(self, hidden: tuple[Hidden, ...], number: int) -> xr.Dataset:
         """The log with effects, before its noise and its losses."""
-        ds = disturb(self.twin, hidden, self.track, self.when, number)
+        ds = disturb(self.twin, hidden, self.track, self.when, number, EFFECTS | FOREIGN)
         return ds if self.chart is None else charted(ds, self.chart)
 
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from passages import BACK, LAST, LOST, OPTIONS, PLACE, hills, passage
+from referee import ArduPilot, Autopilot, Px4, Truth
+from referee.filter import PositionFilter
+from referee.loop import Run, sail
 
 from magbridge.bridge.motion import Motion
 from magbridge.link.fixes import Kind
 from magbridge.mavlink import Codec
-from sitl.referee import ArduPilot, Autopilot, Px4, Truth
-from sitl.referee.filter import PositionFilter
-from sitl.referee.loop import Run, sail
 
 BRIDGE = Codec(1, 191)
 ORIGIN = (*PLACE, 0.0)

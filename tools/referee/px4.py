@@ -7,7 +7,7 @@ from typing import Any
 
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
-from sitl.referee.autopilot import Autopilot, finite
+from referee.autopilot import Autopilot, finite
 
 __all__ = ["Px4"]
 

@@ -18,7 +18,7 @@ from magbridge.link.component import Component
 from magbridge.link.fixes import FIXES
 from magbridge.navigate import Options
 from magbridge.records import Corrected
-from sitl.referee.autopilot import GPS_SIGMA, Autopilot, Truth
+from referee.autopilot import GPS_SIGMA, Autopilot, Truth
 
 __all__ = ["Passage", "Run", "sail"]
 

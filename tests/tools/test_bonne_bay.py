@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from sitl.bonne_bay import TRIALS, Trials, fly
+from bonne_bay_trials import TRIALS, Trials, fly
 
 
 @pytest.fixture(scope="module")

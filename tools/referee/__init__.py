@@ -5,8 +5,8 @@ touch: attitude, height, and the delayed time horizon. :mod:`.filter` is the pos
 :mod:`.autopilot` what both share, and :mod:`.loop` sails a bridge's navigation with one of them.
 """
 
-from sitl.referee.ardupilot import ArduPilot
-from sitl.referee.autopilot import Autopilot, Truth
-from sitl.referee.px4 import Px4
+from referee.ardupilot import ArduPilot
+from referee.autopilot import Autopilot, Truth
+from referee.px4 import Px4
 
 __all__ = ["ArduPilot", "Autopilot", "Px4", "Truth"]

@@ -6,7 +6,7 @@ function of the scene, a size and a random generator.
 
 from __future__ import annotations
 
-from sitl.inject.foreign import payload, sensor, surroundings, vehicle
+from foreign import payload, sensor, surroundings, vehicle
 from sitl.inject.scene import Effect
 
 __all__ = ["FOREIGN"]

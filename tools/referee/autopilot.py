@@ -11,7 +11,7 @@ from magbridge.field.geodesy import offset, separation
 from magbridge.mavlink import Codec, Message, spec
 from magbridge.mavlink.dialect import MAV_CMD, MAV_FRAME, MAV_RESULT, MAV_TYPE
 from magbridge.mavlink.messages import east_e7
-from sitl.referee.filter import PositionFilter
+from referee.filter import PositionFilter
 
 __all__ = ["GPS_SIGMA", "Autopilot", "Truth", "finite"]
 

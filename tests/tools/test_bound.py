@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from bound import BestFit, oracle
 
 from magbridge.calibration.residual import rms
 from sitl import Twin, load, segments, simulate
-from sitl.bound import BestFit, oracle
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import Vehicle
 
@@ -52,8 +52,8 @@ def test_a_best_fit_s_error_is_its_bound(flight: tuple[Vehicle, xr.Dataset, xr.D
 
 def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bare vehicle: the hard iron's information is the sum of the field's directions, over the variance."""
-    monkeypatch.setattr("sitl.bound.SOFT_IRON", 1e-12)
-    monkeypatch.setattr("sitl.bound.HARD_IRON", 1e6)
+    monkeypatch.setattr("bound.SOFT_IRON", 1e-12)
+    monkeypatch.setattr("bound.HARD_IRON", 1e6)
     scenario = SCENARIO.replace(vehicle=Vehicle())
     parts = segments(simulate(scenario, 1))
     u, v = (
