@@ -266,7 +266,7 @@ def unmapped(runs: Runs, asked: argparse.Namespace) -> None:
         ("6 h", UNMAPPED, (Map(30, 500), Map(30, 1000), Map(60, 500), Map(60, 1000))),
         ("6 h", UNMAPPED, (Map(30, 1000, rough=True),)),
         ("12 h", long, (Map(30, 500),)),
-        ("aircraft", AIRCRAFT, (Map(30, 1000),)),
+        ("aircraft", AIRCRAFT, (Map(60, 1500),)),
     ):
         number = max(runs.number // 4, 1) if vehicle is AIRCRAFT else runs.number
         for kind in kinds:

@@ -77,7 +77,7 @@ def navigate(
         Seconds between samples, for --bound. By default those of FILE where it is a log with a magnetometer,
         else those of the calibration, else 4.
     picture
-        A PNG, PDF or SVG to draw: the tracks on the map, errors and innovations; or the bound on the map.
+        A PNG, PDF or SVG to draw: the tracks, on the map if there is one, errors and sigma; or the bound.
     heading_reference
         What headings refer to. If not given: what the log says, else true north.
     reading
@@ -111,16 +111,14 @@ def navigate(
     if map is None:
         from magbridge.navigate.own_survey import localise
 
-        if picture:
-            raise WrongUse("--picture: expected --map, which the tracks are drawn on")
-        track = localise(deployment, options)
+        grid, track = None, localise(deployment, options)
     else:
         grid, options = _continued(read_grid(map), options, deployment)
         track = find_way(deployment, grid, options)
-        if picture:
-            from magbridge.navigate.draw import draw_navigation
+    if picture:
+        from magbridge.navigate.draw import draw_navigation
 
-            draw_navigation(track, grid, picture)
+        draw_navigation(track, grid, picture)
     write(track, output)
     for finding in track.attrs["findings"].splitlines():
         complain(finding)

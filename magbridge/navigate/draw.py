@@ -29,16 +29,19 @@ __all__ = ["draw_bound", "draw_navigation", "measured_on_track"]
 SHADES = {State.SEARCHING: "#f5d76e", State.DEAD_RECKONING: "#d5d8dc", State.LOST: "#e59a93"}
 
 
-def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> None:
-    """Draw what :func:`~magbridge.navigate.batch.navigate` returned, on one page."""
+def draw_navigation(result: xr.Dataset, grid: AnomalyGrid | None, path: str | Path) -> None:
+    """Draw what :func:`~.batch.navigate` returned, or without a map :func:`~.own_survey.localise`."""
     figure = Figure(figsize=(13.0, 9.0), layout="constrained")
-    panels = figure.subplot_mosaic(
-        [["map", "field"], ["map", "innovation"], ["map", "sigma"]], width_ratios=(1.1, 1)
-    )
-    tracks = _tracks(panels["map"], result)
-    _map(panels["map"], grid, *np.concatenate(tracks, axis=1))
+    draws = {"field": _field, "innovation": _innovation, "sigma": _sigma}
+    if grid is None:
+        del draws["innovation"]
+    panels = figure.subplot_mosaic([["map", name] for name in draws], width_ratios=(1.1, 1))
+    tracks = np.concatenate(_tracks(panels["map"], result), axis=1)
+    _frame(panels["map"], *tracks)
+    if grid is not None:
+        _map(panels["map"], grid, tracks[0])
     hours = (result["time"].to_numpy() - float(result["time"][0])) / 3600.0
-    for name, draw in (("field", _field), ("innovation", _innovation), ("sigma", _sigma)):
+    for name, draw in draws.items():
         draw(panels[name], hours, result)
         _legend_above(panels[name])
     _save(figure, path)
@@ -47,7 +50,7 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid, path: str | Path) -> 
 def _field(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
     measured = measured_on_track(result)
     axis.plot(hours, measured, ".", ms=2, color="0.3", label="measured, on the filter's track")
-    axis.plot(hours, result["map_anomaly"], color="C3", lw=1, label="map, on the filter's track")
+    axis.plot(hours, result["map_anomaly"], color="C3", lw=1, label="map's, or found, on that track")
     axis.set_ylabel("anomaly, nT")
 
 
@@ -70,6 +73,10 @@ def _sigma(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
     axis.semilogy(hours, sigma, color="C0", label="sigma, filter")
     smoothed = np.hypot(result["smoothed_sigma_north"], result["smoothed_sigma_east"])
     axis.semilogy(hours, smoothed, color="C2", label="sigma, smoothed")
+    for name, line in (("unaided", "--"), ("bound", ":")):
+        if f"{name}_sigma" in result:
+            label = "sigma, dead reckoning alone" if name == "unaided" else "bound"
+            axis.semilogy(hours, result[f"{name}_sigma"], color="C0", ls=line, lw=1, label=label)
     error, reckoned = errors(result)
     if np.isfinite(error).any():
         axis.semilogy(hours, error, color="0.2", lw=0.8, label="error")
@@ -78,7 +85,8 @@ def _sigma(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
     axis.set_ylabel("position error, m")
     _plain(axis)
     axis.set_xlabel("hours")
-    _shade(axis, hours, result["state"].to_numpy())
+    if "state" in result:
+        _shade(axis, hours, result["state"].to_numpy())
 
 
 def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
@@ -87,7 +95,8 @@ def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
     panels = figure.subplot_mosaic([["map"], ["time"]], height_ratios=(3, 1))
     axis = panels["map"]
     points = np.column_stack([np.unwrap(bound.longitude, period=360.0), bound.latitude])
-    _map(axis, grid, *points.T)
+    _frame(axis, *points.T)
+    _map(axis, grid, points[:, 0])
     axis.plot(*points.T, color="w", lw=7, solid_capstyle="round")
     line = LineCollection(
         list(np.stack([points[:-1], points[1:]], axis=1)), cmap="viridis_r", norm=LogNorm(), linewidths=4
@@ -119,8 +128,9 @@ def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
     _save(figure, path)
 
 
-def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
-    """Draw the map around a track, whose longitudes may be unwound past 180 degrees."""
+def _map(axis: Axes, grid: AnomalyGrid, longitude: Any) -> None:
+    """Draw the map under a track, whose longitudes (n,) may be unwound past 180 degrees, into its frame."""
+    frame = axis.get_xlim(), axis.get_ylim()
     low, high = np.nanpercentile(grid.anomaly, [1, 99])
     west = grid.longitude + 360.0 * np.round((np.nanmean(longitude) - grid.longitude.mean()) / 360.0)
     dx, dy = (0.5 * (edge[-1] - edge[0]) / (edge.size - 1) for edge in (west, grid.latitude))
@@ -133,7 +143,17 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
         vmax=high,
         cmap="RdYlBu_r",
         alpha=0.6,
+        aspect=axis.get_aspect(),
     )
+    axis.set(xlim=frame[0], ylim=frame[1], facecolor="0.92")  # grey is off the map
+    scale = axis.inset_axes((0.04, 0.05, 0.3, 0.02))
+    axis.figure.colorbar(drawn, cax=scale, orientation="horizontal")
+    scale.set_title("anomaly, nT", fontsize=8)
+    scale.tick_params(labelsize=8)
+
+
+def _frame(axis: Axes, longitude: Any, latitude: Any) -> None:
+    """Make room for a track."""
     slender = float(np.cos(np.radians(np.nanmean(latitude))))  # of a degree of longitude
     (x, width), (y, height) = (
         (0.5 * (np.nanmin(v) + np.nanmax(v)), 0.65 * float(np.nanmax(v) - np.nanmin(v)) + 0.005)
@@ -142,17 +162,12 @@ def _map(axis: Axes, grid: AnomalyGrid, longitude: Any, latitude: Any) -> None:
     width, height = max(width, 0.8 * height / slender), max(height, 0.6 * width * slender)
     axis.set_xlim(x - width, x + width)
     axis.set_ylim(y - height, y + height)
-    axis.set_facecolor("0.92")  # off the map
     axis.set_aspect(1.0 / slender)
     axis.ticklabel_format(axis="y", useOffset=False)
     axis.xaxis.set_major_locator(MaxNLocator(5))
     axis.xaxis.set_major_formatter(lambda value, _: f"{signed_longitude(value):.7g}")
     axis.set_xlabel("longitude, deg")
     axis.set_ylabel("latitude, deg")
-    scale = axis.inset_axes((0.04, 0.05, 0.3, 0.02))
-    axis.figure.colorbar(drawn, cax=scale, orientation="horizontal")
-    scale.set_title("anomaly, nT", fontsize=8)
-    scale.tick_params(labelsize=8)
 
 
 def measured_on_track(result: xr.Dataset) -> RealArray:

@@ -36,7 +36,7 @@ from magbridge.navigate.reference_track import reference_track, with_errors
 
 __all__ = ["localise", "own_bound"]
 
-STEP, LASTS, BLOCKS = 60.0, 100.0, 600
+STEP, LASTS, BLOCKS = 60.0, 100.0, 400
 """m that a block of samples covers at most, the share of the log that it lasts at most is one in so many, and
 the number of blocks at most: of more, every second or third is used."""
 FEWEST = 12
@@ -192,7 +192,7 @@ def _dataset(
         "smoothed_sigma_north": np.sqrt(C[:, 0, 0]), "smoothed_sigma_east": np.sqrt(C[:, 1, 1]),
         "north": moved[:, 0], "east": moved[:, 1],
         "unaided_sigma": alone, "anomaly": field.anomaly,
-        "map_anomaly": field.anomaly - R * np.linalg.solve(K, y), "valid": good.astype(float),
+        "map_anomaly": field.mean + y - R * np.linalg.solve(K, y), "valid": good.astype(float),
     }  # fmt: skip
     return made("track", field.time, columns, UNITS | {"unaided_sigma": "m"})
 

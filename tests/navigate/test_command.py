@@ -111,11 +111,22 @@ def test_wrong_use_is_one_line(command: Command) -> None:
 
 def test_without_a_map_the_track_is_bent_to_its_own_survey(command: Command, here: Path) -> None:
     """One smoothed track with its covariance; what can only be done with a map is refused in a line."""
-    texts = command("navigate", "log.nc", *CALIBRATED, "--config", "bridge.toml", "-o", "own.nc")
+    given = "navigate", "log.nc", *CALIBRATED, "--config", "bridge.toml", "--picture", "own.png"
+    texts = command(*given, "-o", "own.nc")
     assert "dead reckoning alone" in texts.err
     track = read([Path("own.nc")])
     assert (track["covariance_nn"] > 0.0).all()
-    for words in (("--bound", "log.nc"), ("log.nc", "--picture", "a.png")):
-        texts = command("navigate", *words, *CALIBRATED, "-o", "none.nc", code=2)
-        assert "expected --map" in texts.err
-        assert not Path("none.nc").exists()
+    assert (track["bound_sigma"] < 1.001 * track["unaided_sigma"]).all()
+    assert "no estimator could be better than" in texts.err
+    assert Path("own.png").stat().st_size > 40_000
+    texts = command("navigate", "--bound", "log.nc", *CALIBRATED, "-o", "none.nc", code=2)
+    assert "expected --map" in texts.err
+    assert not Path("none.nc").exists()
+
+
+def test_a_bound_takes_the_log_s_own_rate(command: Command, here: Path) -> None:
+    """Samples of a log, else those of the calibration, else one in 4 s; or as it is told."""
+    slow = read([Path("log.nc")]).isel(time=slice(None, None, 5))
+    write(slow.assign(latitude=slow["truth_latitude"], longitude=slow["truth_longitude"]), "slow.nc")
+    for words, every in ((("slow.nc",), 20.0), (("plan.csv",), 4.0), (("plan.csv", "--every", "0.2"), 0.2)):
+        assert json.loads(command(*BOUND, *words, "--json").out)["sample_interval_s"] == pytest.approx(every)
