@@ -13,7 +13,7 @@ import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from collections.abc import Callable
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,7 @@ from terminal import command_line
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
+from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.run import diagnose
 
 STEP, HOURS, EPOCH = 5.0, 4.0, 1.75e9
@@ -130,6 +131,8 @@ class Glider:
         return H
 
 
+Case = Callable[[int, str, float], dict[str, Any]]
+"""Number, name of what is hidden, S/N -> what is named."""
 Effect = Callable[[Log, np.random.Generator], FloatArray]
 
 
@@ -237,34 +240,42 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
     seen = effect if effect.ndim == 1 else np.sum(effect * unit, axis=1)
     effect = effect * snr / (np.std(seen) * np.sqrt(len(seen)))
     H = glider.reads(survey) + noise(len(seen)) + (effect if effect.ndim == 2 else 0.0)
-    found = diagnose([dataset(survey, H, effect if effect.ndim == 1 else 0.0)], calibration)
+    return told(name, diagnose([dataset(survey, H, effect if effect.ndim == 1 else 0.0)], calibration))
+
+
+def told(name: str, found: Diagnosis) -> dict[str, Any]:
+    """Return what was hidden, what is named, and what remains possible."""
     named = one_of(one.candidate.cause for one in found.findings)
+    named |= {"outliers"} if found.wrong is not None else set()
     sets = named | one_of(r.candidate.cause for one in found.findings for r in one.competing)
     return {"hidden": name, "named": sorted(named), "sets": sorted(sets), "verdict": found.verdict}
 
 
-def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--cases", type=int, default=30)
+def study(run: Case, names: Sequence[str], own: Container[str], doc: str | None) -> None:
+    """Run cases, each hiding one of `names` (nothing, where empty) in turn, and count what is named."""
+    parser = command_line(doc)
+    parser.add_argument("--cases", type=int, default=2 * len(names))
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument(
         "--snr", type=float, default=25.0, help="RMS along the field, in units of noise per log"
     )
     options = parser.parse_args()
-    names = [*OWN, *FOREIGN]
     rows = []
     for number in range(options.first, options.first + options.cases):
-        row = case(number, names[number % len(names)], options.snr)
+        row = run(number, names[number % len(names)], options.snr)
         rows.append(row)
         print(number, *row.values(), sep=" | ", flush=True)
-    own = [r for r in rows if r["hidden"] in OWN]
-    foreign = [r for r in rows if r["hidden"] in FOREIGN]
-    print(f"right: {fraction([r['hidden'] in r['named'] for r in own])}")
-    print(f"in the set: {fraction([r['hidden'] in r['sets'] for r in own])}")
-    print(f"named alone: {fraction([r['sets'] == [r['hidden']] for r in own])}")
-    print(f"a false second name: {fraction([len(r['named']) > 1 for r in own])}")
-    print(f"foreign, a name: {fraction([bool(r['named']) for r in foreign])}")
+    known = [r for r in rows if r["hidden"] in own]
+    print(f"right: {fraction([r['hidden'] in r['named'] for r in known])}")
+    print(f"in the set: {fraction([r['hidden'] in r['sets'] for r in known])}")
+    print(f"named alone: {fraction([r['sets'] == [r['hidden']] for r in known])}")
+    print(f"a false second name: {fraction([len(r['named']) > 1 for r in known])}")
+    for what, some in (
+        ("foreign", [r for r in rows if r["hidden"] and r["hidden"] not in own]),
+        ("nothing hidden", [r for r in rows if not r["hidden"]]),
+    ):
+        print(f"{what}, a name: {fraction([bool(r['named']) for r in some])}")
 
 
 if __name__ == "__main__":
-    main()
+    study(case, (*OWN, *FOREIGN), OWN, __doc__)

@@ -1,0 +1,222 @@
+"""A third world to examine ``diagnose`` by, once: other physics than the simulator's and the second world's.
+
+Run it as ``python tools/third_world.py --cases 22``. A lawn-mower of yo-yos near the equator; masses are bars
+with two poles, noise is flicker noise, and effects are laws that neither the detector nor the other worlds
+know (Bouc and Wen's hysteresis, a damped filter of second order, a soft clip). Nothing was tuned on it. What
+is counted is what :mod:`second_world` counts; where nothing is hidden, any name is false.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.signal import bessel, sosfilt
+from second_world import STEP, Log, dataset, rotated, study, told
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.diagnose.run import diagnose
+
+HOURS, EPOCH = 4.0, 1.76e9
+EARTH = np.array([27_500.0, 1_900.0, -18_200.0])
+"""nT, north, east, down."""
+POLES = 20.0
+"""nT m² a pole of a mass gives, 1-sigma."""
+
+
+def logged(rng: np.random.Generator, hours: float, *, spins: bool) -> Log:
+    """Mow a lawn with yo-yos, across and then along; or turn about at one place with the masses moved."""
+    n = int(hours * 3600.0 / STEP)
+    t = STEP * np.arange(n)
+    wave = np.sin(2.0 * np.pi * t / rng.uniform(500.0, 800.0))
+    sway = np.convolve(rng.normal(size=n + 8), np.hanning(9), "valid")
+    if spins:
+        heading, pitch = 3.1 * t % 360.0, 25.0 * np.sin(2.0 * np.pi * t / 940.0)
+        roll, north, east = 40.0 * np.sin(2.0 * np.pi * t / 370.0), np.zeros(n), np.zeros(n)
+        batt, vbd = 15.0 * np.sin(2.0 * np.pi * t / 1900.0), 300.0 * np.sin(2.0 * np.pi * t / 2700.0)
+    else:
+        leg = np.floor(16.0 * t / t[-1] * 0.9999)
+        across = leg < 8
+        heading = np.where(leg % 2 == 0, 12.0, 192.0) + 90.0 * ~across + 2.0 * sway
+        pitch, roll = 22.0 * wave + sway, 8.0 * np.sin(2.0 * np.pi * t / 900.0) + 1.5 * sway
+        batt, vbd = 12.0 * wave + 2.0 * np.cos(leg), -250.0 * np.tanh(3.0 * wave)
+        north, east = (0.4 * STEP * np.cumsum(f(np.radians(heading))) for f in (np.cos, np.sin))
+    depth = 40.0 + 35.0 * np.cos(2.0 * np.pi * t / 650.0)
+    warm = 24.0 - 9.0 * np.clip((depth - 25.0) / 30.0, 0.0, 1.0) + 0.8 * t / t[-1]
+    columns = {
+        "time": EPOCH + t + (0.0 if spins else 50_000.0), "roll": roll, "pitch": pitch,
+        "heading": heading % 360.0,
+        "latitude": -4.0 + north / 110_600.0, "longitude": 39.0 + east / 111_100.0,
+        "depth": depth, "battpos": batt, "vbd": vbd, "sensor_temperature": warm,
+        "motor_current": 0.6 * (np.abs(np.gradient(vbd)) > 10.0) + 0.02 * rng.random(n),
+        "fin": 8.0 * np.sin(2.0 * np.pi * t / 310.0 + rng.uniform(0.0, 6.0)),
+    }  # fmt: skip
+    columns["reference_field"] = np.full(n, float(np.linalg.norm(EARTH)))
+    return Log(columns, rotated(columns, np.tile(EARTH, (n, 1))))
+
+
+class Vehicle:
+    """Hard and soft iron, and two masses that are bars with two poles each: ``H = m r / |r|^3``."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.soft, self.hard = 0.015 * rng.normal(size=(3, 3)), rng.normal(0.0, 200.0, 3)
+        self.pole = POLES * rng.normal(size=2)
+        self.bar = rng.normal(0.0, 0.12, (2, 3))
+        self.at = np.array([[-0.7, 0.05, 0.08], [-1.0, -0.04, 0.0]])
+
+    def reads(self, log: Log, later: float = 0.0) -> FloatArray:
+        """(n, 3) nT; with the masses as they will be `later`, s."""
+        H = log.body + log.body @ self.soft.T + self.hard
+        time = log.columns["time"]
+        for at, pole, bar, name, scale in zip(
+            self.at, self.pole, self.bar, ("battpos", "vbd"), (1e-3, 1e-4), strict=True
+        ):
+            x = scale * np.interp(time + later, time, log.columns[name])
+            for end, sign in ((bar, 1.0), (-bar, -1.0)):
+                r = -(at + end + np.outer(x, [1.0, 0.0, 0.0]))
+                H = H + sign * pole * 10.0 * r / np.linalg.norm(r, axis=1)[:, None] ** 3
+        return H
+
+
+Effect = Callable[[Vehicle, Log, np.random.Generator], FloatArray]
+"""What is added to the reading (n, 3), up to a factor."""
+
+
+def _along(x: FloatArray, rng: np.random.Generator) -> FloatArray:
+    axis = rng.normal(size=3)
+    return np.outer(x, axis / np.linalg.norm(axis))
+
+
+def _bouc_wen(log: Log) -> FloatArray:
+    """Hysteresis of a battery's tray: ``dz = dx - (0.6 |dx| z + 0.4 dx |z|)``, x in units of 6 mm."""
+    dx = np.diff(log.columns["battpos"], prepend=log.columns["battpos"][0]) / 6.0
+    z = np.zeros(len(dx))
+    for k in range(1, len(z)):
+        z[k] = z[k - 1] + dx[k] - 0.6 * abs(dx[k]) * z[k - 1] - 0.4 * dx[k] * abs(z[k - 1])
+    return z
+
+
+def _filtered(H: FloatArray) -> FloatArray:
+    """Bessel's filter of second order, 0.02 Hz."""
+    sections = bessel(2, 0.02, fs=1.0 / STEP, output="sos")
+    return np.asarray(sosfilt(sections, H - H[0], axis=0) + H[0])
+
+
+def _shifted(log: Log, H: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Each axis read at a moment of its own."""
+    t = log.columns["time"]
+    late = zip(rng.uniform(0.0, 2.0, 3), H.T, strict=True)
+    return np.stack([np.interp(t - d, t, x) for d, x in late], axis=1)
+
+
+def _soaked(log: Log, seconds: float) -> FloatArray:
+    """One lag: temperature of the electronics."""
+    y = log.columns["sensor_temperature"].copy()
+    for k in range(1, len(y)):
+        y[k] += (y[k - 1] - y[k]) * np.exp(-STEP / seconds)
+    return np.asarray(y - y[0])
+
+
+def _bent(x: FloatArray) -> FloatArray:
+    return np.asarray(x + 0.01 * x * x)
+
+
+def _hours(log: Log) -> FloatArray:
+    return np.asarray((log.columns["time"] - log.columns["time"][0]) / 3600.0)
+
+
+def _pendulum(log: Log) -> FloatArray:
+    """A cable that swings, with a period of 40 s, when the vehicle turns."""
+    rate = np.gradient(np.unwrap(np.radians(log.columns["heading"])))
+    x, v, found = 0.0, 0.0, np.zeros(len(rate))
+    for k, push in enumerate(rate):
+        v += STEP * (-((2.0 * np.pi / 40.0) ** 2) * x - 0.02 * v + push)
+        x += STEP * v
+        found[k] = x
+    return found
+
+
+def _strokes(log: Log, rng: np.random.Generator) -> FloatArray:
+    """Shocks that magnetise a frame, each forgotten within minutes."""
+    since = _hours(log)[:, None] - rng.uniform(0.2, 3.6, 7)
+    fading = np.exp(-np.maximum(since, 0.0) / 0.05) * (since > 0.0)
+    return np.asarray(fading @ rng.normal(size=7))
+
+
+def _escort(log: Log, rng: np.random.Generator) -> FloatArray:
+    """(n, 3) A vessel that circles, its dipole seen from the vehicle."""
+    turn = 2.0 * np.pi * np.cumsum(1.0 + 0.3 * np.sin(_hours(log) * 5.0)) * STEP / 1500.0
+    r = np.stack([90.0 * np.cos(turn) + 60.0, 70.0 * np.sin(turn), np.full_like(turn, -60.0)], axis=1)
+    m = rng.normal(size=3)
+    far = np.linalg.norm(r, axis=1)[:, None]
+    return rotated(log.columns, 3.0 * r * (r @ m)[:, None] / far**5 - m / far**3)
+
+
+def _heater(log: Log, rng: np.random.Generator) -> FloatArray:
+    """A thermostat's current that nobody logs: on while it is cold, for ever longer."""
+    cycle = np.cumsum(1.0 / (300.0 + 400.0 * _hours(log) / HOURS)) * STEP
+    return ((cycle + rng.random()) % 1.0 < 0.3).astype(float)
+
+
+def _step(log: Log, rng: np.random.Generator) -> FloatArray:
+    """A shock that half relaxes."""
+    since = _hours(log) - rng.uniform(0.8, 3.0)
+    return (since > 0.0) * (0.6 + 0.4 * np.exp(-np.maximum(since, 0.0) / 0.2))
+
+
+OWN: dict[str, Effect] = {
+    "temperature_offset": lambda _v, log, rng: _along(_bent(_soaked(log, 900.0)), rng),
+    "temperature_scale": lambda v, log, rng: v.reads(log) * _soaked(log, 400.0)[:, None] * rng.normal(size=3),
+    "hysteresis": lambda _v, log, rng: _along(_bouc_wen(log), rng),
+    "actuator_order": lambda _v, log, rng: _along(np.cos(log.columns["battpos"] / 3.0), rng),
+    "clock_offset": lambda v, log, _rng: v.reads(log, later=-3.0) - v.reads(log),
+    "filter_lag": lambda v, log, _rng: _filtered(v.reads(log)) - v.reads(log),
+    "channel_skew": lambda v, log, rng: _shifted(log, v.reads(log), rng) - v.reads(log),
+    "nonlinearity": lambda v, log, rng: (v.reads(log) / 3e4) ** 3 * rng.normal(size=3),
+    "offset_step": lambda _v, log, rng: _along(_step(log, rng), rng),
+    "current_field": lambda _v, log, rng: _along(log.columns["motor_current"] ** 1.3, rng),
+    "pressure_offset": lambda _v, log, rng: _along(np.sqrt(log.columns["depth"]), rng),
+}  # fmt: skip
+"""Effects by the cause that they are."""
+FOREIGN: dict[str, Effect] = {
+    "a cable that swings": lambda _v, log, rng: _along(_pendulum(log), rng),
+    "shocks that are forgotten": lambda _v, log, rng: _along(_strokes(log, rng), rng),
+    "a vessel that circles": lambda _v, log, rng: _escort(log, rng),
+    "a heater": lambda _v, log, rng: _along(_heater(log, rng), rng),
+    "a thermocouple": lambda _v, log, rng: _along(np.gradient(_soaked(log, 100.0)), rng),
+}  # fmt: skip
+"""Effects that are none of the table's causes."""
+EVERY = (*OWN, *FOREIGN, "", *FOREIGN)
+
+
+def flicker(rng: np.random.Generator, n: int) -> FloatArray:
+    """(n, 3) nT, noise of 1/f below a tenth of the sampling frequency and white above, 1 nT RMS."""
+    f = np.fft.rfftfreq(n)
+    spectrum = np.sqrt(1.0 + 0.1 / np.maximum(f, 1.0 / n))[:, None]
+    made = np.fft.irfft(np.fft.rfft(rng.normal(size=(n, 3)), axis=0) * spectrum, n, axis=0)
+    return np.asarray(made / np.std(made))
+
+
+def case(number: int, name: str, snr: float) -> dict[str, Any]:
+    """Calibrate a vehicle, hide one effect in its survey, and return what `diagnose` names."""
+    rng = np.random.default_rng([20_261, number])
+    vehicle, spins, survey = Vehicle(rng), logged(rng, 1.0, spins=True), logged(rng, HOURS, spins=False)
+    runs = dataset(spins, vehicle.reads(spins) + flicker(rng, len(spins.body)))
+    calibration = fit(observations(runs, ["battpos", "vbd"]), "auto").calibration
+    H = vehicle.reads(survey) + flicker(rng, len(survey.body))
+    if name:
+        effect = (OWN | FOREIGN)[name](vehicle, survey, rng)
+        unit = survey.body / np.linalg.norm(survey.body, axis=1)[:, None]
+        H = H + effect * snr / (np.std(np.sum(effect * unit, axis=1)) * np.sqrt(len(H)))
+    return told(name, diagnose([dataset(survey, H)], calibration))
+
+
+if __name__ == "__main__":
+    study(case, EVERY, OWN, __doc__)
