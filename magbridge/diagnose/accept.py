@@ -33,8 +33,8 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     a description of what the names leave is added to theirs; unless it is a remnant of one of the named
     causes, they pay for it as for a further cause. A cause that the table lacks competes like any other:
     names are asserted if they are likelier than every description of the whole signal, and foretell every
-    eighth dive as well (there a description that contains their regressors counts, too). They remain possible
-    unless one beats them 20:1, the error of their regressors allowed for.
+    eighth dive as well. They remain possible unless one beats them 20:1, allowing for the error of their
+    regressors.
     """
     model = [h.candidate for h in outcome.chosen]
     uneven = [

@@ -45,7 +45,8 @@ def test_the_score_is_the_density_of_each_dive_given_the_others(problem: Problem
     y = fit.noise.response(posed.residual)
     white = fit.noise.response(fit.residual)
     assert np.abs(A.T @ white - fit.prior * (c - np.append(posed.centre, 0.0))).max() < 0.05 * np.abs(A).max()
-    expected = fit.noise.log_likelihood + 0.5 * float(white @ white)
+    moved = fit.z - posed.centre  # the calibration's own logs: their density at the fit
+    expected = fit.noise.log_likelihood + 0.5 * float(white @ white - fit.prior[: len(moved)] @ moved**2)
     for dive in range(DIVES):
         out = posed.survey.dive == dive
         P = A[~out].T @ A[~out] + np.diag(fit.prior)
@@ -63,6 +64,15 @@ def test_what_is_there_wins_on_the_dives_left_out_and_what_is_not_does_not(probl
         posed = replace(problem, residual=problem.residual + size * shape[:, 0])
         scores = [held_out(posed, some, fit_joint(posed, some, 1)).score for some in (columns, [])]
         assert (scores[0] > scores[1] + 3.0) == wins
+
+
+def test_what_the_calibration_would_have_to_become_counts_against_it(problem: Problem) -> None:
+    """A constant that a calibration absorbs is foretold by every other dive, but not by the calibration."""
+    absorbed = problem.calibration_jacobian[:, 14]  # what these dives show best
+    posed = replace(problem, residual=problem.residual - 8.0 * absorbed)
+    columns = [lambda rows: 8.0 * absorbed[rows, None]]
+    scores = [held_out(posed, some, fit_joint(posed, some, 1)).score for some in (columns, [])]
+    assert scores[0] > scores[1] + 10.0
 
 
 def test_what_acts_in_one_dive_only_is_no_surprise_that_counts_against_it(problem: Problem) -> None:

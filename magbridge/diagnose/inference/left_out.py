@@ -7,10 +7,12 @@ likelihood of the noise at the fit c to all dives, c_-f the fit without fold f, 
 of that fold and P that of all folds and the prior, Laplace's approximation (exact for Gaussian noise, by
 Woodbury's identity) is
 
-.. math:: S = l - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
+.. math:: S = l - \tfrac12 |z|^2 - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
               + \log\det P - \log\det (P - A_f^T A_f) \right]
 
-the log likelihood less the price of predicting each fold with coefficients learned from the others. The
+the log likelihood less the price of predicting each fold with coefficients learned from the others. The logs
+that the calibration was fitted to have their say by ``|z|``, in sigmas, by which it has moved from what they
+gave: without that, a constant that the calibration absorbs is foretold by every other dive. The
 difference of two models' scores is the log of the odds that the left-out dives give one against the other:
 the pseudo-Bayes factor (Geisser & Eddy 1979, JASA 74:153).
 """
@@ -72,6 +74,7 @@ def held_out(
     for rows in X.pieces:
         residual[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), without[of[rows]])
     away = c - without
-    learned = np.einsum("fi,fij,fj->", away, others, away)
-    learned += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
-    return HeldOut(residual, noise.log_likelihood - 0.5 * float(learned))
+    price = np.einsum("fi,fij,fj->", away, others, away)
+    price += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
+    price += prior[: len(fit.z)] @ (fit.z - problem.centre) ** 2
+    return HeldOut(residual, noise.log_likelihood - 0.5 * float(price))

@@ -145,27 +145,24 @@ def leftover(
     tone : Candidate, optional
         The strongest tone, where tones are not among the causes.
     but : sequence of Candidate
-        Causes whose own regressors the description may not contain. Those that do are fitted all the same.
+        Causes whose own regressors the description may not contain.
     also : sequence of Description
         Further descriptions.
     """
-    listed = [*descriptions(problem, fit, tone), *also]
+    listed = [one for one in (*descriptions(problem, fit, tone), *also) if not one.covers(but)]
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
     found: list[tuple[Fitted, Scored]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
-        order = sorted(scored, key=lambda one: -one.evidence)
-        sides = ([s for s in order if s.description.covers(but) == covers] for covers in (False, True))
-        tried = [one for side in sides for one in side[:SHORT_LIST]]
+        tried = sorted(scored, key=lambda one: -one.evidence)[:SHORT_LIST]
         weighed = in_threads(len(problem), lambda one: _weighed(problem, columns, fit, one), tried)
         found += zip(weighed, tried, strict=True)
-    others = (entry for entry in found if not entry[1].description.covers(but))
-    (evidence, *_), (_, kind, one, best, _) = max(others, key=lambda entry: entry[0].evidence)
+    (evidence, *_), (_, kind, one, best, _) = max(found, key=lambda entry: entry[0].evidence)
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
-    count = sum(len(one.widths) for one in listed if not one.covers(but))
+    count = sum(len(one.widths) for one in listed)
     p_value = min(1.0, count * tail)
     # stricter where no cause was found: the distribution is only asymptotic
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
