@@ -26,6 +26,12 @@ FORMAT = 4
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
 ``white`` share, ``level`` and the reference's ``level_sigma``: each is written only where there is any."""
 
+AS_IN_MEMORY = (
+    "software", "method", "sensor", "parameters", "noise", "reference", "boresight", "runs", "inputs",
+    "level",
+)  # fmt: skip
+"""What the file holds as :class:`~.model.Calibration` does."""
+
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     """Layout of ``cal.json``; names are public."""
@@ -56,21 +62,12 @@ def encode_calibration(calibration: Calibration) -> bytes:
     """Return `calibration` as JSON, one key a line."""
     content = _File(
         format=4 if calibration.noise.white or calibration.level else 3 if calibration.warnings else 2,
-        software=calibration.software,
-        method=calibration.method,
-        sensor=calibration.sensor,
-        parameters=calibration.parameters,
         terms=[_term_out(term) for term in calibration.terms],
         effects=[_term_out(effect) for effect in calibration.effects],
         coefficients=calibration.coefficients.tolist(),
         covariance=calibration.covariance.tolist(),
-        noise=calibration.noise,
-        reference=calibration.reference,
-        boresight=calibration.boresight,
-        runs=calibration.runs,
-        inputs=calibration.inputs,
         doubts=calibration.warnings,
-        level=calibration.level,
+        **{name: getattr(calibration, name) for name in AS_IN_MEMORY},
     )
     encode = msgspec.json.encode
     names = [
@@ -190,21 +187,12 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
             "terms and effects: an effect stands among the terms or a term among the effects"
         )
     return Calibration(
-        parameters=content.parameters,
         terms=positions,
         effects=others,
         coefficients=coefficients,
         covariance=covariance,
-        noise=content.noise,
-        reference=content.reference,
-        sensor=content.sensor,
-        boresight=content.boresight,
-        runs=content.runs,
-        method=content.method,
-        inputs=content.inputs,
-        software=content.software,
         warnings=content.doubts,
-        level=content.level,
+        **{name: getattr(content, name) for name in AS_IN_MEMORY},
     )
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import pytest
+from study import deployment
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 from sitl import load, simulate
 from sitl.dataset import segments
@@ -31,3 +34,15 @@ def problem() -> Problem:
 def listed(problem: Problem) -> list[Description]:
     """Its descriptions without a name, beside noise alone."""
     return descriptions(problem, fit_joint(problem, [], 1))
+
+
+@pytest.fixture(scope="session")
+def clear() -> Diagnosis:
+    """A current's field that is named alone, in two hours where the study has six."""
+    hours, deployment.HOURS = deployment.HOURS, 2.0
+    deployment.vehicle.cache_clear()
+    here = deployment.Background.of(deployment.vehicle(0), 24, "white")
+    found = diagnose([here.log(here.hide("current_field", 60.0, 24).ds)], here.deployment.calibration)
+    deployment.HOURS = hours
+    deployment.vehicle.cache_clear()
+    return found

@@ -10,6 +10,7 @@ from posed import candidate, missed, right
 
 from magbridge.diagnose.accept import _within, accept
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.causes.candidates import GridPoint
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import ODDS, bayes_factor_threshold
 from magbridge.diagnose.inference.search import search
@@ -65,7 +66,9 @@ def test_dives_left_out_overrule_a_name_that_fits() -> None:
     bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
     problem = replace(problem, residual=bent + rng.normal(size=ROWS))
     for share, named in ((0.0, True), (0.5, False)):
-        alike = candidate("a", bent + share * bent.std() * rng.normal(size=ROWS), likelier=300.0)
+        alike = candidate(
+            "a", bent + share * bent.std() * rng.normal(size=ROWS), point=GridPoint(likelier=300.0)
+        )
         assert accept(problem, search(problem, [alike], 1), None)[0] == named
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from posed import candidate
-from study import deployment
 
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
@@ -22,33 +20,21 @@ from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.report.findings import FORMAT, findings_json
 from magbridge.diagnose.report.page import report_html
-from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.unexplained.leftover import Leftover
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "findings.schema.json").read_text(encoding="utf-8"))
 
 
-@pytest.fixture(scope="module")
-def found() -> Iterator[Diagnosis]:
-    """A current's field in two hours of a log."""
-    hours, deployment.HOURS = deployment.HOURS, 2.0
-    deployment.vehicle.cache_clear()
-    here = deployment.Background.of(deployment.vehicle(0), 24, "white")
-    yield diagnose([here.log(here.hide("current_field", 60.0, 24).ds)], here.deployment.calibration)
-    deployment.HOURS = hours
-    deployment.vehicle.cache_clear()
-
-
-def variants(found: Diagnosis) -> dict[str, Diagnosis]:
+def variants(clear: Diagnosis) -> dict[str, Diagnosis]:
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, "amps")
     competitor = CompetingHypothesis(candidate("offset_drift", np.ones(1)), 1.0)
-    contested = replace(found.findings[0], competing=(competitor,), coefficients=10.0 * np.ones(3))
+    contested = replace(clear.findings[0], competing=(competitor,), coefficients=10.0 * np.ones(3))
     return {
-        "named": found,
-        "contested": replace(found, findings=(contested,)),
-        "nothing": replace(found, findings=(), verdict="nothing_found"),
-        "rest": replace(found, unexplained=rest._replace(within=(competitor,)), verdict="partly_explained"),
-        "wrong": replace(found, wrong=Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0)),
+        "named": clear,
+        "contested": replace(clear, findings=(contested,)),
+        "nothing": replace(clear, findings=(), verdict="nothing_found"),
+        "rest": replace(clear, unexplained=rest._replace(within=(competitor,)), verdict="partly_explained"),
+        "wrong": replace(clear, wrong=Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0)),
     }
 
 
@@ -58,22 +44,22 @@ def test_the_schema_is_one() -> None:
 
 
 @pytest.mark.parametrize("name", ["named", "contested", "nothing", "rest", "wrong"])
-def test_findings_are_as_the_schema_says(found: Diagnosis, name: str) -> None:
-    facts = json.loads(findings_json(variants(found)[name], CAUSES, ["a remark"]))
+def test_findings_are_as_the_schema_says(clear: Diagnosis, name: str) -> None:
+    facts = json.loads(findings_json(variants(clear)[name], CAUSES, ["a remark"]))
     errors = [error.message for error in Draft202012Validator(SCHEMA).iter_errors(facts)]
     assert errors == []
 
 
-def test_what_is_not_in_the_schema_is_refused(found: Diagnosis) -> None:
-    facts: dict[str, Any] = json.loads(findings_json(found, CAUSES))
+def test_what_is_not_in_the_schema_is_refused(clear: Diagnosis) -> None:
+    facts: dict[str, Any] = json.loads(findings_json(clear, CAUSES))
     for wrong in (facts | {"more": 1}, facts | {"verdict": "fine"}, facts | {"format": FORMAT + 1}):
         assert not Draft202012Validator(SCHEMA).is_valid(wrong)
 
 
 @pytest.mark.parametrize("name", ["named", "contested", "nothing", "rest"])
-def test_the_report_says_what_the_assessment_holds(found: Diagnosis, name: str) -> None:
+def test_the_report_says_what_the_assessment_holds(clear: Diagnosis, name: str) -> None:
     """Answer, and each reason and note, word by word; the answer stands before the first section."""
-    diagnosis = variants(found)[name]
+    diagnosis = variants(clear)[name]
     facts = json.loads(findings_json(diagnosis, CAUSES))["assessment"]
     page = unescape(report_html(diagnosis, CAUSES)).replace("\N{NO-BREAK SPACE}", " ")
     first = page.partition("<h2")[0]
@@ -88,15 +74,15 @@ def test_the_report_says_what_the_assessment_holds(found: Diagnosis, name: str) 
         assert {"contested", "implausible_size"} <= {note["code"] for note in facts["reasons_against"]}
 
 
-def test_what_is_seen_stands_apart_from_what_it_may_be(found: Diagnosis) -> None:
-    (one,) = json.loads(findings_json(found, CAUSES))["findings"]
+def test_what_is_seen_stands_apart_from_what_it_may_be(clear: Diagnosis) -> None:
+    (one,) = json.loads(findings_json(clear, CAUSES))["findings"]
     assert one["cause"] == "current_field"
     assert one["follows"]["channel"] == one["channel"]
     assert one["follows"]["size_nT"] > 1.0
 
 
-def test_no_sentence_says_that_nothing_is_left(found: Diagnosis) -> None:
+def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
     """It says how much is left, and how long that remembers."""
-    page = report_html(found, CAUSES)
+    page = report_html(clear, CAUSES)
     assert "Nothing else" not in page
     assert re.search(r"What is left, [\d.]+\xa0nT RMS, .* remembers [\d.]+ s", page)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from posed import candidate, right
 
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.causes.candidates import Candidate, GridPoint
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.evidence import log_bayes
@@ -21,7 +21,7 @@ ROWS, LAG, CELL = 300, 60.0, 40.0
 def decay(lag: float) -> Candidate:
     """What decays, of a size and a lag that nobody knows."""
     x = np.exp(-np.arange(ROWS) / lag)
-    return candidate("made", x, shape={"lag": (lag, "s")}, rebuild=decay, cells=(CELL,))
+    return candidate("made", x, point=GridPoint({"lag": (lag, "s")}, decay, cells=(CELL,)))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_the_covariance_is_that_of_a_fit_in_which_the_lag_is_free(problem: Probl
 
 
 def test_what_has_no_nonlinear_parameter_is_as_well_known_as_before(problem: Problem) -> None:
-    one = replace(decay(LAG), shape={}, rebuild=None, cells=())
+    one = replace(decay(LAG), point=GridPoint())
     fit = fitted(problem, one)
     assert loosened(problem, [one], [one.columns], fit) is fit
 
@@ -68,7 +68,7 @@ def test_parts_of_one_cause_have_each_their_own(problem: Problem) -> None:
 def step(onset: float) -> Candidate:
     """What begins, nobody knows when."""
     x = (np.arange(ROWS) >= onset).astype(float)
-    return candidate("made", x, shape={"onset": (onset, "s")}, rebuild=step, cells=(4.0,))
+    return candidate("made", x, point=GridPoint({"onset": (onset, "s")}, step, cells=(4.0,)))
 
 
 def test_other_peaks_of_the_likelihood_count_by_their_evidence() -> None:
@@ -79,7 +79,7 @@ def test_other_peaks_of_the_likelihood_count_by_their_evidence() -> None:
     t = np.arange(ROWS)
     signal = 0.25 * (t >= 60) + 0.5 * (t >= 240)
     problem = replace(right(ROWS), residual=signal + np.random.default_rng(6).normal(size=ROWS))
-    conditional_on = replace(decay(LAG), cause="other", shape={}, rebuild=None, cells=())
+    conditional_on = replace(decay(LAG), cause="other", point=GridPoint())
     grid = [step(float(onset)) for onset in range(10, ROWS, 10)]
     fits = [fitted(problem, conditional_on, one) for one in grid]
     null = fitted(problem, conditional_on).log_likelihood

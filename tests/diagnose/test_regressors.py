@@ -157,12 +157,12 @@ def test_a_candidate_profiled_again_stays_its_own_channels(problem: Problem) -> 
     seen = 0
     for cause in CAUSES.values():
         for candidate in cause.candidates(pose(survey, problem.calibration)):
-            if candidate.rebuild is None:
+            if candidate.point.rebuild is None:
                 continue
-            shape = [value for value, _ in candidate.shape.values()]
-            once = candidate.rebuild(*shape)
-            assert once.rebuild is not None
-            twice = once.rebuild(*shape)
+            shape = [value for value, _ in candidate.point.shape.values()]
+            once = candidate.point.rebuild(*shape)
+            assert once.point.rebuild is not None
+            twice = once.point.rebuild(*shape)
             assert (twice.channel, twice.effects) == (candidate.channel, candidate.effects)
             np.testing.assert_array_equal(twice.columns(slice(0, 100)), candidate.columns(slice(0, 100)))
             seen += 1
@@ -174,19 +174,19 @@ def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Pro
     t = problem.survey.time
     learned = replace(problem.survey, learned=np.arange(len(t)) < 100, cycles=t[[300]])
     grid = offset_step(replace(problem, survey=learned))
-    odds = {candidate.shape["onset"][0]: np.exp(candidate.likelier) for candidate in grid}
+    odds = {candidate.point.shape["onset"][0]: np.exp(candidate.point.likelier) for candidate in grid}
     assert odds[t[100] - 1.0] + odds[t[300]] == pytest.approx(0.5 * len(grid))
     assert sum(odds.values()) == pytest.approx(len(grid))
-    assert grid[0].rebuild is not None
-    assert [grid[0].rebuild(t[at]).likelier > 0.0 for at in (99, 101, 300)] == [True, False, True]
-    assert {candidate.likelier for candidate in offset_step(problem)} == {0.0}
+    assert grid[0].point.rebuild is not None
+    assert [grid[0].point.rebuild(t[at]).point.likelier > 0.0 for at in (99, 101, 300)] == [True, False, True]
+    assert {candidate.point.likelier for candidate in offset_step(problem)} == {0.0}
 
 
 def test_a_cause_found_twice_is_one(problem: Problem) -> None:
     first, second = CAUSES["hysteresis"].candidates(problem)[:2]
     both = first.with_(second).with_(second)
     assert both.size == len(set(both.names)) == 9
-    assert (len(both.shape), len(both.effects)) == (9, 3)
+    assert (len(both.point.shape), len(both.effects)) == (9, 3)
     np.testing.assert_array_equal(both.columns(slice(0, 50))[:, :3], first.columns(slice(0, 50)))
 
 

@@ -165,6 +165,9 @@ def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
         Improvement(588.1, 587.3, 0.999, (0.863, 1.021)),
         Improvement(117.0, 75.8, 0.65, (0.48, 0.83)),
     )
+    assert improved(none, "").startswith(
+        "On the log that the calibration was fitted to, 588 nT RMS became 587"
+    )
     assert improved(none, "eighths of the log") == (
         "On eighths of the log left out of the fit, 588 nT RMS became 587 nT (ratio 1.00, 95 % interval "
         "0.86 to 1.02: no improvement is shown)."

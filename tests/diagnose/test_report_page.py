@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import re
 from base64 import b64decode
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from posed import candidate
-from study import deployment
 
 from magbridge.diagnose.assessment.weigh import OWN, Assessment
 from magbridge.diagnose.causes import CAUSES
@@ -22,19 +20,7 @@ from magbridge.diagnose.report.canvas import ends, rolling
 from magbridge.diagnose.report.details import remaining, visible
 from magbridge.diagnose.report.page import report_html
 from magbridge.diagnose.report.words import number
-from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.unexplained.leftover import Leftover
-
-
-@pytest.fixture(scope="module")
-def clear() -> Iterator[Diagnosis]:
-    """A current's field that is named alone, in two hours where the study has six."""
-    hours, deployment.HOURS = deployment.HOURS, 2.0
-    deployment.vehicle.cache_clear()
-    here = deployment.Background.of(deployment.vehicle(0), 24, "white")
-    yield diagnose([here.log(here.hide("current_field", 60.0, 24).ds)], here.deployment.calibration)
-    deployment.HOURS = hours
-    deployment.vehicle.cache_clear()
 
 
 def answer(diagnosis: Diagnosis) -> Assessment:

@@ -20,4 +20,4 @@ def test_a_tone_between_two_frequencies_is_found_there(place: float) -> None:
     noise = np.random.default_rng(3).normal(size=len(t))
     residual = 10.0 * quiet.jacobian[:, 6] * np.cos(2.0 * np.pi * f * (t - t[0])) + 0.1 * noise
     first = interference_tone(replace(quiet, residual=residual))[0]
-    assert 1.0 / first.shape["period"][0] == pytest.approx(f, abs=0.1 / 4096 / 4.0)
+    assert 1.0 / first.point.shape["period"][0] == pytest.approx(f, abs=0.1 / 4096 / 4.0)

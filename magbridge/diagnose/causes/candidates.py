@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -13,12 +13,37 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, places, together
 from magbridge.diagnose.compare.problem import Problem, effect_columns
 
-__all__ = ["AXES", "Candidate", "Group", "of_effect", "of_reference", "per", "since", "slices"]
+__all__ = ["AXES", "Candidate", "GridPoint", "Group", "of_effect", "of_reference", "per", "since", "slices"]
 
 AXES = ("x", "y", "z")
 About = Literal["vehicle", "constant", "place", "time"]
 Group = tuple[str, str | None]
 """A cause and its channel: candidates that share both are one grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class GridPoint:
+    """The nonlinear parameters of a candidate: a point of its cause's grid, and what profiling made of it.
+
+    Attributes
+    ----------
+    shape : dict
+        Name -> (value, unit).
+    rebuild : callable or None
+        Shape's values -> the same candidate with those: for profiling.
+    likelier : float
+        Log of its prior probability, relative to the mean of its grid.
+    narrow : float
+        Log of how much narrower than their grid's cells the parameters are by the data.
+    cells : tuple of float
+        How far apart the grid's points are, in each parameter.
+    """
+
+    shape: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    rebuild: Callable[..., Candidate] | None = None
+    likelier: float = 0.0
+    narrow: float = 0.0
+    cells: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,20 +64,12 @@ class Candidate:
         Of the coefficients.
     effects : tuple of Effect
         What it adds to the calibration; none where the reference is wrong, or what it was fitted to.
-    shape : dict
-        Nonlinear parameters: name -> (value, unit).
-    rebuild : callable or None
-        Shape's values -> the same candidate with those: for profiling.
+    point : GridPoint
+        Its nonlinear parameters.
     look_elsewhere : float
         Number of independent hypotheses that this one was picked from (frequencies searched).
     positive : bool
         Its coefficients cannot be negative.
-    likelier : float
-        Log of its prior probability, relative to the mean of its grid.
-    narrow : float
-        Log of how much narrower than their grid's cells its nonlinear parameters are by the data.
-    cells : tuple of float
-        How far apart its grid's points are, in each nonlinear parameter.
     parts : tuple of Candidate
         Those that it was put together from, one after the other.
     spectra : (l, k) array or None
@@ -71,13 +88,9 @@ class Candidate:
     names: tuple[str, ...]
     units: tuple[str, ...]
     effects: tuple[Effect, ...] = ()
-    shape: dict[str, tuple[float, str]] = field(default_factory=dict)
-    rebuild: Callable[..., Candidate] | None = None
+    point: GridPoint = GridPoint()
     look_elsewhere: float = 1.0
     positive: bool = False
-    likelier: float = 0.0
-    narrow: float = 0.0
-    cells: tuple[float, ...] = ()
     parts: tuple[Candidate, ...] = ()
     spectra: FloatArray | None = None
     since: bool = False
@@ -115,8 +128,8 @@ class Candidate:
 
     def with_(self, other: Candidate) -> Candidate:
         """Return both as one: a cause that takes more than one regressor to describe."""
-        parts = (self, other)
-        taken = self.names + tuple(self.shape)
+        parts, one, two = (self, other), self.point, other.point
+        taken = self.names + tuple(one.shape)
         number = 2 + sum(name.startswith(f"{other.names[0]} (") for name in taken)
         mark = "" if set(taken).isdisjoint(other.names) else f" ({number})"
         return replace(
@@ -126,10 +139,12 @@ class Candidate:
             names=self.names + tuple(name + mark for name in other.names),
             units=self.units + other.units,
             effects=self.effects + other.effects,
-            shape=self.shape | {name + mark: value for name, value in other.shape.items()},
-            rebuild=None,
-            likelier=self.likelier + other.likelier,
-            narrow=self.narrow + other.narrow,
+            point=GridPoint(
+                {**one.shape, **{name + mark: value for name, value in two.shape.items()}},
+                likelier=one.likelier + two.likelier,
+                narrow=one.narrow + two.narrow,
+                cells=one.cells,
+            ),
             parts=(*self.pieces, *other.pieces),
         )
 
@@ -141,11 +156,11 @@ def slices(candidates: Sequence[Candidate], first: int = 0) -> list[slice]:
 
 def since(candidate: Candidate, learned: BoolArray) -> Candidate:
     """Return the same cause, absent from the samples (n,) that the calibration has `learned` from."""
-    rebuild, fresh = candidate.rebuild, ~learned
+    rebuild, fresh = candidate.point.rebuild, ~learned
     return replace(
         candidate,
         columns=Mixture(tuple((Since(X, fresh), M) for X, M in parts(candidate.columns))),
-        rebuild=rebuild and (lambda *shape: since(rebuild(*shape), learned)),
+        point=replace(candidate.point, rebuild=rebuild and (lambda *shape: since(rebuild(*shape), learned))),
         since=True,
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
+from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.compare.prior import FALL
 from magbridge.diagnose.compare.problem import Problem
 
@@ -132,6 +132,6 @@ def _plays(problem: Problem, name: str, shapes: Sequence[tuple[float, float, flo
     def rebuild(width: float, centre: float, scale: float) -> Candidate:
         effect = PlayEffect(cause="hysteresis", channel=name, width=width, centre=centre, scale=scale)
         shape = {"width": (width, unit), "centre": (centre, unit), "scale": (scale, unit)}
-        return of_effect(problem, effect, 50.0, "nT", channel=name, shape=shape, rebuild=rebuild)
+        return of_effect(problem, effect, 50.0, "nT", channel=name, point=GridPoint(shape, rebuild))
 
     return [rebuild(2.0 * half * w, middle + half * c, half * s) for w, c, s in shapes]

@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from magbridge.calibration.instrument_effects import ResponseEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
+from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["BENT", "nonlinearity", "saturation"]
@@ -62,7 +62,7 @@ def _clipped(problem: Problem, axis: int, knees: Sequence[float]) -> list[Candid
         effect = ResponseEffect(cause="saturation", unit=unit, axis=axis, knee=knee)
         return of_effect(
             problem, effect, np.array([100.0, 0.1 * unit]), ("nT", per(f"{unit:.0f} nT")), names=names,
-            shape={"knee": (knee, "nT")}, rebuild=rebuild,
+            point=GridPoint({"knee": (knee, "nT")}, rebuild),
         )  # fmt: skip
 
     return [rebuild(knee) for knee in knees]

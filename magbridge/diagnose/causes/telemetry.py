@@ -11,7 +11,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, lagged
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.compare.problem import Problem, once
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
@@ -66,10 +66,9 @@ def _warmed(
         effect = ChannelEffect(
             cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, stages=STAGES, on=on
         )
-        return of_effect(
-            problem, effect, 5.0, unit, channel=name, shape={"origin": (origin, "degC"), "lag": (lag, "s")},
-            rebuild=rebuild, phi=_levels(problem)(name, lag), origin=origin,
-        )  # fmt: skip
+        point = GridPoint({"origin": (origin, "degC"), "lag": (lag, "s")}, rebuild)
+        levels = _levels(problem)(name, lag)
+        return of_effect(problem, effect, 5.0, unit, channel=name, point=point, phi=levels, origin=origin)
 
     return [rebuild(origin, lag) for origin in _origins(problem, name) for lag in lags]
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect, per
+from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["interference_tone", "offset_drift", "offset_step"]
@@ -32,10 +32,9 @@ def offset_step(problem: Problem) -> list[Candidate]:
     def rebuild(onset: float) -> Candidate:
         effect = TimeEffect(cause="offset_step", shape="step", start=onset)
         alike = len(cycles) if max(onset, first) in cycles else len(grid) - len(cycles)
-        return of_effect(
-            problem, effect, 100.0, "nT", shape={"onset": (onset, "s")}, rebuild=rebuild,
-            likelier=float(np.log(0.5 * len(grid) / alike)) if cycles else 0.0,
-        )  # fmt: skip
+        likelier = float(np.log(0.5 * len(grid) / alike)) if cycles else 0.0
+        point = GridPoint({"onset": (onset, "s")}, rebuild, likelier)
+        return of_effect(problem, effect, 100.0, "nT", point=point)
 
     return [rebuild(float(onset)) for onset in grid]
 
@@ -85,7 +84,7 @@ def interference_tone(problem: Problem) -> list[Candidate]:
         effect = TimeEffect(cause="interference_tone", shape="tone", start=float(t[0]), period=period)
         names = tuple(f"{f} {axis}" for f in ("cos", "sin") for axis in AXES)
         return of_effect(
-            problem, effect, 10.0, "nT", names=names, shape={"period": (period, "s")}, rebuild=rebuild,
+            problem, effect, 10.0, "nT", names=names, point=GridPoint({"period": (period, "s")}, rebuild),
             look_elsewhere=0.5 * len(t),
         )  # fmt: skip
 

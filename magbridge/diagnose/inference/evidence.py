@@ -104,7 +104,7 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
     if candidate.spectra is not None:
         return 0.5 * ratio - float(np.log(len(candidate.spectra)))
     sided = float(one_sided(ratio)) if candidate.positive else 0.0
-    return float(log_bayes(ratio, freedom)) + sided + candidate.likelier
+    return float(log_bayes(ratio, freedom)) + sided + candidate.point.likelier
 
 
 def log_bayes(ratio: float | FloatArray, freedom: float | FloatArray) -> FloatArray:
@@ -191,6 +191,6 @@ def log_odds(
     further = max(regressors - 1, 0) * (ODDS + float(np.log(len(look_elsewhere))))
     prices = sum(len(c.pieces) * float(np.log(look_elsewhere[c.cause])) for c in model)
     prices += sum(float(np.log(len(c.spectra))) for c in model if c.spectra is not None)
-    known = sum(c.likelier + float(np.log(2.0)) * c.positive for c in model)
+    known = sum(c.point.likelier + float(np.log(2.0)) * c.positive for c in model)
     worth = float(log_bayes(shaped, free)) if free else 0.5 * shaped
     return 0.5 * (ratio - shaped) + worth + known - further - prices

@@ -16,7 +16,7 @@ w_k that point's posterior weight, the mixture of all points has the covariance
 .. math:: C + \sum_k w_k \left(d_k d_k^T + C_k - C\right)
 
 A point's weight is its evidence. The estimate was profiled within its cell, so its evidence is reduced by the
-log of the share of the cell that it holds (:attr:`~magbridge.diagnose.causes.candidates.Candidate.narrow`).
+log of the share of the cell that it holds (:attr:`~magbridge.diagnose.causes.candidates.GridPoint.narrow`).
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def loosened(
         All candidates that were searched.
     """
     pieces = [piece for candidate in model for piece in candidate.pieces]
-    if all(piece.rebuild is None for piece in pieces):
+    if all(piece.point.rebuild is None for piece in pieces):
         return fit
     more = _within(problem, pieces, columns, fit) + _beyond(problem, pieces, columns, fit, grid)
     return replace(fit, covariance=fit.covariance + 0.5 * (more + more.T))
@@ -90,12 +90,12 @@ def _within(
 
 def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
     """Yield the derivative of the residual by each nonlinear parameter, in units of its cell."""
-    if piece.rebuild is None:
+    if piece.point.rebuild is None:
         return
-    values = [value for value, _ in piece.shape.values()]
-    for k, cell in enumerate(piece.cells):
+    values = [value for value, _ in piece.point.shape.values()]
+    for k, cell in enumerate(piece.point.cells):
         near = [value + SHARE * cell * (n == k) for n, value in enumerate(values)]
-        moved = piece.rebuild(*near)
+        moved = piece.point.rebuild(*near)
 
         def columns(rows: slice, moved: Candidate = moved) -> FloatArray:
             return np.asarray((moved.columns(rows) - piece.columns(rows)) @ b / SHARE)[:, None]
@@ -113,7 +113,7 @@ def _beyond(
     """(q + k, q + k) covariance added by all other cells."""
     more = np.zeros_like(fit.covariance)
     points = [
-        [c for c in grid if piece.rebuild and (c.group, c.names) == (piece.group, piece.names)]
+        [c for c in grid if piece.point.rebuild and (c.group, c.names) == (piece.group, piece.names)]
         for piece in pieces
     ]
     every = [candidate for some in points for candidate in some]
@@ -150,7 +150,7 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
 
     evidence, c, C = moments(piece, own)
     others = [moments(candidate, place) for candidate, place in points]
-    logs = np.array([evidence - piece.narrow, *(e for e, _, _ in others)])
+    logs = np.array([evidence - piece.point.narrow, *(e for e, _, _ in others)])
     weight = np.exp(logs - logs.max())
     apart = zip(weight[1:] / weight.sum(), others, strict=True)
     return np.asarray(sum(w * (np.outer(c_k - c, c_k - c) + C_k - C) for w, (_, c_k, C_k) in apart))

@@ -67,7 +67,7 @@ class _Stack:
         self.places = np.array(places)
         self.index = np.array([np.r_[at[k]] for k in places])
         self.positive = np.array([candidates[k].positive for k in places])
-        self.likelier = np.array([candidates[k].likelier for k in places])
+        self.likelier = np.array([candidates[k].point.likelier for k in places])
         self.S = info.matrix[self.index[:, :, None], self.index[:, None, :]]
         self.b = info.score[self.index]
 

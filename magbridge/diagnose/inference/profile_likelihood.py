@@ -27,9 +27,9 @@ def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: 
     peaks. The evidence pays for the choice: the average over the bracket counts, not the peak.
     """
     best, narrow = hypothesis, 0.0
-    if best.candidate.rebuild is None:
+    if best.candidate.point.rebuild is None:
         return best
-    for position, name in enumerate(best.candidate.shape):
+    for position, name in enumerate(best.candidate.point.shape):
         candidate, start, narrower = _profiled(state, model, best, base, position, name)
         narrow += narrower
         fit = state.fit([*model, candidate], start, plain=False, like=best.fit, rounds=2)
@@ -37,16 +37,17 @@ def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: 
         if improvement > 0.0:
             ratio, evidence = best.ratio + improvement, best.evidence + 0.5 * improvement
             best = replace(best, candidate=candidate, fit=fit, ratio=ratio, evidence=evidence)
-    brackets = [_bracket(state, best.candidate, name) for name in best.candidate.shape]
+    brackets = [_bracket(state, best.candidate, name) for name in best.candidate.point.shape]
     cells = tuple(0.5 * (high - low) for low, high in brackets)
-    return replace(best, candidate=replace(best.candidate, narrow=narrow, cells=cells))
+    point = replace(best.candidate.point, narrow=narrow, cells=cells)
+    return replace(best, candidate=replace(best.candidate, point=point))
 
 
 def _profiled(
     state: State, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
 ) -> tuple[Candidate, FloatArray, float]:
     """Return the best value's candidate, coefficients to begin from, and its share of the bracket."""
-    rebuild = best.candidate.rebuild
+    rebuild = best.candidate.point.rebuild
     assert rebuild is not None
     columns = [candidate.columns for candidate in model]
     low, high = _bracket(state, best.candidate, name)
@@ -55,7 +56,7 @@ def _profiled(
         values = np.linspace(low, high, max(COLUMNS // best.candidate.size, 4) + 2)
         made = []
         for value in values[1:-1]:
-            shape = [v for v, _ in best.candidate.shape.values()]
+            shape = [v for v, _ in best.candidate.point.shape.values()]
             shape[position] = float(value)
             made.append(rebuild(*shape))
         info = information(
@@ -76,11 +77,11 @@ def _profiled(
 
 def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, float]:
     """Return the values of one nonlinear parameter's grid between which a candidate stands."""
-    here = candidate.shape[name][0]
+    here = candidate.point.shape[name][0]
     if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
         share = 0.6 * here / float(np.ptp(state.problem.survey.time))
         return here / (1.0 + share), here * (1.0 + share)
-    grid = sorted({state.candidates[k].shape[name][0] for k in state.groups[candidate.group]})
+    grid = sorted({state.candidates[k].point.shape[name][0] for k in state.groups[candidate.group]})
     width = 0.5 * (grid[-1] - grid[0])
     # a positive parameter stays positive
     low = max(
@@ -98,7 +99,7 @@ def refined(
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])
         base = state.fit([*others, own], np.append(base.z, c), plain=False, like=base, rounds=1)
         model = [*others, own]
-        if own.rebuild is not None:
+        if own.point.rebuild is not None:
             rest = state.fit(others, plain=False)
             ratio = 2.0 * (base.log_likelihood - rest.log_likelihood)
             best = sharpen(state, others, Hypothesis(own, ratio, 0.0, 0.0, base), rest)

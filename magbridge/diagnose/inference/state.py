@@ -157,7 +157,7 @@ class State:
     def value(self, model: Sequence[Candidate], fit: Joint) -> float:
         """Log evidence of a model; each cause must also outweigh what idealised regressors may leave."""
         ratio, causes = self.ratio(fit), {candidate.cause for candidate in model}
-        narrow, shaped = sum(candidate.narrow for candidate in model), shaped_ratio(ratio, model, fit)
+        narrow, shaped = sum(candidate.point.narrow for candidate in model), shaped_ratio(ratio, model, fit)
         return (
             log_odds(ratio, model, self.look_elsewhere, shaped)
             - narrow
@@ -257,7 +257,7 @@ class State:
 
         The noise's level is estimated, too, so the distribution is Fisher's F.
         """
-        hypotheses = self.look_elsewhere.get(candidate.cause, 1.0) * float(np.exp(-candidate.likelier))
+        hypotheses = self.look_elsewhere.get(candidate.cause, 1.0) * float(np.exp(-candidate.point.likelier))
         tests = candidate.tail * hypotheses * self.causes
         freedom, certain = max(freedom, 1), self.certain.get(candidate.group, np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))

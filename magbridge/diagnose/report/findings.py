@@ -113,7 +113,8 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
                 "unit": candidate.units[members[0]],
             }
     shape = {
-        name: {"value": float(v), "sigma": None, "unit": unit} for name, (v, unit) in candidate.shape.items()
+        name: {"value": float(v), "sigma": None, "unit": unit}
+        for name, (v, unit) in candidate.point.shape.items()
     }
     return found | shape
 
@@ -134,7 +135,7 @@ def _rms(finding: Finding, samples: int) -> dict[str, Any]:
 def _adds_up(candidate: Candidate) -> bool:
     """Tell whether coefficients of one name add up: those of one channel at several lags or onsets."""
     channels = {getattr(effect, "channel", None) for effect in candidate.effects}
-    return len(channels) == 1 and not candidate.shape.keys().isdisjoint(("lag", "onset"))
+    return len(channels) == 1 and not candidate.point.shape.keys().isdisjoint(("lag", "onset"))
 
 
 def assessment(found: Assessment) -> dict[str, Any]:

@@ -113,8 +113,10 @@ def _sentence(diagnosis: Diagnosis) -> str:
     ]
     if diagnosis.wrong is not None:
         names.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
+    survey = diagnosis.problem.survey
+    own = (survey.fitted & ~survey.learned).any()  # the calibration was fitted to what is diagnosed
     worth = (
-        improved(total, diagnosis.problem.survey.parts)
+        improved(total, "" if own else survey.parts)
         if diagnosis.findings
         else f"Without them, {number(total.before)} nT RMS; nothing is added to the calibration."
     )
@@ -129,10 +131,14 @@ def _sentence(diagnosis: Diagnosis) -> str:
 
 
 def improved(improvement: Improvement, parts: str) -> str:
-    """Say what all findings together improve on what was left out, or that nothing shows."""
+    """Say what all findings together improve on what was left out, or that nothing shows.
+
+    `parts` is what was left out in turn; empty where the calibration was fitted to the log itself.
+    """
     low, high = improvement.interval
+    where = f"On {parts} left out of the fit" if parts else "On the log that the calibration was fitted to"
     return (
-        f"On {parts} left out of the fit, {number(improvement.before)} nT RMS became "
+        f"{where}, {number(improvement.before)} nT RMS became "
         f"{number(improvement.after)} nT (ratio {improvement.ratio:.2f}, 95 % interval {low:.2f} to "
         f"{high:.2f}{'' if improvement.shown else ': no improvement is shown'})."
     )

@@ -237,7 +237,13 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
         listed.append(_of("tone", rings.columns, look_elsewhere=rings.look_elsewhere, period=rings.period))
     if tone is not None:
         listed.append(
-            _of("tone", tone.columns, 1.0, look_elsewhere=tone.look_elsewhere, period=tone.shape["period"][0])
+            _of(
+                "tone",
+                tone.columns,
+                1.0,
+                look_elsewhere=tone.look_elsewhere,
+                period=tone.point.shape["period"][0],
+            )
         )
     return listed
 
