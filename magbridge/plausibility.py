@@ -304,7 +304,11 @@ class Plausibility:
             self._accepted += 1
             self._agreed = 0
             self._before = self._level if e * e > GATE * GATE * variance else nan
-            self._begin(time_us, self._level + 0.5 * e, sigma)
+            known = (
+                self._slope < 0.5 * SLOPE * SLOPE
+            )  # then after a pause or a motion the sample knows better
+            gain = 1.0 - 0.5 * (variance / spread if known else 1.0)
+            self._begin(time_us, self._level + gain * e, sigma)
             if time_us - self._mark_us >= SLOPE_US:
                 self._learn_slope(time_us)
             self._unrest = self._unrest * self._decay if self._unrest > variance else 0.0

@@ -137,3 +137,13 @@ def test_attitudes_that_are_older_than_five_seconds_tell_nothing() -> None:
     for k in range(100):
         assert one.check(k * 1_000_000, 0.0, 0.0, -50_000.0) == 0.0
     assert one.flags == 0
+
+
+def test_a_wrong_heading_and_a_wrong_inclination_are_each_told() -> None:
+    one = Direction()
+    one.expect(*NED.tolist())
+    turned = Rotation.from_euler("z", 90.0, degrees=True).apply(NED)
+    for k in range(40):
+        one.attitude(k * 1_000_000, 0.0, 0.0, 0.0)
+        one.check(k * 1_000_000, *(turned if k < 20 else NED * [1.0, 1.0, -1.0]).tolist())
+    assert [text.split()[0] for text in one.notices] == ["vector", "inclination"]

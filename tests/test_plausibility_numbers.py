@@ -102,6 +102,35 @@ def test_what_is_told_of_a_jump_is_its_size_and_sigma_is_that_until_it_is_over()
     )
 
 
+def test_after_a_spike_the_next_sample_is_less_sure_and_within_a_burst_even_less() -> None:
+    fed = Fed()
+    fed.quiet(12.0 * HOUR)
+    most = 16.0 * gate(1.0) ** 2
+    for pause, share in ((40, 0.3), (3, 0.3), (40, 0.8)):
+        fed(500.0)
+        assert fed.flagged
+        more = [fed(0.0) for _ in range(pause)]
+        assert more[:2] == pytest.approx([share * most, share**2 * most], rel=0.02)
+        assert (more[-1] == 0.0) is (pause == 40)
+
+
+def test_a_level_that_is_wrong_at_first_is_none_to_jump_from() -> None:
+    judge = Plausibility(1.0)
+    for k in range(4):
+        judged(900.0, judge=judge, at=k)
+    for k in range(4, 30):
+        judged(0.0, judge=judge, at=k)
+    assert not [text for text in judge.notices if "jumps" in text]
+
+
+def test_repeats_are_counted_from_the_last_change() -> None:
+    judge = Plausibility(1.0)
+    for k in range(400):  # three of a kind, for ever
+        x = 20_000.0 + 7.0 * (k // 3)
+        judge.check(k * 4_000_000, (x, 30_000.0 + k, 35_000.0 - k), FIELD, 0.5, 0, FIELD, 1e6)
+        assert judge.flags == 0
+
+
 def remembered(fed: Fed) -> float:
     """Return for how long, s, a level that is as before has a wider sigma."""
     began = fed.time
@@ -193,14 +222,15 @@ def test_a_wrong_level_is_remembered_for_an_hour_if_it_lasted_eight_seconds() ->
         assert sum(flag != 0 for flag in flags[3:]) == pytest.approx(remembered_for, abs=4)
 
 
-def run_until_stuck(repeats: float) -> int:
+def run_until_stuck(repeats: float, axis: int = 0) -> int:
     """Return after how many samples a channel that repeats itself so often is taken for stuck, if it is."""
     rng, judge = np.random.default_rng(1), Plausibility(1.0)
     x = 20_000.0
 
     def feed(k: int, value: float) -> int:
-        raw = (value, 30_000.0 + k, 35_000.0 - k)
-        judge.check(k * 4_000_000, raw, FIELD, 0.5, 0, FIELD, 1e6)
+        raw = [30_000.0 + k, 35_000.0 - k]
+        raw.insert(axis, value)
+        judge.check(k * 4_000_000, (raw[0], raw[1], raw[2]), FIELD, 0.5, 0, FIELD, 1e6)
         return judge.flags
 
     for k in range(4000):
@@ -212,9 +242,10 @@ def run_until_stuck(repeats: float) -> int:
 
 
 def test_an_axis_is_stuck_when_so_many_repeats_are_one_chance_in_a_thousand_million() -> None:
-    assert 4 <= run_until_stuck(0.0) <= 6
-    for p in (0.3, 0.6):
-        assert run_until_stuck(p) == pytest.approx(np.log(1e-9) / np.log(p), rel=0.35)
+    for axis in range(3):
+        assert 4 <= run_until_stuck(0.0, axis) <= 6
+    for p, axis in ((0.3, 0), (0.6, 0), (0.5, 1), (0.4, 2)):
+        assert run_until_stuck(p, axis) == pytest.approx(np.log(1e-9) / np.log(p), rel=0.35)
 
 
 def test_a_value_once_stuck_at_is_known_again_at_once_also_with_the_other_sign() -> None:

@@ -92,17 +92,35 @@ def test_where_rock_changes_fast_only_more_than_that_is_seen() -> None:
     assert (large[2000:] > 300.0).all()
 
 
-def test_one_turn_alone_may_tell() -> None:
-    """The sum of squares over their variance is the statistic: 8 sigmas are beyond it, 4 are not."""
-    for sigmas, seen in ((8.0, True), (4.0, False)):
-        turns, quiet = Turns(), SIGMA**2
-        for k in range(10):  # a straight course of ten minutes
-            turns.check(k * 60_000_000, FIELD, 0.0, 0.0, FIELD, quiet, 0)
-        rock = (LEAST * 60.0) ** 2 * (1.0 + 4.0 / 9.0)
-        F = FIELD + sigmas * (2.0 * quiet + rock) ** 0.5
-        more = turns.check(600_000_000, 0.0, F, 0.0, F, quiet, 0)
-        assert more == (pytest.approx((F - FIELD) ** 2) if seen else 0.0)
-        assert (sigmas**2 - 3.0 > ALARM) is seen
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize(("sigmas", "seen"), [(5.4, True), (5.2, False)])
+def test_one_turn_alone_may_tell(sigmas: float, seen: bool, axis: int) -> None:
+    """The sum of squares over their variance, less three, is the statistic: 28 is the limit of the first."""
+    assert (sigmas**2 - 3.0 > ALARM) is seen
+    turns, quiet = Turns(), SIGMA**2
+    for k in range(1, 11):  # a straight course of ten minutes
+        assert turns.check(k * 60_000_000, FIELD, 0.0, 0.0, FIELD, quiet, 0) == 0.0
+    rock = (LEAST * 60.0) ** 2 * (1.0 + 4.0 / 9.0)
+    F = FIELD + sigmas * (2.0 * quiet + rock) ** 0.5
+    y, z = (F, 0.0) if axis == 1 else (0.0, F)
+    more = turns.check(660_000_000, 0.0, y, z, F, quiet, 0)
+    assert more == (pytest.approx((F - FIELD) ** 2) if seen else 0.0)
+
+
+def test_the_rate_is_the_mean_square_of_what_straight_courses_do() -> None:
+    """In the first four windows, whatever they are; later one counts as 64 times the usual at most."""
+    for first, then, rate2 in (
+        ([30.0, 0.0, 0.0, 0.0], [], (0.25 + 3.0 * LEAST**2) / 4.0),
+        ([6.0] * 4, [6000.0], 0.01 + (64.0 - 1.0) * 0.01 / 5.0),
+    ):
+        for share, seen in ((1.03, True), (0.97, False)):
+            turns, F, k = Turns(), FIELD, 1
+            turns.check(60_000_000, F, 0.0, 0.0, F, 0.0, 0)
+            for change in (*first, *then):
+                k, F = k + 1, F + change
+                turns.check(k * 60_000_000, F, 0.0, 0.0, F, 0.0, 0)
+            F += share * (28.0 * rate2 * 3600.0 * (1.0 + 4.0 / (k - 1))) ** 0.5
+            assert (turns.check((k + 1) * 60_000_000, 0.0, F, 0.0, F, 0.0, 0) > 0.0) is seen
 
 
 def flagged() -> list[int]:

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.evidence import Quadratic, evidence
-from magbridge.calibration.fitting.fit import METHODS, fit
+from magbridge.calibration.fitting.fit import LEVEL, METHODS, fit
 from magbridge.calibration.fitting.noise import estimate_noise, memory
 from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
@@ -287,6 +287,20 @@ def test_nominal_constraints(glider: Gliders) -> None:
     assert not coefficients[3:6].any()
     assert not covariance[3:6].any()
     assert nominal_samples(glider(0).runs).phi.shape[1] == 1
+
+
+@pytest.mark.parametrize(
+    ("unmapped", "map_sigma", "bias"), [(0.0, None, 0.0), (1.0, None, LEVEL), (1.0, 30.0, 30.0)]
+)
+def test_by_default_the_level_is_known_as_well_as_the_reference(
+    glider: Gliders, unmapped: float, map_sigma: float | None, bias: float
+) -> None:
+    """A true field has no bias, a main-field model lacks the rock, a map has its own sigma."""
+    runs = glider(1).runs
+    runs = replace(runs, unmapped=np.full(len(runs), unmapped), map_sigma=map_sigma)
+    found = fit(runs, "nominal").calibration
+    assert found.reference.bias_sigma == bias
+    assert (found.reference.level_sigma > 0.8 * bias) if bias else found.level == ()
 
 
 def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:

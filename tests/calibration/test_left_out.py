@@ -72,3 +72,36 @@ def test_auto_is_better_than_one_ellipsoid_where_the_first_part_differs() -> Non
             error, _ = in_sensor_units(fit(first, method).calibration, late)
             squares[method] += float(np.mean(error**2))
     assert squares["auto"] < 0.84**2 * squares["nominal"]
+
+
+def smoothed(window: int, roll: float = 0.0, pitch: float = 20.0, n: int = 7200) -> Observations:
+    """Circles of 150 s, ten minutes up and ten down; a reading is the mean of so many seconds."""
+    rng, second = np.random.default_rng(7), np.arange(n)
+    dive = lfilter([0.08], [1.0, -0.92], np.where(second // 600 % 2, pitch, -pitch))
+    roll_s, pitch_s = (lfilter([0.06], [1.0, -0.94], rng.normal(0.0, size, n)) for size in (8.0, 2.0))
+    angles = np.column_stack([2.4 * second, dive + pitch_s, roll + roll_s])
+    field = Rotation.from_euler("ZYX", angles, degrees=True).inv().apply(FIELD)
+    field = field @ (np.eye(3) + 0.01 * np.diag([1.0, -0.5, 0.3])) + np.array([900.0, -400.0, 300.0])
+    field = np.column_stack([np.convolve(axis, np.full(window, 1.0 / window), "same") for axis in field.T])
+    rows = second[(second > 60) & (second < n - 60)][::4]
+    return Observations(
+        field[rows] + rng.normal(0.0, 1.0, (len(rows), 3)),
+        np.full(len(rows), np.linalg.norm(FIELD)),
+        np.empty((len(rows), 0)),
+        time=rows.astype(float),
+    )
+
+
+def test_a_smoothed_field_is_as_unsure_as_it_is_wrong_in_attitudes_not_seen() -> None:
+    """What the model lacks is told by groups of like attitude left out: by runs alone sigma is too small."""
+    found = fit(smoothed(12))
+    assert found.details["left_out_ratio"] > 1.8
+    for roll, pitch in ((0.0, 20.0), (25.0, 20.0), (0.0, 55.0)):
+        other = smoothed(12, roll, pitch, 2400)
+        _, standardised = in_sensor_units(found.calibration, other.part(other.time % 600.0 > 90.0))
+        assert np.sqrt(np.mean(standardised**2)) < 1.15
+    clean = fit(smoothed(1))
+    assert clean.details["left_out_ratio"] == 1.0
+    for roll, pitch in ((0.0, 20.0), (25.0, 20.0)):
+        _, standardised = in_sensor_units(clean.calibration, smoothed(1, roll, pitch, 2400))
+        assert 0.6 < np.sqrt(np.mean(standardised**2)) < 1.3

@@ -46,6 +46,20 @@ def test_a_damaged_list_of_sensors_is_named(real_data: Path, tmp_path: Path) -> 
         read(tmp_path / "comet-2016-174-05-003.dbd")
 
 
+@pytest.mark.parametrize("key", [b"sensors_per_cycle", b"state_bytes_per_cycle"])
+def test_a_slocums_number_that_is_too_large_for_its_reader(
+    key: bytes, real_data: Path, tmp_path: Path
+) -> None:
+    for name in ("comet-2016-174-05-003.dbd", "11d38bfd.cac"):
+        shutil.copy(real_data / "slocum_comet" / name, tmp_path)
+    path = tmp_path / "comet-2016-174-05-003.dbd"
+    whole = path.read_bytes()
+    path.chmod(0o644)
+    path.write_bytes(whole.replace(key + b":    ", key + b":    " + b"9" * 23, 1))
+    with pytest.raises(FormatError, match="expected a whole Slocum file"):
+        read(path)
+
+
 @pytest.mark.parametrize("name", ["no_row_group.parquet", "attribute.nc", "hangs.ulg", "short.dbd"])
 def test_files_that_once_failed(cases: Path, name: str) -> None:
     """A result, or one line: within 10 s of processor time."""

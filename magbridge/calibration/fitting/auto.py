@@ -94,7 +94,7 @@ def fit_auto(
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
     coefficients = prior.coefficients(best.solution.z)
     check_scales(samples, coefficients)
-    left = leave_out(samples, prior, best.solution.z, best.noise, data.runs)
+    left = leave_out(samples, prior, best.solution.z, best.noise, data.runs, attitudes=True)
     covariance = prior.E @ covariance_of(precision) @ prior.E.T
     found = assemble(
         data, samples, posed.ranges, posed.exponents, coefficients, covariance, best.noise, "auto", left,

@@ -8,9 +8,10 @@ part k its Hessian and gradient are missing, so to first order::
     P_k = ((H - H_k) / sigma^2 + L)^-1,   z_k - z = P_k g_k / sigma^2
     e_i(z_k) = e_i + J_i (z_k - z),   s_i^2 = sigma^2 + J_i P_k J_i^T     for i in part k
 
-If the model is right, ``e_i / s_i`` has the variance 1. Its root mean square is Birge's ratio R (Birge 1932,
-Phys. Rev. 40:207): where it is larger than chance allows, the model lacks something of that size, and all
-sigmas are too small by R.
+If the model is right, ``e_i / s_i`` has the variance 1, whichever parts are left out: runs, or the samples of
+like attitude, which tell how far the fit can be carried to attitudes that it has not seen. Its root mean
+square is Birge's ratio R (Birge 1932, Phys. Rev. 40:207): where it is larger than chance allows, the model
+lacks something of that size, and all sigmas are too small by R.
 
 That takes the normal equations only. To first order two fits can look alike that are not, so where one is to
 be preferred to another each is fitted again without the part (:func:`refitted`).
@@ -22,6 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel
@@ -43,6 +45,10 @@ __all__ = ["LeftOut", "leave_out", "refitted"]
 PARTS, BLOCKS = 10, 4
 """Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three, or one
 that is most of the log."""
+ATTITUDES = 6
+"""Groups of samples with the field in like directions, each of which is left out, too."""
+LASTING = 0.98
+"""Autocorrelation of neighbours from which on a group of like attitude cannot be left out."""
 STEPS = 10
 """Gauss-Newton's, at most, of a fit without a part: it begins at the fit to all."""
 TESTED = 20_000
@@ -63,6 +69,7 @@ class LeftOut:
         nT, in the sensor's own units; single samples count as five sigmas at most.
     ratio : float
         Root mean square of the errors over their claimed sigmas; 1 where it is less, or not more than chance.
+        The larger one, where groups of like attitude are left out, too.
     """
 
     rms: float
@@ -70,7 +77,13 @@ class LeftOut:
 
 
 def leave_out(
-    samples: Samples, prior: Prior, z: FloatArray, noise: NoiseModel, runs: NDArray[np.generic]
+    samples: Samples,
+    prior: Prior,
+    z: FloatArray,
+    noise: NoiseModel,
+    runs: NDArray[np.generic],
+    *,
+    attitudes: bool = False,
 ) -> LeftOut:
     """Predict each part of the samples from the others.
 
@@ -86,8 +99,21 @@ def leave_out(
         Its noise, nT.
     runs : (n,) array
         A label for each sample: whole runs are left out, or blocks of neighbours where there are few runs.
+    attitudes : bool
+        Leave out groups of like attitude, too. (Not where noise is remembered for longer than an attitude
+        lasts, as on an aircraft: neighbours that stay then tell what was left out.)
     """
-    parts = _parts(runs)
+    found = _left_out(samples, prior, z, noise, _parts(runs))
+    if attitudes and noise.autocorrelation < LASTING:
+        apart = _left_out(samples, prior, z, noise, _alike(samples))
+        found = replace(found, ratio=max(found.ratio, apart.ratio))
+    return found
+
+
+def _left_out(
+    samples: Samples, prior: Prior, z: FloatArray, noise: NoiseModel, parts: list[IndexArray]
+) -> LeftOut:
+    """Predict each of the `parts` from the others."""
     c = prior.coefficients(z)
     normals = [prior.reduce(_normal(samples, c, noise, rows)) for rows in parts]
     hessian = np.sum([normal.hessian for normal in normals], axis=0)
@@ -153,8 +179,16 @@ def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
     return [np.flatnonzero(part == k) for k in range(part.max() + 1)]
 
 
+def _alike(samples: Samples) -> list[IndexArray]:
+    """Return the places of each group of samples in which the field has like directions, by k-means."""
+    u = samples.field / np.linalg.norm(samples.field, axis=1)[:, None]
+    _, group = kmeans2(u, ATTITUDES, minit="++", rng=np.random.default_rng(1))
+    return [rows for k in range(ATTITUDES) if len(rows := np.flatnonzero(group == k))]
+
+
 def _normal(samples: Samples, c: FloatArray, noise: NoiseModel, rows: IndexArray) -> NormalEquations:
     part = samples.part(rows)
     part.steps[0] = np.inf
+    part.steps[1:][np.diff(rows) > 1] = np.inf
     weight = None if noise.weight is None else noise.weight[rows]
     return normal_equations(part, c, weight, *noise.shape)
