@@ -102,7 +102,7 @@ def run(case: Case) -> list[Row]:
         best = BestFit(vehicle, runs, survey, noise, memory, at_sigma)
         add(f"{name}: bound", rms(best.floor), rms(best.bound) / rms(best.floor) * floor)
         add(f"{name}: reached", np.nan, rms(best.error(np.random.default_rng([case.seed, 98]))))
-    for name, (A, T, failed) in strangers(runs, case.peers):
+    for name, (A, T, failed) in other_methods(runs, case.peers):
         add(name, rms(left(A, T, runs)), rms(left(A, T, survey)), failed=failed)
     return rows
 
@@ -133,7 +133,7 @@ def tape(vehicle: Vehicle, seed: int) -> dict[str, dict[str, object]]:
     }
 
 
-def strangers(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, str]]]:
+def other_methods(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, str]]]:
     """Yield the public methods' results: the corrected field is ``A (raw - T)``."""
     yield "scipy ellipsoid", (*ellipsoid(runs), "")
     if not peers:

@@ -240,10 +240,10 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
     seen = effect if effect.ndim == 1 else np.sum(effect * unit, axis=1)
     effect = effect * snr / (np.std(seen) * np.sqrt(len(seen)))
     H = glider.reads(survey) + noise(len(seen)) + (effect if effect.ndim == 2 else 0.0)
-    return told(name, diagnose([dataset(survey, H, effect if effect.ndim == 1 else 0.0)], calibration))
+    return reported(name, diagnose([dataset(survey, H, effect if effect.ndim == 1 else 0.0)], calibration))
 
 
-def told(name: str, found: Diagnosis) -> dict[str, Any]:
+def reported(name: str, found: Diagnosis) -> dict[str, Any]:
     """Return what was hidden, what is named, and what remains possible."""
     named = one_of(one.candidate.cause for one in found.findings)
     named |= {"outliers"} if found.wrong is not None else set()

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import bessel, sosfilt
-from second_world import STEP, Log, dataset, rotated, study, told
+from second_world import STEP, Log, dataset, reported, rotated, study
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -215,7 +215,7 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
         effect = (OWN | FOREIGN)[name](vehicle, survey, rng)
         unit = survey.body / np.linalg.norm(survey.body, axis=1)[:, None]
         H = H + effect * snr / (np.std(np.sum(effect * unit, axis=1)) * np.sqrt(len(H)))
-    return told(name, diagnose([dataset(survey, H)], calibration))
+    return reported(name, diagnose([dataset(survey, H)], calibration))
 
 
 if __name__ == "__main__":

@@ -80,22 +80,22 @@ class Information:
 
 
 def information(
-    problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns], strangers: int = 0
+    problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns], unshared: int = 0
 ) -> Information:
     """Sum up the information of columns at `base` under `noise`, only the calibration projected out.
 
-    The first `strangers` of them share no parts with any other, and their products with each other are not
+    The first `unshared` of them share no parts with any other, and their products with each other are not
     computed.
     """
     q, shared = problem.calibration_jacobian.shape[1], together(columns).parts
-    alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:strangers]), q)
+    alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:unshared]), q)
     others = slice(alone[-1].stop if alone else q, None)
     asked = [(slice(q), slice(None)), *zip(alone, alone, strict=True), (others, slice(q, None))]
     G, b = normal(
         lambda rows: side_by_side([problem.calibration_jacobian[rows], *(X(rows) for X, _ in shared)]),
         noise.response(base.residual),
         noise,
-        asked if strangers else ALL,
+        asked if unshared else ALL,
     )
     pull = base.prior[:q] * (problem.centre - base.z)
     K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])

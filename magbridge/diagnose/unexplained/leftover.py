@@ -179,7 +179,7 @@ def _scored(
 ) -> Iterator[Scored]:
     """Score each description with each of its widths under `noise`."""
     columns = [*(one.columns for one in listed), *model]
-    info = information(problem, noise, fit, columns, strangers=len(listed)).fitted(fit)
+    info = information(problem, noise, fit, columns, unshared=len(listed)).fitted(fit)
     for one, at in zip(listed, places(one.widths[0][1].size for one in listed), strict=True):
         for kind, width in one.widths:
             S, b = info.matrix[at, at], info.score[at]
