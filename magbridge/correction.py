@@ -16,7 +16,7 @@ import numpy as np
 from magbridge.align import Aligner, Input, Sample
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import Corrector
-from magbridge.calibration.model import Calibration, identity
+from magbridge.calibration.model import RAISED, Calibration, identity
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
 from magbridge.direction import Direction
@@ -194,7 +194,7 @@ class Correction:
         if self._raised is None:
             return nan
         raised = self._raised.numbers(sample.time_us, sample.field, sample.values, sample.quality)[0][0]
-        return abs(raised - corrected.total_field)
+        return abs(raised - corrected.total_field) / RAISED
 
     def _more(self, sample: Sample) -> float:
         """Return the variance to add: ``s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""

@@ -29,7 +29,21 @@ from magbridge.calibration.terms import Effect, Parameter, Polynomial, PositionT
 from magbridge.deprecated import old_name
 from magbridge.errors import CalibrationError
 
-__all__ = ["Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity"]
+__all__ = [
+    "RAISED",
+    "Boresight",
+    "Calibration",
+    "Noise",
+    "Parameter",
+    "Reference",
+    "Run",
+    "Sensor",
+    "identity",
+]
+
+
+RAISED = 0.01
+"""Of its 1-sigma, by which the level is raised to see what that does."""
 
 
 class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -197,10 +211,13 @@ class Calibration:
         )  # fmt: skip
 
     def at_level(self) -> Calibration:
-        """Return the calibration with its reference's level, and all that follows from it, 1-sigma up."""
+        """Return the calibration with its reference's level, and all that follows, :data:`RAISED` 1-sigma up.
+
+        A whole one may move the offset by 100 nT across the field: the total field is not linear in that.
+        """
         moved = self.coefficients.copy()
         many = min(len(moved), len(self.level))
-        moved[:many] += self.level[:many]
+        moved[:many] += RAISED * np.asarray(self.level[:many])
         return replace(self, coefficients=moved)
 
     def matrices(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:

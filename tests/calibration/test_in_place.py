@@ -16,6 +16,7 @@ from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.model import Noise, identity
 from magbridge.field.place.blocks import Factor, near_inverse
 from magbridge.field.place.matern import Matern
 from magbridge.field.place.nodes import nodes_near
@@ -98,6 +99,18 @@ def test_level_stands_in_the_file(survey: Survey) -> None:
     assert again.reference == calibration.reference
     assert again.level == calibration.level
     assert again.reference.bias_sigma == LEVEL
+
+
+def test_level_is_less_than_the_sigma_by_the_noise_at_least() -> None:
+    """Whatever it does to the offset: 150 nT across the field lengthen it by 0.2 nT, which is no level."""
+    w = np.zeros(9)
+    w[:3], w[6] = LEVEL / np.sqrt(3.0), 150.0
+    still = identity()
+    known = replace(still, covariance=np.outer(w, w), level=tuple(w), noise=Noise(NOISE), method="survey")
+    field = np.array([[0.0, 0.0, 50_000.0], [0.0, 30_000.0, 40_000.0]])
+    got = correct(known, field, np.empty((2, 0)), np.arange(2.0))
+    level = level_of(known, field, np.empty((2, 0)), np.arange(2.0))
+    np.testing.assert_allclose(got.sigma**2 - level**2, NOISE**2, atol=0.5)
 
 
 def test_true_field_is_fitted_as_before() -> None:

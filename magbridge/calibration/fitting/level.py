@@ -14,7 +14,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
-from magbridge.calibration.model import Calibration, Reference
+from magbridge.calibration.model import RAISED, Calibration, Reference
 from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.calibration.terms import symmetric
 
@@ -64,7 +64,7 @@ def level_of(
     if not calibration.level:
         return np.zeros(len(field))
     up, here = (correct(one, field, channels, time).total for one in (calibration.at_level(), calibration))
-    return np.abs(up - here)
+    return np.abs(up - here) / RAISED
 
 
 def sizes(samples: Samples, coefficients: FloatArray) -> FloatArray:
