@@ -196,17 +196,28 @@ FOREIGN: dict[str, Effect] = {
 EVERY = (*OWN, *FOREIGN, "", *FOREIGN)
 
 
-def flicker(rng: np.random.Generator, n: int) -> FloatArray:
-    """(n, 3) nT, noise of 1/f below a tenth of the sampling frequency and white above, 1 nT RMS."""
+def _colour(n: int) -> FloatArray:
+    """Amplitude of the noise by frequency: 1/f in power, below a tenth of the sampling frequency."""
     f = np.fft.rfftfreq(n)
-    spectrum = np.sqrt(1.0 + 0.1 / np.maximum(f, 1.0 / n))[:, None]
-    made = np.fft.irfft(np.fft.rfft(rng.normal(size=(n, 3)), axis=0) * spectrum, n, axis=0)
+    return np.asarray(np.sqrt(1.0 + 0.1 / np.maximum(f, 1.0 / n)))
+
+
+def flicker(rng: np.random.Generator, n: int) -> FloatArray:
+    """(n, 3) nT of noise, 1 nT RMS."""
+    made = np.fft.irfft(np.fft.rfft(rng.normal(size=(n, 3)), axis=0) * _colour(n)[:, None], n, axis=0)
     return np.asarray(made / np.std(made))
+
+
+def loudness(x: FloatArray) -> float:
+    """Signal-to-noise of x (n,), nT, in such noise: its norm when filtered so that the noise is white."""
+    n, colour = len(x), _colour(len(x))
+    white = np.fft.irfft(np.fft.rfft(x - x.mean()) / colour, n)
+    return float(np.linalg.norm(white) * np.sqrt(np.mean(colour**2)))
 
 
 def case(number: int, name: str, snr: float) -> dict[str, Any]:
     """Calibrate a vehicle, hide one effect in its survey, and return what `diagnose` names."""
-    rng = np.random.default_rng([20_261, number])
+    rng = np.random.default_rng([20_262, number])
     vehicle, spins, survey = Vehicle(rng), logged(rng, 1.0, spins=True), logged(rng, HOURS, spins=False)
     runs = dataset(spins, vehicle.reads(spins) + flicker(rng, len(spins.body)))
     calibration = fit(observations(runs, ["battpos", "vbd"]), "auto").calibration
@@ -214,7 +225,7 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
     if name:
         effect = (OWN | FOREIGN)[name](vehicle, survey, rng)
         unit = survey.body / np.linalg.norm(survey.body, axis=1)[:, None]
-        H = H + effect * snr / (np.std(np.sum(effect * unit, axis=1)) * np.sqrt(len(H)))
+        H = H + effect * snr / loudness(np.sum(effect * unit, axis=1))
     return reported(name, diagnose([dataset(survey, H)], calibration))
 
 
