@@ -14,7 +14,7 @@ axis
     is learned: a coarse instrument repeats itself, `n` times in a row with the probability ``p^n``.
 jump
     The total field does not change with the attitude, and changes slowly with the place. The innovation
-    ``e = F - L`` from a level L that follows it has the variance ``S = s^2 + (slope dt)^2 + sigma^2 +
+    ``e = F - L`` from a level L that follows it has the variance ``S = s^2 + (5/7 slope dt)^2 + sigma^2 +
     sigma_L^2``: s and the slope are learned, and the sigmas are those of the correction, only where
     a mass may have moved. Where ``e^2 > GATE^2 S``, a Kalman filter's gate (Bar-Shalom et al. 2001,
     *Estimation with Applications to Tracking and Navigation*, section 5.4), the sample is an outlier.
@@ -42,7 +42,9 @@ MOST: Final = 72_000.0
 """nT: the main field's extremes on Earth, 22,000 and 67,000 nT, with rock."""
 GATE: Final = 7.0
 """Sigmas of an innovation; 5.5 would be one false alarm a month, were the noise Gaussian."""
-SLOPE: Final = 0.5
+ROCK: Final = (5.0 / GATE) ** 2
+"""Of the slope's share in S: over a pause or a motion it is five sigmas of a slope that are acceptable."""
+SLOPE: Final = 0.7
 LEAST_SLOPE: Final = 0.05
 """nT/s, 1-sigma, by which the field changes as a vehicle passes rock: at first, and at least."""
 SLOPE_US: Final = 20_000_000
@@ -289,7 +291,7 @@ class Plausibility:
             return 0.0
         seconds = 1e-6 * (time_us - self._level_us)
         moved = self._unsteady
-        spread = variance + self._slope * seconds * seconds
+        spread = variance + ROCK * self._slope * seconds * seconds
         if moved:
             spread += sigma * sigma + self._level_variance
         e = total - self._level

@@ -119,6 +119,11 @@ def test_eight_looks_in_a_row_have_to_differ_one_a_second() -> None:
     assert not any(looks(([20.0] * 7 + [0.0]) * 5)[0])
     assert not any(looks([20.0] * 60 + [0.0] * 60, every_us=100_000)[0]), "six seconds"
     assert looks([20.0] * 90, every_us=100_000)[0][-1]
+    one = Direction()
+    one.expect(*NED.tolist())
+    for k in range(60):  # the heading, too
+        one.attitude(k * 1_000_000, 0.0, 0.0, 0.0 if k % 8 == 7 else 2.0)
+        assert one.check(k * 1_000_000, *NED.tolist()) == 0.0
 
 
 def test_what_was_seen_is_remembered_for_an_hour() -> None:

@@ -42,7 +42,7 @@ class Fed:
 def gate(noise: float, sigma2: float = 0.0, slope: float = 0.05, seconds: float = 4.0) -> float:
     """Return the innovation, nT, that is just acceptable: 7 sigmas of a level's, a slope's and a sensor's."""
     floor = 1.5 * max(noise, QUIETEST) ** 2
-    return float(GATE * (floor + (slope * seconds) ** 2 + sigma2) ** 0.5)
+    return float((GATE**2 * (floor + sigma2) + (5.0 * slope * seconds) ** 2) ** 0.5)
 
 
 @pytest.mark.parametrize("noise", [1.0, 3.0, 0.01])
@@ -220,6 +220,18 @@ def test_a_wrong_level_is_remembered_for_an_hour_if_it_lasted_eight_seconds() ->
         reported = any(text.startswith("field of 50900 nT, expected 50000") for text in judge.notices)
         assert reported is (samples == 5)
         assert sum(flag != 0 for flag in flags[3:]) == pytest.approx(remembered_for, abs=4)
+
+
+def test_a_burst_of_garbage_is_no_wrong_level() -> None:
+    """Seven seconds at 1 Hz are forgotten, ten are not."""
+    for seconds, kept in ((7, False), (10, True)):
+        judge = Plausibility(1.0)
+        flags = []
+        for k in range(400):
+            F = FIELD + (900.0 if 100 <= k < 100 + seconds else 0.0)
+            judge.check(k * 1_000_000, (1.0 + k, 2.0 - k, 3.0 * k), F, 10.0, 0, FIELD, 145.0)
+            flags.append(judge.flags)
+        assert any(flags[200:]) is kept
 
 
 def run_until_stuck(repeats: float, axis: int = 0) -> int:
