@@ -14,6 +14,8 @@ from pathlib import Path
 
 import live
 import numpy as np
+from live_changes import MASSES
+from live_changes import hours as hours_of
 from rich.console import Console
 from terminal import command_line, table
 
@@ -32,12 +34,12 @@ def run(seed: int, hours: float) -> np.ndarray:
     """Return, of each stretch, the error about its mean, the mean error, the claimed sigma; nT."""
     _, log = live.fly("nothing", seed, hours)
     parameters = []
-    for name in live.MASSES:
+    for name in MASSES:
         low, high = float(log[name].min()), float(log[name].max())
         parameters.append(Parameter(name, "", low, high, 0.5 * (low + high), 0.5 * (high - low)))
     prior = class_prior(tuple(parameters))
     seen = live.learn(Learner(prior), prior, log)
-    time, error = live.hours(log), seen.total - log["truth_total_field"].to_numpy()
+    time, error = hours_of(log), seen.total - log["truth_total_field"].to_numpy()
     rest = (seen.quality & int(Quality.MOVING | Quality.STALE_TELEMETRY)) == 0
     rows = np.full((len(EDGES) - 1, 3), np.nan)
     for row, low, high in zip(rows, EDGES[:-1], EDGES[1:], strict=True):
@@ -53,7 +55,7 @@ def draw(results: np.ndarray, file: Path) -> None:
 
     flown = np.isfinite(results[:, :, 0]).any(0)
     results, middle = results[:, flown], np.sqrt(np.array(EDGES[:-1]) * np.array(EDGES[1:]))[flown]
-    figure, axes = plt.subplots(figsize=(7.0, 4.2), constrained_layout=True)
+    figure, axes = plt.subplots(figsize=(7.0, 4.0), constrained_layout=True)
     for one in results:
         axes.plot(middle, one[:, 0], color="tab:blue", alpha=0.35, lw=1)
         axes.plot(middle, np.abs(one[:, 1]), color="tab:orange", alpha=0.35, lw=1)
@@ -65,7 +67,7 @@ def draw(results: np.ndarray, file: Path) -> None:
     axes.set(xscale="log", yscale="log", xlabel="hours since the start", ylabel="nT")
     axes.set_xticks([0.1, 0.3, 1, 3, 6, 12, 24], ["0.1", "0.3", "1", "3", "6", "12", "24"])
     axes.grid(alpha=0.3)
-    axes.legend()
+    figure.legend(loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(file)
 
 

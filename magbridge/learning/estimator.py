@@ -37,9 +37,11 @@ NEAR: Final = 250.0
 rock."""
 LONG: Final = 1000
 """Samples over which the mean derivative of the total field is followed."""
-LASTING: Final = 6.0 * 3600.0
+LASTING: Final = 24.0 * 3600.0
 """s over which what is known of a drift's slope gets less certain by a factor of e in variance: a drift
 changes, but what was found to be none does not begin anew by itself."""
+STEEPEST: Final = 20.0 / 3600.0
+"""nT/s: no drift's slope gets less certain than that."""
 
 
 class Estimator:
@@ -81,7 +83,7 @@ class Estimator:
         self._P[-STATES:, -STATES:] = nuisance.initial
         self.offsets, self.slope = offsets, np.arange(K, K + SLOPE)
         self._nuisance, self._creep = nuisance, creep
-        self._sloping = False
+        self._sloping, self._lasting = False, LASTING
         self._near: FloatArray | None = None
         self._mean = np.zeros(K)
         self._stay = 1.0
@@ -127,9 +129,15 @@ class Estimator:
         by = float(self._mean @ (published - self.coefficients))
         return np.asarray(self.coefficients + toward * (by / float(self._mean @ toward)))
 
-    def open(self, variance: float) -> None:
-        """Let the offsets be unknown by a further `variance` (nT²) an axis."""
-        self._P[self.offsets, self.offsets] += variance
+    def open(self, variance: float, which: IndexArray | None = None) -> None:
+        """Let coefficients `which` (3,), by default the offsets, be unknown by a further `variance` each."""
+        which = self.offsets if which is None else which
+        self._P[which, which] += variance
+
+    def drift(self, rate: float, lasting: float) -> None:
+        """Let the offsets drift by `rate` (nT/s, 1-sigma an axis), which changes within `lasting` (s)."""
+        self._P[self.slope, self.slope] += rate * rate
+        self._sloping, self._lasting = True, lasting
 
     def shift(self, by: FloatArray, covariance: FloatArray) -> None:
         """Move the state by `by` (n,), which is known to a further `covariance` (n, n)."""
@@ -151,7 +159,11 @@ class Estimator:
         self.advance(P, F, seconds)
         self.advance(P.T, F, seconds)
         P[-STATES:, -STATES:] += Q
-        P[self.slope, self.slope] *= 1.0 + seconds / LASTING
+        if self._sloping:
+            known = P[self.slope, self.slope]
+            P[self.slope, self.slope] = np.where(
+                known < STEEPEST * STEEPEST, known * (1.0 + seconds / self._lasting), known
+            )
         self.open(self._creep * self._creep * seconds)
         self._stay = exp(-metres / NEAR)
         return F

@@ -15,6 +15,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.field.geodesy import separation
+from magbridge.learning.bank import Bank
 from magbridge.learning.doubt import Doubt, Signs
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.judge import FIRST, LEARNED
@@ -144,7 +145,7 @@ class Learner:
 
     def learned(self) -> Calibration:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
-        return self._publication.made(self._estimator, self.samples, self._noise)
+        return self._publication.made(self._bank.best, self.samples, self._noise)
 
     def accept(self) -> None:
         """Let what is learned be the calibration that nothing rolls back, and the doubt be known."""
@@ -171,20 +172,22 @@ class Learner:
         """Begin to learn from the first calibration, whose offsets may have changed at this power-on."""
         first, offsets = self.first, self._model.offsets
         coefficients, covariance = self._model.coefficients(first)
-        self._estimator = Estimator(coefficients, covariance, offsets, self._nuisance, CREEP)
-        self._estimator.open(self._turn_on**2)
-        self._doubt = Doubt(self._model, self._estimator)
+        quiet = Estimator(coefficients, covariance, offsets, self._nuisance, CREEP)
+        quiet.open(self._turn_on**2)
+        self._bank, self._doubt = Bank(self._model, quiet), Doubt(self._model, quiet)
         self._outliers, self._noise = 0, first.noise
         self._start: Start | None = None
         if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * LINEAR**2:
             self._start = Start(self._model, coefficients, covariance, first.reference.field)
+        else:
+            self._bank.suppose()
 
     def _notify(self, text: str, *, grave: bool = False) -> None:
         self.notices.append(Notice(text, self._now_us * 1e-6, grave))
 
     def restarted(self) -> None:
         """Take note that the sensor was powered anew: its offsets may have changed."""
-        self._estimator.open(self._turn_on**2)
+        self._bank.open(self._turn_on**2)
 
     def sample(
         self,
@@ -240,30 +243,41 @@ class Learner:
             return
         metres, seconds = self._moved(time_us, where)
         before, self._before = self._before, phi
-        estimator = self._estimator
-        F = estimator.propagate(metres, seconds)
-        self._doubt.propagate(estimator, F, seconds)
-        weights = self._model.weights(estimator.coefficients)
-        live = self._observe(field, phi @ weights, reference)
-        clock = 0.0
+        bank = self._bank
+        best, quiet = bank.best, bank.quiet
+        for other in bank.all[1:]:
+            other.propagate(metres, seconds)
+        self._doubt.propagate(quiet, quiet.propagate(metres, seconds), seconds)
+        live = {id(one): self._predict(one, field, phi, reference) for one in bank.all}
+        observed, clock = live[id(quiet)], 0.0
         if before is not None and 0.0 < seconds < 30.0:  # what it would be, were telemetry a second late
-            clock = (self._observe(field, before @ weights, reference).e - live.e) / seconds
+            late = self._observe(field, before @ self._model.weights(quiet.coefficients), reference)
+            clock = (late.e - observed.e) / seconds
         positions = tuple(self._model.scaled(values))
-        signs = Signs(time_us * 1e-6, live.by_nine[6:], positions, tuple(watched), clock, -1.0 / live.s)
-        estimator.predict(live.e, live.s, self._model.derivative(phi, live.by_nine))
+        signs = Signs(
+            time_us * 1e-6, observed.by_nine[6:], positions, tuple(watched), clock, -1.0 / observed.s
+        )
         by_first, by_published = self._publication.nine(phi)
         first = self._observe(field, by_first, reference)
         self._publication.judge.judge(
-            *self._nuisance.over(metres, seconds), first.e, first.s, estimator.residual, estimator.variance
+            *self._nuisance.over(metres, seconds), first.e, first.s, best.residual, best.variance
         )
         if self._start is not None:
             if not self.frozen:
                 self._fit(self._start, due=self._start.add(field, phi, reference, metres, seconds))
         else:
+            bank.judge()
             self._learn(signs)
         published = self._observe(field, by_published, reference)
-        estimator.follow(live.s)
-        self._decide((published.e - live.e) * live.s)
+        learned = live[id(best)]
+        self._decide((published.e - learned.e) * learned.s)
+
+    def _predict(self, one: Estimator, field: Vector, phi: FloatArray, reference: float) -> Observation:
+        """Let an estimator predict a sample; return what it is by its coefficients."""
+        live = self._observe(field, phi @ self._model.weights(one.coefficients), reference)
+        one.predict(live.e, live.s, self._model.derivative(phi, live.by_nine))
+        one.follow(live.s)
+        return live
 
     def _nothing(self, time_us: int) -> None:
         """Say once an hour or more passes without a sample to learn from."""
@@ -285,23 +299,25 @@ class Learner:
 
     def _learn(self, signs: Signs) -> None:
         """Doubt what was predicted, and learn from it."""
-        estimator = self._estimator
-        far = abs(estimator.residual) > OUTLIER * estimator.sigma
+        quiet, best = self._bank.quiet, self._bank.best
+        far = abs(best.residual) > OUTLIER * best.sigma
         self._outliers = self._outliers + 1 if far else 0
-        alarm = self._doubt.test(estimator, signs)
+        alarm = self._doubt.test(quiet, signs)
         if alarm is not None and (news := self._standing.raised(alarm)):
             self._notify(news, grave=True)
         if far and self._outliers < AGREE and self._standing.alarm is None:
             return
-        learn = estimator.telling and not self.frozen
-        self._doubt.updated(estimator.update(learn=learn))
+        for other in self._bank.all[1:]:
+            other.update(learn=other.telling and not self.frozen)
+        learn = quiet.telling and not self.frozen
+        self._doubt.updated(quiet.update(learn=learn))
         self.samples += learn
-        self._standing.count(telling=estimator.telling)
+        self._standing.count(telling=quiet.telling)
         self._publication.age += 1
 
     def _fit(self, start: Start, *, due: bool) -> None:
         """Learn from a sample while next to nothing is known; fit all so far where that is due."""
-        estimator = self._estimator
+        estimator = self._bank.quiet
         if not due:
             estimator.update(learn=True)
             self.samples += 1
@@ -316,6 +332,7 @@ class Learner:
             self._publication.renew(self.learned())
         if start.over:
             self._start = None
+            self._bank.suppose()
 
     def _settle(self, how: str) -> None:
         """End the doubt."""
@@ -342,7 +359,7 @@ class Learner:
             change = publication.roll_back()
             self._restart()
             self._notify(change)
-        elif self.frozen or standing.alarm is not None:
+        elif self.frozen or (standing.alarm is not None and self._bank.best is self._bank.quiet):
             return
         elif not publication.learned and publication.judge.adopt:
             self._publish("learned")
@@ -351,13 +368,16 @@ class Learner:
 
     def _take_up(self) -> None:
         """Learn what is behind the doubt, if coefficients can take it up."""
-        if float(self._doubt.statistic.max()) < GONE:
+        strength = float(self._doubt.statistic.max())
+        if strength < GONE:
             self._settle("gone")
             return
-        moved = self._doubt.learned()
-        if moved is None:
-            return
-        self._estimator.shift(*moved)
+        assert self._standing.alarm is not None
+        if "temperature_offset" not in self._standing.alarm.causes or not self._bank.take_over(strength):
+            moved = self._doubt.learned()
+            if moved is None:
+                return
+            self._bank.explained(*moved, strength)
         self._publish("learned")
         self._settle("learned")
 

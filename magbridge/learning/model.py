@@ -40,6 +40,8 @@ class Model:
         Names of the calibration's.
     watched : tuple of str
         The temperature and the currents.
+    further : tuple of str
+        Of these, which the calibration does not follow itself.
     size : int
         K, of coefficients with those of the further terms, three a channel.
     offsets : (3,) int array
@@ -56,6 +58,7 @@ class Model:
         self.parameters = tuple(parameter.name for parameter in calibration.parameters)
         self.watched = (TEMPERATURE, *currents)
         self._further = [k for k, name in enumerate(self.watched) if name not in calibration.channels]
+        self.further = tuple(self.watched[k] for k in self._further)
         self._origins = [nan if name == TEMPERATURE else 0.0 for name in self.watched]
         self._regressors = [0.0] * len(self._further)
         extended = self._extended(self._further)

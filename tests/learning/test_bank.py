@@ -1,0 +1,108 @@
+"""Estimators side by side: which is believed, and what the quiet one takes over."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from worlds import FIELD, World, calibration
+
+from magbridge.calibration.correct import Corrector
+from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.model import Calibration
+from magbridge.learning.bank import Bank
+from magbridge.learning.estimator import Estimator
+from magbridge.learning.model import Model
+from magbridge.learning.nuisance import Nuisance
+from magbridge.learning.observation import observe
+
+PER_DEGREE = np.array([4.0, -3.0, 5.0])
+
+
+def bank_of(known: Calibration) -> tuple[Bank, Model, Nuisance]:
+    """Return one that begins with a calibration, beside the IGRF."""
+    model, nuisance = Model(known, ()), Nuisance(known.noise, 145.0)
+    coefficients, covariance = model.coefficients(known)
+    quiet = Estimator(coefficients, covariance, model.offsets, nuisance, 0.01)
+    quiet.open(20.0**2)
+    bank = Bank(model, quiet)
+    bank.suppose()
+    return bank, model, nuisance
+
+
+def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[Bank, Model]:
+    """Learn from a world whose offset follows the temperature (n,) by so much (3,)."""
+    known = calibration()
+    bank, model, _ = bank_of(known)
+    world, corrector = World(known, len(temperature)), Corrector(known)
+    field = world.field + (temperature - temperature[0])[:, None] * per_degree
+    for (x, y, z), mass, degrees in zip(
+        field.tolist(), world.mass.tolist(), temperature.tolist(), strict=True
+    ):
+        corrector.numbers(0, (x, y, z), (mass,), 0)
+        phi = model.regressors(corrector.regressors, (degrees,))
+        for one in bank.all:
+            one.propagate(1.4, 4.0)
+            seen = observe((x, y, z), phi @ model.weights(one.coefficients), FIELD, FIELD)
+            one.predict(seen.e, seen.s, model.derivative(phi, seen.by_nine))
+        bank.judge()
+        for one in bank.all:
+            one.update(learn=one.telling)
+    return bank, model
+
+
+def test_a_warming_is_taken_over_from_the_one_that_follows_the_temperature() -> None:
+    """It is believed, has found by how much, and the quiet one goes on with that."""
+    warming = 12.0 * (1.0 - np.exp(-np.arange(400) / 150.0))
+    bank, model = flown(warming, PER_DEGREE)
+    warm = bank.all[1]
+    assert bank.best is warm
+    assert warm.coefficients[model.slots("sensor_temperature")] == pytest.approx(PER_DEGREE, abs=1.0)
+    assert not bank.take_over(1000.0)  # what a doubt has found is far better
+    assert bank.take_over(20.0)
+    assert bank.best is bank.quiet is not warm
+    np.testing.assert_array_equal(bank.quiet.coefficients, warm.coefficients)
+
+
+def test_a_temperature_that_does_nothing_is_not_believed() -> None:
+    """However much it changes."""
+    bank, _ = flown(4.0 + 8.0 * np.sin(np.arange(300) / 40.0), np.zeros(3))
+    assert bank.best is not bank.all[1]
+    assert not bank.take_over(0.0)
+
+
+def test_what_a_doubt_has_found_is_believed_if_it_is_far_better() -> None:
+    """Else whoever was believed still is."""
+    warming = 12.0 * (1.0 - np.exp(-np.arange(400) / 150.0))
+    bank, _ = flown(warming, PER_DEGREE)
+    nothing = np.zeros(bank.quiet.states), np.zeros((bank.quiet.states, bank.quiet.states))
+    bank.explained(*nothing, 1.0)
+    assert bank.best is bank.all[1]
+    bank.explained(*nothing, 1000.0)
+    assert bank.best is bank.quiet
+
+
+def test_a_calibration_that_follows_the_temperature_is_not_supposed_to() -> None:
+    """Only the drifting one stands beside the quiet one then."""
+    known = calibration()
+    assert len(bank_of(known)[0].all) == 3
+    effect = ChannelEffect(cause="temperature_offset", channel="sensor_temperature", origin=0.0)
+    size = len(known.coefficients) + 3
+    own = Calibration(
+        parameters=known.parameters,
+        terms=known.terms,
+        effects=(effect,),
+        coefficients=np.zeros(size),
+        covariance=np.eye(size),
+        noise=known.noise,
+        reference=known.reference,
+        method="auto",
+    )
+    assert len(bank_of(own)[0].all) == 2
+
+
+def test_no_drift_gets_less_certain_than_the_steepest() -> None:
+    """A month straight and level tells nothing, and overflows nothing."""
+    drifting = bank_of(calibration())[0].all[-1]
+    for _ in range(30 * 24):
+        drifting.propagate(5000.0, 3600.0)
+    assert 19.0 < np.sqrt(drifting._P[drifting.slope, drifting.slope]).max() * 3600.0 < 30.0
