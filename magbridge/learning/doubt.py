@@ -240,11 +240,12 @@ class Doubt:
         fits = self._fitting
         if self._causes[fits[0]].states is None:
             return None
-        rows = [row for row in fits if self._causes[row].states is not None]
-        share = np.exp(self.statistic[rows] - self.statistic[rows[0]])
+        share = np.exp(self.statistic[fits] - self.statistic[fits[0]])
         share /= share.sum()
         by, covariance = np.zeros(self._states), np.zeros((self._states, self._states))
-        for weight, row in zip(share.tolist(), rows, strict=True):
+        for weight, row in zip(share.tolist(), fits, strict=True):
+            if self._causes[row].states is None:  # it moves no coefficient
+                continue
             G, a = self._moves(row), self._amplitude[row]
             V = np.linalg.inv(self._M[row] + np.eye(3)) + np.outer(a, a)
             covariance += weight * G @ V @ G.T

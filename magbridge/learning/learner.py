@@ -342,6 +342,11 @@ class Learner:
         self._doubt.restart()
         self._notify(f"explained again: {how}")
 
+    def _gone(self) -> None:
+        """End a doubt that no coefficient took up; what was judged meanwhile was judged by its cause."""
+        self._publication.judge.restart()
+        self._settle("gone")
+
     def _decide(self, apart: float) -> None:
         """Publish what predicts better, go back to what does, and end a doubt whose cause is known or gone.
 
@@ -352,7 +357,7 @@ class Learner:
         """
         publication, standing = self._publication, self._standing
         if standing.gone and not self.frozen:
-            self._settle("gone")
+            self._gone()
         elif standing.ripe and not self.frozen:
             self._take_up()
         if publication.learned and publication.judge.roll_back:
@@ -370,7 +375,7 @@ class Learner:
         """Learn what is behind the doubt, if coefficients can take it up."""
         strength = float(self._doubt.statistic.max())
         if strength < GONE:
-            self._settle("gone")
+            self._gone()
             return
         assert self._standing.alarm is not None
         if "temperature_offset" not in self._standing.alarm.causes or not self._bank.take_over(strength):
