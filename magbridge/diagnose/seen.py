@@ -35,7 +35,9 @@ LEAST = 0.1
 MOSTLY = 0.8
 """Share of what all axes together explain that one must explain alone, to be said to be the one."""
 WORTH = 0.02
-"""Share of the signal's power that a lag must add over none, and the one axis over the next."""
+"""Share of the signal's power that a lag must add over none."""
+CLEARLY = 0.1
+"""Share of what is left unexplained by which an axis must beat the next, to be said to be the one."""
 WAVES, SLOW = 48, 0.5
 """Half waves per log by which the axis of a slow signal that follows no series is found, and the share of its
 power, constants aside, that they must explain."""
@@ -120,7 +122,7 @@ def seen(problem: Problem, signal: FloatArray) -> Seen:
     def axis(q: FloatArray, whole: float) -> str | None:
         alone = [explained(q, slice(k, k + 1)) for k in range(len(AXES))]
         *_, second, k = np.argsort(alone)
-        clear = alone[k] >= MOSTLY * whole and alone[k] - alone[second] >= WORTH
+        clear = alone[k] >= MOSTLY * whole and alone[k] - alone[second] >= CLEARLY * (1.0 - whole)
         return AXES[k] if clear else None
 
     found = [(explained(q), name, lag, q) for name, lag, q in _series(problem, part)]

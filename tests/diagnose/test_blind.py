@@ -171,7 +171,16 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     ds, tmp_path = warm[0], written[0]
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     assert found["verdict"] == "explained"
-    keys = {"verdict", "rms_before_nT", "rms_after_nT", "gain", "findings", "unexplained", "remarks"}
+    keys = {
+        "verdict",
+        "rms_before_nT",
+        "rms_after_nT",
+        "improvement",
+        "gain",
+        "findings",
+        "unexplained",
+        "remarks",
+    }
     assert set(found) == {*keys, "format", "assessment"}
     assert found["findings"][0]["cause"] == "current_field"
     assert found["gain"]["interval"][0] <= found["gain"]["rms_ratio"] <= found["gain"]["interval"][1] < 1.0
