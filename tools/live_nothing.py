@@ -67,7 +67,7 @@ def draw(results: np.ndarray, file: Path) -> None:
     axes.set(xscale="log", yscale="log", xlabel="hours since the start", ylabel="nT")
     axes.set_xticks([0.1, 0.3, 1, 3, 6, 12, 24], ["0.1", "0.3", "1", "3", "6", "12", "24"])
     axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False)
     figure.savefig(file)
 
 

@@ -54,13 +54,15 @@ class _Found:
     """The tracks that agree with the field: their errors (k, n, 2), m, and the likeliest kind of field.
 
     `typical` (q,) is the one of that kind that lies nearest to the mean; `scales` (3,) are the median size,
-    length and noise.
+    length and noise. Tracks further apart than the field's length agree with it at different repetitions, of
+    which so few particles miss most: then `lost`, and the errors are those of dead reckoning alone.
     """
 
     moved: FloatArray
     kind: int
     typical: FloatArray
     scales: FloatArray
+    lost: bool
 
     @classmethod
     def of(cls, field: OwnField, particles: Particles) -> _Found:
@@ -69,7 +71,8 @@ class _Found:
         off = ((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2))
         nearest = int(np.where(particles.kind == kind, off, np.inf).argmin())
         scales = np.median(field.scales(particles.u), axis=0)
-        return cls(moved, kind, particles.u[nearest], scales)
+        lost = bool(np.median(np.sqrt(moved.var(axis=0).sum(axis=1))) > scales[1])
+        return cls(_unaided(field) if lost else moved, kind, particles.u[nearest], scales, lost)
 
 
 def localise(
@@ -147,6 +150,13 @@ def own_bound(
     G = np.hstack([felt[:, :1] * W[whole], felt[:, 1:] * W[whole]])
     P = np.linalg.inv(np.eye(G.shape[1]) + G.T @ np.linalg.solve(K, G))
     return np.asarray(np.einsum("nr,arbs,ns->nab", W, P.reshape(2, field.r, 2, field.r), W))
+
+
+def _unaided(field: OwnField) -> FloatArray:
+    """Return errors (4 r, n, 2), m, whose mean is zero and whose covariance is dead reckoning's."""
+    one = np.sqrt((4 * field.r - 1) / 2.0) * field.drift.T
+    north = np.stack([one, np.zeros_like(one)], axis=2)
+    return np.concatenate([north, -north, north[..., ::-1], -north[..., ::-1]])
 
 
 def _blocks(
@@ -235,7 +245,12 @@ def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> 
             + (f" (every {step}th is used)" if step > 1 else "")
             + ": it is hardly followed"
         )
-    if np.median(sigma) > GAINED * np.median(alone):
+    if found.lost:
+        yield (
+            "tracks further apart than the field's length agree with it alike, and not all are known: this "
+            "is dead reckoning alone"
+        )
+    elif np.median(sigma) > GAINED * np.median(alone):
         yield (
             "the field adds little to dead reckoning: the track has to come back to places it has met, "
             "before it has drifted by more than the field's length"

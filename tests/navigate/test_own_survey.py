@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from msgspec import structs
 
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
@@ -54,6 +55,17 @@ def test_a_straight_track_learns_nothing_and_says_so() -> None:
     sigma = (track["covariance_nn"] + track["covariance_ee"]) ** 0.5
     assert float(sigma[-1]) > 0.5 * float(track["unaided_sigma"][-1])
     assert "adds little to dead reckoning" in track.attrs["findings"]
+
+
+def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning() -> None:
+    """Rock that repeats itself within what the drift may be: of the many tracks no few are published."""
+    lost = localise(flown(straight=True), structs.replace(OPTIONS, current_sigma=1.0), start=START)
+    np.testing.assert_allclose(
+        lost["covariance_nn"] + lost["covariance_ee"], lost["unaided_sigma"] ** 2, rtol=1e-9
+    )
+    np.testing.assert_allclose(lost["north"], 0.0, atol=1e-6)
+    assert not lost["valid"][-1]
+    assert "this is dead reckoning alone" in lost.attrs["findings"]
 
 
 @pytest.mark.parametrize("missing", ["total_field", "dr_latitude"])
