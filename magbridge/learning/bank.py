@@ -111,7 +111,10 @@ class Bank:
         return True
 
     def explained(self, by: FloatArray, covariance: FloatArray, strength: float) -> None:
-        """Move the quiet one by what a doubt has found, with a log-likelihood ratio `strength`."""
+        """Move the quiet one by `by` (n,), known to a further `covariance` (n, n), as a doubt has found.
+
+        Its log-likelihood ratio `strength` speaks for the quiet one from now on.
+        """
         self.quiet.shift(by, covariance)
         self._weights[0] += strength
         if self._weights[0] > self._weights[self._best] + AHEAD:

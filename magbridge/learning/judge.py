@@ -22,7 +22,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.learning.nuisance import STATES, Nuisance
 
-__all__ = ["FIRST", "LEARNED", "Judge"]
+__all__ = ["BEYOND_CHANCE", "FIRST", "LEARNED", "Judge"]
 
 FIRST, LEARNED = range(2)
 BEYOND_CHANCE: Final = 13.5

