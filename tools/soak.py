@@ -5,15 +5,16 @@
 
 Bytes of an emulated digitizer and of an autopilot go straight into the bridge's pipeline. In the end,
 readings made = samples + lost, as MAG_STATUS tells; of the samples without a flag at most 0.3 % lie beyond
-three of their sigmas, as of a Gaussian error; and memory is what it was at half time.
+three of their sigmas, as of a Gaussian error; and the most memory that the process ever held is what it
+was at half time. Each hour of the instrument's time has its line.
 """
 
 from __future__ import annotations
 
 import gc
+import resource
 import sys
 import tempfile
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -55,8 +56,10 @@ EVERY = 5_000
 
 MOST_WRONG = 0.003
 """Share of the samples without a flag beyond 3 sigma; a Gaussian error has 0.0027."""
-MOST_GROWN = 100_000
-"""Bytes by which memory may grow in the second half."""
+MOST_GROWN = 1000
+"""Kilobytes by which the process's peak may grow in the second half."""
+HOUR = 3_600_000
+"""Readings."""
 
 
 def calibration() -> Calibration:
@@ -112,6 +115,10 @@ class Soak:
                 self.flagged += flags != 0
                 self.wrong += flags == 0 and not error <= 3.0 * message["total_field_sigma"]
 
+    def account(self) -> str:
+        """Return in words how many samples were flagged, and how many wrong."""
+        return f"flagged {self.flagged}, wrong without a flag {self.wrong}"
+
     def telemetry(self) -> None:
         """Send the mass's position."""
         frame = self._autopilot.pack("NAMED_VALUE_FLOAT", name="battpos", value=self.position)
@@ -146,6 +153,12 @@ class Soak:
             self.telemetry()
 
 
+def peak() -> int:
+    """Return the most memory that this process has held so far, kB."""
+    gc.collect()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
 def main() -> int:
     parser = command_line(__doc__)
     parser.add_argument("--minutes", type=float, default=2.0)
@@ -154,30 +167,27 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         soak = Soak(Path(name), chosen.seed)
         last = round(chosen.minutes * 60_000)
-        early = 0
+        half = told = 0
         while soak.made < last:
             if soak.made % 100 == 0:
                 soak.telemetry()
             soak.feed(Channel.SENSOR, soak.reading())
             if soak.rng.random() < 1.0 / EVERY and soak.made > 20_000:
                 soak.fault()
-            if not tracemalloc.is_tracing() and soak.made > last // 4:
-                tracemalloc.start()
-            if (
-                not early and soak.made > last // 2
-            ):  # what was there before is now known to it, and caches are full
-                gc.collect()
-                early = tracemalloc.get_traced_memory()[0] + 1
+            if soak.made >= told + HOUR:
+                told = soak.made
+                print(f"{told / HOUR:.1f} h: {soak.account()}, {peak()} kB", flush=True)
+            if not half and soak.made > last // 2:  # what it caches is full by now
+                half = peak()
         for _ in range(3):
             soak.feed(Channel.SENSOR, soak.reading())
-        gc.collect()
-        grown = tracemalloc.get_traced_memory()[0] - early if early else 0
+        grown = peak() - half
         soak.later_us = 2_000_000
         soak.feed(Channel.STATE, b"")  # the last status
         assert soak.status is not None
         lost, samples = soak.status["samples_lost"], soak.status["samples"]
     print(f"made {soak.made}, published {samples}, lost {lost}: difference {soak.made - samples - lost}")
-    print(f"flagged {soak.flagged}, wrong without a flag {soak.wrong}, memory grown by {grown / 1e3:.0f} kB")
+    print(f"{soak.account()}, memory's peak {half} kB at half time, grown by {grown} kB")
     print(", ".join(f"{what} {count}" for what, count in soak.done.items()))
     plain = soak.published - soak.flagged
     print(f"beyond 3 sigma {100 * soak.wrong / max(plain, 1):.2f} % of {plain}")
