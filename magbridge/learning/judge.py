@@ -46,6 +46,8 @@ class Judge:
         Log-likelihood ratio of what is learned over the first calibration, and of that over it.
     mean_square : (2,) array
         nT², of the errors of prediction lately.
+    last : tuple of 2 float
+        nT and nT², by how much the first calibration's last prediction was wrong, and expected to be.
     """
 
     def __init__(self, nuisance: Nuisance) -> None:
@@ -53,6 +55,7 @@ class Judge:
         self.mean_square = np.zeros(2)
         self._noisier = np.ones(2)
         self._judged = 0
+        self.last = 0.0, 1.0
         self.restart()
 
     def restart(self, nuisance: Nuisance | None = None) -> None:
@@ -83,6 +86,7 @@ class Judge:
         Ph = self._P @ h
         S = float(h @ Ph) + self._nuisance.white
         v = e + float(h @ self._m)
+        self.last = v, S
         self._m -= Ph * (v / S)
         self._P -= np.outer(Ph / S, Ph)
         if self._fresh:  # the first sample says only what the rock's level is

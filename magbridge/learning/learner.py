@@ -262,15 +262,17 @@ class Learner:
         self._publication.judge.judge(
             *self._nuisance.over(metres, seconds), first.e, first.s, best.residual, best.variance
         )
+        apart = self._observe(field, by_published, reference).e - live[id(best)].e
         if self._start is not None:
             if not self.frozen:
                 self._fit(self._start, due=self._start.add(field, phi, reference, metres, seconds))
         else:
             bank.judge()
+            publication = self._publication
+            seen = (best.residual + apart, best.variance) if publication.learned else publication.judge.last
+            self._standing.count(*seen, telling=quiet.telling)
             self._learn(signs)
-        published = self._observe(field, by_published, reference)
-        learned = live[id(best)]
-        self._decide((published.e - learned.e) * learned.s)
+        self._decide(apart * live[id(best)].s)
 
     def _predict(self, one: Estimator, field: Vector, phi: FloatArray, reference: float) -> Observation:
         """Let an estimator predict a sample; return what it is by its coefficients."""
@@ -312,7 +314,6 @@ class Learner:
         learn = quiet.telling and not self.frozen
         self._doubt.updated(quiet.update(learn=learn))
         self.samples += learn
-        self._standing.count(telling=quiet.telling)
         self._publication.age += 1
 
     def _fit(self, start: Start, *, due: bool) -> None:
@@ -357,14 +358,23 @@ class Learner:
         """
         publication, standing = self._publication, self._standing
         if standing.gone and not self.frozen:
-            self._gone()
+            if standing.tried:
+                self._settle("learned" if publication.learned else "the first calibration holds")
+            else:
+                self._gone()
         elif standing.ripe and not self.frozen:
             self._take_up()
-        if publication.learned and publication.judge.roll_back:
-            change = publication.roll_back()
+        if publication.judge.roll_back:
+            if publication.learned:
+                self._notify(publication.roll_back())
+            publication.judge.restart()
             self._restart()
-            self._notify(change)
-        elif self.frozen or (standing.alarm is not None and self._bank.best is self._bank.quiet):
+            standing.mistaken()
+        elif (
+            self.frozen
+            or standing.relapses
+            or (standing.alarm is not None and self._bank.best is self._bank.quiet)
+        ):
             return
         elif not publication.learned and publication.judge.adopt:
             self._publish("learned")
@@ -383,8 +393,11 @@ class Learner:
             if moved is None:
                 return
             self._bank.explained(*moved, strength)
-        self._publish("learned")
-        self._settle("learned")
+        change = self._publication.publish(self.learned(), "learned")
+        self._doubt.restart()
+        if self._standing.learned():
+            self._notify(change)
+            self._notify("explained again: learned")
 
     def _publish(self, how: str) -> None:
         self._notify(self._publication.publish(self.learned(), how))

@@ -108,7 +108,6 @@ class Publication:
         """Publish the first again; return what to say of that."""
         self.calibration, self.age = self.first, 0
         self._weights[LEARNED] = self._weights[FIRST]
-        self.judge.restart()
         return self._change("rolled back: the first calibration predicts better", LEARNED, FIRST)
 
     def _change(self, how: str, before: int, after: int) -> str:

@@ -22,8 +22,18 @@ QUIET: Final = 300
 """Telling samples without an alarm after which its cause is gone."""
 
 
+SLOWER: Final = 4
+"""How many times as much evidence and patience each relapse asks for."""
+SEEN: Final = 16.0
+"""Variances of a prediction from which on its error is more than chance."""
+
+
 class Standing:
     """The alarm that stands, if any.
+
+    What was learned was mistaken if the next alarm comes before it has explained :data:`QUIET` telling
+    samples: a relapse. From then on it is one doubt, whatever is learned meanwhile: it is announced once, and
+    ends once something has explained as many samples.
 
     Attributes
     ----------
@@ -33,37 +43,81 @@ class Standing:
         ``unexplained`` while it stands, or 0.
     variance : float
         nT², of what is not explained.
+    relapses : int
+        How often what was learned was mistaken.
+    tried : bool
+        What is behind the doubt was learned again, and has not been mistaken so far.
     """
 
     def __init__(self) -> None:
+        self._peak = self._since = 0.0
         self.end()
 
     def end(self) -> None:
         """Let none stand."""
         self.alarm: Alarm | None = None
-        self.flags, self.variance = 0, 0.0
+        self.flags, self.variance, self.relapses, self.tried = 0, 0.0, 0, False
         self._sure = 0.0
         self._doubted = self._quiet = 0
+        self._explained = QUIET + 1
+
+    @property
+    def _slower(self) -> int:
+        return int(SLOWER**self.relapses)
 
     def raised(self, alarm: Alarm) -> str:
         """Take an alarm that the doubt has raised; return what to say of it, if anything."""
-        standing = self.alarm
-        if standing is not None and alarm.strength < standing.strength + MORE:
+        before = self.alarm
+        anew = before is None or self.tried
+        if before is not None and not anew and alarm.strength < before.strength + MORE:
             return ""
-        self.alarm, self._quiet = alarm, 0
-        self.flags, self.variance = int(Quality.UNEXPLAINED), alarm.size**2
-        if standing is None:
-            self._doubted, self._sure = 0, alarm.strength + SURE
-            names = " or ".join(alarm.causes[:2]).replace("_", " ")
-            return f"unexplained: {alarm.size:.0f} nT, {names}"
-        if standing.causes != alarm.causes and len(alarm.causes) == 1:
-            return f"unexplained: it is {alarm.causes[0].replace('_', ' ')}"
+        if anew and self._explained <= QUIET:
+            self.relapses += 1
+        self._since = self._since if self.relapses else alarm.since
+        self.alarm, self.tried, self._quiet = alarm._replace(since=self._since), False, 0
+        self.flags = int(Quality.UNEXPLAINED)
+        self._cover()
+        if anew:
+            self._doubted, self._sure = 0, alarm.strength + self._slower * SURE
+        names = " or ".join(alarm.causes[:2]).replace("_", " ")
+        if before is None:
+            return f"unexplained{' still' * bool(self.relapses)}: {alarm.size:.0f} nT, {names}"
+        if not self.relapses and before.causes != alarm.causes and len(alarm.causes) == 1:
+            return f"unexplained: it is {names}"
         return ""
 
-    def count(self, *, telling: bool) -> None:
-        """Take note of a sample that tells something of the coefficients, or does not."""
+    def learned(self) -> bool:
+        """Take note that what is behind the alarm was learned; return whether that ends the doubt."""
+        self.tried, self._quiet = self.relapses > 0, 0
+        if not self.tried:
+            self.end()
+        self._explained = 0
+        return not self.tried
+
+    def mistaken(self) -> None:
+        """Take note that what was learned is not published any more."""
+        if self.alarm is not None:
+            self.relapses, self.tried = max(1, self.relapses), True
+            self._explained = self._quiet = 0
+
+    def count(self, error: float, variance: float, *, telling: bool) -> None:
+        """Take note of the published calibration's error with a sample, nT, of a variance expected (nT²).
+
+        `telling` is whether the sample tells something of the coefficients.
+        """
         self._quiet += telling
         self._doubted += telling
+        self._explained += telling
+        seen = error * error - SEEN * variance
+        self._peak = max(self._peak * (1.0 - telling / QUIET), seen)
+        if self.relapses and seen > 0.0:
+            self._quiet = 0
+        self._cover()
+
+    def _cover(self) -> None:
+        """Let the variance cover the likeliest cause and, where that was mistaken, all that is seen."""
+        size = 0.0 if self.alarm is None or self.tried else self.alarm.size
+        self.variance = max(size * size, self._peak if self.relapses else 0.0)
 
     @property
     def gone(self) -> bool:
@@ -73,7 +127,10 @@ class Standing:
     @property
     def ripe(self) -> bool:
         """Whether it is time to learn what is behind the alarm."""
-        if self.alarm is None:
+        if self.alarm is None or self.tried:
             return False
-        fit = len(self.alarm.channels)
-        return self.alarm.strength > self._sure + COMPETING * (fit - 1) or self._doubted > PATIENCE * fit
+        fit, slower = len(self.alarm.channels), self._slower
+        return (
+            self.alarm.strength > self._sure + slower * COMPETING * (fit - 1)
+            or self._doubted > slower * PATIENCE * fit
+        )

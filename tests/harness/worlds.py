@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import nan
 
 import numpy as np
@@ -67,8 +68,9 @@ def learn(
     added: np.ndarray | None = None,
     quality: int = 0,
     watched: np.ndarray | None = None,
+    seen: Callable[[int], None] | None = None,
 ) -> list[int]:
-    """Give the learner a world's samples; return where it doubted."""
+    """Give the learner a world's samples, and call `seen` after each; return where it doubted."""
     corrector, doubted = Corrector(learner.first), []
     field = world.field if added is None else world.field + added
     for n, reading in enumerate(field.tolist()):
@@ -87,6 +89,8 @@ def learn(
         )
         if learner.flags:
             doubted.append(n)
+        if seen is not None:
+            seen(n)
     return doubted
 
 

@@ -16,9 +16,14 @@ def standing(*alarms: Alarm, telling: int = 0) -> Standing:
     one = Standing()
     for each in alarms:
         one.raised(each)
+    return counted(one, telling)
+
+
+def counted(one: Standing, telling: int, error: float = 0.0) -> Standing:
+    """Return it after so many telling samples, predicted within `error` (nT), and as many that are not."""
     for _ in range(telling):
-        one.count(telling=True)
-        one.count(telling=False)
+        one.count(error, 1.0, telling=True)
+        one.count(0.0, 1.0, telling=False)
     return one
 
 
@@ -53,3 +58,47 @@ def test_an_alarm_that_is_not_news_for_long_is_gone() -> None:
     gone.end()
     assert (gone.alarm, gone.flags, gone.variance) == (None, 0, 0.0)
     assert not Standing().ripe
+
+
+def relapsed() -> Standing:
+    """Return one whose cause was learned, and mistaken: errors of 30 nT were seen."""
+    one = standing(alarm(20.0, "offset_step"))
+    assert one.learned()
+    counted(one, QUIET - 1, 30.0)
+    assert one.raised(alarm(19.0, "offset_drift")) == "unexplained still: 5 nT, offset drift"
+    return one
+
+
+def test_what_was_learned_and_is_doubted_again_was_mistaken() -> None:
+    """The doubt is the same, sigma covers all that was seen, and more is asked for the next time."""
+    one = relapsed()
+    assert (one.relapses, one.alarm and one.alarm.since) == (1, 0.0)
+    assert 28.0 < one.variance**0.5 < 30.0
+    assert one.raised(alarm(19.0 + 2 * SURE, "offset_step")) == ""
+    assert not one.ripe
+    one.raised(alarm(20.0 + 4 * SURE, "offset_step"))
+    assert one.ripe
+
+
+def test_a_relapsed_doubt_ends_when_what_was_learned_has_explained_many_samples() -> None:
+    """Without a word before; an error that is no chance lets it count anew."""
+    one = relapsed()
+    assert not one.learned()
+    assert one.tried
+    assert not one.ripe
+    counted(one, QUIET, 0.0)
+    counted(one, 1, 5.0)
+    assert not one.gone
+    assert one.flags
+    assert counted(one, QUIET + 1).gone
+
+
+def test_the_next_doubt_after_a_long_while_is_another() -> None:
+    """What was learned has explained the data; so it was no mistake."""
+    one = standing(alarm(20.0, "offset_step"))
+    one.learned()
+    counted(one, QUIET + 1)
+    assert one.raised(alarm(19.0, "offset_drift")) == "unexplained: 5 nT, offset drift"
+    assert one.relapses == 0
+    one.mistaken()  # rolled back meanwhile: on trial
+    assert (one.relapses, one.tried) == (1, True)
