@@ -125,6 +125,8 @@ class Correction:
         )
         judged = 0.0
         if self.plausibility is not None:
+            if where is not None:
+                self.plausibility.place(sample.time_us, *where)
             judged = self.plausibility.check(
                 sample.time_us,
                 reading.field,

@@ -7,7 +7,13 @@ from faults import FAULTS, Flight, prepare, score, stalls
 
 HALF_A_PERCENT = 4
 """Samples of 900 that may be wrong without a flag: 0.3 % are 2.7 of them, as chance has it."""
-UNSEEN = {"gain of x +2 %", "offset of x +100 nT with a motion", "drift of z, 20 nT/h"}
+HUMS = {"hum of 30 nT, 37 s", "hum of 10 nT, 90 s"}
+UNSEEN = HUMS | {
+    "hum of 10 nT, 150 s",
+    "gain of x +2 %",
+    "offset of x +100 nT with a motion",
+    "drift of z, 20 nT/h",
+}
 """On a steady course it is a constant, or a slope, as rock is."""
 
 
@@ -36,6 +42,13 @@ def test_what_waited_while_the_process_stood_still(flight: Flight, seconds: floa
 def test_another_glider_s_calibration(tmp_path_factory: pytest.TempPathFactory) -> None:
     other = prepare(tmp_path_factory.mktemp("other"), 1, 0.5, calibrated_by=101)
     assert score(other, other.survey).wrong <= HALF_A_PERCENT
+
+
+@pytest.mark.parametrize("fault", sorted(HUMS))
+def test_a_hum_is_learned_within_some_of_its_periods(flight: Flight, fault: str) -> None:
+    found = score(flight, FAULTS[fault](flight.survey))
+    assert found.wrong < 0.03 * found.samples
+    assert found.sigma > 5.0
 
 
 def test_a_gain_of_one_axis_is_seen_when_the_dive_becomes_a_climb(flight: Flight) -> None:

@@ -29,14 +29,16 @@ class Flight:
         self.raw = np.rint(self.raw / steps) * steps
         self.quality = np.zeros(n, int)
 
-    def judge(self, reference: float = FIELD) -> tuple[IntArray, FloatArray, list[str]]:
-        """Return the flags (n,), the sigma (n,) and what was told."""
+    def judge(self, reference: float = FIELD, speed: float = 0.0) -> tuple[IntArray, FloatArray, list[str]]:
+        """Return the flags (n,), the sigma (n,) and what was told; a speed of 0 (m/s) is not known."""
         judge = Plausibility(1.0)
         flags: list[int] = []
         sigma: list[float] = []
         total = np.linalg.norm(self.raw, axis=1).tolist()
         for k, raw in enumerate(self.raw.tolist()):
             quality = int(self.quality[k])
+            if speed:
+                judge.place(k * PERIOD_US, 48.0 + speed * 4.0 * k / 111_200.0, -57.0)
             more = judge.check(
                 k * PERIOD_US, tuple(raw), total[k], SIGMA, quality, reference, 145.0
             )  # fmt: skip
@@ -175,6 +177,34 @@ def test_more_noise_than_the_calibration_s_widens_sigma_within_a_hundred_samples
     assert np.mean(wrong[700:800]) < 0.08
     assert [line for line in reported if "noise" in line]
     assert len(reported) == len(set(reported))
+
+
+@pytest.mark.parametrize("period", [13.0, 25.0, 37.0, 60.0, 150.0])
+@pytest.mark.parametrize("size", [12.0, 40.0])
+def test_a_hum_widens_sigma_or_is_flagged_where_rock_is_passed_more_slowly(
+    period: float, size: float
+) -> None:
+    """At 0.35 m/s, rock of 500 m takes 24 minutes; second differences from sample to sample do not see it."""
+    flight = Flight(n=3000)
+    before = np.linalg.norm(flight.raw, axis=1)
+    hum = size * np.sin(2.0 * np.pi * 4.0 * np.arange(2500) / period)
+    flight.raw[500:] += along(flight.raw[500:], 1.0) * hum[:, None]
+    flags, sigma, reported = flight.judge(speed=0.35)
+    wrong = (flags == 0) & (np.abs(np.linalg.norm(flight.raw, axis=1) - before) > 3.0 * sigma)
+    assert np.mean(wrong[500:]) < 0.02
+    assert np.mean(wrong[700:]) < 0.004
+    assert reported
+
+
+@pytest.mark.parametrize("speed", [0.35, 2.0, 20.0])
+def test_rock_of_half_a_kilometre_is_no_noise_at_any_speed(speed: float) -> None:
+    flight = Flight(n=3000)
+    way = speed * 4.0 * np.arange(3000)
+    flight.raw += along(flight.raw, 1.0) * (145.0 * 2.0**0.5 * np.sin(2.0 * np.pi * way / 500.0))[:, None]
+    _, sigma, reported = flight.judge(speed=speed)
+    _, before, _ = flight.judge()
+    assert (sigma == before).all()
+    assert [line for line in reported if "noise" in line] == [] or speed > 10.0  # 80 m from sample to sample
 
 
 @pytest.mark.parametrize("times", [5.0, 20.0])

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.plausibility import FAR, GATE, LEVEL, NEAR, QUIETEST, SLOPE_US, Plausibility
+from magbridge.plausibility import Plausibility
+from magbridge.plausibility.jump import GATE, SLOPE_US
+from magbridge.plausibility.level import FAR, LEVEL, NEAR
+from magbridge.plausibility.scatter import QUIETEST
 from magbridge.records import Quality
 
 FIELD, IMPLAUSIBLE, MOVING = 50_000.0, int(Quality.IMPLAUSIBLE), int(Quality.MOVING)

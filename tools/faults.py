@@ -183,6 +183,11 @@ def noise(values: FloatArray, _: FloatArray) -> FloatArray:
     return np.asarray(values + np.random.default_rng(seed).normal(0.0, 20.0, len(values)))
 
 
+def hum(size: float, period: float) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """Return what adds a sine of `size` nT and a `period` in s."""
+    return lambda v, t: np.asarray(v + size * np.sin(2.0 * np.pi * t / period))
+
+
 FAULTS: dict[str, Callable[[Rows], Rows]] = {
     "none": lambda rows: rows,
     "scaled by a thousandth": fault_of(*CHANNELS, by=lambda v, _: v / 1000),
@@ -214,6 +219,9 @@ FAULTS: dict[str, Callable[[Rows], Rows]] = {
     ),
     "steps of 100 nT": fault_of(*CHANNELS, by=lambda v, _: 100.0 * np.round(v / 100.0), late=True),
     "noise times 20": fault_of(*CHANNELS, by=noise, late=True),
+    "hum of 30 nT, 37 s": fault_of(*CHANNELS, by=hum(30.0, 37.0), late=True),
+    "hum of 10 nT, 90 s": fault_of("mag_z", by=hum(10.0, 90.0), late=True),
+    "hum of 10 nT, 150 s": fault_of("mag_z", by=hum(10.0, 150.0), late=True),
 }
 
 

@@ -43,7 +43,12 @@ TESTS = {
     "calibration/fitting/noise": "calibration/test_noise.py",
     "diagnose/inference/evidence": "diagnose/test_evidence.py",
     "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py",
-    "plausibility": "test_plausibility.py test_plausibility_numbers.py",
+    "plausibility/axes": "test_plausibility.py test_plausibility_numbers.py",
+    "plausibility/judge": "test_plausibility.py test_plausibility_numbers.py",
+    "plausibility/jump": "test_plausibility.py test_plausibility_numbers.py",
+    "plausibility/level": "test_plausibility.py test_plausibility_numbers.py",
+    "plausibility/moves": "test_plausibility.py test_plausibility_numbers.py",
+    "plausibility/scatter": "test_plausibility.py test_plausibility_numbers.py",
     "turns": "test_turns.py",
     "direction": "test_direction.py",
 }
