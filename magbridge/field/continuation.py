@@ -13,6 +13,7 @@ is extrapolated by its vertical gradient, of spectrum |k| T.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import isfinite, sqrt
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.spline import filled
 
-__all__ = ["Continued", "continued", "smoothed"]
+__all__ = ["Continued", "continued", "raised", "smoothed"]
 
 
 SURE, TERMS = 3, 10
@@ -94,6 +95,14 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     )
     sigma2, steepness2 = float(error2.mean()), float((k * k * error2).mean())
     return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
+
+
+def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatArray]:
+    """Return what continues values (ny, nx), nT, on a grid's nodes to another altitude, m, as its own are."""
+    from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
+
+    gain = _growth(_wavenumber(grid), grid.altitude - altitude, SURE)
+    return lambda values: np.asarray(idctn(dctn(filled(values), norm="ortho") * gain, norm="ortho"))
 
 
 ALIKE = 0.25

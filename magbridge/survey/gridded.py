@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.evidence import Widths
-from magbridge.field.place.blocks import NearInverse
+from magbridge.field.place.blocks import Factor, NearInverse
 from magbridge.field.place.matern import Matern
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.samples import Samples
@@ -32,8 +33,10 @@ class Posterior:
         The field's coefficients.
     follow : (nodes, r) array
         How they move with 1-sigma of what is uncertain elsewhere: levels, slow changes, the calibration.
+    precision : csr_array
+        (nodes, nodes), in units of the noise's.
     inverse : NearInverse
-        Of the precision, in units of the noise's.
+        Of it.
     levels : (n,) array
         nT, what was taken off each sample: its line's level and the slow part.
     """
@@ -44,12 +47,20 @@ class Posterior:
     sigma: float
     w: FloatArray
     follow: FloatArray
+    precision: csr_array
     inverse: NearInverse
     levels: FloatArray
 
     def at(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance, (n,) each, of splines B (n, nodes)."""
         return B @ self.w, self.sigma**2 * self.inverse.variances(B) + ((B @ self.follow) ** 2).sum(axis=1)
+
+    def draw(self, rng: np.random.Generator, number: int) -> FloatArray:
+        """Return so many coefficients (nodes, number) that the data leave open, equally likely."""
+        off = self.sigma * Factor(self.precision).draw(rng.normal(size=(len(self.w), number)))
+        return np.asarray(
+            self.w[:, None] + off + self.follow @ rng.normal(size=(self.follow.shape[1], number))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +128,14 @@ class Gridded:
             mean += one.weight * here
             square += one.weight * (variance + here**2)
         return self.mean + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+
+    def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
+        """Yield about so many anomalies (n,), nT, at places (n, 2), m, that the data leave open alike."""
+        rng, rough = np.random.default_rng(0), self.roughness.at(place)
+        for one in self.posteriors:
+            B = one.field.basis(place)
+            for w in one.draw(rng, round(one.weight * number)).T:
+                yield self.mean + rough * (B @ w)
 
     def at_samples(self, samples: Samples) -> FloatArray:
         """Return the anomaly (n,), nT, at the samples' own places and depths."""

@@ -187,8 +187,8 @@ def _posterior(
     follow = np.hstack([reduced.follow @ np.linalg.cholesky(covariance), shaken])
     return Posterior(
         weight, choice.field, choice.ratio * widths.sigma, widths.sigma, reduced.field(z),
-        _apart(follow, problem, choice.field), near_inverse(reduced.precision, choice.field.edges),
-        problem.D @ z,
+        _apart(follow, problem, choice.field), reduced.precision,
+        near_inverse(reduced.precision, choice.field.edges), problem.D @ z,
     )  # fmt: skip
 
 

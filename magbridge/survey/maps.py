@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from magbridge.field.continuation import continued
+from magbridge.arrays import FloatArray
+from magbridge.field.continuation import continued, raised
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.survey.gridded import Gridded
@@ -15,6 +16,8 @@ A_LENGTH = 8.0
 """Nodes of a map to one length of its field."""
 NODES = 250_000
 """Nodes of a map at most, unless a spacing is asked for."""
+DRAWN = 100
+"""Fields by which the sigma of a continued map is found: to 7 %."""
 KNOWN = 0.95
 """Of the field's own size: where the sigma is as large, nothing is known, and the map has a hole."""
 
@@ -38,7 +41,7 @@ def anomaly_map(
     spacing : float, optional
         m between nodes; an eighth of the field's length if not given.
     altitude : float, optional
-        m above the ellipsoid, not below the survey.
+        m above the ellipsoid. Downward, what the series leaves out counts in the sigma.
     name : str
         Of the map.
     """
@@ -64,4 +67,19 @@ def anomaly_map(
         altitude=-gridded.middle,
         name=name,
     )
-    return grid if altitude is None else continued(grid, -altitude).grid
+    return grid if altitude is None else _continued(grid, gridded, at, altitude)
+
+
+def _continued(grid: AnomalyGrid, gridded: Gridded, at: FloatArray, altitude: float) -> AnomalyGrid:
+    """Return a map at another altitude, m; `at` (n, 2) are its nodes' places, m.
+
+    Its sigma is the spread of fields that the data leave open, each continued: errors smaller than the height
+    cancel, and what lies beyond the survey's edge comes in from as far as the height.
+    """
+    there, missing, _ = continued(grid, -altitude)
+    rise = raised(grid, altitude)
+    drawn = [(rise(one.reshape(grid.anomaly.shape)) - there.anomaly) ** 2 for one in gridded.draw(at, DRAWN)]
+    return AnomalyGrid(
+        grid.longitude, grid.latitude, there.anomaly, np.hypot(np.sqrt(np.mean(drawn, axis=0)), missing),
+        altitude, grid.name, there.vertical,
+    )  # fmt: skip

@@ -27,7 +27,8 @@ from magbridge.calibration.residual import NormalEquations
 __all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
 
 FARTHEST = 10.0
-"""Sigmas of the prior of eta: nothing physical lies beyond, and exp must not overflow."""
+"""Sigmas of the prior of eta, and of log sigma from where it starts: nothing physical lies beyond, and exp
+must not overflow."""
 STILL = 0.01
 """Log evidence: two answers that differ by less count as the same."""
 SIGMA_STEP = 0.1
@@ -100,7 +101,8 @@ def maximise(quadratic: Quadratic, family: PriorFamily, eta: FloatArray, sigma: 
     scale = np.append(family.spread, SIGMA_STEP)
 
     def downhill(x: FloatArray) -> tuple[float, FloatArray]:
-        if np.abs(x[:-1]).max(initial=0.0) > FARTHEST:
+        # (where sigma vanishes the cost is but what rounding leaves of it, and the evidence has no end)
+        if np.abs(x[:-1]).max(initial=0.0) > FARTHEST or abs(scale[-1] * x[-1]) > FARTHEST:
             return 1e300, 0.0 * x
         at = middle + scale * x
         value, slope, _ = evidence(quadratic, family, at[:-1], at[-1])

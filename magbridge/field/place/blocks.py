@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf
 from scipy.sparse import csc_array, csr_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import splu, spsolve_triangular
 
 from magbridge.arrays import FloatArray, IndexArray
 
@@ -53,6 +53,16 @@ class Factor:
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the inverse times b (n,) or (n, r)."""
         return np.asarray(self._lu.solve(np.asfortranarray(right)))
+
+    def draw(self, white: FloatArray) -> FloatArray:
+        """Return vectors (n, k) whose covariance is the inverse, of `white` ones (n, k) ~ N(0, 1).
+
+        With the matrix ``P^T L D L^T P`` they are ``P^T L^-T D^-1/2 white`` (Rue & Held 2005, section 2.4).
+        """
+        scaled = white / np.sqrt(self._lu.U.diagonal())[:, None]
+        upper = csr_array(self._lu.L.T)
+        drawn = spsolve_triangular(upper, scaled, lower=False, unit_diagonal=True)
+        return np.asarray(drawn[self._lu.perm_r], float)
 
 
 @dataclass(frozen=True, eq=False)

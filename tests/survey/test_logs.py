@@ -1,0 +1,123 @@
+"""Raw logs to one map: several vehicles, a base station, and what a bad log is told."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from commands import Command
+from scipy.spatial.transform import Rotation
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Noise, identity
+from magbridge.field.geodesy import offset
+from magbridge.field.igrf import igrf
+from magbridge.field.read import read_grid
+from magbridge.logs import write
+
+ORIGIN, START, STEP = (49.5, -57.9), 1.4e9, 20.0
+NOISE = 1.5
+IRON = {
+    "comet": (np.array([900.0, -600.0, 1200.0]), 40.0),
+    "rocket": (np.array([-400.0, 300.0, 700.0]), -20.0),
+}
+"""nT: the hard iron of each vehicle, and by how much its calibration makes the field too large."""
+
+
+def rock(place: FloatArray) -> FloatArray:
+    """Return nT (n,) at places (n, 2), m: 50 nT over 900 m."""
+    rng = np.random.default_rng(5)
+    k, phase = rng.normal(0, 1 / 900.0, (500, 2)), rng.uniform(0, 2 * np.pi, 500)
+    return np.asarray(50.0 * np.sqrt(2 / 500) * np.cos(place @ k.T + phase).sum(axis=1))
+
+
+def lanes(axis: int, count: int = 6) -> FloatArray:
+    """Return places (n, 2), m, of parallel lines along an axis, back and forth."""
+    along = np.linspace(-2600.0, 2600.0, 44)
+    turned = [along[:: 1 if k % 2 else -1] for k in range(count)]
+    across = np.linspace(-2400.0, 2400.0, count) if count > 1 else np.zeros(1)
+    lines = [np.stack([one, np.full(44, y)], axis=1) for one, y in zip(turned, across, strict=True)]
+    return np.roll(np.concatenate(lines), axis, axis=1)
+
+
+def flown(
+    vehicle: str, place: FloatArray, began: float = START, varied: FloatArray | float = 0.0
+) -> xr.Dataset:
+    """Return what a vehicle reads at places (n, 2), m, on a day on which the field `varied` (n,), nT."""
+    rng = np.random.default_rng(len(vehicle))
+    latitude, longitude = offset(*ORIGIN, place[:, 0], place[:, 1])
+    n = len(place)
+    main = igrf(longitude, latitude, np.zeros(n), np.full(n, began))
+    total = np.linalg.norm(main, axis=1)
+    ned = main * ((total + rock(place) + varied) / total)[:, None]
+    way = np.gradient(place, axis=0)
+    attitude = np.stack([np.degrees(np.arctan2(way[:, 1], way[:, 0])), *rng.normal(0, 8.0, (2, n))], axis=1)
+    body = Rotation.from_euler("ZYX", attitude, degrees=True).inv().apply(ned)
+    read = body + IRON[vehicle][0] + rng.normal(0, NOISE, (n, 3))
+    names = "mag_x", "mag_y", "mag_z", "heading", "pitch", "roll", "latitude", "longitude"
+    columns = dict(zip(names, (*read.T, *attitude.T, latitude, longitude), strict=True))
+    units = {"mag": "nT"}
+    return xr.Dataset(
+        {name: ("time", one, {"units": units.get(name[:3], "deg")}) for name, one in columns.items()},
+        {"time": ("time", began + STEP * np.arange(n), {"units": "s"})}, {"source": vehicle},
+    )  # fmt: skip
+
+
+def calibrated(vehicle: str, path: Path) -> Path:
+    """Write the vehicle's calibration: its hard iron, exactly, on a wrong level."""
+    iron, level = IRON[vehicle]
+    coefficients = np.array([level, level, level, 0.0, 0.0, 0.0, *iron])
+    known = replace(
+        identity(), coefficients=coefficients, covariance=1e-6 * np.eye(9), noise=Noise(NOISE), method="auto"
+    )
+    save(known, path)
+    return path
+
+
+def judged(command: Command, folder: Path, *words: object) -> tuple[FloatArray, FloatArray, dict[str, Any]]:
+    """Return the error (n,) of a survey's map about its mean, at places inside, its sigma, and the facts."""
+    facts = json.loads(command("survey", *words, "-o", folder / "map.nc", "--json").out)
+    grid = read_grid(folder / "map.nc")
+    at = np.random.default_rng(7).uniform(-2200.0, 2200.0, (300, 2))
+    latitude, longitude = offset(*ORIGIN, at[:, 0], at[:, 1])
+    there = grid.evaluate(longitude, latitude)
+    error = there.anomaly - rock(at)
+    return error - error.mean(), np.sqrt(there.variance), facts
+
+
+def test_two_vehicles_with_a_calibration_each_make_one_map(command: Command, tmp_path: Path) -> None:
+    """Their hard irons are not the same, their levels 64 nT apart: no seam is left, and the sigma holds."""
+    words: list[object] = []
+    for axis, vehicle in enumerate(IRON):
+        write(flown(vehicle, lanes(axis), START + 1e5 * axis), tmp_path / f"{vehicle}.nc")
+        words.append(tmp_path / f"{vehicle}.nc")
+    for vehicle in IRON:
+        words += ["--calibration", calibrated(vehicle, tmp_path / f"{vehicle}.json")]
+    error, sigma, facts = judged(command, tmp_path, *words)
+    assert facts["lines"] == 2
+    assert facts["misties_before_nT"] == pytest.approx(64.0, abs=2.0)
+    assert facts["misties_after_nT"] < 2.0 * NOISE
+    assert np.std(error) < 3.0 * NOISE
+    assert 0.4 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.3
+
+
+def test_a_base_station_takes_a_daily_variation_off(command: Command, tmp_path: Path) -> None:
+    """Forty minutes, 25 nT: left in the log, it is in the map."""
+    place = np.concatenate([lanes(0), lanes(1)])
+    time = STEP * np.arange(-10.0, len(place) + 10.0)
+    varied = 25.0 * np.sin(2.0 * np.pi * time / 2400.0)
+    write(flown("comet", place, varied=varied[10:-10]), tmp_path / "log.nc")
+    base = xr.Dataset({"total_field": ("time", 53_000.0 + varied, {"units": "nT"})}, {"time": START + time})
+    write(base, tmp_path / "base.nc")
+    words = tmp_path / "log.nc", "--calibration", calibrated("comet", tmp_path / "cal.json")
+    without, with_base = (
+        judged(command, tmp_path, *words, *more)[:2] for more in ([], ["--base", tmp_path / "base.nc"])
+    )
+    assert np.std(with_base[0]) < 1.5
+    assert 3.0 * np.std(with_base[0]) < np.std(without[0])
