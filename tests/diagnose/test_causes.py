@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import magbridge
@@ -51,5 +52,8 @@ def test_a_cause_takes_one_row_and_one_function() -> None:
 
 
 @pytest.mark.parametrize("name", CAUSES)
-def test_what_a_row_puts_forward_has_its_name(name: str, problem: Problem) -> None:
-    assert {one.cause for one in CAUSES[name].candidates(problem)} <= {name}
+def test_what_a_row_puts_forward_has_its_name_and_can_be_written(name: str, problem: Problem) -> None:
+    """A number of numpy's, as is read off a spectrum, is none to a file."""
+    made = CAUSES[name].candidates(problem)
+    assert {one.cause for one in made} <= {name}
+    msgspec.to_builtins([one.effects for one in made])

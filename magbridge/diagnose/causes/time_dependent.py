@@ -92,7 +92,7 @@ def interference_tone(problem: Problem) -> list[Candidate]:
         peak = int(np.argmax(ratio))
         if ratio[peak] <= 0.0:
             break
-        made.append(rebuild(1.0 / (_top(power, peak) * frequency[1])))
+        made.append(rebuild(float(1.0 / (_top(power, peak) * frequency[1]))))
         ratio[max(peak - 4, 0) : peak + 5] = 0.0
     return made
 
