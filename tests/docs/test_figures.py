@@ -54,6 +54,14 @@ def test_a_page_of_many_tools_names_one_beside_every_table(page: str) -> None:
         assert commands(section + first), first
 
 
+def test_the_tests_that_are_said_to_hold_a_promise_are_there() -> None:
+    text = (ROOT / "tests" / "README.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([\w/]+\.py): (\w+)`", text)
+    assert len(named) > 40
+    lost = [one for one in named if f"\ndef {one[1]}(" not in (ROOT / "tests" / one[0]).read_text("utf-8")]
+    assert lost == []
+
+
 def test_the_examination_finds_what_is_missing() -> None:
     assert commands("see `python3 tools/nowhere.py --size 3`") == [(ROOT / "tools/nowhere.py", ["--size"])]
     assert commands("see `faults.py \\\n  --hours 3` and `turns.py`") == [

@@ -284,6 +284,32 @@ def test_a_polygon_may_have_a_header(tmp_path: Path) -> None:
             read_polygon(tmp_path / "mask.csv")
 
 
+@pytest.mark.parametrize(
+    ("name", "answer"),
+    [
+        ("files/geosoft_unbound.grd", "damaged"),
+        ("files/geosoft_zlib.grd", "damaged"),
+        ("files/surfer7_memory.grd", "claims 1076101120 x 0 values"),
+        ("grids/latfirst_nohdr.csv", "longitude or latitude first"),
+        ("grids/local_meters.nc", "unknown projection"),
+        ("grids/c2d.nc", ""),
+        ("grids/uT.csv", ""),
+        ("grids/xyz_mag.csv", ""),
+    ],
+)
+def test_grids_that_once_failed(cases: Path, name: str, answer: str) -> None:
+    """The three that are read are the same map."""
+    if answer:
+        with pytest.raises(FormatError, match=answer) as error:
+            read_grid(cases / name)
+        assert str(error.value).startswith(f"{cases / name}: ")
+        assert "\n" not in str(error.value)
+        return
+    grid = read_grid(cases / name)
+    assert (grid.longitude[0], grid.latitude[0]) == pytest.approx((-56.995, 49.005))
+    assert np.abs(grid.anomaly).max() == pytest.approx(156.451, abs=1e-3)
+
+
 @given(
     suffix=st.sampled_from([".grd", ".asc", ".csv", ".xyz", ".tif"]),
     raw=st.one_of(
