@@ -93,7 +93,10 @@ def navigate(
     known, options = load(calibration) if calibration else None, _options(config)
     if bound:
         if map is None:
-            raise WrongUse("--bound: expected --map, what the track is worth depends on it")
+            raise WrongUse(
+                "--bound: expected --map, what the track is worth depends on it; without one, navigate FILE "
+                "--calibration cal.json says what a survey that was flown is worth, and its bound"
+            )
         _bound(files, map, output, options, known, every, picture, reading, json)
         return
     if known is None or calibration is None:

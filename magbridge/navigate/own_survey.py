@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from math import ceil
 
 import numpy as np
@@ -30,11 +31,12 @@ from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import Options
+from magbridge.navigate.own_bound import with_bound
 from magbridge.navigate.own_field import KINDS, OwnField
 from magbridge.navigate.particles import Particles, sample
 from magbridge.navigate.reference_track import reference_track, with_errors
 
-__all__ = ["localise", "own_bound"]
+__all__ = ["localise"]
 
 STEP, LASTS, BLOCKS = 60.0, 100.0, 400
 """m that a block of samples covers at most, the share of the log that it lasts at most is one in so many, and
@@ -43,6 +45,8 @@ FEWEST = 12
 """Blocks."""
 STAGES, PARTICLES = 10, 80
 """Parts in which the track is taken in, and tracks that are followed."""
+SOON = 0.49
+"""Share of the blocks from which on a track can be lost."""
 CONTRADICTED = 1.5
 """Noise over the calibration's from which on field and track contradict each other."""
 GAINED = 0.85
@@ -71,8 +75,19 @@ class _Found:
         off = ((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2))
         nearest = int(np.where(particles.kind == kind, off, np.inf).argmin())
         scales = np.median(field.scales(particles.u), axis=0)
-        lost = bool(np.median(np.sqrt(moved.var(axis=0).sum(axis=1))) > scales[1])
+        lost = _lost(field, particles.u)
         return cls(_unaided(field) if lost else moved, kind, particles.u[nearest], scales, lost)
+
+
+def _lost(field: OwnField, u: FloatArray, count: int | None = None) -> bool:
+    """Return whether tracks u (k, q) lie further apart than the field's length over the first `count` blocks.
+
+    Then more blocks do not bring them together: the first half decides.
+    """
+    if count is not None and count < SOON * len(field.time):
+        return False
+    apart = np.sqrt(field.moved(u)[:, :count].var(axis=0).sum(axis=1))
+    return bool(np.median(apart) > np.median(field.scales(u), axis=0)[1])
 
 
 def localise(
@@ -94,7 +109,7 @@ def localise(
     Dataset
         On ``time`` of the blocks: position with covariance, ``north east`` from the dead-reckoned one,
         ``unaided_sigma`` of dead reckoning alone, anomaly and that of the field found; where the log has a
-        better position, ``error_*`` and ``bound_sigma``, the smallest error possible (:func:`own_bound`).
+        better position, ``error_*`` and ``bound_sigma``, the smallest (:func:`~.own_bound.own_bound`).
         Attributes: ``findings``, ``motion``, ``reference_track``.
 
     Raises
@@ -111,45 +126,16 @@ def localise(
     field = OwnField(blocks, np.stack(separation(*origin, rows[:, 1], rows[:, 2]), axis=1), options)
     counts = [len(blocks) * stage // STAGES for stage in range(1, STAGES + 1)]
     with threadpool_limits(1, "blas"):
-        particles = sample(field.log_likelihood, field.q, len(KINDS), counts, PARTICLES)
+        particles = sample(
+            field.log_likelihood, field.q, len(KINDS), counts, PARTICLES, partial(_lost, field)
+        )
         found = _Found.of(field, particles)
         known = reference_track(deployment, frozenset(MOTIONS[motion]))
         result = with_errors(_dataset(field, found, options, origin, rows[:, 7]), known)
-        result = _with_bound(result, field, found)
+        if known is not None:
+            result = with_bound(result, field, found.moved.mean(axis=0), found.typical, found.kind)
     attrs = {"source": source, "map": "none: its own survey", "motion": motion}
     return result.assign_attrs(attrs | {"findings": "\n".join(_findings(result, field, found, step))})
-
-
-def own_bound(
-    field: OwnField, place: FloatArray, slopes: FloatArray, typical: FloatArray, kind: int
-) -> FloatArray:
-    """Return the smallest covariance (n, 2, 2), m², that any estimator of the drift could reach.
-
-    Parameters
-    ----------
-    field : OwnField
-        What was measured.
-    place, slopes : (n, 2) array
-        The true places, m, and the field's slopes there, nT/m; NaN where not known: such blocks tell nothing.
-    typical : (q,) array
-        Unknowns of which size, length and noise are taken.
-    kind : int
-        Of the field.
-
-    Notes
-    -----
-    Field and drift are linearised at the truth, jointly Gaussian; with the field integrated out the posterior
-    Cramér-Rao bound of the drift's weights is ``(I + G' K^-1 G)^-1``, G the slopes times the drift's
-    functions (Tichavský, Muravchik & Nehorai 1998, eq. 21, for one batch). The field's covariance is taken
-    as known.
-    """
-    whole = np.asarray(np.isfinite(np.hstack([place, slopes])).all(axis=1))
-    K = field.covariance(np.where(whole[:, None], place, 0.0), typical, kind)[0][np.ix_(whole, whole)]
-    felt = slopes[whole] + field.slope[whole]
-    W = field.drift
-    G = np.hstack([felt[:, :1] * W[whole], felt[:, 1:] * W[whole]])
-    P = np.linalg.inv(np.eye(G.shape[1]) + G.T @ np.linalg.solve(K, G))
-    return np.asarray(np.einsum("nr,arbs,ns->nab", W, P.reshape(2, field.r, 2, field.r), W))
 
 
 def _unaided(field: OwnField) -> FloatArray:
@@ -205,19 +191,6 @@ def _dataset(
         "map_anomaly": field.mean + y - R * np.linalg.solve(K, y), "valid": good.astype(float),
     }  # fmt: skip
     return made("track", field.time, columns, UNITS | {"unaided_sigma": "m"})
-
-
-def _with_bound(result: xr.Dataset, field: OwnField, found: _Found) -> xr.Dataset:
-    """Add the smallest error possible, m, where the true track is known."""
-    if "error_north" not in result:
-        return result
-    error = np.stack([result["error_north"], result["error_east"]], axis=1)
-    true = field.place + found.moved.mean(axis=0) - error
-    whole = np.isfinite(true).all(axis=1)
-    slopes = field.slopes(np.where(whole[:, None], true, field.place), found.typical, found.kind)
-    P = own_bound(field, true, slopes, found.typical, found.kind)
-    about = {"units": "m", "long_name": "smallest possible position error (DRMS)"}
-    return result.assign(bound_sigma=("time", np.sqrt(np.trace(P, axis1=1, axis2=2)), about))
 
 
 def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> Iterator[str]:

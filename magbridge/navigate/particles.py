@@ -53,10 +53,18 @@ class _Seen:
         return (1.0 - share) * a + share * b - 0.5 * float(u @ u), (1.0 - share) * da + share * db - u
 
 
-def sample(likelihood: Likelihood, q: int, kinds: int, counts: Sequence[int], number: int) -> Particles:
+def sample(
+    likelihood: Likelihood,
+    q: int,
+    kinds: int,
+    counts: Sequence[int],
+    number: int,
+    hopeless: Callable[[FloatArray, int], bool] = lambda _u, _count: False,
+) -> Particles:
     """Return `number` particles of the posterior of u (q,), N(0, 1) beforehand, and of one of `kinds` models.
 
-    `counts` says how many data each stage has.
+    `counts` says how many data each stage has; after one that is `hopeless`, by its u (k, q) and its count,
+    no more are taken in.
     """
     rng = np.random.default_rng(0)
     u, kind = rng.normal(size=(number, q)), rng.integers(0, kinds, number)
@@ -75,6 +83,8 @@ def sample(likelihood: Likelihood, q: int, kinds: int, counts: Sequence[int], nu
             u, kind, seen = u[chosen], kind[chosen], [seen[i] for i in chosen.tolist()]
             mover.share, mover.root = share, metric
             mover.move(u, kind, seen)
+        if hopeless(u, count):
+            break
         last = [one.now for one in seen]
     return Particles(u, kind)
 

@@ -121,6 +121,7 @@ def test_without_a_map_the_track_is_bent_to_its_own_survey(command: Command, her
     assert Path("own.png").stat().st_size > 40_000
     texts = command("navigate", "--bound", "log.nc", *CALIBRATED, "-o", "none.nc", code=2)
     assert "expected --map" in texts.err
+    assert "says what a survey that was flown is worth, and its bound" in texts.err
     assert not Path("none.nc").exists()
 
 

@@ -11,6 +11,7 @@ from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
 from magbridge.field.igrf import total_field
 from magbridge.navigate.options import Options
+from magbridge.navigate.own_field import OwnField
 from magbridge.navigate.own_survey import localise
 from magbridge.navigate.reference_track import errors
 
@@ -57,8 +58,20 @@ def test_a_straight_track_learns_nothing_and_says_so() -> None:
     assert "adds little to dead reckoning" in track.attrs["findings"]
 
 
-def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning() -> None:
-    """Rock that repeats itself within what the drift may be: of the many tracks no few are published."""
+def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Rock that repeats itself within what the drift may be: of the many tracks no few are published.
+
+    Half of the blocks tells that, and the other half, which would cost most of the time, is left alone.
+    """
+    asked, likelihood = set(), OwnField.log_likelihood
+
+    def counted(field: OwnField, u: FloatArray, kind: int, count: int) -> tuple[float, FloatArray]:
+        asked.add(count / len(field.time))
+        return likelihood(field, u, kind, count)
+
+    monkeypatch.setattr(OwnField, "log_likelihood", counted)
     lost = localise(flown(straight=True), structs.replace(OPTIONS, current_sigma=1.0), start=START)
     np.testing.assert_allclose(
         lost["covariance_nn"] + lost["covariance_ee"], lost["unaided_sigma"] ** 2, rtol=1e-9
@@ -66,6 +79,7 @@ def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning
     np.testing.assert_allclose(lost["north"], 0.0, atol=1e-6)
     assert not lost["valid"][-1]
     assert "this is dead reckoning alone" in lost.attrs["findings"]
+    assert 0.4 < max(asked) < 0.7
 
 
 @pytest.mark.parametrize("missing", ["total_field", "dr_latitude"])
