@@ -32,7 +32,7 @@ from terminal import command_line, table
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.field_search import nodes_for
+from magbridge.calibration.fitting.field_nodes import nodes_for
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observations import Observations
@@ -198,7 +198,7 @@ def best_map(
     place = data.place[:, :2]
     rock = twin.world.rock.anomaly(place + shift)  # type: ignore[attr-defined]
     noise = twin.scenario.instrument.noise_sigma
-    field = Matern(nodes_for(place, 1.5 * length, 6.0), 1.5 * length, 4)
+    field = Matern(nodes_for(place, 1.5 * length, 4), 1.5 * length, 4)
     B = field.basis(place)
     read = rock + np.random.default_rng(1).normal(0, noise, len(rock))
     w = Factor(B.T @ B / noise**2 + field.precision / size**2).solve(B.T @ read / noise**2)

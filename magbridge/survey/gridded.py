@@ -39,6 +39,8 @@ class Posterior:
         Of it.
     levels : (n,) array
         nT, what was taken off each sample: its line's level and the slow part.
+    mean : float
+        nT, of the field over the samples: a level, which no survey knows and which is not doubt of the map.
     """
 
     weight: float
@@ -50,6 +52,7 @@ class Posterior:
     precision: csr_array
     inverse: NearInverse
     levels: FloatArray
+    mean: float
 
     def at(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance, (n,) each, of splines B (n, nodes)."""
@@ -125,9 +128,14 @@ class Gridded:
         for one in self.posteriors:
             here, variance = one.at(csr_array(diags_array(scale) @ one.field.basis(place, deeper)))
             variance[outside] = (one.size * scale[outside]) ** 2
+            here = here - one.mean
             mean += one.weight * here
             square += one.weight * (variance + here**2)
-        return self.mean + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+        return self.mean + self._level + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+
+    @property
+    def _level(self) -> float:
+        return sum(one.weight * one.mean for one in self.posteriors)
 
     def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
         """Yield about so many anomalies (n,), nT, at places (n, 2), m, that the data leave open alike."""
@@ -135,7 +143,7 @@ class Gridded:
         for one in self.posteriors:
             B = one.field.basis(place)
             for w in one.draw(rng, round(one.weight * number)).T:
-                yield self.mean + rough * (B @ w)
+                yield self.mean + self._level - one.mean + rough * (B @ w)
 
     def at_samples(self, samples: Samples) -> FloatArray:
         """Return the anomaly (n,), nT, at the samples' own places and depths."""

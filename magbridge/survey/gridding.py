@@ -11,7 +11,7 @@ uncertainty: Schmidt 1966).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,13 +20,12 @@ from scipy.sparse import csr_array, diags_array
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_doubt import plausible
+from magbridge.calibration.fitting.field_nodes import ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
     choose,
     climb,
-    ladder,
-    nodes_for,
 )
 from magbridge.calibration.fitting.joint import Linear, Reduced, Sums, add_up, eliminate
 from magbridge.calibration.fitting.latent import NOTHING, Group, slow_functions, with_groups
@@ -34,8 +33,7 @@ from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
 from magbridge.field.place.blocks import near_inverse
-from magbridge.field.place.matern import SMOOTHNESS, Matern
-from magbridge.field.place.nodes import Nodes
+from magbridge.field.place.matern import Matern
 from magbridge.survey.gridded import Gridded, Posterior
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.samples import Samples
@@ -52,10 +50,8 @@ OUTLIER = 6.0
 """Sigmas beyond which a sample is left out."""
 LARGE, LIKELIER = 100.0, 5.0
 """Areas of a length's square, and nats, from which on the field's size may vary from place to place."""
-FINE, ENOUGH = 4.0, 8_000
-"""Nodes a length, as long as there are no more than enough: a map shows what coarser ones leave out."""
 MOST = 40_000
-"""Nodes of a rough field at most; their variances take 0.5 GB."""
+"""Nodes at most; their variances take 0.5 GB."""
 CHUNK = 16_384
 """Rows at a time."""
 
@@ -75,6 +71,11 @@ class _Problem:
     def basis(self, field: Matern, rows: IndexArray) -> csr_array:
         known = field.basis(self.samples.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.scale[rows]) @ known)
+
+    def mean_over_samples(self, field: Matern) -> FloatArray:
+        """Return what each of the field's coefficients adds to the samples' mean: (nodes,)."""
+        n = len(self.samples.value)
+        return np.asarray(self.basis(field, np.arange(n)).sum(axis=0)).ravel() / n
 
     def sums(self, field: Matern, rows: IndexArray, modes: bool = False) -> Sums:
         return add_up(self._pieces(field, rows, modes))
@@ -110,7 +111,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     """
     sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1)
     choice, roughness = _searched(samples, sigma, local=local)
-    nodes = _nodes(samples.place, choice.field)
+    nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MOST)
     choice = replace(choice, field=replace(choice.field, nodes=nodes))
     groups = _groups(samples)
     problem, family = _Problem(samples, groups, roughness), with_groups(NOTHING, groups)
@@ -132,41 +133,20 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     if samples.modes.shape[1]:
         shaken = _considered(problem, choice, reduced, widths, family, every)
 
-    def sums_of(field: Matern) -> Sums:
-        return problem.sums(field, every) if field.harmonic else sums
-
     posteriors = [
-        _posterior(weight, one, sums_of(one.field), problem, family, widths, shaken)
-        for weight, one in _left_open(choice, sums_of, replace(weighed, eta=widths.eta))
+        _posterior(weight, one, sums, problem, family, widths, shaken)
+        for weight, one in _left_open(choice, sums, replace(weighed, eta=widths.eta))
     ]
     return Gridded(
         tuple(posteriors), roughness, choice.rho, problem.middle, problem.mean, problem.kept, widths
     )
 
 
-def _nodes(place: FloatArray, found: Matern) -> Nodes:
-    """Return the nodes of the map about places (n, 2), m.
-
-    The roughest field changes within a small part of its length: its evidence holds for nodes as fine as
-    those it was found with, and on coarser ones such rock would be taken for noise and for outliers.
-    """
-    if found.alpha == SMOOTHNESS[0]:
-        fine = found.length / found.nodes.spacing
-        while fine > FINE and (nodes := nodes_for(place, found.length, fine)).size > MOST:
-            fine *= 0.98 * (MOST / nodes.size) ** 0.5
-        if fine > FINE:
-            return nodes
-    nodes = nodes_for(place, found.length, FINE)
-    return nodes if nodes.size <= ENOUGH else nodes_for(place, found.length)
-
-
-def _left_open(
-    choice: Choice, sums_of: Callable[[Matern], Sums], weighed: Weighed
-) -> list[tuple[float, Choice]]:
+def _left_open(choice: Choice, sums: Sums, weighed: Weighed) -> list[tuple[float, Choice]]:
     """Return the plausible sizes and lengths of the field, with their weights."""
 
     def score(one: Choice) -> float:
-        reduced = eliminate(sums_of(one.field), one.field, one.ratio, one.rho)
+        reduced = eliminate(sums, one.field, one.ratio, one.rho)
         return weighed.score(reduced, one.field, one.ratio)
 
     return plausible(score, choice)
@@ -185,10 +165,11 @@ def _posterior(
     reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
     z, covariance = _solved(reduced, widths, family)
     follow = np.hstack([reduced.follow @ np.linalg.cholesky(covariance), shaken])
+    w, mean = reduced.field(z), problem.mean_over_samples(choice.field)
     return Posterior(
-        weight, choice.field, choice.ratio * widths.sigma, widths.sigma, reduced.field(z),
-        _apart(follow, problem, choice.field), reduced.precision,
-        near_inverse(reduced.precision, choice.field.edges), problem.D @ z,
+        weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, _apart(follow, mean),
+        reduced.precision, near_inverse(reduced.precision, choice.field.edges), problem.D @ z,
+        float(mean @ w),
     )  # fmt: skip
 
 
@@ -198,6 +179,8 @@ def _groups(samples: Samples) -> tuple[Group, ...]:
     levels = np.zeros((len(of), int(of.max()) + 1))
     levels[np.arange(len(of)), of] = 1.0
     groups = [Group("levels of lines", levels, np.ones(levels.shape[1]), LEVEL, LEVEL_SPREAD)]
+    if levels.shape[1] == 1:  # rock of its size may be all on one side of zero along one line
+        groups = [Group("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
     if np.isfinite(samples.time).all():
         waves, shape = slow_functions(samples.time)
         if len(shape):
@@ -260,10 +243,6 @@ def _considered(
     return np.asarray(all_in.follow[:, q:] - reduced.follow @ own)
 
 
-def _apart(follow: FloatArray, problem: _Problem, field: Matern) -> FloatArray:
+def _apart(follow: FloatArray, mean: FloatArray) -> FloatArray:
     """Take from the uncertain shifts of the field (nodes, r) their mean over the samples: that is level."""
-    every = np.arange(len(problem.samples.value))
-    mean = np.asarray(problem.basis(field, every).sum(axis=0)).ravel() / len(every)
-    shift = mean @ follow
-    even = mean.sum()
-    return np.asarray(follow - shift[None, :] / max(even, 1e-9))
+    return np.asarray(follow - (mean @ follow)[None, :] / max(mean.sum(), 1e-9))

@@ -299,12 +299,12 @@ def test_creep_of_the_offset_goes_neither_into_rock_nor_into_the_map() -> None:
     assert any("crept by" in line for line in found.warnings)
 
 
-@pytest.mark.parametrize("alpha", [2, 3, 4])
-def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int) -> None:
+@pytest.mark.parametrize(("alpha", "harmonic"), [(2, False), (3, False), (4, False), (4, True)])
+def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: bool) -> None:
     """Away from edges the splines' variance is 1; blocks of the inverse are those of the dense one."""
     rng = np.random.default_rng(alpha)
     place = np.cumsum(rng.normal(0, 60, (1500, 2)), axis=0)
-    field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha)
+    field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha, harmonic)
     Q = field.precision.toarray()
     B = field.basis(place[::9])
     variance = near_inverse(field.precision, field.edges).variances(B)
@@ -317,13 +317,29 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int) -> None:
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(Q), atol=1e-6 * np.abs(np.linalg.inv(Q)).max())
 
 
+@pytest.mark.parametrize("waves", [1.0, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("deeper", [-150.0, -50.0, 80.0, 150.0])
+def test_a_wave_falls_off_upwards_as_laplace_demands(waves: float, deeper: float) -> None:
+    """A wave of wave number k is larger by exp(k d) where the track is d deeper."""
+    length = 900.0
+    x = np.linspace(-4000.0, 4000.0, 400)
+    field = Matern(nodes_near(np.stack([x, 0.0 * x], axis=1), 300.0, 2000.0), length, 6, harmonic=True)
+    k = waves / length
+    u = np.cos(k * field.nodes.places[:, 0])
+    inner = np.stack([np.linspace(-1500.0, 1500.0, 60), np.zeros(60)], axis=1)
+    here, there = (field.basis(inner, depth) @ u for depth in (0.0, deeper))
+    np.testing.assert_allclose(there, np.exp(k * deeper) * here, atol=0.012 * np.abs(here).max())
+
+
 def test_slopes_are_the_splines_derivatives() -> None:
     nodes = nodes_near(np.array([[0.0, 0.0], [3000.0, 500.0]]), 300.0, 900.0)
     rng = np.random.default_rng(1)
     w, x = rng.normal(size=nodes.size), np.array([[100.0, 50.0], [2900.0, 600.0]])
-    north, east = (slope @ w for slope in nodes.slopes(x))
     step = np.array([[0.5, 0.0]])
-    np.testing.assert_allclose(north, (nodes.basis(x + step) - nodes.basis(x - step)) @ w, rtol=1e-4)
-    np.testing.assert_allclose(
-        east, (nodes.basis(x + step[:, ::-1]) - nodes.basis(x - step[:, ::-1])) @ w, rtol=1e-4
-    )
+    for harmonic in (False, True):
+        field = Matern(nodes, 900.0, 4, harmonic)
+        north, east = (slope @ w for slope in field.slopes(x))
+        np.testing.assert_allclose(north, (field.basis(x + step) - field.basis(x - step)) @ w, rtol=1e-4)
+        np.testing.assert_allclose(
+            east, (field.basis(x + step[:, ::-1]) - field.basis(x - step[:, ::-1])) @ w, rtol=1e-4
+        )

@@ -106,6 +106,33 @@ def test_a_map_is_continued_upward_with_its_sigma(done: tuple[Rock, Result]) -> 
     assert np.median(sigma[edge]) > 1.5 * np.median(sigma[middle])
 
 
+def test_map_of_a_vehicle_that_dives_is_right_between_its_tracks() -> None:
+    """Rock at 1 km (waves k of power k² exp(-2 k 1000)) over which a glider dives to 140 m and climbs."""
+    rng = np.random.default_rng(2)
+    n, legs = 2400, 12
+    course = np.cumsum(rng.uniform(1.5, 3.0, legs))[np.arange(n) * legs // n]
+    place = np.cumsum(4.0 * np.stack([np.cos(course), np.sin(course)], axis=1), axis=0)
+    depth = 140.0 * np.abs(np.arange(n) % 300 / 150.0 - 1.0)
+    k, way = rng.gamma(4.0, 1 / 2000.0, 1500), rng.uniform(0.0, 2.0 * np.pi, 1500)
+    phase, middle = rng.uniform(0.0, 2.0 * np.pi, 1500), float(np.median(depth))
+    waves = np.stack([k * np.cos(way), k * np.sin(way)])
+
+    def rock(at: FloatArray, deep: FloatArray | float) -> FloatArray:
+        falling = np.exp(np.multiply.outer(np.broadcast_to(np.asarray(deep, float), len(at)) - middle, k))
+        return np.asarray(40.0 * np.sqrt(2 / 1500) * (falling * np.cos(at @ waves + phase)).sum(axis=1))
+
+    value = rock(place, depth) + rng.normal(0.0, 1.0, n)
+    zero = np.zeros(n, int)
+    found = survey(Samples(place, depth, np.arange(4.0, 4 * n + 4, 4), value, zero, zero > 0, ORIGIN)).gridded
+    assert found.field.harmonic
+    at = place[rng.integers(n, size=400)] + rng.normal(0.0, 250.0, (400, 2))
+    anomaly, sigma = found.at(at)
+    error = anomaly - rock(at, middle)
+    error -= np.mean(found.at(place[::10])[0] - rock(place[::10], middle))
+    assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+    assert np.sqrt(np.mean(error**2)) < 2.2
+
+
 def test_crossing_is_where_the_lines_cross() -> None:
     """Two straight lines; the value there is interpolated on each."""
     t = np.linspace(0.0, 100.0, 11)

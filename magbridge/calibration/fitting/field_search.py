@@ -10,10 +10,10 @@ from scipy.optimize import minimize, minimize_scalar
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.evidence import evidence
+from magbridge.calibration.fitting.field_nodes import SMOOTH, fine_enough, ladder, nodes_for
 from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.field.place.matern import SMOOTHNESS, Matern
-from magbridge.field.place.nodes import Nodes, nodes_near
 
 __all__ = [
     "Choice",
@@ -21,20 +21,14 @@ __all__ = [
     "choose",
     "climb",
     "first_guess",
-    "ladder",
-    "nodes_for",
     "refined",
     "same_noise",
 ]
 
-RUNGS = 7
-"""Lengths that are tried first."""
-FINE, COARSE = 3.0, 2.0
-"""Nodes a length, of the field that is kept and of those that are tried first."""
-PAD = 1.0
-"""Lengths around the track that have nodes."""
-NODES = 30_000
-"""Nodes at most: a shorter length is not tried on so large an area."""
+RESOLVED = 2.0
+"""Nodes a length at least: a shorter one is not tried on so large an area."""
+BENDS = 0.25
+"""Fields look alike where the length times this power of alpha - 1 is the same."""
 SMALL = 0.03
 """Autocorrelation below which noise counts as white."""
 HIGHEST = 0.995
@@ -43,8 +37,6 @@ SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
 """nT of rock, and the 1-sigma of its logarithm: sea floor and land as airborne surveys meet them."""
 LENGTH_SPREAD = np.log(6.0)
 """1-sigma of the logarithm of the length, about the middle of those that are tried."""
-SHORTEST = 60.0
-"""m, least length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,56 +103,59 @@ def choose(
         Share of the usual steps.
     """
     best: Choice | None = None
-    move_rho = rho is None
+    worse, move_rho = 0, rho is None
     ratio, rho = start, 0.3 if rho is None else rho
-    for length in ladder(place):
-        nodes = nodes_near(place, length / COARSE, PAD * length)
-        if nodes.size > NODES:
+    for length in ladder(place)[::-1]:
+        nodes = nodes_for(place, length, SMOOTH)
+        if length < RESOLVED * nodes.spacing:
             continue
-        field = Matern(nodes, float(length), SMOOTHNESS[1], harmonic)
+        field = Matern(nodes, float(length), SMOOTH, harmonic)
         found = climb(
-            sums_of(field), Choice(field, ratio, rho), weighed, move_length=False, steps=int(24 * effort)
-        )
+            sums_of(field), Choice(field, ratio, rho), weighed,
+            move_length=False, move_rho=move_rho, steps=int(24 * effort),
+        )  # fmt: skip
         ratio, rho = found.ratio, found.rho
         if best is None or found.score > best.score:
-            best = found
+            best, worse = found, 0
+        elif (worse := worse + 1) == 2:
+            break  # shorter ones take more nodes, and would be worse still
     assert best is not None
-    nodes = nodes_for(place, best.field.length)
-    best = replace(best, score=-np.inf)
-    for alpha in SMOOTHNESS:
-        field = Matern(nodes, best.field.length, alpha, harmonic)
-        begin = replace(best, field=field)
-        found = climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
-        if found.score < best.score:
-            break
-        best = found
+
+    def tried(one: Choice, alpha: int, harmonic: bool) -> Choice:
+        length = one.field.length * ((one.field.alpha - 1) / (alpha - 1)) ** BENDS
+        field = Matern(nodes_for(place, length, alpha), length, alpha, harmonic)
+        begin = replace(one, field=field)
+        return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
+
+    kinds = (True, False) if harmonic else (False,)
+    best = max((tried(best, SMOOTH, kind) for kind in kinds), key=lambda one: one.score)
+    best = _smoothness(best, tried)
     if harmonic:
-        flat = replace(best.field, harmonic=False)
-        other = climb(
-            sums_of(flat), replace(best, field=flat), weighed, move_rho=move_rho, steps=int(20 * effort)
-        )
-        best = max(best, other, key=lambda one: one.score)
+        other = tried(best, best.field.alpha, not best.field.harmonic)
+        best = _smoothness(other, tried) if other.score > best.score else best
+    return best
+
+
+def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> Choice:
+    """Climb from a choice through the powers alpha, upwards, and if that is no better downwards."""
+    at = SMOOTHNESS.index(best.field.alpha)
+    for others in (SMOOTHNESS[at + 1 :], SMOOTHNESS[:at][::-1]):
+        before = best
+        for alpha in others:
+            found = tried(best, alpha, best.field.harmonic)
+            if found.score <= best.score:
+                break
+            best = found
+        if best is not before:
+            break
     return best
 
 
 def first_guess(place: FloatArray) -> Choice:
     """Return a field to begin with at places (n, 2), m: of the middle length, and of usual size and noise."""
-    length = float(ladder(place)[RUNGS // 2 + 1])
-    return Choice(Matern(nodes_near(place, length / COARSE, PAD * length), length, SMOOTHNESS[1]), SIZE, 0.0)
-
-
-def nodes_for(place: FloatArray, length: float, fine: float = FINE) -> Nodes:
-    """Return the nodes, so many a `length`, m, on which a field is kept, about places (n, 2), m."""
-    return nodes_near(place, length / fine, PAD * length)
-
-
-def ladder(place: FloatArray) -> FloatArray:
-    """Return the lengths to try, (7,) m: from what samples at places (n, 2), m, resolve to the area."""
-    known = place[np.isfinite(place).all(axis=1)]
-    extent = float(np.hypot(*np.ptp(known, axis=0)))
-    step = np.linalg.norm(np.diff(known, axis=0), axis=1)
-    shortest = max(4.0 * float(np.median(step)), extent / 60.0, SHORTEST)
-    return np.asarray(np.geomspace(shortest, max(extent / 2.5, 1.5 * shortest), RUNGS))
+    rungs = ladder(place)
+    length = float(rungs[len(rungs) // 2 + 1])
+    return Choice(Matern(nodes_for(place, length, SMOOTH), length, SMOOTH), SIZE, 0.0)
 
 
 def climb(
@@ -181,8 +176,9 @@ def climb(
         x = first.copy()
         x[moves] = moved
         rho = HIGHEST / (1.0 + np.exp(-np.clip(x[1], -30.0, 30.0))) if move_rho else start.rho
-        length = start.field.length * float(np.exp(np.clip(x[2], -0.5, 0.9)))
-        field = replace(start.field, length=length)
+        field = start.field
+        if move_length:
+            field = replace(field, length=field.length * float(np.exp(np.clip(x[2], -0.5, 0.9))))
         return Choice(field, start.ratio * float(np.exp(np.clip(x[0], -6.0, 6.0))), float(rho))
 
     def downhill(x: FloatArray) -> float:
@@ -206,8 +202,8 @@ def climb(
 def refined(sums_of: Callable[[Matern], Sums], place: FloatArray, choice: Choice, weighed: Weighed) -> Choice:
     """Climb from a choice; nodes at places (n, 2), m, are made anew where they no longer suit the length."""
     field = choice.field
-    if not 0.7 * FINE <= field.length / field.nodes.spacing <= 1.5 * FINE:
-        nodes = nodes_for(place, field.length)
+    if not fine_enough(field.nodes, field.length, field.alpha):
+        nodes = nodes_for(place, field.length, field.alpha)
         field = replace(field, nodes=nodes)
     return climb(sums_of(field), replace(choice, field=field), weighed, steps=30)
 

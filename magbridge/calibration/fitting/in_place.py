@@ -29,12 +29,12 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_doubt import plausible
+from magbridge.calibration.fitting.field_nodes import ladder
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
     choose,
     first_guess,
-    ladder,
     refined,
     same_noise,
 )
@@ -306,8 +306,7 @@ class _Rounds:
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
 
         def reduced(one: Choice) -> Reduced:
-            mine = self._sums(one.field, 1) if one.field.harmonic else sums
-            return eliminate(mine, one.field, one.ratio, one.rho)
+            return eliminate(sums, one.field, one.ratio, one.rho)
 
         total = np.zeros_like(precision)
         for weight, one in plausible(lambda one: weighed.score(reduced(one), one.field, one.ratio), start):

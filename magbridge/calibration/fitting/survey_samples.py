@@ -103,7 +103,7 @@ class SurveySamples:
         north, east = latent[self.bent :].reshape(2, -1)
         waves = self.drift.waves
         self.place = self.as_logged + np.stack([waves @ north, waves @ east], axis=1)
-        slopes = [(slope @ w * self.unmapped)[:, None] * waves for slope in field.nodes.slopes(self.place)]
+        slopes = [(slope @ w * self.unmapped)[:, None] * waves for slope in field.slopes(self.place)]
         self.slopes = np.hstack(slopes)
 
     def linear(

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
-from magbridge.calibration.fitting.field_search import nodes_for
+from magbridge.calibration.fitting.field_nodes import nodes_for
 from magbridge.calibration.fitting.joint import Linear, add_up, eliminate
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
@@ -151,7 +151,7 @@ def _expected(
     names = tuple(one.name for one in calibration.parameters)
     family = polynomial_prior(design.exponents, names, calibration.reference.field)
     D = np.column_stack([np.zeros(len(phi)), jacobian(phi, g) @ family.E, -np.ones(len(phi))])
-    field = Matern(nodes_for(place, LENGTH), LENGTH, SMOOTH)
+    field = Matern(nodes_for(place, LENGTH, SMOOTH), LENGTH, SMOOTH)
     sums = add_up([Linear(D, -field.basis(place), np.zeros(len(phi), bool))])
     H = eliminate(sums, field, ROCK / noise, 0.0).quadratic.H / noise**2
     prior = np.append(family.widths(family.centre), LEVEL) ** -2.0

@@ -1,0 +1,57 @@
+"""The lengths that a track can tell, and the nodes on which a field of such a length is kept."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.field.place.nodes import Nodes, nodes_near
+
+__all__ = ["SMOOTH", "fine_enough", "ladder", "nodes_for"]
+
+RUNGS = 7
+"""Lengths that are tried first."""
+FINE = {2: 8.0, 3: 8.0, 4: 5.0}
+SMOOTH, ENOUGH = 6, 3.0
+"""Nodes a length by the power alpha, and from SMOOTH on: of a field 40 times the noise they leave out less
+than that noise (rough ones on coarser nodes gave maps with errors of 5 to 8 sigmas)."""
+PAD = 1.0
+"""Lengths around the track that have nodes."""
+NODES = 10_000
+"""Nodes at most, unless more are asked for."""
+SHORTEST = 60.0
+"""m, least length."""
+
+
+def fine_enough(nodes: Nodes, length: float, alpha: int) -> bool:
+    """Return whether nodes still suit a field of a `length`, m, and power alpha."""
+    return 0.7 <= length / nodes.spacing / FINE.get(alpha, ENOUGH) <= 1.5
+
+
+def nodes_for(place: FloatArray, length: float, alpha: int, most: int = NODES) -> Nodes:
+    """Return the nodes on which a field is kept about places (n, 2), m; coarser where they are too many.
+
+    Parameters
+    ----------
+    place : (n, 2) array
+        m.
+    length : float
+        m, of the field.
+    alpha : int
+        Its smoothness: a rough one takes finer nodes.
+    most : int
+        Nodes at most, about.
+    """
+    spacing = length / FINE.get(alpha, ENOUGH)
+    while (nodes := nodes_near(place, spacing, PAD * length)).size > 1.05 * most:
+        spacing *= (nodes.size / most) ** 0.5
+    return nodes
+
+
+def ladder(place: FloatArray) -> FloatArray:
+    """Return the lengths to try, (7,) m: from what samples at places (n, 2), m, resolve to the area."""
+    known = place[np.isfinite(place).all(axis=1)]
+    extent = float(np.hypot(*np.ptp(known, axis=0)))
+    step = np.linalg.norm(np.diff(known, axis=0), axis=1)
+    shortest = max(4.0 * float(np.median(step)), extent / 60.0, SHORTEST)
+    return np.asarray(np.geomspace(shortest, max(extent / 2.5, 1.5 * shortest), RUNGS))
