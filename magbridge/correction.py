@@ -19,16 +19,17 @@ from magbridge.calibration.correct import Corrector
 from magbridge.calibration.model import RAISED, Calibration, identity
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
 from magbridge.config import Align
-from magbridge.direction import Direction
 from magbridge.field.igrf import magnitude
 from magbridge.field.nearby import HeldField
 from magbridge.field.reference import main_field
 from magbridge.learning import Learner
 from magbridge.learning.model import TEMPERATURE
-from magbridge.plausibility import Plausibility
+from magbridge.plausibility import Attitude, Plausibility
+from magbridge.plausibility.direction import Direction
+from magbridge.plausibility.told import Told
+from magbridge.plausibility.turns import Turns
 from magbridge.records import BEYOND, Corrected, Quality, Reading
 from magbridge.toml import convert
-from magbridge.turns import Turns
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,6 +51,11 @@ class Correction:
         If not given, and what :func:`correct_rows` corrects is a bridge's own log: that bridge's.
     learner : Learner, optional
         Learns from the samples; what it publishes is used from the next sample on.
+
+    Attributes
+    ----------
+    notices : list of str
+        What was found doubtful since the caller has last emptied it, each once.
     """
 
     def __init__(
@@ -70,9 +76,12 @@ class Correction:
         self._corrector = Corrector(calibration)
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
         # what has no calibration is not expected to be the Earth's field
-        self.plausibility = None if calibration.method == "none" else Plausibility(calibration.noise.sensor)
-        self.turns = Turns()
-        self.direction = None if calibration.boresight is None else Direction()
+        self._told = told = Told()
+        self.notices = told.notices
+        judged = calibration.method != "none"
+        self.plausibility = Plausibility(calibration.noise.sensor, told) if judged else None
+        self.turns, self.attitude = Turns(told), Attitude(told)
+        self.direction = None if calibration.boresight is None else Direction(told)
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
@@ -137,7 +146,8 @@ class Correction:
                 self.aligner.settings.reference_sigma,
             )
             quality |= self.plausibility.flags
-            judged += self.turns.check(sample.time_us, x, y, z, F, sigma * sigma + judged, quality)
+            turns = self.turns.check(sample.time_us, x, y, z, F, sigma * sigma + judged, quality)
+            judged += turns + self.attitude.check(sample.time_us, x, y, z, F, sigma * sigma, quality)
         turned = 0.0
         if self.direction is not None:
             turned = self.direction.check(sample.time_us, x, y, z)
@@ -186,10 +196,11 @@ class Correction:
         if self._raised is not None:
             self._raised.replace(calibration.at_level(), values)
         if self.plausibility is None:
-            self.plausibility = Plausibility(calibration.noise.sensor)
+            self.plausibility = Plausibility(calibration.noise.sensor, self._told)
         elif self.learner is not None:
             self.plausibility.explain(by, jumps=not self.learner.renewed)
             self.turns.explain(by)
+            self.attitude.forget()
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
         """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""

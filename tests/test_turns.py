@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magbridge.arrays import BoolArray, FloatArray
+from magbridge.plausibility.turns import ALARM, LEAST, Turns
 from magbridge.records import Quality
-from magbridge.turns import ALARM, LEAST, Turns
 
 FIELD, SIGMA = 52_000.0, 1.5
 LEG = 120

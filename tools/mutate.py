@@ -49,8 +49,8 @@ TESTS = {
     "plausibility/level": "test_plausibility.py test_plausibility_numbers.py",
     "plausibility/moves": "test_plausibility.py test_plausibility_numbers.py",
     "plausibility/scatter": "test_plausibility.py test_plausibility_numbers.py",
-    "turns": "test_turns.py",
-    "direction": "test_direction.py",
+    "plausibility/turns": "test_turns.py",
+    "plausibility/direction": "test_direction.py",
 }
 """The tests that have to see a change to each module."""
 SLOWER = 5.0

@@ -103,8 +103,7 @@ class Pipeline:
         used = None if foreign else calibration
         learner = open_learner(config, used)
         self._correction = Correction(used, config.align, learner)
-        self._plausibility, self._direction = self._correction.plausibility, self._correction.direction
-        self._turns = self._correction.turns
+        self._notices, self._direction = self._correction.notices, self._correction.direction
         self._calibration_id = calibration_id(used) if used else 0
         autopilot = config.link.system, config.link.autopilot
         stamps = start.signing_timestamp, start.signing_streams
@@ -221,12 +220,8 @@ class Pipeline:
             main_field=main_field,
             where=position.where,
         )
-        if self._plausibility is not None and self._plausibility.notices:
-            self._report_implausible(self._plausibility.notices)
-        if self._turns.notices:
-            self._report_implausible(self._turns.notices)
-        if self._direction is not None and self._direction.notices:
-            self._report_implausible(self._direction.notices)
+        if self._notices:
+            self._report_implausible()
         doubtful = corrected.quality & DOUBTFUL
         if doubtful != self._quality:
             self._report_doubtful(doubtful)
@@ -276,10 +271,10 @@ class Pipeline:
         self.component.announcer.state("quality", f"field: {names or 'good'}", severity)
         self._quality = doubtful
 
-    def _report_implausible(self, notices: list[str]) -> None:
-        for text in notices:
+    def _report_implausible(self) -> None:
+        for text in self._notices:
             self.component.announcer.send_statustext(text, MAV_SEVERITY.ERROR)
-        notices.clear()
+        self._notices.clear()
 
     def _report_no_anomaly(self, reason: str) -> None:
         self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from magbridge.calibration.model import Calibration
     from magbridge.config import Config
+    from magbridge.correction import Correction
     from magbridge.learning import Learner
 
 KEPT = (
@@ -122,8 +123,7 @@ def correct(
             corrected = _beside(part, correct_rows(correction, part), known, source)
             corrected = corrected.isel(time=sampled.any("variable").to_numpy())
             writer.append(corrected)
-            if correction.learner is not None:
-                _notify(correction.learner)
+            _notify(correction)
             if picture:
                 drawn.append(corrected[list(CORRECTED)])
             tally.add(corrected, part.sizes["time"])
@@ -197,11 +197,15 @@ def _learner(known: Calibration, log: xr.Dataset, settings: Config) -> Learner:
     return learner
 
 
-def _notify(learner: Learner) -> None:
-    """Print what learning has changed."""
-    for notice in learner.notices:
-        complain(f"{notice.text}, {notice.date}")
-    learner.notices.clear()
+def _notify(correction: Correction) -> None:
+    """Print what was found doubtful, and what learning has changed."""
+    for text in correction.notices:
+        complain(text)
+    correction.notices.clear()
+    if correction.learner is not None:
+        for notice in correction.learner.notices:
+            complain(f"{notice.text}, {notice.date}")
+        correction.learner.notices.clear()
 
 
 def _keep_learned(learner: Learner, known: Calibration, facts: dict[str, Any], file: Path | None) -> str:

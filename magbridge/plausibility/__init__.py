@@ -6,6 +6,7 @@ stuck, a :mod:`~magbridge.plausibility.jump` off the trend and what it leaves
 (:mod:`~magbridge.plausibility.moves`), and :mod:`~magbridge.plausibility.scatter` beyond the calibration's.
 """
 
+from magbridge.plausibility.attitude import Attitude
 from magbridge.plausibility.judge import Plausibility
 
-__all__ = ["Plausibility"]
+__all__ = ["Attitude", "Plausibility"]

@@ -26,6 +26,8 @@ class Plausibility:
     ----------
     noise : float
         nT, 1-sigma of a channel's noise by the calibration.
+    told : Told, optional
+        Takes what is found.
 
     Attributes
     ----------
@@ -33,14 +35,12 @@ class Plausibility:
         Of the last sample: :class:`~magbridge.records.Quality` bits.
     fault : bool
         The last sample is an outlier, of a sensor at fault, or not of the Earth: no level, old or new.
-    notices : list of str
-        What was found since the caller has last emptied it, each once.
     """
 
-    def __init__(self, noise: float) -> None:
+    def __init__(self, noise: float, told: Told | None = None) -> None:
         self.flags = 0
         self.fault = False
-        told = Told()
+        told = told or Told()
         self.notices = told.notices
         self._axes, self._level, self._moves = Axes(told), Level(told), Moves(told)
         self._scatter = Scatter(noise, told)

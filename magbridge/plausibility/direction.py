@@ -16,6 +16,7 @@ from __future__ import annotations
 from math import asin, atan2, cos, degrees, inf, isfinite, nan, pi, radians, remainder, sin, sqrt
 from typing import Final
 
+from magbridge.plausibility.told import Told
 from magbridge.records import Quality
 
 __all__ = ["Direction"]
@@ -40,18 +41,21 @@ IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 class Direction:
     """Judges the vector now and then.
 
+    Parameters
+    ----------
+    told : Told, optional
+        Takes what is found.
+
     Attributes
     ----------
     flags : int
         Of the last sample: :class:`~magbridge.records.Quality` bits.
-    notices : list of str
-        What was found since the caller has last emptied it, each once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, told: Told | None = None) -> None:
         self.flags = 0
-        self.notices: list[str] = []
-        self._reported = 0
+        self._told = told or Told()
+        self.notices = self._told.notices
         self._roll = self._pitch = self._yaw = nan
         self._attitude_us = -FRESH_US
         self._inclination = self._declination = nan
@@ -109,12 +113,9 @@ class Direction:
         self._turned = self._turned + 1 if abs(turn) > TURNED else 0
         if self._tilted >= LASTING:
             self._tilted_until_us = time_us + LONG_US
-            self._notify(1, f"inclination off by {degrees(tilt):+.0f} deg: axes or mounting wrong")
+            text = f"inclination off by {degrees(tilt):+.0f} deg: axes or mounting wrong"
+            self._told.tell("inclination", text)
         if self._turned >= LASTING:
-            self._notify(2, f"vector {degrees(turn):+.0f} deg off the heading: axes or compass wrong")
+            text = f"vector {degrees(turn):+.0f} deg off the heading: axes or compass wrong"
+            self._told.tell("heading", text)
         self.flags = IMPLAUSIBLE if time_us < self._tilted_until_us else 0
-
-    def _notify(self, which: int, text: str) -> None:
-        if not self._reported & which:
-            self._reported |= which
-            self.notices.append(text)

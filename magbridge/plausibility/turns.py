@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from magbridge.plausibility.told import Told
 from magbridge.records import Quality
 
 __all__ = ["Turns"]
@@ -47,15 +48,15 @@ UNSTEADY: Final = int(
 class Turns:
     """Judges the total field from turn to turn.
 
-    Attributes
+    Parameters
     ----------
-    notices : list of str
-        What was found since the caller has last emptied it, each once.
+    told : Told, optional
+        Takes what is found.
     """
 
-    def __init__(self) -> None:
-        self.notices: list[str] = []
-        self._reported = False
+    def __init__(self, told: Told | None = None) -> None:
+        self._told = told or Told()
+        self.notices = self._told.notices
         self._next_us = 0
         self._anchor_us = -LONGEST_US
         self._field, self._variance = 0.0, 0.0
@@ -116,7 +117,6 @@ class Turns:
         self._sum = min(max(self._sum + min(ratio, CLIP) - DRIFT, 0.0), MOST)
         self._largest = max(self._largest, e * e) if self._sum else 0.0
         self._wrong = self._sum > (0.0 if self._wrong else ALARM)
-        if self._wrong and not self._reported:
-            self._reported = True
+        if self._wrong:
             size = self._largest**0.5
-            self.notices.append(f"field changes by {size:.0f} nT in turns: offset, gain or a mass wrong")
+            self._told.tell("turns", f"field changes by {size:.0f} nT in turns: offset, gain or a mass wrong")
