@@ -227,7 +227,7 @@ def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> t
         side = "above" if there.altitude > 0.0 else "below"
         complain(
             f"{grid.name}: at {grid.altitude:.0f} m; continued to {abs(there.altitude):.0f} m {side} the "
-            f"surface, and what that leaves out counts as the map's error: {known.map_sigma:.1f} nT over "
+            f"surface; with what that leaves out, the map's error is typically {known.map_sigma:.1f} nT over "
             f"{known.map_length:.0f} m"
         )
     return there, known

@@ -223,9 +223,7 @@ def _map(
     from magbridge.survey.maps import anomaly_map
     from magbridge.survey.write import write_geotiff
 
-    grid = anomaly_map(
-        done.gridded, done.samples.origin, spacing=spacing, altitude=altitude, name=output.name
-    )
+    grid = anomaly_map(done.gridded, done.samples, spacing=spacing, altitude=altitude, name=output.name)
     grid.save(output)
     if geotiff:
         write_geotiff(grid, geotiff)

@@ -83,16 +83,7 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
         error2 += (surveyed * (_growth(k, height + below, TERMS) - linear)) ** 2 / len(LEVELS)
     hole = np.isnan(grid.anomaly)
     anomaly, vertical = (np.where(hole, np.nan, idctn(surveyed * g, norm="ortho")) for g in (gain, k * gain))
-    there = AnomalyGrid(
-        grid.longitude,
-        grid.latitude,
-        anomaly,
-        grid.sigma,
-        -level,
-        grid.name,
-        filled(vertical),
-        sigma_length=grid.sigma_length,
-    )
+    there = grid.replaced(anomaly=anomaly, altitude=-level, vertical=filled(vertical))
     sigma2, steepness2 = float(error2.mean()), float((k * k * error2).mean())
     return Continued(there, sqrt(sigma2), sqrt(2 * sigma2 / steepness2) if steepness2 else float("inf"))
 
@@ -107,6 +98,8 @@ def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatAr
 
 ALIKE = 0.25
 """Share of the wavelength that is smoothed away, within which what was taken out has one sign."""
+AROUND = 4.0
+"""Such wavelengths over which its RMS is taken: over one, the RMS is of a wave or two, and chance."""
 
 
 def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
@@ -122,24 +115,22 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     Notes
     -----
     The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The sigma added at a node
-    is the RMS of what was taken out around it, by the same Gaussian, which is positive everywhere.
+    is the RMS of what was taken out around it, by such a Gaussian too: it is positive everywhere.
     """
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 
-    gain = np.exp2(-((_wavenumber(grid) * wavelength / (2.0 * np.pi)) ** 2))
+    waves = _wavenumber(grid) * wavelength / (2.0 * np.pi)
 
-    def low(values: FloatArray) -> FloatArray:
-        return np.asarray(idctn(dctn(values, norm="ortho") * gain, norm="ortho"))
+    def mean(values: FloatArray, over: float = 1.0) -> FloatArray:
+        return np.asarray(idctn(dctn(values, norm="ortho") * np.exp2(-((over * waves) ** 2)), norm="ortho"))
 
     hole = np.isnan(grid.anomaly)
     whole = filled(grid.anomaly)
-    long = low(whole)
-    removed = np.sqrt(np.maximum(low((whole - long) ** 2), 0.0))
+    long = mean(whole)
+    removed = np.sqrt(np.maximum(mean((whole - long) ** 2, AROUND), 0.0))
     anomaly, sigma = np.where(hole, np.nan, long), np.hypot(np.nan_to_num(grid.sigma), removed)
-    return AnomalyGrid(
-        grid.longitude, grid.latitude, anomaly, sigma, grid.altitude, grid.name,
-        sigma_length=max(grid.sigma_length, ALIKE * wavelength),
-    )  # fmt: skip
+    length = max(grid.sigma_length, ALIKE * wavelength)
+    return grid.replaced(anomaly=anomaly, sigma=sigma, vertical=None, sigma_length=length)
 
 
 def _growth(k: FloatArray, height: float, terms: int) -> FloatArray:

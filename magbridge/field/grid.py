@@ -10,6 +10,7 @@ from __future__ import annotations
 from functools import cached_property
 from math import inf, nan, sqrt
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +19,7 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.geodesy import metres_per_degree, signed_longitude, wrap
 from magbridge.field.grid_netcdf import write
-from magbridge.field.local import OFF_THE_MAP, Local
+from magbridge.field.local import OFF_THE_MAP, Local, T
 from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
 
 __all__ = ["HOLE", "AnomalyGrid"]
@@ -34,6 +35,12 @@ NOT_AN_ANOMALY = 15_000.0
 
 FEWEST, MIDDLE = 20, 400
 """Nodes along an axis, with fewer of which the error between them is not asked for; and at most asked for."""
+
+PARAMETERS = (
+    "longitude", "latitude", "anomaly", "sigma", "altitude", "name", "vertical", "sigma_length",
+    "typical_error", "level_sigma",
+)  # fmt: skip
+"""Of a grid."""
 
 DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]
 """Orders of derivative, north and east, in the order of Local."""
@@ -61,6 +68,10 @@ class AnomalyGrid:
         is the same at every depth.
     sigma_length : float, optional
         m, within which errors of that sigma are alike; 0: those of any two samples are independent.
+    typical_error : float, optional
+        nT, of an error that lasts from sample to sample; `sigma` is then all of that kind.
+    level_sigma : float, optional
+        nT, 1-sigma of what the whole map may be off by; `sigma` is without it.
 
     Raises
     ------
@@ -78,6 +89,8 @@ class AnomalyGrid:
         name: str = "grid",
         vertical: ArrayLike | None = None,
         sigma_length: float = 0.0,
+        typical_error: float = 0.0,
+        level_sigma: float = 0.0,
     ) -> None:
         values = np.array(anomaly, float)
         x, flip_x = _axis(longitude, name, "longitude")
@@ -98,6 +111,7 @@ class AnomalyGrid:
                 name, f"expected an anomaly, found a median of {median:.0f} nT: subtract the IGRF first"
             )
         self.name, self.altitude, self.sigma_length = name, float(altitude), float(sigma_length)
+        self.typical_error, self.level_sigma = float(typical_error), float(level_sigma)
         self.longitude, self.latitude, self.anomaly, self.sigma = x, y, values, scatter
         self.vertical = None if vertical is None else np.asarray(vertical, float)[order]
         self._x0, self._dx = float(x[0]), float(x[-1] - x[0]) / (x.size - 1)
@@ -105,6 +119,16 @@ class AnomalyGrid:
         self._whole = ~(hole[1:, 1:] | hole[1:, :-1] | hole[:-1, 1:] | hole[:-1, :-1])
         self._variance = np.nan_to_num(scatter**2)
         self._even_sigma = bool(np.ptp(self._variance) == 0.0)
+
+    def replaced(self, **changes: Any) -> AnomalyGrid:
+        """Return this grid with other parameters."""
+        return AnomalyGrid(**{name: getattr(self, name) for name in PARAMETERS} | changes)
+
+    def error(self, variance: T) -> tuple[T | float, T | float]:
+        """Return how many typical lasting errors a local variance (nT²) is, and the variance that is none."""
+        if not self.typical_error:
+            return 1.0, variance
+        return variance**0.5 / self.typical_error, 0.0
 
     @cached_property
     def _coefficients(self) -> FloatArray:

@@ -63,6 +63,8 @@ def netcdf(path: Path) -> Parts:
         length = flat[sigmas[0]].attrs.get("length_m", 0.0)
         options["sigma_length"] = float(length) if isinstance(length, (int, float, np.number)) else 0.0
     altitude = grid.attrs.get("altitude", data.attrs.get("altitude"))
+    level = data.attrs.get("level_sigma", 0.0)
+    options["level_sigma"] = float(level) if isinstance(level, (int, float, np.number)) else 0.0
     if altitude is not None:
         try:
             options["altitude"] = float(altitude)
@@ -133,6 +135,8 @@ def write(grid: AnomalyGrid, path: str | Path) -> None:
     attrs: dict[str, object] = {"Conventions": "CF-1.8", "title": "magnetic anomaly"}
     if isfinite(grid.altitude):
         attrs |= {"altitude": grid.altitude, "altitude_units": "m above the ellipsoid"}
+    if grid.level_sigma:
+        attrs |= {"level_sigma": grid.level_sigma, "level_sigma_units": "nT"}  # of the whole map
     packed = {name: {"zlib": True, "dtype": "float32"} for name in fields}
     with atomic_path(path) as temporary, systems_reason(temporary):
         xr.Dataset(fields, axes, attrs).to_netcdf(temporary, engine="netcdf4", encoding=packed)

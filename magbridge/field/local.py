@@ -7,7 +7,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["OFF_THE_MAP", "Local", "curvature"]
+__all__ = ["OFF_THE_MAP", "Local", "T", "curvature"]
 
 T = TypeVar("T", float, FloatArray)
 

@@ -106,7 +106,7 @@ def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> lis
         raise WrongUse(f"--surveyed: {count}: one for all, or one for each")
     each = altitudes if len(altitudes) > 1 else [*altitudes] * len(grids)
     return [
-        grid if isfinite(grid.altitude) else _like(grid, grid.anomaly, altitude)
+        grid if isfinite(grid.altitude) else grid.replaced(altitude=altitude)
         for grid, altitude in zip(grids, each, strict=True)
     ]
 
@@ -164,6 +164,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
             first.altitude,
             " + ".join(Path(grid.name).name for grid in grids),
             sigma_length=max(grid.sigma_length for grid in grids),
+            level_sigma=max(grid.level_sigma for grid in grids),
         )
     return merged, apart
 
@@ -210,14 +211,7 @@ def _masked(grid: AnomalyGrid, polygon: FloatArray) -> AnomalyGrid:
     inside = Polygon(polygon).contains_points(np.column_stack([x.ravel(), y.ravel()])).reshape(x.shape)
     if not (inside & np.isfinite(grid.anomaly)).any():
         raise OutOfRange("mask", f"{len(polygon)} corners", f"no node of {grid} lies inside")
-    return _like(grid, np.where(inside, grid.anomaly, np.nan))
-
-
-def _like(grid: AnomalyGrid, values: FloatArray, altitude: float | None = None) -> AnomalyGrid:
-    level = grid.altitude if altitude is None else altitude
-    return AnomalyGrid(
-        grid.longitude, grid.latitude, values, grid.sigma, level, grid.name, sigma_length=grid.sigma_length
-    )
+    return grid.replaced(anomaly=np.where(inside, grid.anomaly, np.nan), vertical=None)
 
 
 def _cover(axes: Sequence[FloatArray], step: float) -> FloatArray:

@@ -95,7 +95,7 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     altitude = options.get("altitude", nan)
     return AnomalyGrid(
         longitude, latitude, fields["anomaly"], fields.get("sigma", 0.0), altitude, name=str(path),
-        sigma_length=options.get("sigma_length", 0.0),
+        sigma_length=options.get("sigma_length", 0.0), level_sigma=options.get("level_sigma", 0.0),
     )  # fmt: skip
 
 

@@ -188,7 +188,7 @@ def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> Iterator[R
 def _map(job: Job, logs: list[xr.Dataset], calibration: Calibration, path: Path) -> Row:
     """Write the anomaly map of a deployment's corrected field; return its row."""
     made = survey(samples_of(logs, [calibration]))
-    grid = anomaly_map(made.gridded, made.samples.origin, name=path.name)
+    grid = anomaly_map(made.gridded, made.samples, name=path.name)
     grid.save(path)
     return {
         **job.mark, "rms": float(np.sqrt(np.mean(made.residual**2))),

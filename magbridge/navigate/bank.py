@@ -139,12 +139,13 @@ class Bank:
         bent, spread = curvature(local, self.P[0, 0], self.P[0, 1], self.P[1, 1])
         self.curvature_variance = float(self.w @ spread)
         anomaly = local.anomaly + (block.slope_north * north + block.slope_east * east + bent)
-        v = local.variance + block.variance + spread
+        errors, independent = self._grid.error(local.variance)
+        v = independent + block.variance + spread
         slopes = np.where(off, 0.0, (local.north + block.slope_north, local.east + block.slope_east))
-        gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + self.P[5]
-        s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + gain[5]
+        gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + errors * self.P[5]
+        s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + errors * gain[5]
         anomaly[off], v[off] = self._elsewhere[0], block.variance + self._elsewhere[1]
-        return self._observe(block.anomaly - anomaly - self.x[4] - self.x[5], gain, s + v, off)
+        return self._observe(block.anomaly - anomaly - self.x[4] - errors * self.x[5], gain, s + v, off)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
         """Take in a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""

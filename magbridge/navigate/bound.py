@@ -116,9 +116,10 @@ def position_bound(
         F, Q = transition(o, now - previous, float(metres[i]))
         P, alone, previous = F @ P @ F.T + Q, F @ alone @ F.T + Q, now
         if np.isfinite(local.anomaly[i]):
-            row = measurement_row(local.north[i] + slope_north[i], local.east[i] + slope_east[i])
+            errors, independent = grid.error(float(local.variance[i]))
+            row = measurement_row(local.north[i] + slope_north[i], local.east[i] + slope_east[i], errors)
             gain = P @ row.T
-            P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + local.variance[i])
+            P = P - gain @ gain.T / float((row @ gain)[0, 0] + variance + independent)
         covariance[i], unaided[i] = P, np.sqrt(alone[0, 0] + alone[1, 1])
     reached = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
     return Bound(at, lat, lon, covariance, reached, unaided)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import Options, with_level
 
 __all__ = ["at_depth", "lasting_errors"]
 
@@ -45,19 +45,22 @@ def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[Ano
 
 
 def lasting_errors(grid: AnomalyGrid, options: Options) -> tuple[AnomalyGrid, Options]:
-    """Return the map without a sigma that lasts from sample to sample, and options whose map error has it.
+    """Return the map and options whose map error has the sigma that lasts from sample to sample.
 
-    A sigma with a ``sigma_length`` becomes a part of the filter's map error, of its RMS over the map: that
-    state is correlated along the track, and the noise of a measurement is not.
+    A sigma with a ``sigma_length`` is correlated along the track, as the filter's map error is, and the noise
+    of a measurement is not. The state is a typical error, the map's median and that of the options; by how
+    much it counts at a node, the map's sigma there says, with that of the options in it. The map's level is
+    a bias.
     """
-    if not grid.sigma_length:
+    options = with_level(options, grid.level_sigma)
+    if grid.level_sigma:
+        grid = grid.replaced(level_sigma=0.0)
+    typical = float(np.median(grid.sigma[np.isfinite(grid.anomaly)]))
+    if not (grid.sigma_length and typical):
         return grid, options
-    known = np.isfinite(grid.anomaly)
-    sigma = float(np.sqrt(np.mean(grid.sigma[known] ** 2)))
-    plain = AnomalyGrid(
-        grid.longitude, grid.latitude, grid.anomaly, 0.0, grid.altitude, grid.name, grid.vertical
-    )
-    return plain, _added(options, [(sigma, grid.sigma_length)]) if sigma else options
+    known = _added(options, [(typical, grid.sigma_length)])
+    sigma = np.hypot(grid.sigma, options.map_sigma)
+    return grid.replaced(sigma=sigma, sigma_length=0.0, typical_error=known.map_sigma), known
 
 
 def _added(options: Options, errors: list[tuple[float, float]]) -> Options:

@@ -9,7 +9,7 @@ vehicle does, and one model serves every estimator, the smoother and the bound:
 2   current north, m/s                         what carries the dead reckoning off; slow Gauss-Markov
 3   current east, m/s
 4   calibration bias, nT                       Gauss-Markov in time
-5   map error, nT                              Gauss-Markov in the distance travelled
+5   map error, nT, where it is typical         Gauss-Markov in the distance travelled
 ==  =========================================  =====================================================
 """
 
@@ -118,9 +118,9 @@ def transition(options: Options, seconds: float, metres: float) -> tuple[FloatAr
     return f, q
 
 
-def measurement_row(north: float, east: float) -> FloatArray:
-    """Return H (1, 6): the field's slopes at the position, and 1 for calibration bias and map error."""
-    return np.array([[north, east, 0.0, 0.0, 1.0, 1.0]])
+def measurement_row(north: float, east: float, errors: float = 1.0) -> FloatArray:
+    """Return H (1, 6): the field's slopes, 1 for the calibration's bias, and how many errors of the map."""
+    return np.array([[north, east, 0.0, 0.0, 1.0, errors]])
 
 
 def block_length(grid: AnomalyGrid) -> float:

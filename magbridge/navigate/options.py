@@ -11,7 +11,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.config import NotNegative, Positive
 from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["Options", "any_level", "informed"]
+__all__ = ["Options", "any_level", "informed", "with_level"]
 
 LASTING = 3.0
 """Intervals: noise with a longer correlation time becomes a bias."""
@@ -103,7 +103,12 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
         bias_sigma=hypot(options.bias_sigma, slow),
         bias_time=min(options.bias_time, lasts) if slow > options.bias_sigma else options.bias_time,
     )
-    return _wider_level(known, hypot(known.bias_sigma, level)) if level else known
+    return with_level(known, level)
+
+
+def with_level(options: Options, sigma: float) -> Options:
+    """Return options with a level that is uncertain by a further `sigma`, nT, and changes as before."""
+    return _wider_level(options, hypot(options.bias_sigma, sigma)) if sigma else options
 
 
 def any_level(options: Options, grid: AnomalyGrid) -> Options:

@@ -66,8 +66,8 @@ class Tracker:
 
         Notes
         -----
-        ``h = a(p) + ∇F·δ + b + m`` and ``R = r + map variance``, both with what the map's curvature adds
-        (:func:`~magbridge.field.local.curvature`).
+        ``h = a(p) + ∇F·δ + b + e m`` and ``R = r + map variance``, both with what the map's curvature adds
+        (:func:`~magbridge.field.local.curvature`); e as in :meth:`~magbridge.field.grid.AnomalyGrid.error`.
         """
         north, east = float(self.x[0]), float(self.x[1])
         per_latitude, per_longitude = metres_per_degree(block.latitude)
@@ -79,9 +79,11 @@ class Tracker:
         (pnn, pne), (_, pee) = self.P[:2, :2].tolist()
         bent, self.curvature_variance = curvature(local, pnn, pne, pee)
         expected = local.anomaly + block.slope_north * north + block.slope_east * east + bent
-        variance = block.variance + local.variance + self.curvature_variance
-        row = measurement_row(local.north + block.slope_north, local.east + block.slope_east)
-        innovation = self._observe(block.anomaly, expected + float(self.x[4] + self.x[5]), row, variance)
+        errors, independent = self._grid.error(local.variance)
+        variance = block.variance + independent + self.curvature_variance
+        row = measurement_row(local.north + block.slope_north, local.east + block.slope_east, errors)
+        expected += float(self.x[4] + errors * self.x[5])
+        innovation = self._observe(block.anomaly, expected, row, variance)
         return innovation._replace(anomaly=local.anomaly)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:

@@ -38,7 +38,7 @@ class Posterior:
     inverse : NearInverse
         Of it.
     levels : (n,) array
-        nT, what was taken off each sample: its line's level and the slow part.
+        nT, what was taken off each sample: its line's level and the slow part, about their mean.
     mean : float
         nT, of the field over the samples: a level, which no survey knows and which is not doubt of the map.
     """
@@ -81,7 +81,7 @@ class Gridded:
     middle : float
         m, depth at which the map holds.
     mean : float
-        nT, of all samples.
+        nT, of all samples, and of the map over them.
     kept : (n,) array
         Which samples are no outliers.
     widths : Widths
@@ -131,11 +131,7 @@ class Gridded:
             here = here - one.mean
             mean += one.weight * here
             square += one.weight * (variance + here**2)
-        return self.mean + self._level + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
-
-    @property
-    def _level(self) -> float:
-        return sum(one.weight * one.mean for one in self.posteriors)
+        return self.mean + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
 
     def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
         """Yield about so many anomalies (n,), nT, at places (n, 2), m, that the data leave open alike."""
@@ -143,10 +139,13 @@ class Gridded:
         for one in self.posteriors:
             B = one.field.basis(place)
             for w in one.draw(rng, round(one.weight * number)).T:
-                yield self.mean + self._level - one.mean + rough * (B @ w)
+                yield self.mean - one.mean + rough * (B @ w)
 
     def at_samples(self, samples: Samples) -> FloatArray:
         """Return the anomaly (n,), nT, at the samples' own places and depths."""
         deeper, rough = np.nan_to_num(samples.depth - self.middle), self.roughness.at(samples.place)
-        parts = [one.weight * (one.field.basis(samples.place, deeper) @ one.w) for one in self.posteriors]
-        return np.asarray(self.mean + rough * sum(parts))
+        parts = [
+            one.weight * (rough * (one.field.basis(samples.place, deeper) @ one.w) - one.mean)
+            for one in self.posteriors
+        ]
+        return np.asarray(self.mean + sum(parts))

@@ -74,8 +74,7 @@ class _Problem:
 
     def mean_over_samples(self, field: Matern) -> FloatArray:
         """Return what each of the field's coefficients adds to the samples' mean: (nodes,)."""
-        n = len(self.samples.value)
-        return np.asarray(self.basis(field, np.arange(n)).sum(axis=0)).ravel() / n
+        return np.asarray(self.basis(field, np.flatnonzero(self.kept)).mean(axis=0)).ravel()
 
     def sums(self, field: Matern, rows: IndexArray, modes: bool = False) -> Sums:
         return add_up(self._pieces(field, rows, modes))
@@ -138,7 +137,13 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         for weight, one in _left_open(choice, sums, replace(weighed, eta=widths.eta))
     ]
     return Gridded(
-        tuple(posteriors), roughness, choice.rho, problem.middle, problem.mean, problem.kept, widths
+        tuple(posteriors),
+        roughness,
+        choice.rho,
+        problem.middle,
+        float(samples.value[problem.kept].mean()),
+        problem.kept,
+        widths,
     )
 
 
@@ -166,10 +171,11 @@ def _posterior(
     z, covariance = _solved(reduced, widths, family)
     follow = np.hstack([reduced.follow @ np.linalg.cholesky(covariance), shaken])
     w, mean = reduced.field(z), problem.mean_over_samples(choice.field)
+    levels = problem.D @ z
     return Posterior(
         weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, _apart(follow, mean),
-        reduced.precision, near_inverse(reduced.precision, choice.field.edges), problem.D @ z,
-        float(mean @ w),
+        reduced.precision, near_inverse(reduced.precision, choice.field.edges),
+        levels - levels[problem.kept].mean(), float(mean @ w),
     )  # fmt: skip
 
 

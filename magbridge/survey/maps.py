@@ -9,6 +9,7 @@ from magbridge.field.continuation import continued, raised
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.survey.gridded import Gridded
+from magbridge.survey.samples import Samples
 
 __all__ = ["anomaly_map"]
 
@@ -24,7 +25,7 @@ KNOWN = 0.95
 
 def anomaly_map(
     gridded: Gridded,
-    origin: tuple[float, float],
+    samples: Samples,
     *,
     spacing: float | None = None,
     altitude: float | None = None,
@@ -36,8 +37,8 @@ def anomaly_map(
     ----------
     gridded : Gridded
         The survey.
-    origin : tuple of 2 float
-        deg, latitude and longitude of its places' origin.
+    samples : Samples
+        That it was made of.
     spacing : float, optional
         m between nodes; an eighth of the field's length if not given.
     altitude : float, optional
@@ -58,6 +59,7 @@ def anomaly_map(
     hole = ~gridded.field.nodes.inside(at) | (sigma > KNOWN * size)
     anomaly[hole] = sigma[hole] = np.nan
     shape = len(north), len(east)
+    origin = samples.origin
     per_latitude, per_longitude = metres_per_degree(origin[0])
     grid = AnomalyGrid(
         origin[1] + east / per_longitude,
@@ -66,6 +68,8 @@ def anomaly_map(
         sigma.reshape(shape),
         altitude=-gridded.middle,
         name=name,
+        sigma_length=gridded.field.length,
+        level_sigma=samples.level_sigma,
     )
     return grid if altitude is None else _continued(grid, gridded, at, altitude)
 
@@ -79,7 +83,4 @@ def _continued(grid: AnomalyGrid, gridded: Gridded, at: FloatArray, altitude: fl
     there, missing, _ = continued(grid, -altitude)
     rise = raised(grid, altitude)
     drawn = [(rise(one.reshape(grid.anomaly.shape)) - there.anomaly) ** 2 for one in gridded.draw(at, DRAWN)]
-    return AnomalyGrid(
-        grid.longitude, grid.latitude, there.anomaly, np.hypot(np.sqrt(np.mean(drawn, axis=0)), missing),
-        altitude, grid.name, there.vertical,
-    )  # fmt: skip
+    return there.replaced(sigma=np.hypot(np.sqrt(np.mean(drawn, axis=0)), missing))

@@ -131,7 +131,8 @@ def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
     else:
         raise FormatError(source, "expected mag_x mag_y mag_z, total_field or anomaly")
     lines = ds["line"].to_numpy() if "line" in ds else np.zeros(len(value))
-    return _placed(ds, value, lines, label)
+    samples = _placed(ds, value, lines, label)
+    return replace(samples, level_sigma=float(ds["level_sigma"].median())) if "level_sigma" in ds else samples
 
 
 def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples:
@@ -147,7 +148,12 @@ def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples
     ]
     read = np.stack(channels, axis=1)[known] if channels else np.empty((len(field), 0))
     modes = _modes(apart_from_level(calibration), field, read, ds["time"].to_numpy()[known])
-    return replace(samples, rho=calibration.noise.autocorrelation, modes=modes)
+    return replace(
+        samples,
+        rho=calibration.noise.autocorrelation,
+        modes=modes,
+        level_sigma=calibration.reference.level_sigma,
+    )
 
 
 def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:
@@ -180,7 +186,7 @@ def joined(parts: Sequence[Samples]) -> Samples:
     )
     return Samples(
         np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
-        max(one.rho for one in parts), modes,
+        max(one.rho for one in parts), modes, max(one.level_sigma for one in parts),
     )  # fmt: skip
 
 

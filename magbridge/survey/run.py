@@ -142,6 +142,7 @@ def facts(result: Result, path: Path) -> dict[str, Any]:
         "noise_nT": found.sigma,
         "rock": {"size_nT": found.size, "length_m": found.field.length, "smoothness": found.field.alpha - 1},
         "depth_m": found.middle,
+        "level_sigma_nT": result.samples.level_sigma,
         "warnings": result.warnings,
     }
 

@@ -37,6 +37,8 @@ class Samples:
         Autocorrelation of successive samples' noise.
     modes : (n, r) array
         nT, what 1-sigma of each of the calibration's uncertain combinations does to every sample.
+    level_sigma : float
+        nT, 1-sigma of what all samples are off by, the reference's level.
     """
 
     place: FloatArray
@@ -49,6 +51,7 @@ class Samples:
     weight: FloatArray = field(default_factory=lambda: np.empty(0))
     rho: float = 0.0
     modes: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    level_sigma: float = 0.0
 
     def __post_init__(self) -> None:
         n = len(self.value)
@@ -61,5 +64,5 @@ class Samples:
         """Pick samples: an (n,) mask."""
         return Samples(
             self.place[rows], self.depth[rows], self.time[rows], self.value[rows], self.line[rows],
-            self.tie[rows], self.origin, self.weight[rows], self.rho, self.modes[rows],
+            self.tie[rows], self.origin, self.weight[rows], self.rho, self.modes[rows], self.level_sigma,
         )  # fmt: skip

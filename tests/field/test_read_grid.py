@@ -177,12 +177,14 @@ def test_every_format_gives_the_same_map(tmp_path: Path, name: str, write: Calla
 def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     holed = MAP.copy()
     holed[2, 3] = np.nan
-    grid = AnomalyGrid(LON, LAT, holed, sigma=np.abs(MAP) / 10, altitude=90.0)
+    grid = AnomalyGrid(
+        LON, LAT, holed, sigma=np.abs(MAP) / 10, altitude=90.0, sigma_length=700.0, level_sigma=145.0
+    )
     grid.save(tmp_path / "g.nc")
     back = read_grid(tmp_path / "g.nc")
     np.testing.assert_allclose(back.anomaly, holed, rtol=1e-6)
     np.testing.assert_allclose(back.sigma, grid.sigma, rtol=1e-6)
-    assert back.altitude == 90.0
+    assert (back.altitude, back.sigma_length, back.level_sigma) == (90.0, 700.0, 145.0)
     assert list(tmp_path.iterdir()) == [tmp_path / "g.nc"]
 
 

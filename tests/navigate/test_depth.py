@@ -64,16 +64,24 @@ def test_what_lies_between_nodes_counts_as_map_error() -> None:
     assert known.map_length == pytest.approx(0.5 * coarse.spacing)
 
 
+def test_a_map_whose_level_is_uncertain_leaves_the_bias_open() -> None:
+    surveyed = synthetic(Map(40, 1000), 0).replaced(level_sigma=100.0)
+    there, known = lasting_errors(surveyed, Options(bias_sigma=5.0))
+    assert known.bias_sigma == pytest.approx(hypot(100.0, 5.0))
+    assert lasting_errors(there, known) == (there, known), "counted once"
+
+
 def test_what_was_smoothed_away_is_a_map_error_that_lasts_and_a_flight_holds_its_position() -> None:
     """Rough rock without its waves below 1 km: near the bound, and honest; counted with every measurement
     instead, a field that has nothing to do with the map explained the flight better, and it was lost.
     """
     raw = synthetic(Map(40, 1000, rough=True), 0)
     less = smoothed(raw, 1_000.0)
-    plain, known = lasting_errors(less, Options(map_sigma=0.0))
+    lasting, known = lasting_errors(less, Options(map_sigma=0.0))
     assert known.map_sigma == pytest.approx(float(np.std(less.anomaly - raw.anomaly)), rel=0.3)
     assert known.map_length == pytest.approx(less.sigma_length)
-    assert not plain.sigma.any()
+    assert lasting.error(4.0 * known.map_sigma**2)[0] == pytest.approx(2.0)
+    assert lasting_errors(lasting, known) == (lasting, known), "counted once"
     assert lasting_errors(raw, known) == (raw, known)
     options = replace(GLIDER, start_sigma=150.0)
     flown = sail(track_over(raw, options, 1000, hours=3.0), less, options).score()

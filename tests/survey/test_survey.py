@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Command
+from msgspec.structs import replace
+from navigation_studies.simulated import GLIDER, PLACE, Map, sail, synthetic, track_over
 
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset, separation
@@ -88,7 +90,7 @@ def test_a_map_is_continued_upward_with_its_sigma(done: tuple[Rock, Result]) -> 
     So it is near the edge, where what lies beyond comes in: the survey's own sigma does not know of that.
     """
     rock, result = done
-    grid = anomaly_map(result.gridded, result.samples.origin, altitude=600.0)
+    grid = anomaly_map(result.gridded, result.samples, altitude=600.0)
     assert grid.altitude == pytest.approx(600.0)
     assert grid.sigma is not None
     y, x = np.meshgrid(grid.latitude, grid.longitude, indexing="ij")
@@ -201,3 +203,27 @@ def test_a_bad_table_is_one_line(command: Command, tmp_path: Path, text: str, wo
     assert words in output.err
     assert output.err.count("\n") == 1
     assert not (tmp_path / "map.nc").exists()
+
+
+def test_a_vehicle_finds_itself_on_the_map_that_its_own_survey_drew() -> None:
+    """Between the tracks the map's errors last for hundreds of metres. Counted anew with every sample they
+    made the filter sure of a wrong place; a level taken off the map left the field unexplained by it.
+    """
+    rock = synthetic(Map(40, 1000), 2)
+    flown = track_over(rock, GLIDER, 2, hours=4.0)
+    longitude, latitude = flown["truth_longitude"].to_numpy(), flown["truth_latitude"].to_numpy()
+    n = len(latitude)
+    level = -70.0
+    value = rock.at(longitude, latitude) + level + np.random.default_rng(9).normal(0.0, 1.0, n)
+    place = np.stack(separation(*PLACE, latitude, longitude), axis=1)
+    samples = Samples(
+        place, np.zeros(n), flown["time"].to_numpy(), value, np.zeros(n, int), np.zeros(n, bool), PLACE,
+        level_sigma=100.0,
+    )  # fmt: skip
+    drawn = anomaly_map(survey(samples).gridded, samples)
+    assert np.mean(drawn.at(longitude, latitude)) == pytest.approx(np.mean(value), abs=0.3)
+    found = sail(flown, drawn, replace(GLIDER, start_sigma=50.0)).score()
+    assert not found.lost
+    assert found.drms < 0.4 * found.unaided
+    assert found.nees < 2.0
+    assert found.valid > 0.5

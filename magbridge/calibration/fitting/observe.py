@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import hypot
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -121,8 +122,8 @@ def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple
 
 
 def grid_sigma(grid: AnomalyGrid) -> float:
-    """Return the error of a map, nT: its own sigma (RMS), or a plausible one where it states none."""
-    return float(np.sqrt(np.nanmean(grid.sigma**2))) or MAP_ERROR
+    """Return the error of a map, nT: its own (RMS) with its level's, or a plausible one if it states none."""
+    return hypot(float(np.sqrt(np.nanmean(grid.sigma**2))), grid.level_sigma) or MAP_ERROR
 
 
 def _column(ds: xr.Dataset, name: str) -> FloatArray:
