@@ -10,10 +10,14 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.fit import LEVEL
 from sitl.dataset import channels
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
-__all__ = ["BestFit", "oracle"]
+DENSE = 2_700
+"""Samples of a covariance at most."""
+
+__all__ = ["BestFit", "oracle", "survey_bound"]
 
 
 def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> FloatArray:
@@ -106,6 +110,58 @@ class BestFit:
         follows = (np.diff(self._calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
         innovations = (values - self._phi * np.roll(values, 1, axis=0)) / np.sqrt(1 - self._phi**2)
         return np.where(follows, innovations, values)
+
+
+def survey_bound(
+    vehicle: Vehicle,
+    survey: xr.Dataset,
+    other: xr.Dataset,
+    place: FloatArray,
+    rock: tuple[float, float],
+    noise: tuple[float, float],
+) -> float:
+    r"""Return the least error about its mean, over the floor, of another survey after this one alone.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        The truth, as for :class:`BestFit`.
+    survey : Dataset (time)
+        From which it is learned, of n samples.
+    other : Dataset (time)
+        The other day's.
+    place : (n, 2) array
+        m, of the survey's samples.
+    rock : tuple of 2 float
+        nT and m, of a Gaussian field with a Gaussian covariance, which is known.
+    noise : tuple of 2 float
+        nT of a channel, and its memory in samples.
+
+    Notes
+    -----
+    As :class:`BestFit`, with rock and level in the covariance K of the magnitudes:
+    :math:`P = (I + G^T K^{-1} G)^{-1}`. Neighbouring samples are averaged until :data:`DENSE` are left.
+    """
+    sigma, memory = noise
+    scale = _widths(vehicle, 0.05)
+    (g, floor), (h, after) = (_sensitivity(vehicle, one, sigma) for one in (survey, other))
+    step = -(-len(g) // DENSE)
+    n = len(g) // step
+    g, place, floor = (
+        one[: n * step].reshape(n, step, -1).mean(axis=1) for one in (g, place, floor[:, None])
+    )
+
+    def alike(samples: int, apart: int) -> FloatArray:
+        lag = apart * np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+        return np.asarray(np.exp(-lag / memory) if memory else 1.0 * (lag == 0))
+
+    R = alike(n, step)
+    np.fill_diagonal(R, alike(step, 1).mean())
+    far = ((place[:, None] - place) ** 2).sum(axis=2)
+    K = floor * floor.T * R + rock[0] ** 2 * np.exp(-0.5 * far / rock[1] ** 2) + LEVEL**2
+    G, H = g * scale, (h - h.mean(axis=0)) * scale
+    P = np.linalg.inv(G.T @ np.linalg.solve(K, G) + np.eye(len(scale)))
+    return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (after**2).sum()))
 
 
 def _widths(vehicle: Vehicle, at_sigma: float) -> FloatArray:

@@ -268,6 +268,8 @@ def unmapped(runs: Runs, asked: argparse.Namespace) -> None:
         ("12 h", long, (Map(30, 500),)),
         ("aircraft", AIRCRAFT, (Map(60, 1500),)),
     ):
+        if asked.vehicle and name not in asked.vehicle:
+            continue
         number = max(runs.number // 4, 1) if vehicle is AIRCRAFT else runs.number
         for kind in kinds:
             made = runs._replace(number=number)(partial(located, vehicle, kind), asked.first)
@@ -378,6 +380,7 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="number of the first run (unmapped, smoothed)")
+    parser.add_argument("--vehicle", choices=("6 h", "12 h", "aircraft"), action="append", help="of unmapped")
     parser.add_argument("--part", choices=sorted(PARTS), action="append")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="folder in which rows that are done are kept")

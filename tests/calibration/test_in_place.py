@@ -31,13 +31,17 @@ NOISE = 1.0
 Survey = tuple[Observations, FloatArray, Fit]
 
 
-def flown(*, legs: int = 16, straight: bool = False, seed: int = 3) -> tuple[Observations, FloatArray]:
+def flown(
+    *, legs: int = 16, straight: bool = False, zigzag: bool = False, seed: int = 3
+) -> tuple[Observations, FloatArray]:
     """Fly dives and climbs criss-cross over rock of 40 nT; return what was read, and the true total field."""
     rng = np.random.default_rng(seed)
     each, dt, speed = 110, 4.0, 0.9
     n = legs * each
     leg = np.arange(n) // each
     course = np.zeros(legs) if straight else np.radians(rng.uniform(0, 360, legs))
+    if zigzag:
+        course = np.radians(np.where(np.arange(legs) // 2 % 2, 50.0, -50.0))
     heading = course[leg] + rng.normal(0, 0.02, n)
     pitch = np.radians(np.where(leg % 2, 25, -25) + rng.normal(0, 1, n))
     roll = np.radians(rng.normal(0, 5, legs)[leg] + rng.normal(0, 1, n))
@@ -138,6 +142,16 @@ def test_straight_line_is_not_supported() -> None:
     error, sigma = error_of(found, data, true)
     assert error < 1.5 * sigma
     assert any("never crossed your own track" in line for line in found.warnings)
+
+
+def test_a_zigzag_tells_rock_from_heading_without_a_crossing() -> None:
+    """Rock is smooth about a turn, and what changes there is the vehicle's."""
+    data, true = flown(zigzag=True)
+    found = fit(data)
+    assert found.calibration.method == "survey"
+    error, sigma = error_of(found, data, true)
+    assert error < 1.15 * NOISE
+    assert 0.8 < error / sigma < 1.25
 
 
 def test_a_jump_in_position_is_left_out_and_told() -> None:

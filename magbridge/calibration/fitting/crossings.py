@@ -15,12 +15,12 @@ from magbridge.calibration.fitting.observations import Observations
 __all__ = [
     "courses",
     "crossed",
-    "crosses_itself",
     "far_off",
     "jumped",
     "left_open",
     "left_open_by",
     "rough_rock",
+    "tells_rock",
     "too_rough",
 ]
 
@@ -39,6 +39,10 @@ PLACES = (125.0, 250.0, 500.0)
 OFTEN, TWICE = 0.08, 2
 """Share of the places, and how many at least, that a survey meets again on another course if it tells its own
 rock: six hours of a glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
+AHEAD, LEGS = 0.8, 6
+"""Mean resultant length of the courses (Mardia & Jupp 2000, eq. 2.3.3) below which legs lead different ways,
+and places of the widest kind to which they must: rock that is smooth beside a leg is then no heading's. A
+zigzag of 3 h that crosses nothing has 0 to 0.6, dives along one line 0.93; runs stay at one place."""
 LEAP = 100.0
 """m beyond what the vehicle can have moved: a jump in position."""
 BETWEEN = 0.5
@@ -47,8 +51,11 @@ STILL = 5.0
 """m between samples, below which a course is not one."""
 
 
-def crosses_itself(data: Observations) -> bool:
-    """Return whether the track came back to places on other courses, so that it can tell what is rock."""
+def tells_rock(data: Observations) -> bool:
+    """Return whether the track can tell what is rock.
+
+    It does where it came back to places on other courses, or where legs on other courses follow each other.
+    """
     if data.place is None:
         return False
     whole = np.isfinite(data.place[:, :2]).all(axis=1)
@@ -58,7 +65,10 @@ def crosses_itself(data: Observations) -> bool:
         places = len(np.unique(np.floor(place / cell), axis=0))
         return sum(crossed(place, course, cell)) >= max(OFTEN * places, TWICE)
 
-    return len(place) > 0 and any(map(often, PLACES))
+    if not len(place):
+        return False
+    legs = len(np.unique(np.floor(place / PLACES[-1]), axis=0)) >= LEGS
+    return (legs and abs(np.exp(1j * course).mean()) < AHEAD) or any(map(often, PLACES))
 
 
 def left_open(data: Observations, length: float) -> Iterator[str]:

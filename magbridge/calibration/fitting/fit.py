@@ -12,7 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.crossings import crosses_itself, far_off, jumped, left_open
+from magbridge.calibration.fitting.crossings import far_off, jumped, left_open, tells_rock
 from magbridge.calibration.fitting.judged import judged
 from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.left_out import LeftOut
@@ -131,9 +131,9 @@ def fit(
     data : Observations
         The calibration runs; :func:`~.observe.observations` takes them from a deployment.
     method : str
-        One of :data:`METHODS`. Where the reference lacks the rock and the track crosses itself, so that it
-        tells rock from heading, ``auto`` is ``survey``. (Five dives of a Seaglider along one line, each left
-        out: 88 nT without a field in place, 152 with it.)
+        One of :data:`METHODS`. Where the reference lacks the rock and the track crosses itself or turns, so
+        that it tells rock from heading, ``auto`` is ``survey``. (The last of five dives of a Seaglider along
+        one line, left out: 88 nT without a field in place, 94 with it.)
     order : int
         Highest total degree of the polynomials.
     site_bias : float
@@ -152,7 +152,7 @@ def fit(
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
     bias = _default_bias(data) if site_bias is None else site_bias
-    if method == "auto" and data.lacks_rock and crosses_itself(data) and _rock_may_show(data, order):
+    if method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order):
         method = "survey"
     if method == "survey":
         options["level"] = bias
