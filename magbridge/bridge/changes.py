@@ -45,6 +45,11 @@ class Changes:
         self.since_us = self.until_us = 0
         self._clock_unset = False
 
+    @staticmethod
+    def held_up(data: bytes) -> int:
+        """Return for how many µs the bridge stood still by these frames; 0 where it did not."""
+        return sum(one["duration"] for one in Codec(0, 0).parse(data) if one.id == STANDSTILL)
+
     def receive(self, data: bytes, time_us: int) -> None:
         """Take frames that came at `time_us`."""
         for message in Codec(0, 0).parse(data):

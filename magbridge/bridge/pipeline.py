@@ -51,6 +51,8 @@ DOUBTFUL = int(
     | Quality.UNEXPLAINED
 )
 """Flags whose changes are announced; the others change with every manoeuvre."""
+SILENCES = "sensor", "autopilot"
+"""Timers that say who is silent."""
 
 
 class Pipeline:
@@ -167,6 +169,9 @@ class Pipeline:
         """Process an event; return the frames to send over the link, each with its event time (µs)."""
         component, recorder = self.component, self.recorder
         outbox, time_us, channel, data = component.outbox, event.time_us, event.channel, event.data
+        if channel is Channel.STATE and data and (held_us := self._changes.held_up(data)):
+            for name in SILENCES:  # who was not listened to was not silent
+                component.timers.delay(name, held_us)
         component.advance(time_us)
         due = outbox.drain()
         recorder.sent(due)

@@ -36,6 +36,12 @@ class Timers:
         if name == self._next:
             self._sort()
 
+    def delay(self, name: str, by_us: int) -> None:
+        """Fire a timer, if there is one, by so many µs (a multiple of 4) later."""
+        if name in self._deadlines:
+            self._deadlines[name] += by_us & ~3
+            self._sort()
+
     def advance(self, t_us: int, begin: Callable[[int], None]) -> None:
         """Fire all that are due up to `t_us`, with ``begin(deadline)`` before each."""
         while self.next_deadline <= t_us:

@@ -56,6 +56,7 @@ def test_a_standstill_just_before_a_mass_moves(
     rig.process.send_signal(signal.SIGCONT)
     back = rig.until_well()
     rig.until_reported("stood still for", mark)
+    assert [text for text in rig.texts(mark) if "silent" in text] == [], "nobody listened"
     rig.run(0.5)
     samples = rig.of("MAG_FIELD", mark)
     assert len(samples) >= 4 * still
