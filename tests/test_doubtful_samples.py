@@ -11,6 +11,7 @@ HUMS = {"hum of 30 nT, 37 s", "hum of 10 nT, 90 s"}
 UNSEEN = HUMS | {
     "hum of 10 nT, 150 s",
     "gain of x +2 %",
+    "gain of y +2 %",
     "offset of x +100 nT with a motion",
     "drift of z, 20 nT/h",
 }
@@ -55,3 +56,9 @@ def test_a_gain_of_one_axis_is_seen_when_the_dive_becomes_a_climb(flight: Flight
     found = score(flight, FAULTS["gain of x +2 %"](flight.survey))
     assert found.worst < 60.0
     assert found.flagged > 0.7 * found.samples
+
+
+def test_a_gain_across_the_field_is_seen_before_the_course_changes(flight: Flight) -> None:
+    found = score(flight, FAULTS["gain of y +2 %"](flight.survey))
+    assert found.wrong < 0.1 * found.samples
+    assert found.sigma > 50.0

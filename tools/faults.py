@@ -208,6 +208,7 @@ FAULTS: dict[str, Callable[[Rows], Rows]] = {
     "gain +2 %": fault_of(*CHANNELS, by=lambda v, _: v * 1.02),
     "gain +1 %": fault_of(*CHANNELS, by=lambda v, _: v * 1.01),
     "gain of x +2 %": fault_of("mag_x", by=lambda v, _: v * 1.02),
+    "gain of y +2 %": fault_of("mag_y", by=lambda v, _: v * 1.02),
     "gain +2 % on the way": fault_of(*CHANNELS, by=lambda v, _: v * 1.02, late=True),
     "spikes of 500 nT": fault_of("mag_x", by=spikes),
     "telemetry 2 s late": late,
