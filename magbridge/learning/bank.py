@@ -5,7 +5,10 @@ then is hard to undo: a warming passes for the offset of this power-on, a drift 
 estimator that supposes nothing, and that doubt tests, others suppose from the start that
 
 - the offset follows the sensor's temperature;
-- the offset drifts, at a rate that changes within hours.
+- the offset drifts, at a rate that changes within hours;
+- the map, where there is one, shows nothing of the rock. An error no larger than rock moves single samples
+  by next to nothing, so no test of innovations shows it; but once this one predicts better beyond chance, the
+  map is doubted, and this one believed until it does not predict better any more.
 
 Which to believe is dynamic model selection (Raftery, Karny & Ettler 2010, Technometrics 52:52): with each
 innovation v of variance S,
@@ -20,9 +23,11 @@ from math import log
 from typing import Final
 
 from magbridge.arrays import FloatArray
+from magbridge.learning.doubt import LEAST, Alarm
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.judge import BEYOND_CHANCE
 from magbridge.learning.model import TEMPERATURE, Model
+from magbridge.learning.nuisance import Nuisance
 
 __all__ = ["Bank"]
 
@@ -50,16 +55,24 @@ class Bank:
     model : Model
     quiet : Estimator
         The one that supposes nothing.
+    mapless : Nuisance, optional
+        Rock without the map, where there is one.
 
     Attributes
     ----------
     all : list of Estimator
         That one first.
+    without_map : Estimator or None
+        The last of them.
+    map_doubted : bool
+        Whether that one is to be believed.
     """
 
-    def __init__(self, model: Model, quiet: Estimator) -> None:
-        self._model, self.all = model, [quiet]
-        self._weights, self._best = [0.0], 0
+    def __init__(self, model: Model, quiet: Estimator, mapless: Nuisance | None = None) -> None:
+        self._model, self.all, self._mapless = model, [quiet], mapless
+        self._weights, self._best, self._warm = [0.0], 0, 0
+        self.without_map: Estimator | None = None
+        self.map_doubted, self._since = False, 0.0
 
     @property
     def quiet(self) -> Estimator:
@@ -69,6 +82,8 @@ class Bank:
     @property
     def best(self) -> Estimator:
         """The one to believe."""
+        if self.map_doubted and self.without_map is not None:
+            return self.without_map
         return self.all[self._best]
 
     def suppose(self) -> None:
@@ -77,10 +92,15 @@ class Bank:
         if TEMPERATURE in self._model.further and slots is not None:
             warm = deepcopy(self.quiet)
             warm.open(PER_DEGREE**2, slots)
+            self._warm = len(self.all)
             self.all.append(warm)
         drifting = deepcopy(self.quiet)
         drifting.drift(RATE, CHANGES)
         self.all.append(drifting)
+        if self._mapless is not None:
+            self.without_map = deepcopy(self.quiet)
+            self.without_map.leave_map(self._mapless)
+            self.all.append(self.without_map)
         self._weights = [0.0] * len(self.all)
 
     def open(self, variance: float) -> None:
@@ -88,15 +108,26 @@ class Bank:
         for one in self.all:
             one.open(variance)
 
-    def judge(self) -> None:
-        """Take note of what each has predicted."""
+    def judge(self, time: float) -> Alarm | None:
+        """Take note of what each has predicted at a time (s); return a doubt in the map, if there is one."""
         for k, one in enumerate(self.all):
             S = one.variance
             self._weights[k] *= 1.0 - 1.0 / MEMORY
             self._weights[k] -= 0.5 * (min(one.residual * one.residual / S, MOST) + log(S))
-        ahead = max(range(len(self.all)), key=self._weights.__getitem__)
+        with_map = [k for k, one in enumerate(self.all) if one is not self.without_map]
+        ahead = max(with_map, key=self._weights.__getitem__)
         if self._weights[ahead] > self._weights[self._best] + AHEAD:
             self._best = ahead
+        return None if self.without_map is None else self._doubt_map(time, self.without_map, ahead)
+
+    def _doubt_map(self, time: float, without: Estimator, best_with: int) -> Alarm | None:
+        lead = self._weights[-1] - self._weights[best_with]
+        if lead <= 0.0:
+            self.map_doubted, self._since = False, time
+        self.map_doubted = self.map_doubted or lead > LEAST
+        if not self.map_doubted:
+            return None
+        return Alarm(("map_error",), ("",), self._since, abs(without.rock), lead, mapless=True)
 
     def take_over(self, strength: float) -> bool:
         """Let the quiet one go on from the one that follows the temperature; return whether it does.
@@ -104,10 +135,10 @@ class Bank:
         It does where that one has predicted better beyond chance, and hardly worse than what a doubt has
         found, with a log-likelihood ratio `strength`. For what was supposed from the start is known better.
         """
-        lead = max((w - self._weights[0] for w in self._weights[1:-1]), default=0.0)
-        if lead < max(BEYOND_CHANCE, strength - CLOSE):
+        warm = self._warm
+        if self._weights[warm] - self._weights[0] < max(BEYOND_CHANCE, strength - CLOSE):
             return False
-        self.all[0], self._weights[0], self._best = deepcopy(self.all[1]), self._weights[1], 0
+        self.all[0], self._weights[0], self._best = deepcopy(self.all[warm]), self._weights[warm], 0
         return True
 
     def explained(self, by: FloatArray, covariance: FloatArray, strength: float) -> None:

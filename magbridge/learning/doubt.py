@@ -58,6 +58,8 @@ STANDS_OUT: Final = 3.0
 """Sigmas of an innovation at which the first onset begins anew."""
 FROM_ZERO: Final = ("offset_step", "current_field", "clock_offset", "map_error")
 """Causes that add as much as their regressor, not as much as it has changed since the onset."""
+NO_COEFFICIENT: Final = frozenset(("clock_offset", "map_error"))
+"""Causes that no coefficient can take up."""
 COMPETING: Final = log(20.0)
 """How far behind the best a cause may be, and still fit."""
 NOISIER_OVER: Final = 3000
@@ -114,6 +116,9 @@ class Alarm(NamedTuple):
         nT, root mean square of what it adds to the total field.
     strength : float
         L of the likeliest.
+    mapless : bool
+        It is only the map that is doubted, and rock that it does not show explains the data: what is
+        corrected is in no doubt, and the alarm stands as long as it is raised.
     """
 
     causes: tuple[str, ...]
@@ -121,6 +126,7 @@ class Alarm(NamedTuple):
     since: float
     size: float
     strength: float
+    mapless: bool = False
 
 
 class Doubt:
@@ -149,7 +155,7 @@ class Doubt:
         self._period = np.tile(PERIODS, len(causes))
         self._unit = np.array([CAUSES[name] for name in names])
         self._since_onset = np.array([name not in FROM_ZERO for name in names], float)
-        self._no_vector = np.array([name in ("clock_offset", "map_error") for name in names])
+        self._no_vector = np.array([name in NO_COEFFICIENT for name in names])
         self._noisier = 1.0
         self.restart()
 

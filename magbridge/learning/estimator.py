@@ -147,7 +147,8 @@ class Estimator:
 
     def advance(self, state: FloatArray, F: FloatArray, seconds: float) -> None:
         """Move `state` (n, ...) on in place, over a time; F (3, 3) is the nuisance's transition."""
-        state[-STATES:] = np.tensordot(F, state[-STATES:], 1)
+        beside = state[-STATES:]
+        beside[:] = (F @ beside.reshape(STATES, -1)).reshape(beside.shape)
         if self._sloping:
             state[self.offsets] += seconds * state[self.slope]
 
@@ -201,6 +202,24 @@ class Estimator:
         P -= cross.T
         P += np.outer(S * gain, gain)
         return np.asarray(gain)
+
+    def leave_map(self, nuisance: Nuisance) -> None:
+        """Let rock be as `nuisance` says, which is without a map, and nothing be known of it."""
+        self._nuisance = nuisance
+        P, states = self._P, slice(-STATES, None)
+        self._x[states] = 0.0
+        P[states] = P[:, states] = 0.0
+        P[states, states] = nuisance.initial
+
+    @property
+    def rock(self) -> float:
+        """The rock's field as learned, nT."""
+        return float(self._x[-STATES])
+
+    @property
+    def expected(self) -> float:
+        """The residual, nT, that what is not the calibration's lets expect of a sample like the last one."""
+        return -float(self._h[-STATES:] @ self._x[-STATES:])
 
     def response(self, signature: FloatArray, state: FloatArray) -> FloatArray:
         """Return how the innovation (q,) answers signatures (q,) that have moved the state by (n, q)."""

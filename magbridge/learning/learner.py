@@ -5,7 +5,7 @@ What is published of it is :mod:`.publication`'s, how a doubt stands :mod:`.stan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isnan
 from typing import TYPE_CHECKING, Final
 
@@ -16,8 +16,9 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.field.geodesy import separation
 from magbridge.learning.bank import Bank
-from magbridge.learning.doubt import Doubt, Signs
+from magbridge.learning.doubt import Alarm, Doubt, Signs
 from magbridge.learning.estimator import Estimator
+from magbridge.learning.hindsight import Hindsight, Kept
 from magbridge.learning.judge import FIRST, LEARNED
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
@@ -33,8 +34,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Learner"]
 
-UNFIT: Final = int(Quality.STALE_TELEMETRY | Quality.MOVING | Quality.SATURATED | Quality.LATE_JOIN)
+MOVING: Final = int(Quality.MOVING)
+UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
 """Samples that nothing is learned from."""
+MAPLESS: Final = 145.0
+"""nT, 1-sigma of the field about the main field alone."""
 LINEAR: Final = 300.0
 """nT, 1-sigma of an axis's offset: from here on it is fitted anew as a whole."""
 CREEP: Final = 3.0 / 86_400.0**0.5
@@ -104,7 +108,7 @@ class Learner:
         self.notices: list[Notice] = []
         self._now_us = 0
         self._publication = Publication(self._model, calibration, self._nuisance)
-        self._standing = Standing()
+        self._standing = Standing(mapped=grid is not None)
         self._begin()
 
     @property
@@ -164,7 +168,7 @@ class Learner:
     def _begin(self) -> None:
         self._restart()
         self.samples = 0
-        self._last_us = self._reported_us = 0
+        self._last_us = self._looked_us = self._reported_us = 0
         self._where: tuple[float, float] | None = None
         self._before: FloatArray | None = None
 
@@ -174,7 +178,9 @@ class Learner:
         coefficients, covariance = self._model.coefficients(first)
         quiet = Estimator(coefficients, covariance, offsets, self._nuisance, CREEP)
         quiet.open(self._turn_on**2)
-        self._bank, self._doubt = Bank(self._model, quiet), Doubt(self._model, quiet)
+        self._mapless = Nuisance(first.noise, MAPLESS) if self._grid is not None else None
+        self._bank, self._doubt = Bank(self._model, quiet, self._mapless), Doubt(self._model, quiet)
+        self._hindsight = Hindsight()
         self._outliers, self._noise = 0, first.noise
         self._start: Start | None = None
         if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * LINEAR**2:
@@ -227,59 +233,89 @@ class Learner:
         """
         if not self.enabled:
             return
-        self._now_us = time_us
-        if quality & self._unfit or faulty or isnan(reference) or where is None:
+        self._now_us, unfit = time_us, quality & self._unfit
+        if unfit & ~MOVING or isnan(reference) or where is None:
             self._nothing(time_us)
             return
-        if 0 <= time_us - self._last_us < 0.99 * self._period_us:
+        fit = not (unfit or faulty)
+        if 0 <= time_us - (self._last_us if fit else self._looked_us) < 0.99 * self._period_us:
             return
         if self._grid is not None:
             reference += self._grid.look_up(where[1], where[0]).anomaly
-            if isnan(reference):
-                self._nothing(time_us)
-                return
-        phi = self._model.regressors(regressors, watched)
-        if not np.isfinite(phi).all():
+        phi, positions = self._model.regressors(regressors, watched), self._model.scaled(values)
+        if isnan(reference) or not np.isfinite(phi).all():
+            self._nothing(time_us)
+            return
+        self._look_back(time_us, phi, positions)
+        quiet = self._bank.quiet
+        if not unfit and faulty:
+            missed = self._by(quiet)(field, phi, reference).e - quiet.expected
+            self._hindsight.keep(Kept(time_us, field, reference, phi, positions, missed, quiet.variance))
+        if not fit:
+            self._nothing(time_us)
             return
         metres, seconds = self._moved(time_us, where)
         before, self._before = self._before, phi
         bank = self._bank
-        best, quiet = bank.best, bank.quiet
+        best, doubted = bank.best, bank.map_doubted
         for other in bank.all[1:]:
             other.propagate(metres, seconds)
         self._doubt.propagate(quiet, quiet.propagate(metres, seconds), seconds)
         live = {id(one): self._predict(one, field, phi, reference) for one in bank.all}
+        self._hindsight.keep(Kept(time_us, field, reference, phi, positions, quiet.residual, quiet.variance))
         observed, clock = live[id(quiet)], 0.0
         if before is not None and 0.0 < seconds < 30.0:  # what it would be, were telemetry a second late
-            late = self._observe(field, before @ self._model.weights(quiet.coefficients), reference)
-            clock = (late.e - observed.e) / seconds
-        positions = tuple(self._model.scaled(values))
+            clock = (self._by(quiet)(field, before, reference).e - observed.e) / seconds
         signs = Signs(
-            time_us * 1e-6, observed.by_nine[6:], positions, tuple(watched), clock, -1.0 / observed.s
+            time_us * 1e-6, observed.by_nine[6:], tuple(positions), tuple(watched), clock, -1.0 / observed.s
         )
         by_first, by_published = self._publication.nine(phi)
         first = self._observe(field, by_first, reference)
+        nuisance = self._mapless if doubted and self._mapless else self._nuisance
         self._publication.judge.judge(
-            *self._nuisance.over(metres, seconds), first.e, first.s, best.residual, best.variance
+            *nuisance.over(metres, seconds), first.e, first.s, best.residual, best.variance
         )
         apart = self._observe(field, by_published, reference).e - live[id(best)].e
         if self._start is not None:
             if not self.frozen:
                 self._fit(self._start, due=self._start.add(field, phi, reference, metres, seconds))
         else:
-            bank.judge()
-            publication = self._publication
-            seen = (best.residual + apart, best.variance) if publication.learned else publication.judge.last
-            self._standing.count(*seen, telling=quiet.telling)
+            self._compare(time_us * 1e-6, apart)
             self._learn(signs)
         self._decide(apart * live[id(best)].s)
 
+    def _compare(self, time: float, apart: float) -> None:
+        """Follow which estimator predicts best, and how well what is published does, `apart` (nT) from it."""
+        bank, publication = self._bank, self._publication
+        best, doubted = bank.best, bank.map_doubted
+        seen = (best.residual + apart, best.variance) if publication.learned else publication.judge.last
+        self._standing.count(*seen, telling=bank.quiet.telling)
+        self._raise(bank.judge(time))
+        if bank.map_doubted != doubted:
+            publication.judge.restart(self._mapless if bank.map_doubted else self._nuisance)
+
     def _predict(self, one: Estimator, field: Vector, phi: FloatArray, reference: float) -> Observation:
         """Let an estimator predict a sample; return what it is by its coefficients."""
-        live = self._observe(field, phi @ self._model.weights(one.coefficients), reference)
+        live = self._by(one)(field, phi, reference)
         one.predict(live.e, live.s, self._model.derivative(phi, live.by_nine))
         one.follow(live.s)
         return live
+
+    def _look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> None:
+        """Test whether what telemetry reports now fits earlier samples better than what it did then."""
+        self._looked_us = time_us
+        if self._start is None:
+            self._raise(self._hindsight.test(time_us, phi, positions, self._by(self._bank.quiet)))
+
+    def _by(self, one: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
+        """Return what a field, at some regressors (m,), is by an estimator's coefficients."""
+        return lambda field, phi, reference: self._observe(
+            field, phi @ self._model.weights(one.coefficients), reference
+        )
+
+    def _raise(self, alarm: Alarm | None) -> None:
+        if alarm is not None and (news := self._standing.raised(alarm)):
+            self._notify(news, grave=True)
 
     def _nothing(self, time_us: int) -> None:
         """Say once an hour or more passes without a sample to learn from."""
@@ -304,10 +340,8 @@ class Learner:
         quiet, best = self._bank.quiet, self._bank.best
         far = abs(best.residual) > OUTLIER * best.sigma
         self._outliers = self._outliers + 1 if far else 0
-        alarm = self._doubt.test(quiet, signs)
-        if alarm is not None and (news := self._standing.raised(alarm)):
-            self._notify(news, grave=True)
-        if far and self._outliers < AGREE and self._standing.alarm is None:
+        self._raise(self._doubt.test(quiet, signs))
+        if far and self._outliers < AGREE and not self._standing.learnable:
             return
         for other in self._bank.all[1:]:
             other.update(learn=other.telling and not self.frozen)
@@ -341,6 +375,7 @@ class Learner:
             return
         self._standing.end()
         self._doubt.restart()
+        self._hindsight.restart()
         self._notify(f"explained again: {how}")
 
     def _gone(self) -> None:
@@ -370,16 +405,20 @@ class Learner:
             publication.judge.restart()
             self._restart()
             standing.mistaken()
-        elif (
-            self.frozen
-            or standing.relapses
-            or (standing.alarm is not None and self._bank.best is self._bank.quiet)
-        ):
+        elif self.frozen or not self._trusted:
             return
         elif not publication.learned and publication.judge.adopt:
             self._publish("learned")
         elif publication.stale(apart):
             publication.renew(self.learned())
+
+    @property
+    def _trusted(self) -> bool:
+        """Whether nothing is doubted, but perhaps what the best estimator has supposed from the start."""
+        standing, bank = self._standing, self._bank
+        if standing.alarm is None or standing.mapless:
+            return True
+        return standing.learnable and not standing.relapses and bank.best is not bank.quiet
 
     def _take_up(self) -> None:
         """Learn what is behind the doubt, if coefficients can take it up."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from magbridge.learning.doubt import Alarm
+from magbridge.learning.doubt import NO_COEFFICIENT, Alarm
 from magbridge.records import Quality
 
 __all__ = ["Standing"]
@@ -29,7 +29,7 @@ SEEN: Final = 16.0
 
 
 class Standing:
-    """The alarm that stands, if any.
+    """The alarm that stands, if any; `mapped` is whether the reference is a map.
 
     What was learned was mistaken if the next alarm comes before it has explained :data:`QUIET` telling
     samples: a relapse. From then on it is one doubt, whatever is learned meanwhile: it is announced once, and
@@ -49,7 +49,8 @@ class Standing:
         What is behind the doubt was learned again, and has not been mistaken so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, mapped: bool = False) -> None:
+        self._mapped = mapped
         self._peak = self._since = 0.0
         self.end()
 
@@ -69,6 +70,10 @@ class Standing:
         """Take an alarm that the doubt has raised; return what to say of it, if anything."""
         before = self.alarm
         anew = before is None or self.tried
+        if before is not None and (alarm.mapless or before.mapless):
+            if alarm.mapless and before.causes == alarm.causes:
+                self.alarm, self._quiet = alarm, 0
+            return ""  # what else is doubted is doubted by a wrong map
         if before is not None and not anew and alarm.strength < before.strength + MORE:
             return ""
         if anew and self._explained <= QUIET:
@@ -116,8 +121,13 @@ class Standing:
 
     def _cover(self) -> None:
         """Let the variance cover the likeliest cause and, where that was mistaken, all that is seen."""
-        size = 0.0 if self.alarm is None or self.tried else self.alarm.size
+        size = 0.0 if self.alarm is None or self.tried or self.mapless else self.alarm.size
         self.variance = max(size * size, self._peak if self.relapses else 0.0)
+
+    @property
+    def mapless(self) -> bool:
+        """Whether only the map is doubted, and rock that it does not show explains the data."""
+        return self.alarm is not None and self.alarm.mapless
 
     @property
     def gone(self) -> bool:
@@ -125,12 +135,17 @@ class Standing:
         return self.alarm is not None and self._quiet > QUIET
 
     @property
+    def learnable(self) -> bool:
+        """Whether there is a doubt, behind which may be something to learn."""
+        return self.alarm is not None and not NO_COEFFICIENT.issuperset(self.alarm.causes)
+
+    @property
     def ripe(self) -> bool:
         """Whether it is time to learn what is behind the alarm."""
-        if self.alarm is None or self.tried:
+        if self.alarm is None or self.tried or not self.learnable:
             return False
         fit, slower = len(self.alarm.channels), self._slower
-        return (
-            self.alarm.strength > self._sure + slower * COMPETING * (fit - 1)
-            or self._doubted > slower * PATIENCE * fit
-        )
+        sure = self.alarm.strength > self._sure + slower * COMPETING * (fit - 1)
+        if self._mapped and "map_error" in self.alarm.causes:
+            sure = False  # maps have sheets: the attitudes to come tell an offset from another level
+        return sure or self._doubted > slower * PATIENCE * fit

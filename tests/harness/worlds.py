@@ -68,6 +68,7 @@ def learn(
     added: np.ndarray | None = None,
     quality: int = 0,
     watched: np.ndarray | None = None,
+    faulty: np.ndarray | None = None,
     seen: Callable[[int], None] | None = None,
 ) -> list[int]:
     """Give the learner a world's samples, and call `seen` after each; return where it doubted."""
@@ -82,7 +83,7 @@ def learn(
             corrector.regressors,
             values,
             quality,
-            faulty=False,
+            faulty=faulty is not None and bool(faulty[n]),
             reference=FIELD,
             where=world.where[n],
             watched=(nan,) if watched is None else watched[n].tolist(),
@@ -101,10 +102,10 @@ def error_of(learned: Calibration, world: World) -> float:
     return float(np.std(total - world.total))
 
 
-def grid_of(scale: float, shift: float = 0.0) -> AnomalyGrid:
-    """Return a map of the world's rock, which runs north; `scale` and `shift` (m) make it a wrong one."""
+def grid_of(scale: float, shift: float = 0.0, level: float = 0.0) -> AnomalyGrid:
+    """Return a map of the world's rock, running north; `scale`, `shift` (m), `level` (nT) make it wrong."""
     metres = np.arange(-3_000.0, 5_000.0, 100.0)
-    rock = scale * 60.0 * np.sin((metres + shift) / 900.0)
+    rock = scale * 60.0 * np.sin((metres + shift) / 900.0) + level
     latitude = 49.0 + metres / 111_000.0
     longitude = np.linspace(-57.1, -56.9, 5)
     return AnomalyGrid(longitude, latitude, np.repeat(rock[:, None], 5, axis=1), altitude=0.0)

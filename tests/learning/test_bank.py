@@ -44,7 +44,7 @@ def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[Bank, Model]
             one.propagate(1.4, 4.0)
             seen = observe((x, y, z), phi @ model.weights(one.coefficients), FIELD, FIELD)
             one.predict(seen.e, seen.s, model.derivative(phi, seen.by_nine))
-        bank.judge()
+        bank.judge(0.0)
         for one in bank.all:
             one.update(learn=one.telling)
     return bank, model

@@ -9,6 +9,7 @@ import pytest
 from worlds import World, calibration, error_of, grid_of, learn
 
 from magbridge.learning import Learner
+from magbridge.records import Quality
 
 
 def reported(learner: Learner) -> list[str]:
@@ -24,6 +25,37 @@ def test_a_wrong_map_teaches_nothing_wrong(scale: float, shift: float) -> None:
     learner = Learner(known, grid=grid_of(scale, shift), spread=20.0)
     learn(learner, world)
     assert error_of(learner.calibration, world) < 1.3
+
+
+def test_a_map_that_is_wrong_by_no_more_than_rock_is_told() -> None:
+    """Upside down, twice: the bridge goes on without it, and sigma need not grow."""
+    known, doubted = calibration(), {}
+    for scale in (-2.0, 1.0):
+        learner = Learner(known, grid=grid_of(scale), spread=20.0)
+        doubted[scale] = learn(learner, World(known, 1000))
+        if scale < 0.0:
+            assert learner.state.causes == ("map_error",)
+            assert learner.variance < 2.0
+            assert learner.calibration is known
+            assert len([text for text in reported(learner) if text.startswith("unexplained")]) == 1
+    assert doubted[1.0] == []
+    assert doubted[-2.0]
+
+
+def test_another_sheet_for_a_while_is_not_learned() -> None:
+    """Its level is 80 nT off: nothing is learned of that, then or after, and the doubt ends by itself."""
+    known, n = calibration(), 1900
+    right, wrong = grid_of(1.0), grid_of(1.0, level=80.0)
+    world, learner = World(known, n), Learner(known, grid=right, spread=20.0)
+
+    def change(k: int) -> None:
+        learner._grid = wrong if 400 <= k < 700 else right
+
+    doubted = learn(learner, world, seen=change)
+    assert doubted[0] == 401
+    assert learner.calibration is known
+    assert len([text for text in reported(learner) if text.startswith("unexplained")]) == 1
+    assert learner.flags == 0
 
 
 def test_a_month_without_a_fix_changes_nothing() -> None:
@@ -109,3 +141,33 @@ def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> Non
     assert learner.variance == 0.0
     world.mass = truth
     assert error_of(learner.calibration, world) < 1.3
+
+
+def test_telemetry_that_is_late_is_told() -> None:
+    """By 8 s: before a motion is reported, two samples are outliers, which fit what is reported later."""
+    known, n = calibration(), 400
+    world = World(known, n)
+    late = np.concatenate([world.mass[:2], world.mass[:-2]])
+    moved = np.flatnonzero(np.diff(world.mass)) + 1
+    faulty = late != world.mass
+    world.mass = late
+    learner = Learner(known)
+    doubted = learn(learner, world, faulty=faulty)
+    assert doubted[0] == moved[0] + 2  # as soon as it is reported
+    assert learner.state.causes == ("clock_offset",)
+    assert learner.state.since_us == (moved[0] + 1) * 4_000_000
+    assert learner.calibration is known
+    assert [text for text in reported(learner) if "clock offset" in text] == reported(learner)
+
+
+def test_evidence_gathered_while_a_map_was_wrong_is_not_believed_after() -> None:
+    """A doubt that is gone without anything learned leaves no evidence for what was learned meanwhile."""
+    known = calibration()
+    learner, added = Learner(known), np.zeros((300, 3))
+    added[250:] = [0.0, 0.0, 30.0]
+    learner.frozen = True
+    learn(learner, World(known, 300), added=added)
+    learner._publication.judge.better = 10.0
+    assert (learner.state.better, learner.flags) == (10.0, Quality.UNEXPLAINED)
+    learner._gone()
+    assert (learner.state.better, learner.flags) == (0.0, 0)
