@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.level import apart_from_level
 from magbridge.calibration.model import Calibration
@@ -127,9 +127,9 @@ def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
         value = ds["anomaly"].to_numpy().astype(float)
     elif "total_field" in ds:
         value = ds["total_field"].to_numpy().astype(float) - magnitude(main_field(ds))
-        value = value - _daily(ds)
     else:
         raise FormatError(source, "expected mag_x mag_y mag_z, total_field or anomaly")
+    value = np.where(_doubtful(ds), np.nan, value - _daily(ds))
     lines = ds["line"].to_numpy() if "line" in ds else np.zeros(len(value))
     samples = _placed(ds, value, lines, label)
     return replace(samples, level_sigma=float(ds["level_sigma"].median())) if "level_sigma" in ds else samples
@@ -138,8 +138,7 @@ def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
 def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples:
     """Correct a log with its calibration; doubtful samples are left out, the calibration's doubt is kept."""
     corrected = correct_rows(Correction(calibration), ds)
-    flagged = (corrected["quality"].to_numpy().astype(int) & int(~Quality.NO_BORESIGHT)) != 0
-    value = np.where(flagged, np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
+    value = np.where(_doubtful(corrected), np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
     samples = _placed(ds, value, np.zeros(len(value)), label)
     known = np.isfinite(value) & np.isfinite(positions(ds)[1])
     field = np.stack([ds[name].to_numpy() for name in CHANNELS], axis=1)[known]
@@ -188,6 +187,12 @@ def joined(parts: Sequence[Samples]) -> Samples:
         np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
         max(one.rho for one in parts), modes, max(one.level_sigma for one in parts),
     )  # fmt: skip
+
+
+def _doubtful(corrected: xr.Dataset) -> BoolArray:
+    """Return which samples carry a flag that may spoil the field (n,); none where there are no flags."""
+    quality = np.asarray(corrected.get("quality", np.zeros(corrected.sizes["time"])), float)
+    return np.asarray(np.nan_to_num(quality).astype(int) & int(~Quality.NO_BORESIGHT), bool)
 
 
 def _daily(ds: xr.Dataset) -> FloatArray | float:

@@ -19,7 +19,8 @@ from magbridge.calibration.model import Noise, identity
 from magbridge.field.geodesy import offset
 from magbridge.field.igrf import igrf
 from magbridge.field.read import read_grid
-from magbridge.logs import write
+from magbridge.logs import read_each, write
+from magbridge.records import Quality
 
 ORIGIN, START, STEP = (49.5, -57.9), 1.4e9, 20.0
 NOISE = 1.5
@@ -121,3 +122,19 @@ def test_a_base_station_takes_a_daily_variation_off(command: Command, tmp_path: 
     )
     assert np.std(with_base[0]) < 1.5
     assert 3.0 * np.std(with_base[0]) < np.std(without[0])
+
+
+def test_what_correct_has_flagged_stays_out_of_the_map(command: Command, tmp_path: Path) -> None:
+    """A corrected log makes the map that its raw log makes; a flagged sample may be off by anything."""
+    write(flown("comet", np.concatenate([lanes(0), lanes(1)])), tmp_path / "log.nc")
+    cal = calibrated("comet", tmp_path / "cal.json")
+    command("correct", tmp_path / "log.nc", "--calibration", cal, "-o", tmp_path / "corrected.nc")
+    (corrected,) = read_each([tmp_path / "corrected.nc"])
+    spoilt = corrected.load().copy(deep=True)
+    spoilt["anomaly"][::10] += 80.0
+    spoilt["quality"][::10] = float(Quality.MOVING)
+    write(spoilt, tmp_path / "spoilt.nc")
+    error, _, facts = judged(command, tmp_path, tmp_path / "spoilt.nc")
+    flags = spoilt["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)
+    assert facts["samples"] == np.sum(flags == 0) < 0.91 * len(flags)
+    assert np.std(error) < 1.5
