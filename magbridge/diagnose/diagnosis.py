@@ -145,6 +145,11 @@ class Diagnosis:
         """(n,) samples by which an improvement is measured."""
         return counted(self.problem, self.wrong)
 
+    @cached_property
+    def residual(self) -> FloatArray:
+        """(n,) nT of the sensor, what the fit to the whole log leaves: noise of any kind."""
+        return self.fit.residual + self.problem.slow_noise(self.fit.z)
+
     @property
     def named(self) -> list[Candidate]:
         """The causes of the findings."""

@@ -17,7 +17,7 @@ from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.prior import isotropic
-from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
+from magbridge.diagnose.compare.problem import Problem, samples_of
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.evidence import IDEAL
@@ -185,9 +185,9 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
     rebuilt = replace(problem, residual=e, jacobian=g)
-    # the residual at the first point, extrapolated linearly from this one; errors of the reference and the
-    # channels' delays are in both, as `extended` corrects neither
-    rebuilt.residual[:] += rebuilt.calibration_jacobian[:, : DELAYS.start] @ fit.z[: DELAYS.start]
+    # the residual at the first point, extrapolated linearly from this one; errors of the reference, slow
+    # noise and the channels' delays are in both, as `extended` corrects none
+    rebuilt.residual[:] += rebuilt.calibration_jacobian[:, problem.known] @ fit.z[problem.known]
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:
             columns.append(candidate.columns)

@@ -121,6 +121,7 @@ def _examine(
     candidates, untestable = _put_forward(problem, causes)
     progress("searching")
     outcome = search(problem, candidates, len(causes))
+    problem = outcome.problem
     progress("what is left")
     tone = _strongest_tone(problem, candidates)
     stand, rest = accept(problem, outcome, tone)
@@ -146,7 +147,7 @@ def _examine(
             # the dives left out speak 20:1 against these names
             named, competing, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
-    rest = rest or _passing(off) or _slow(problem, fit) or _loud(problem, after, counts)
+    rest = rest or _passing(off) or _slow(problem, fit, named) or _loud(problem, after, counts)
     chances = chances_alone(candidates, outcome.info, named, outcome.look_elsewhere, len(causes))
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
@@ -249,14 +250,24 @@ def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | 
     return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
 
 
-def _slow(problem: Problem, fit: Joint) -> Leftover | None:
+def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
     """Describe a residual that is far from white, though no description of the list stands out of it.
 
-    Noise of a long memory can describe anything slow: what it describes is still no noise of the sensor.
+    Noise of a long memory can describe anything slow: what it describes is still no noise of the sensor. So
+    can noise that grows towards low frequencies, unless it may be a remnant of the strongest cause.
     """
-    residual = fit.residual / problem.reference_jacobian
+    slow = problem.slow_noise(fit.z)
+    residual = (fit.residual + slow) / problem.reference_jacobian
     found = memory(problem, residual)
     far = found.slow >= SLOW or found.rms >= SMOOTH * found.white
+    if problem.waves.size:
+        known = fit.prior[problem.slow] * np.diag(fit.covariance)[problem.slow]
+        power, freedom = float(np.sum(fit.noise.whiten(slow) ** 2)), float(np.sum(1.0 - known))
+        if power >= (REMNANT * max((h.signal_to_noise for h in named), default=0.0)) ** 2:
+            channel = seen(problem, residual).channel
+            return Leftover(
+                "drift", float(np.sqrt(power)), float(chi2.sf(power, freedom)), 0.0, None, channel
+            )
     if not far or found.rms < NEGLIGIBLE * float(np.median(problem.survey.reference)):
         return None
     power = found.means * found.samples * found.slow

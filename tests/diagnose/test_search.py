@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from posed import candidate, right
+from posed import calibrated, candidate, right, surveyed
 from scipy.signal import lfilter
 
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.reference import reference_bias
+from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.inference.state import State
@@ -42,6 +43,28 @@ def test_noise_does_not_swallow_what_two_causes_do_together(
     outcome = search(problem, [fault("temperature_offset", warming, 10.0), step, chart], 3)
     assert {h.candidate.cause for h in outcome.chosen} == {"temperature_offset", "map_error"}
     assert outcome.fit.noise.slowest < 20.0 < 80.0 < outcome.null.noise.slowest
+
+
+@pytest.mark.parametrize(
+    ("noise", "size", "named"), [("flicker", 0.0, set()), ("white", 0.25, {"offset_step"})]
+)
+def test_flicker_noise_gets_no_name_and_a_step_in_white_noise_its_own(
+    noise: str, size: float, named: set[str]
+) -> None:
+    """Noise of power 1/f down to the length of the log is slower than any autoregression of 13 samples."""
+    n, rng = 6000, np.random.default_rng(0)
+    turn, t = np.linspace(0.0, 6.0 * np.pi, n), np.linspace(0.0, 1.0, n)
+    directions = np.column_stack([0.4 * np.cos(turn), 0.4 * np.sin(turn), np.full(n, 0.9)])
+    problem = pose(surveyed(directions, np.linspace(-1.0, 1.0, n)), calibrated(np.zeros(9), 1e-6))
+    white, power = rng.normal(size=(n, 3)), 1.0 + 0.3 / np.maximum(np.fft.rfftfreq(n), 1.0 / n)
+    coloured = np.fft.irfft(np.fft.rfft(white, axis=0) * np.sqrt(power)[:, None], n, axis=0)
+    read = np.sum(problem.jacobian[:, 6:] * (coloured if noise == "flicker" else white), axis=1)
+    problem = replace(problem, residual=read + size * (t > 0.5))
+    steps = [fault("offset_step", (t > at).astype(float), 10.0) for at in np.arange(0.05, 1.0, 0.05)]
+    outcome = search(problem, [fault("offset_drift", t, 10.0), *steps], 2)
+    assert {h.candidate.cause for h in outcome.chosen} == named
+    slow = outcome.problem.slow_noise(outcome.fit.z)
+    assert (np.std(slow) > 0.3 * np.std(read)) == (noise == "flicker")
 
 
 def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:

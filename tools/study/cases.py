@@ -22,7 +22,7 @@ from sitl.inject import EFFECTS, Hidden
 from study.both import both
 from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of
 from study.improvement import DELAYS, harm, improvement
-from study.noise import GLIDER, LOSSES, NOISES
+from study.noise import FLICKER, GLIDER, LOSSES, NOISES
 from study.theory import Setting, ideal
 
 Row = dict[str, Any]
@@ -116,10 +116,16 @@ def _charted(k: int) -> Row:
     }  # fmt: skip
 
 
+def _flicker(k: int) -> Row:
+    """In flicker noise, nothing or a cause that lasts; S/N is counted in white noise of the same RMS."""
+    names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
+    return {"names": names, "wanted": 25.0 * bool(names), "noise": FLICKER}
+
+
 PARTS: dict[str, Part] = {
-    "null": Part(0.2, _null),
+    "null": Part(0.18, _null),
     "named": Part(0.22, _named),
-    "ladder": Part(0.14, _ladder),
+    "ladder": Part(0.12, _ladder),
     "loud": Part(0.08, _loud),
     "unknown": Part(0.1, _unknown),
     "pair": Part(0.08, _pair),
@@ -127,6 +133,7 @@ PARTS: dict[str, Part] = {
     "seen": Part(0.03, _foreign(SEEN)),
     "foreign": Part(0.04, _foreign(STRANGE)),
     "charted": Part(0.04, _charted),
+    "flicker": Part(0.04, _flicker),
 }
 
 
@@ -146,14 +153,15 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
     else anew.
     """
     made = []
-    for place, (name, part) in enumerate(PARTS.items()):
+    # the last two share their hundred thousand: a seed has no more numbers
+    for place, (name, part) in zip((*range(10), 9.5), PARTS.items(), strict=True):
         count = round(cases * part.share) if name in parts else 0
         made += [
             (
                 (k + 0.5) / part.share,
                 {"losses": losses(k)}
                 | part.entry(k)
-                | {"part": name, "number": SEEDS * seed + 100_000 * place + k},
+                | {"part": name, "number": SEEDS * seed + int(100_000 * place) + k},
             )
             for k in range(count)
         ]

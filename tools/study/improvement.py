@@ -76,7 +76,7 @@ def _oracle(name: str, result: Diagnosis) -> Calibration:
     known = "clock_offset" if name in DELAYS else name
     outcome = search(problem, CAUSES[known].candidates(problem), 1)
     model = [hypothesis.candidate for hypothesis in outcome.chosen]
-    settled, _, fit = relinearised(problem, model, outcome.fit)
+    settled, _, fit = relinearised(outcome.problem, model, outcome.fit)
     return extend(settled, model, with_misfit(model, fit))
 
 

@@ -16,6 +16,9 @@ SLOWER = 0.95
 NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
 """White; autoregressive; white plus slower autoregressive; heavy-tailed; louder at times; half as loud again
 as calibrated; white over rock of a stronger field."""
+FLICKER, CORNER = "flicker", 0.1
+"""Noise of 1 nT RMS whose power grows as 1/f down to the length of the log, and the share of the sampling
+frequency at which that begins."""
 GLIDER = "glider"
 """The noise of the paper's twin: eight times as large, and correlated."""
 LOSSES = ("single", "bursts", "hole", "surfacing")
@@ -35,6 +38,10 @@ def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
     noise = rng.standard_normal((n, 3))
     if kind == "heavy":
         noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
+    if kind == FLICKER:
+        power = 1.0 + CORNER / np.maximum(np.fft.rfftfreq(n), 1.0 / n)[:, None]
+        noise = np.fft.irfft(np.fft.rfft(noise, axis=0) * np.sqrt(power), n, axis=0)
+        noise /= noise.std()
     if kind in ("ar", GLIDER):
         noise = correlated(noise, MEMORY)
     if kind == "mixed":

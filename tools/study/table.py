@@ -50,10 +50,11 @@ Line = tuple[str, str, str, str]
 def lines(rows: Sequence[Row]) -> list[str]:
     """Return the tables: the figures, logs with losses beside whole ones, and cause by cause."""
     part = {name: [r for r in rows if r["part"] == name] for name in {r["part"] for r in rows}}
-    true = [r for r in rows if r["part"] != "charted"]
+    true = [r for r in rows if r["part"] not in ("charted", "flicker")]
     figures = [
-        *_nulls(part.get("null", [])), *_detection(part), *_sets(part.get("named", [])), *_parameters(true),
-        *_gains(part.get("gain", [])), *_harm(part), *_nameless(part), *_pairs(part.get("pair", [])),
+        *_nulls(part.get("null", [])), *_flicker(part.get("flicker", [])), *_detection(part),
+        *_sets(part.get("named", [])), *_parameters(true), *_gains(part.get("gain", [])), *_harm(part),
+        *_nameless(part), *_pairs(part.get("pair", [])),
     ]  # fmt: skip
     return [
         "| figure | target | ideal detector | measured (95 % interval) | cases |",
@@ -74,6 +75,15 @@ def _nulls(nulls: Sequence[Row]) -> list[Line]:
         of("false alarm on nulls", nulls, "at most 1 %"),
         *(of(f"... {noise}", [r for r in nulls if r["noise"] == noise]) for noise in NOISES),
         *(of(f"... samples lost, {how}", [r for r in nulls if r["losses"] == how]) for how in LOSSES),
+    ]
+
+
+def _flicker(rows: Sequence[Row]) -> list[Line]:
+    one, none = ([r for r in rows if bool(r["names"]) == hides] for hides in (True, False))
+    return [
+        ("in flicker noise, nothing hidden: a name", "", "", share(none, lambda r: bool(r["found"]))),
+        ("... one hidden: named", "", "", share(one, right)),
+        ("... a false second name", "", "", share(one, second)),
     ]
 
 

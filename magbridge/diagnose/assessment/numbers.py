@@ -171,4 +171,4 @@ def budget(diagnosis: Diagnosis) -> Budget:
     counts, total = diagnosis.counts, diagnosis.total
     predicted = float(np.sqrt(np.mean(diagnosis.problem.stated[counts])))
     after = total.after if diagnosis.findings else None
-    return Budget(predicted, total.before, after, rms(diagnosis.fit.residual[counts]))
+    return Budget(predicted, total.before, after, rms(diagnosis.residual[counts]))

@@ -98,7 +98,7 @@ class Assessment:
 
 def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
     """Weigh a diagnosis; `causes` is the table that was asked about."""
-    problem, residual = diagnosis.problem, diagnosis.fit.residual / diagnosis.problem.reference_jacobian
+    problem, residual = diagnosis.problem, diagnosis.residual / diagnosis.problem.reference_jacobian
     shift = level(problem, diagnosis.possible, diagnosis.calibration)
     track = returns(problem.survey)
     against = _against(diagnosis, causes, shift, track) if diagnosis.named else []

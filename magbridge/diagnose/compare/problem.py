@@ -18,6 +18,8 @@ were they left out, a pair of large causes that cancel each other could mimic th
 (:mod:`~magbridge.diagnose.inference.statistic`), because many logs have no such delays, and three numbers
 that are each free take up to a tenth of a skew's power.
 
+Where the data want it (:func:`with_slow_noise`), so is the slow part of the noise (:mod:`.slow_noise`).
+
 Derivatives are taken at ``H_r - e w / |w|^2``, the reading moved until its residual vanishes: at the reading
 itself they would correlate with its noise, and scales could grow against offsets until they fit the noise
 (errors in variables).
@@ -26,7 +28,7 @@ itself they would correlate with its noise, and scales could grow against offset
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from typing import TypeVar
 from weakref import WeakKeyDictionary
@@ -42,9 +44,10 @@ from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.design_columns import Mixture
 from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import noise_sigma, prior
+from magbridge.diagnose.compare.slow_noise import slow_columns, waves
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["DELAY", "DELAYS", "Problem", "effect_columns", "once", "pose", "samples_of"]
+__all__ = ["DELAY", "DELAYS", "Problem", "effect_columns", "once", "pose", "samples_of", "with_slow_noise"]
 
 T = TypeVar("T")
 
@@ -75,11 +78,13 @@ class Problem:
     delay_jacobian : (n, 3) array
         ``-de/dz`` of the delays, in units of :data:`DELAY`.
     directions : (K, q) array
-        L; zero for the delays.
+        L; zero for slow noise and the delays.
     centre : (q,) array
         m, prior mean of z.
     unseen : (K, K) array
         nT², covariance in the directions that these data cannot see.
+    waves : (k,) array
+        Half waves per log of each coefficient of slow noise; there are none where the noise has no such part.
     """
 
     survey: Survey
@@ -92,6 +97,7 @@ class Problem:
     directions: FloatArray
     centre: FloatArray
     unseen: FloatArray
+    waves: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -101,6 +107,22 @@ class Problem:
         own = {parameter.name for parameter in self.calibration.parameters}
         return [name for name, c in self.survey.channels.items() if kind in c.kinds and name not in own]
 
+    @property
+    def known(self) -> slice:
+        """Places in z of what moves the calibration's own coefficients."""
+        return slice(len(self.centre) - len(self.waves) - 3)
+
+    @property
+    def slow(self) -> slice:
+        """Places in z of slow noise."""
+        return slice(self.known.stop, len(self.centre) - 3)
+
+    def slow_noise(self, z: FloatArray) -> FloatArray:
+        """(n,) what slow noise of z (q,) adds to the residual."""
+        if not self.waves.size:
+            return np.zeros(len(self))
+        return np.asarray(self.calibration_jacobian[:, self.slow] @ z[self.slow])
+
     def series(self, effect: Effect, rows: slice = slice(None)) -> Series:
         """Return rows of the log as the array form of an effect takes them."""
         names = dict.fromkeys([*(p.name for p in self.calibration.parameters), *effect.channels()])
@@ -109,10 +131,12 @@ class Problem:
 
     @cached_property
     def calibration_jacobian(self) -> FloatArray:
-        """(n, q) ``-de/dz``; the delays' are :attr:`delay_jacobian`."""
+        """(n, q) ``-de/dz``; the delays' are :attr:`delay_jacobian`, slow noise is in nT."""
         samples, _ = samples_of(self.survey, self.calibration)
         found = derivatives(self.calibration, samples, self.jacobian, -self.directions)
         found[:, DELAYS] = self.delay_jacobian
+        if self.waves.size:
+            found[:, self.slow] = slow_columns(self.jacobian[:, 6:])
         return found
 
     def let_go(self) -> None:
@@ -122,7 +146,7 @@ class Problem:
     @property
     def stated(self) -> FloatArray:
         """(n,) nT², variance that the calibration states: of the noise, and of its coefficients."""
-        noise, J = self.calibration.noise, self.calibration_jacobian[:, : DELAYS.start]
+        noise, J = self.calibration.noise, self.calibration_jacobian[:, self.known]
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", J, J))
 
     def straight(self, z: FloatArray) -> FloatArray:
@@ -251,4 +275,15 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
         directions,
         centre,
         rest @ rest.T,
+    )
+
+
+def with_slow_noise(problem: Problem) -> Problem:
+    """Return the problem with slow noise: its coefficients are places of z that move no calibration."""
+    at, more = problem.known.stop, np.zeros(waves().size)
+    return replace(
+        problem,
+        directions=np.insert(problem.directions, at, more[:, None], axis=1),
+        centre=np.insert(problem.centre, at, more),
+        waves=waves(),
     )

@@ -40,7 +40,7 @@ class Joint:
     ----------
     log_likelihood : float
         Of the noise model, with the prior of the calibration and of the effects; coefficients of one common
-        size, as the channels' delays are, are integrated out (Laplace's approximation).
+        size, as the channels' delays and slow noise are, are integrated out (Laplace's approximation).
     z : (q,) array
     coefficients : (k,) array
         Of the effects, in units of their prior width.
@@ -114,6 +114,8 @@ def fit_joint(
     q, k = X.calibration_jacobian.shape[1], X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]
+    if problem.waves.size:
+        common.append((problem.slow, 1.0 / problem.waves[None]))
     common += [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
     centre = np.append(problem.centre, np.zeros(k))
     past = problem.survey.past(order)

@@ -13,6 +13,10 @@ Noise that ends up as slow as it may be may have absorbed what several causes do
 stands out from it. So a second start finds causes beside noise of a short correlation. What they are worth is
 judged beside noise of any.
 
+What is found is then searched for beside noise that grows towards low frequencies, where that gains anything
+(:mod:`~.compare.slow_noise`), and the likelier of the two is kept: a cause that only stands for
+such noise is no longer found.
+
 The competing hypotheses are read off one matrix at the end: the information of all candidates under the noise
 that is left, the other causes projected out.
 """
@@ -26,7 +30,7 @@ import numpy as np
 
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.problem import Problem, with_slow_noise
 from magbridge.diagnose.inference.competing import CompetingHypothesis, sets_of
 from magbridge.diagnose.inference.evidence import (
     LEVEL,
@@ -56,6 +60,8 @@ class Outcome:
 
     Attributes
     ----------
+    problem : Problem
+        With slow noise, if that is the likelier.
     chosen : tuple of Hypothesis
         In the order found; each against the model without it.
     competing : tuple of tuple of CompetingHypothesis
@@ -68,8 +74,11 @@ class Outcome:
         Of all candidates under the noise that is left, only the calibration projected out.
     look_elsewhere : dict
         Cause -> number of independent hypotheses behind it.
+    evidence : float
+        Log evidence of what was found and of its noise, against the null without slow noise.
     """
 
+    problem: Problem
     chosen: tuple[Hypothesis, ...]
     competing: tuple[tuple[CompetingHypothesis, ...], ...]
     null: Joint
@@ -77,6 +86,7 @@ class Outcome:
     tested: dict[str, tuple[float, float]]
     info: Information
     look_elsewhere: dict[str, float]
+    evidence: float
 
 
 def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:
@@ -91,6 +101,21 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     causes : int
         How many causes were asked about.
     """
+    found = _search(problem, candidates, causes)
+    if not found.chosen or problem.waves.size:
+        return found
+    noisy, null = with_slow_noise(problem), found.null
+    slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
+    if slow.log_likelihood <= null.log_likelihood:
+        return found
+    beside = _search(noisy, candidates, causes, null)
+    return beside if beside.evidence > found.evidence else found
+
+
+def _search(
+    problem: Problem, candidates: Sequence[Candidate], causes: int, plain: Joint | None = None
+) -> Outcome:
+    """Find the causes that the data support under one noise; `plain` is the null without its slow part."""
     rough = fit_joint(problem, [], 1, rounds=2)
     order = autoregressive_order(rough.residual, problem.survey.slots)
     state = State(problem, candidates, order, causes)
@@ -104,7 +129,13 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     model = [h.candidate for h in chosen]
     info = state.conditional_on(model, base)
     competing = sets_of(state, info, model, base) if model else ()
-    return Outcome(tuple(chosen), competing, state.null, base, tested, info, state.look_elsewhere)
+    # Akaike's price of the autoregression, which slow noise makes shorter. Of the coefficients that what is
+    # left no longer needs, as beside a step, only the half nat counts that each has gained by chance
+    needed = autoregressive_order(base.residual, problem.survey.slots)
+    evidence = state.value(model, base, plain) - 0.5 * (order + needed)
+    return Outcome(
+        problem, tuple(chosen), competing, state.null, base, tested, info, state.look_elsewhere, evidence
+    )
 
 
 def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:

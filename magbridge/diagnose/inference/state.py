@@ -80,13 +80,13 @@ class Best(NamedTuple):
     info: Information
 
 
-def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint) -> float:
+def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: bool = False) -> float:
     """Likelihood ratio of the causes of a model that have a shape, beside those that take any.
 
-    `ratio` is that of the whole model.
+    `ratio` is that of the whole model, and of `slow` noise beside it.
     """
     free = np.repeat([one.nonparametric for one in model], [one.size for one in model])
-    return min(ratio, fit.wald(np.flatnonzero(~free))) if free.any() else ratio
+    return min(ratio, fit.wald(np.flatnonzero(~free))) if slow or free.any() else ratio
 
 
 def wald_ratio(fit: Joint, candidate: Candidate) -> float:
@@ -150,14 +150,20 @@ class State:
             like=like, blocks=self.blocks, brief=self.brief, ridge=_ridge(model), rounds=rounds,
         )  # fmt: skip
 
-    def ratio(self, fit: Joint) -> float:
-        """Twice the gain in log likelihood over the fit without any cause."""
-        return 2.0 * (fit.log_likelihood - self.null.log_likelihood)
+    def ratio(self, fit: Joint, null: Joint | None = None) -> float:
+        """Twice the gain in log likelihood over the fit without any cause, or over another `null`."""
+        return 2.0 * (fit.log_likelihood - (null or self.null).log_likelihood)
 
-    def value(self, model: Sequence[Candidate], fit: Joint) -> float:
-        """Log evidence of a model; each cause must also outweigh what idealised regressors may leave."""
-        ratio, causes = self.ratio(fit), {candidate.cause for candidate in model}
-        narrow, shaped = sum(candidate.point.narrow for candidate in model), shaped_ratio(ratio, model, fit)
+    def value(self, model: Sequence[Candidate], fit: Joint, null: Joint | None = None) -> float:
+        """Log evidence of a model; each cause must also outweigh what idealised regressors may leave.
+
+        It is relative to this search's null, or to one without slow noise.
+        """
+        ratio = self.ratio(fit, null)
+        if not model:
+            return 0.5 * ratio
+        causes, narrow = {candidate.cause for candidate in model}, sum(c.point.narrow for c in model)
+        shaped = shaped_ratio(ratio, model, fit, slow=null is not None)
         return (
             log_odds(ratio, model, self.look_elsewhere, shaped)
             - narrow

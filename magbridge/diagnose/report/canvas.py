@@ -121,6 +121,6 @@ def sides(diagnosis: Diagnosis) -> dict[str, tuple[FloatArray, str]]:
     if not diagnosis.findings:
         return {
             "as calibrated": (diagnosis.before, BEFORE),
-            "calibration refitted": (diagnosis.fit.residual, AFTER),
+            "calibration refitted": (diagnosis.residual, AFTER),
         }
     return {"before": (diagnosis.before, BEFORE), "after, held out": (diagnosis.after, AFTER)}

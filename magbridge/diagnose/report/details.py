@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.isolability import CONFOUNDED, Visible
@@ -158,7 +159,7 @@ def described(rest: Leftover, residual: Memory) -> str:
 
 
 def _noise(diagnosis: Diagnosis) -> str:
-    noise = diagnosis.fit.noise
+    noise, slow = diagnosis.fit.noise, rms(diagnosis.problem.slow_noise(diagnosis.fit.z))
     tails = (
         "Gaussian" if noise.nu > 1e5 else f"with heavy tails (Student's t, {noise.nu:g} degrees of freedom)"
     )
@@ -169,7 +170,8 @@ def _noise(diagnosis: Diagnosis) -> str:
         else "practically uncorrelated in time"
     )
     return (
-        f"The noise model: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {correlation}. "
+        f"The noise model: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {correlation}"
+        f"{f'; beside it {number(slow)} nT RMS of slow noise, of power 1/f or so' if slow else ''}. "
         f"The calibration states {number(diagnosis.problem.calibration.noise.sensor)} nT."
     )
 

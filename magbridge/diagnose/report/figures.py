@@ -75,7 +75,7 @@ def terms(diagnosis: Diagnosis) -> str | None:
     figure, axes = canvas(10, 0.4 + 2.1 * count, count, 1, sharex=True)
     for axis, finding in zip(axes[:, 0], diagnosis.findings, strict=True):
         added = finding.field(diagnosis.problem)
-        alone = added + diagnosis.fit.residual / diagnosis.problem.reference_jacobian
+        alone = added + diagnosis.residual / diagnosis.problem.reference_jacobian
         since, line = curves(diagnosis, added)
         axis.plot(since, alone[part], color=FAINT, label="all else removed", **DOTS)
         axis.plot(*rolling(diagnosis, alone), color=INK, linewidth=0.9, label="its running mean")

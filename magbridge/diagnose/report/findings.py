@@ -191,7 +191,7 @@ def follows(what: Seen) -> dict[str, Any]:
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
     wrong = diagnosis.wrong
     assert wrong is not None
-    size = np.abs(diagnosis.fit.residual[wrong.rows])
+    size = np.abs(diagnosis.residual[wrong.rows])
     return {
         "cause": "outliers",
         "channel": None,

@@ -99,7 +99,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "nothing_found":
         return (
             f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
-            f"({number(rms(diagnosis.fit.residual))} nT) and the calibration's stated uncertainty."
+            f"({number(rms(diagnosis.residual))} nT) and the calibration's stated uncertainty."
         )
     if diagnosis.verdict == "unexplained" and rest:
         within = f"no name is asserted; it resembles {listed(rest.within)}"
