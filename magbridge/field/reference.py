@@ -12,7 +12,7 @@ from magbridge.errors import FormatError
 from magbridge.field.continuation import continued
 from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.igrf import igrf, magnitude, total_field
+from magbridge.field.igrf import igrf, magnitude
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -34,7 +34,11 @@ EARTHS = 20_000.0, 70_000.0
 
 
 def reference_field(
-    deployment: xr.Dataset, grid: AnomalyGrid | None = None, site_bias: float = 0.0
+    deployment: xr.Dataset,
+    grid: AnomalyGrid | None = None,
+    site_bias: float = 0.0,
+    *,
+    main: FloatArray | None = None,
 ) -> FloatArray:
     """Return the true total field at every sample.
 
@@ -47,6 +51,8 @@ def reference_field(
         Added to the main field; if its altitude is known, continued to the deployment's depth.
     site_bias : float, optional
         nT, what the main-field model misses at the site; added where the field is modelled.
+    main : (n, 3) array, optional
+        nT, :func:`main_field` of the deployment, where it is known already.
 
     Returns
     -------
@@ -82,11 +88,8 @@ def reference_field(
         )
     require_date(deployment)
     longitude, latitude, depth = positions(deployment)
-    time = deployment["time"].to_numpy()
     reference = given.copy()
-    reference[unknown] = site_bias + total_field(
-        longitude[unknown], latitude[unknown], depth[unknown], time[unknown]
-    )
+    reference[unknown] = site_bias + magnitude((main_field(deployment) if main is None else main)[unknown])
     if grid is not None:
         there = continued(grid, depth[unknown]).grid
         reference[unknown] += there.at(longitude[unknown], latitude[unknown], depth[unknown])
@@ -134,10 +137,10 @@ def earth_field(
         without a date.
     name : str
     """
-    total = reference_field(deployment, grid)
     if not {"latitude", "longitude"} <= set(deployment.variables) or counts_from_boot(deployment):
-        return total, None, "reference_field"
+        return reference_field(deployment, grid), None, "reference_field"
     field = main_field(deployment)
+    total = reference_field(deployment, grid, main=field)
     vector = field * (total / magnitude(field))[:, None]
     given = "reference_field" in deployment
     name = " + ".join(["reference_field" if given else "IGRF", *([grid.name] if grid is not None else [])])

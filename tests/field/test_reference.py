@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from numpy.typing import ArrayLike
 
+from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
+from magbridge.field import reference as module
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
-from magbridge.field.igrf import total_field
-from magbridge.field.reference import positions, reference_field
+from magbridge.field.igrf import igrf, total_field
+from magbridge.field.reference import earth_field, positions, reference_field
 from sitl import Twin, load
 
 TIME = 1386201600.0 + np.arange(6.0)
@@ -27,6 +30,21 @@ def test_is_the_main_field_at_each_depth_plus_anomaly_plus_bias() -> None:
     grid = AnomalyGrid(np.linspace(-58, -57.8, 9), np.linspace(49.4, 49.6, 9), np.full((9, 9), 33.0))
     expected = total_field(-57.9, 49.5, PLACE["depth"], TIME) + 33.0 - 4.0
     np.testing.assert_allclose(reference_field(deployment(**PLACE), grid, -4.0), expected, atol=1e-6)
+
+
+def test_total_and_vector_come_from_one_evaluation_of_the_main_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+
+    def counted(*of: ArrayLike) -> FloatArray:
+        calls.append(1)
+        return igrf(*of)
+
+    monkeypatch.setattr(module, "igrf", counted)
+    total, vector, name = earth_field(deployment(**PLACE))
+    assert (len(calls), name) == (1, "IGRF")
+    assert vector is not None
+    np.testing.assert_allclose(total, total_field(-57.9, 49.5, PLACE["depth"], TIME), rtol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(vector, axis=1), total, rtol=1e-12)
 
 
 def test_a_map_flown_above_is_continued_to_the_depth() -> None:
