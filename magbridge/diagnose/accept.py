@@ -12,10 +12,10 @@ from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT, bayes_factor_threshold, log_odds
+from magbridge.diagnose.inference.hypothesis import Hypothesis, shaped_ratio
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.search import Outcome
-from magbridge.diagnose.inference.state import Hypothesis, shaped_ratio
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.varying import varying
 

@@ -18,11 +18,11 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.inference.competing import CompetingHypothesis
+from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import Isolability
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.search import Outcome
-from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.seen import Seen, seen
 from magbridge.diagnose.unexplained.leftover import Leftover
 

@@ -186,7 +186,7 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
     rebuilt = replace(problem, residual=e, jacobian=g)
     # the residual at the first point, extrapolated linearly from this one; errors of the reference, slow
-    # noise and the channels' delays are in both, as `extended` corrects none
+    # noise and the axes' delays are in both, as `extended` corrects none
     rebuilt.residual[:] += rebuilt.calibration_jacobian[:, problem.known] @ fit.z[problem.known]
     for candidate, place in zip(model, slices(model), strict=True):
         if not candidate.effects:

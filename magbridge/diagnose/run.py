@@ -27,6 +27,7 @@ from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_er
 from magbridge.diagnose.improvement import Improvement, paired
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
+from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.left_out import held_out
@@ -34,7 +35,6 @@ from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.search import search
-from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.seen import memory, seen
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.errors import DataError

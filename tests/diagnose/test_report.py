@@ -22,7 +22,7 @@ from magbridge.diagnose.compare.survey import Channel, _channels
 from magbridge.diagnose.diagnosis import Finding
 from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.state import Hypothesis
+from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import _folded, _outliers, nameless
 from magbridge.diagnose.report.page import improved

@@ -105,7 +105,7 @@ def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration
 
 
 def delays(problem: Problem, fit: Joint) -> Delays | None:
-    """Return the channels' delays where they look interpolated: a noise that no calibration can undo."""
+    """Return the axes' delays where they look interpolated: a noise that no calibration can undo."""
     places, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
     later = DELAY * to_x @ fit.z[places]
     covariance = DELAY**2 * to_x @ fit.covariance[np.ix_(places, places)] @ to_x.T

@@ -71,7 +71,7 @@ class Assessment:
     level : Level or None
         Shift of the whole corrected field that may be the reference's.
     delays : Delays or None
-        Of the channels, where they look interpolated.
+        Of the sensor's axes, where they look interpolated.
     budget : Budget
         RMS predicted, before, after, fitted.
     residual : Memory

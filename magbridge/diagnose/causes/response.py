@@ -1,4 +1,4 @@
-"""The channel's own response: it bends, it clips."""
+"""The response of each of the sensor's axes: it bends, it clips."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     The leak is that of an even harmonic. A feedback of finite gain leaves the core the field that its output
     takes, and that is the inverse of its magnetisation curve: steeper the farther out, but not flat at zero
     either. So a core that shows through also changes the sensitivity, and p = 1 belongs to the bend. All nine
-    coefficients have one common size, because the three channels are built alike, up to :data:`BENT`: nine
+    coefficients have one common size, because the three axes are built alike, up to :data:`BENT`: nine
     free numbers could otherwise take a wrong reference and a mass' error for one bend.
     """
     # a common size is at most ten widths (:data:`~magbridge.diagnose.inference.statistic.SIZES`)
@@ -43,7 +43,7 @@ def _power(problem: Problem, power: int, width: float) -> Candidate:
 
 
 def saturation(problem: Problem) -> list[Candidate]:
-    """A channel compresses or clips near its end: ``T_i -= b_1 + b_2 (H_i - knee) / H_0`` beyond the knee."""
+    """An axis compresses or clips near its end: ``T_i -= b_1 + b_2 (H_i - knee) / H_0`` beyond the knee."""
     made = []
     for axis, sign in product(range(3), (1.0, -1.0)):
         reading = sign * problem.reading[:, axis]

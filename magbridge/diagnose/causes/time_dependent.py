@@ -57,7 +57,7 @@ def offset_drift(problem: Problem) -> list[Candidate]:
 def interference_tone(problem: Problem) -> list[Candidate]:
     """Machinery at a fixed frequency, seen through the sampling: ``T += b cos + c sin (2 pi t / period)``.
 
-    Frequencies are those where the differenced residual, seen through each channel's projection, has its
+    Frequencies are those where the differenced residual, seen through each axis' projection, has its
     highest peaks. The highest of m (in steps of one period in the log), taken between them, too, exceeds
     a high u by chance as often as the highest of ``m sqrt(pi u / 6)`` independent ones (Davies 1987,
     Biometrika 74:33). At the test's level that is 5 m, and there are five peaks to count.

@@ -52,7 +52,7 @@ def eddy_current(problem: Problem) -> list[Candidate]:
 
 
 def channel_skew(problem: Problem) -> list[Candidate]:
-    """One digitiser takes the channels in turn: ``T_i += tau_i dH_i/dt``."""
+    """One digitiser takes the sensor's axes in turn: ``T_i += tau_i dH_i/dt``."""
     effect = RateEffect(cause="channel_skew", on="skew")
     return [of_effect(problem, effect, 0.5, "s", phi=field_rates(problem))]
 

@@ -1,4 +1,4 @@
-"""Rates of change of sampled channels, and the error of channels that were interpolated to their rows."""
+"""Rates of change of sampled axes, and the error of axes that were interpolated to their rows."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
 
 
 def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
-    r"""(3, n) error of channels H (3, n) sampled late and interpolated to their row, nT per s of delay.
+    r"""(3, n) error of axes H (3, n) sampled late and interpolated to their row, nT per s of delay.
 
     Linear interpolation is in error when the vehicle sways from sample to sample. `H` must be free of the
     readings' noise: the difference is one-sided and would correlate with it.
 
     Notes
     -----
-    A channel sampled tau after its row, and interpolated linearly from there and from the sample before it
+    An axis sampled tau after its row, and interpolated linearly from there and from the sample before it
     (H_-, an interval h earlier), reads at its row (H_0)
 
     .. math:: H(t + \tau) - \frac{\tau}{h} \left(H(t + \tau) - H(t - h + \tau)\right)

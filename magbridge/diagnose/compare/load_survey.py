@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["load_survey"]
 
 TRUSTED = 0.5
-"""Largest cubic term in the interpolation of a channel to the time of its row, as a multiple of the noise;
+"""Largest cubic term in the interpolation of an axis to the time of its row, as a multiple of the noise;
 where it is exceeded the sample is not used."""
 FAR = 10.0
 """Distance from the middle of the calibrated range, in half ranges, beyond which a parameter's value is
@@ -103,7 +103,7 @@ def _joined(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
 
 
 def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
-    """Return the rows that have channels, reference and parameters, each instant once."""
+    """Return the rows that have field, reference and parameters, each instant once."""
     needed = [*CHANNELS, "reference_field", *calibration.units]
     size = table["time"].size
     if size < FEWEST:
@@ -125,7 +125,7 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
 def _columns(
     ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, fitted: bool, learned: bool = False
 ) -> dict[str, FloatArray]:
-    """Return every numeric column, the channels interpolated to the rows' times, and the reference field."""
+    """Return every numeric column, the axes interpolated to the rows' times, and the reference field."""
     source = str(ds.attrs.get("source", "deployment"))
     sensor = str(ds.attrs.get("sensor", ""))
     if not calibration.sensor.may_be(sensor):
@@ -142,7 +142,7 @@ def _columns(
         if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
     }
     in_turn, trusted = False, TRUSTED * calibration.noise.sensor
-    for axis in "xyz":  # a log of channels that were sampled in turn has a time for each
+    for axis in "xyz":  # a log of axes that were sampled in turn has a time for each
         sampled = table.pop(f"mag_time_{axis}", None)
         if sampled is not None and np.isfinite(sampled).all() and not np.array_equal(sampled, time):
             table[f"mag_{axis}"] = _at(time, sampled, table[f"mag_{axis}"], trusted)
@@ -159,10 +159,10 @@ def _columns(
 
 
 def _at(time: FloatArray, sampled: FloatArray, values: FloatArray, trusted: float) -> FloatArray:
-    """Return a channel at the row's time: the cubic through its sample, the one after and the two before.
+    """Return an axis at the row's time: the cubic through its sample, the one after and the two before.
 
     Linear interpolation is off by the curvature of a turn: tenths of a nanotesla, always with the same sign.
-    Where the cubic term itself exceeds `trusted`, nT, the channel is not known well enough: NaN.
+    Where the cubic term itself exceeds `trusted`, nT, the axis is not known well enough: NaN.
     """
     out = np.full(time.size, np.nan)
     if time.size < 4:
@@ -181,7 +181,7 @@ def _at(time: FloatArray, sampled: FloatArray, values: FloatArray, trusted: floa
 def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray:
     """(n,) samples next to which a mass moves, by the bridge's own criterion.
 
-    There the channels, sampled in turn, saw the mass at different places and form no vector. With
+    There the axes, sampled in turn, saw the mass at different places and form no vector. With
     simultaneous sampling such samples are kept: only they reveal an offset of the clocks.
     """
     moving = np.zeros(table["time"].size, bool)
@@ -190,5 +190,5 @@ def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray
         fastest = Align().moving_rate * (parameter.high - parameter.low)
         step = np.abs(np.diff(table[parameter.name])) > fastest * elapsed
         moving[1:] |= step
-        moving[:-1] |= step  # the later channels of this sample were taken when it had begun
+        moving[:-1] |= step  # the later axes of this sample were taken when it had begun
     return moving

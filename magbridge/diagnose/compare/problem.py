@@ -12,7 +12,7 @@ passes through the forward model by this one rule. The calibration's coefficient
 posterior as prior (:mod:`.prior`): ``c = c_0 + L z``, ``z ~ N(m, 1)``, where L spans only the directions that
 these data can determine.
 
-Three delays are free, too: the channels may have been sampled late, and then interpolated to their rows
+Three delays are free, too: the sensor's axes may have been sampled late, and then interpolated to their rows
 (:mod:`.interpolation`). That is a fault of the log, not of the vehicle, so the delays change no coefficient;
 were they left out, a pair of large causes that cancel each other could mimic them. They have one common size
 (:mod:`~magbridge.diagnose.inference.statistic`), because many logs have no such delays, and three numbers
@@ -52,9 +52,9 @@ __all__ = ["DELAY", "DELAYS", "Problem", "effect_columns", "once", "pose", "samp
 T = TypeVar("T")
 
 DELAY = 0.3
-"""s, a plausible size of a channel's delay after its row."""
+"""s, a plausible size of an axis' delay after its row."""
 DELAYS = slice(-3, None)
-"""Places of the channels' delays in z."""
+"""Places of the axes' delays in z."""
 SEEN = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
 
@@ -150,7 +150,7 @@ class Problem:
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", J, J))
 
     def straight(self, z: FloatArray) -> FloatArray:
-        """(n,) residual without what the channels' delays in z (q,) add to it."""
+        """(n,) residual without what the axes' delays in z (q,) add to it."""
         return np.asarray(self.residual - self.delay_jacobian @ z[DELAYS])
 
 

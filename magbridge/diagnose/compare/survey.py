@@ -35,7 +35,7 @@ NOT_TELEMETRY = {
 
 
 class Channel(NamedTuple):
-    """A telemetry channel: values (n,), unit, and which of the kinds it may be."""
+    """A telemetry series, as a channel is throughout a diagnosis: values (n,), unit, kinds that it may be."""
 
     values: FloatArray
     unit: str
@@ -56,7 +56,7 @@ class Survey:
     time : (n,) array
         s since 1970 UTC.
     field : (n, 3) array
-        nT, raw channels at `time`.
+        nT, the sensor's raw axes at `time`.
     reference : (n,) array
         nT.
     channels : dict of Channel

@@ -40,7 +40,7 @@ class Joint:
     ----------
     log_likelihood : float
         Of the noise model, with the prior of the calibration and of the effects; coefficients of one common
-        size, as the channels' delays and slow noise are, are integrated out (Laplace's approximation).
+        size, as the axes' delays and slow noise are, are integrated out (Laplace's approximation).
     z : (q,) array
     coefficients : (k,) array
         Of the effects, in units of their prior width.

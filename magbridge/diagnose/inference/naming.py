@@ -21,8 +21,8 @@ from scipy.stats import chi2, ncx2, norm
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import LEVEL, bayes_factor_threshold, log_bayes
+from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.information import Information
-from magbridge.diagnose.inference.state import Hypothesis
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = ["chances_alone"]

@@ -9,9 +9,10 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import score
+from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.state import Hypothesis, State
+from magbridge.diagnose.inference.state import State
 
 __all__ = ["refined", "sharpen"]
 

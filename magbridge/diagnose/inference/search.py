@@ -42,11 +42,12 @@ from magbridge.diagnose.inference.evidence import (
 )
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import BRIEFEST, autoregressive_order
+from magbridge.diagnose.inference.hypothesis import Hypothesis, shaped_ratio
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
-from magbridge.diagnose.inference.state import Hypothesis, State, shaped_ratio
+from magbridge.diagnose.inference.state import State
 
 __all__ = ["Outcome", "search"]
 

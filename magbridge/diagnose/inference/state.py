@@ -1,12 +1,15 @@
-"""The state of a search, and a round of it: score every cause beside the model so far, fit the likeliest."""
+"""What a search knows of a log, and a round of it: score every cause beside a model, fit the likeliest.
+
+The model is no part of it: every step of a search takes one and returns another. What a round adds belongs
+to the log and not to the model, and is the same whenever it is computed: the look-elsewhere factors and the
+certainty of the noise's level, in the first; and the last information, which several steps ask for.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import fdtrc
@@ -17,7 +20,6 @@ from magbridge.diagnose.compare.design_columns import Columns, Mixture, parts, t
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, precomputed
 from magbridge.diagnose.inference.evidence import (
-    Score,
     evidence_of,
     log_odds,
     look_elsewhere_factors,
@@ -25,79 +27,19 @@ from magbridge.diagnose.inference.evidence import (
     score,
 )
 from magbridge.diagnose.inference.fit_noise import certainty
+from magbridge.diagnose.inference.hypothesis import Best, Hypothesis, shaped_ratio, wald_ratio
 from magbridge.diagnose.inference.information import Information, information
-from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint, volume_of
+from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["Hypothesis", "State", "shaped_ratio"]
+__all__ = ["State"]
 
 SHORT_LIST = 9
 """Causes that are fitted jointly in a round."""
 
 
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One cause beside the others of a model.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    ratio : float
-        Twice the gain in log likelihood.
-    evidence : float
-        Log Bayes factor against the model without it.
-    p_value : float
-        With the price of the hypotheses behind the cause (look-elsewhere) and of the number of causes.
-    fit : Joint
-        Of the whole model; this cause's coefficients are the last.
-    """
-
-    candidate: Candidate
-    ratio: float
-    evidence: float
-    p_value: float
-    fit: Joint
-
-    @property
-    def signal_to_noise(self) -> float:
-        """Whitened norm of the effect, calibration and model projected out, less what noise alone gives."""
-        own = slice(-self.candidate.size, None)
-        known = self.fit.prior[own] * np.diag(self.fit.covariance)[own]
-        power = self.fit.wald(own) - float(np.sum(1.0 - known))
-        return float(np.sqrt(power)) if power > 0.0 else 0.0
-
-
-class Best(NamedTuple):
-    """The best candidate of a grid under one noise.
-
-    Its place among all, the price of its nonlinear parameters (log of the grid's average evidence, relative
-    to the best), its score, and the information that gave it.
-    """
-
-    place: int
-    price: float
-    score: Score
-    info: Information
-
-
-def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: bool = False) -> float:
-    """Likelihood ratio of the causes of a model that have a shape, beside those that take any.
-
-    `ratio` is that of the whole model, and of `slow` noise beside it.
-    """
-    free = np.repeat([one.nonparametric for one in model], [one.size for one in model])
-    return min(ratio, fit.wald(np.flatnonzero(~free))) if slow or free.any() else ratio
-
-
-def wald_ratio(fit: Joint, candidate: Candidate) -> float:
-    """Likelihood ratio of the last candidate's coefficients under the noise that is left."""
-    own = slice(-candidate.size, None)
-    spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
-    return fit.wald(own) - 2.0 * spread
-
-
 class State:
-    """The state of one search: the problem, its candidates, the model so far.
+    """The problem of one search, its candidates, and what is known of the log.
 
     Attributes
     ----------

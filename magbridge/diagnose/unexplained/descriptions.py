@@ -161,7 +161,7 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
 
 
 def _of_reading(problem: Problem) -> list[Description]:
-    """Functions of the field's direction, its rates of change, each channel's reading; one common delay."""
+    """Functions of the field's direction, its rates of change, each axis' reading; one common delay."""
     body, rates = _body(problem), field_rates(problem)
     listed = [
         _of("broadband", shapes.direction(body), holds=_bends, wider=True),
@@ -254,7 +254,7 @@ def _body(problem: Problem) -> Columns:
 
 
 def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:
-    """Each function of `basis` along each axis of the body; with `scales`, times that channel's reading."""
+    """Each function of `basis` along each axis of the body; with `scales`, times that axis' reading."""
 
     def columns(rows: slice) -> FloatArray:
         part = basis(rows)

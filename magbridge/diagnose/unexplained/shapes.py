@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 BEND = 32
-"""Order of the polynomials of a channel's response: fine enough for a converter's coarsest steps."""
+"""Order of the polynomials of an axis' response: fine enough for a converter's coarsest steps."""
 PLAYS = (0.3, 0.8)
 """Widths of the play operators that describe a channel's past, in half ranges."""
 LAGS = (0.0, 300.0, 1000.0, 3000.0, 10000.0)
@@ -46,7 +46,7 @@ SKIN = (5.0, 20.0)
 REPEATED = 8
 """Half waves per dive of what repeats with every dive."""
 ZERO = (500.0, 1000.0, 2000.0)
-"""Widths, nT, of errors where a channel reads zero."""
+"""Widths, nT, of errors where an axis reads zero."""
 JACOBIAN = (0.0, 0.1, 0.2)
 """Sines of the angles at which a loose object in the hull starts to slide."""
 
@@ -75,14 +75,14 @@ def direction(body: Columns) -> Columns:
 
 
 def response(reading: FloatArray, jacobian: Columns) -> Columns:
-    """Each channel's error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
+    """Each axis' error as any smooth function of its own reading (n, 3): Chebyshev polynomials.
 
-    `jacobian` (m, 3) are what one nT in each channel adds to the residual.
+    `jacobian` (m, 3) are what one nT in each axis adds to the residual.
     """
-    channels = [_scaled(channel) for channel in reading.T]
+    axes = [_scaled(axis) for axis in reading.T]
 
     def columns(rows: slice) -> FloatArray:
-        x = np.clip([channel(rows) for channel in channels], -1.0, 1.0)
+        x = np.clip([axis(rows) for axis in axes], -1.0, 1.0)
         turning = x + 1j * np.sqrt(1.0 - x**2)  # cos k theta = T_k(x), with x = cos theta
         waves = np.stack(powers(turning, BEND), 1).real
         return np.asarray((jacobian(rows).T[:, None] * waves).reshape(3 * BEND, -1).T)
@@ -99,7 +99,7 @@ def bends() -> tuple[tuple[str, FloatArray], ...]:
 
 
 def crossing(reading: FloatArray, jacobian: Columns) -> Columns:
-    """Each channel's error where it passes zero (Hermite's functions); arguments as of :func:`response`.
+    """Each axis' error where it passes zero (Hermite's functions); arguments as of :func:`response`.
 
     There the feedback current changes sign, or a converter's first bit flips.
     """
