@@ -40,12 +40,13 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.observe import observations
     from magbridge.calibration.model import Calibration
-    from magbridge.correction import Correction, correct_rows
+    from magbridge.correction import Correction
     from magbridge.errors import MagbridgeError
     from magbridge.field.read import read_grid
     from magbridge.field.reference import reference_field
     from magbridge.logs import read, write
     from magbridge.logs.frames import from_frame, to_frame
+    from magbridge.rows import correct_rows
     from magbridge.version import __version__
 
 __all__ = [
@@ -76,7 +77,7 @@ _HOMES = {
     "MagbridgeError": "errors",
     "__version__": "version",
     "correct": "calibration.correct",
-    "correct_rows": "correction",
+    "correct_rows": "rows",
     "fit": "calibration.fitting.fit",
     "from_frame": "logs.frames",
     "load": "calibration.file",

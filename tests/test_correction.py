@@ -11,8 +11,9 @@ import xarray as xr
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import Align
-from magbridge.correction import Correction, correct_rows
+from magbridge.correction import Correction
 from magbridge.records import Quality, Reading
+from magbridge.rows import correct_rows
 
 START, SECOND = 1_780_000_000_000_000, 1_000_000
 FIELD = (20_000.0, -1_000.0, 45_000.0)

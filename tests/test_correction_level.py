@@ -8,7 +8,8 @@ import numpy as np
 import xarray as xr
 
 from magbridge.calibration.model import Reference, identity
-from magbridge.correction import Correction, correct_rows
+from magbridge.correction import Correction
+from magbridge.rows import correct_rows
 
 
 def test_level_sigma_is_what_the_level_moves() -> None:

@@ -99,8 +99,9 @@ def correct(
     logs_to_read(files, output, source)
     check_inputs((*files, output), picture)
 
-    from magbridge.correction import Correction, correct_rows
+    from magbridge.correction import Correction
     from magbridge.logs import Writer, read_chunks
+    from magbridge.rows import correct_rows
 
     known, settings = _known(calibration, config)
     for doubt in warnings_of(known, source):

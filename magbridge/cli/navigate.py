@@ -138,9 +138,10 @@ def _corrected(
 ) -> xr.Dataset:
     """Return the logs with their field corrected by the calibration `known`, which the file holds."""
     from magbridge.columns import CHANNELS
-    from magbridge.correction import Correction, correct_rows
+    from magbridge.correction import Correction
     from magbridge.field.declination import with_true_heading
     from magbridge.logs import read
+    from magbridge.rows import correct_rows
 
     with waiting("reading"):
         whole = read(files, required=CHANNELS, options=reading.options)

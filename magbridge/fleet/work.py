@@ -20,7 +20,7 @@ from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.columns import CHANNELS, counts_from_boot, require
-from magbridge.correction import Correction, correct_rows
+from magbridge.correction import Correction
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, FormatError, MagbridgeError, WriteError
 from magbridge.files import digest
@@ -29,6 +29,7 @@ from magbridge.logs import Writer, read
 from magbridge.logs.deployment import join, passed_over, sliced
 from magbridge.logs.info import GAP
 from magbridge.records import Quality
+from magbridge.rows import correct_rows
 from magbridge.survey.maps import anomaly_map
 from magbridge.survey.run import samples_of, survey
 

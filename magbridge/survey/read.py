@@ -14,12 +14,13 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.level import apart_from_level
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
-from magbridge.correction import Correction, correct_rows
+from magbridge.correction import Correction
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field, positions
 from magbridge.records import Quality
+from magbridge.rows import correct_rows
 from magbridge.survey.samples import Samples
 
 if TYPE_CHECKING:

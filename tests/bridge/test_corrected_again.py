@@ -15,11 +15,12 @@ from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.model import Parameter
 from magbridge.cli import main
 from magbridge.columns import CORRECTED
-from magbridge.correction import Correction, correct_rows
+from magbridge.correction import Correction
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
 from magbridge.mavlink.dialect import MAV_PARAM_TYPE
 from magbridge.records import Channel, Quality
+from magbridge.rows import correct_rows
 
 KEPT = {"MB_AGE_BATTPOS": 3.0, "MB_SETTLE_TIME": 4.0, "MB_STALE_GROW": 20.0}
 """Set over the link in an earlier run."""

@@ -23,12 +23,13 @@ from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Parameter, identity
 from magbridge.calibration.planning.plan import expected_calibration
 from magbridge.cli.common import app
-from magbridge.correction import Correction, correct_rows
+from magbridge.correction import Correction
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.logs import read, write
 from magbridge.progress import waiting
 from magbridge.records import Quality
+from magbridge.rows import correct_rows
 
 FEW = 40  # rows, which a diagnosis refuses: what it says before is said all the same
 

@@ -12,9 +12,10 @@ from msgspec.structs import replace as with_options
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
-from magbridge.correction import Correction, correct_rows
+from magbridge.correction import Correction
 from magbridge.field.geodesy import separation
 from magbridge.navigate.options import informed
+from magbridge.rows import correct_rows
 from navigation_studies.simulated import GLIDER, PLACE, Map, Score, adrift, sail, synthetic
 from sitl import load, segments, simulate
 from sitl.dataset import at_rest
