@@ -7,7 +7,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.field.place.nodes import Nodes, nodes_near
 
-__all__ = ["SMOOTH", "fine_enough", "ladder", "nodes_for"]
+__all__ = ["NODES", "SMOOTH", "fine_enough", "ladder", "nodes_for"]
 
 RUNGS = 7
 """Lengths that are tried first."""
@@ -17,7 +17,7 @@ SMOOTH, ENOUGH = 6, 3.0
 than that noise (rough ones on coarser nodes gave maps with errors of 5 to 8 sigmas)."""
 PAD = 1.0
 """Lengths around the track that have nodes."""
-NODES = 10_000
+NODES = 4_000
 """Nodes at most, unless more are asked for."""
 SHORTEST = 60.0
 """m, least length."""

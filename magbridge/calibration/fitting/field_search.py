@@ -10,7 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.evidence import evidence
-from magbridge.calibration.fitting.field_nodes import SMOOTH, fine_enough, ladder, nodes_for
+from magbridge.calibration.fitting.field_nodes import NODES, SMOOTH, fine_enough, ladder, nodes_for
 from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.field.place.matern import SMOOTHNESS, Matern
@@ -27,6 +27,8 @@ __all__ = [
 
 RESOLVED = 2.0
 """Nodes a length at least: a shorter one is not tried on so large an area."""
+FEWER = 1_500
+"""Nodes at most of the smoothest fields, whose precisions are nearly full."""
 BENDS = 0.25
 """Fields look alike where the length times this power of alpha - 1 is the same."""
 SMALL = 0.03
@@ -123,7 +125,8 @@ def choose(
 
     def tried(one: Choice, alpha: int, harmonic: bool) -> Choice:
         length = one.field.length * ((one.field.alpha - 1) / (alpha - 1)) ** BENDS
-        field = Matern(nodes_for(place, length, alpha), length, alpha, harmonic)
+        most = NODES if alpha <= SMOOTH else FEWER
+        field = Matern(nodes_for(place, length, alpha, most), length, alpha, harmonic)
         begin = replace(one, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 

@@ -41,7 +41,7 @@ from magbridge.calibration.fitting.field_search import (
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
 from magbridge.calibration.fitting.known import Known
-from magbridge.calibration.fitting.latent import Group, Offset, slow_functions, with_groups
+from magbridge.calibration.fitting.latent import Group, slow_functions, with_groups
 from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.nominal import check_scales, starts
@@ -120,8 +120,9 @@ def fit_in_place(
         )
     posed = pose(data, order, vehicle, known)
     samples, q = posed.samples, posed.family.E.shape[1]
-    survey = SurveySamples(data, samples, _groups(data, level), _drift(data, position_sigma))
-    rounds = _Rounds(survey, posed.family, offered(data))
+    groups = (*_groups(data, level), *offered(data))
+    survey = SurveySamples(data, samples, groups, _drift(data, position_sigma))
+    rounds = _Rounds(survey, posed.family)
     found = rounds.settle()
     prior, z = found.family.at(found.widths.eta), found.z
     coefficients = prior.coefficients(z)
@@ -200,9 +201,10 @@ class _Answer:
 class _Rounds:
     """Alternate coefficients, widths and the field until no residual moves."""
 
-    def __init__(self, survey: SurveySamples, own: PriorFamily, offers: tuple[Offset, ...]) -> None:
+    def __init__(self, survey: SurveySamples, own: PriorFamily) -> None:
         self.survey, self.own, self.q = survey, own, own.E.shape[1]
-        self.offers, self.until = offers, GUESSED + SEARCHES
+        self.until = GUESSED + SEARCHES
+        self.weigh_offers = self.until + 1 if survey.offsets else -1
         self.family = with_groups(own, survey.groups)
         self.step = max(len(survey.samples.field) // SEARCHED, 1)
         self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
@@ -225,8 +227,8 @@ class _Rounds:
             if self.own.renew is not None and turn:
                 self.own = self.own.renew(self.z[: self.q])
                 self.family = with_groups(self.own, survey.groups)
-            if self.offers and turn == self.until + 1:
-                self._offer()
+            if turn == self.weigh_offers:
+                self._weigh_offers()
             answer = self._round(turn)
             e = self._residuals(answer.z, answer.lacking)
             if last is not None:
@@ -271,19 +273,14 @@ class _Rounds:
         score = widths.log_evidence + reduced.log_evidence
         return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
 
-    def _offer(self) -> None:
-        """Keep the offsets that the log needs; where it needs any, the field is searched anew, once."""
+    def _weigh_offers(self) -> None:
+        """Keep the offsets that the log needs; where it does not need all, the search goes on without."""
         survey, choice = self.survey, self.choice
-        steady = tuple(one for one in survey.groups if not isinstance(one, Offset))
-        again = len(steady) < len(survey.groups)
-        first = len([one for one in steady if not one.name.startswith("position")])
-        self._regroup((*steady[:first], *self.offers, *steady[first:]))
         reduced = eliminate(self._sums(choice.field, 1), choice.field, choice.ratio, choice.rho)
-        self._regroup(likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma))
-        if survey.offsets and not again:
-            self.until += SEARCHES + 1
-        else:
-            self.offers = ()
+        kept = likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma)
+        if len(kept) < len(survey.groups):
+            self._regroup(kept)
+            self.until += SEARCHES
 
     def _regroup(self, groups: tuple[Group, ...]) -> None:
         """Go on with other groups of unknowns; those that were there stay where they are."""

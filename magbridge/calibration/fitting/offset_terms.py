@@ -27,6 +27,8 @@ __all__ = ["Creep", "in_words", "likeliest", "offered", "with_creep", "with_temp
 
 LAGS = (0.0, 600.0, 2400.0)
 """s, by which the offset may follow the temperature: a sensor by itself, in its housing, in a hull."""
+FASTEST = 1200.0
+"""s, half the period of the fastest creep: of a random walk of 20 nT in 6 h all but 1 nT, and a step."""
 VARIES = 0.5
 """degC, standard deviation of a temperature, from which on it can tell anything."""
 PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
@@ -68,7 +70,7 @@ def offered(data: Observations) -> tuple[Offset, ...]:
                 column = (warm - warm.mean())[:, None]
                 name = f"offset by temperature, lag {lag:.0f} s"
                 groups.append(Offset(name, column, np.ones(3), PER_DEGREE, SPREAD, lag))
-    waves, shape = slow_functions(data.time)
+    waves, shape = slow_functions(data.time, FASTEST)
     if len(shape):
         groups.append(Offset("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD))
     return tuple(groups)
