@@ -141,6 +141,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
 def causes_of(facts: dict[str, Any]) -> list[str]:
     """Return a line for each cause found, with the alternatives to it, and for what is left unexplained."""
     from magbridge.diagnose.report.words import number
+    from magbridge.diagnose.seen import WHITE
 
     causes = []
     for one in facts["findings"]:
@@ -149,8 +150,10 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
         causes.append(lines + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:
         lines = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"
-        size = number(facts["assessment"]["residual"]["rms_nT"])
-        lines += f", {size} nT RMS that lasts {rest['correlation_time_s']:.3g} s"
+        left = facts["assessment"]["residual"]
+        own = f"{number(rest['rms_nT'])} of " if rest["rms_nT"] is not None else ""
+        lines += f", {own}{number(left['rms_nT'])} nT RMS"
+        lines += f", lasts {rest['correlation_time_s']:.3g} s" * (left["white_nT"] < WHITE * left["rms_nT"])
         within = ", ".join(map(_plain, rest["alternatives"]))
         causes.append(f"{lines}{_followed(rest['follows'])}" + f"; resembles {within}" * bool(within))
     return causes or ["no cause"]

@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
 from magbridge.deprecated import old_argument
 from magbridge.diagnose.accept import accept
 from magbridge.diagnose.causes import Cause, known
@@ -263,17 +264,19 @@ def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover
     if problem.waves.size:
         known = fit.prior[problem.slow] * np.diag(fit.covariance)[problem.slow]
         power, freedom = float(np.sum(fit.noise.whiten(slow) ** 2)), float(np.sum(1.0 - known))
-        if power >= (REMNANT * max((h.signal_to_noise for h in named), default=0.0)) ** 2:
-            channel = seen(problem, residual).channel
-            return Leftover(
-                "drift", float(np.sqrt(power)), float(chi2.sf(power, freedom)), 0.0, None, channel
-            )
-    if not far or found.rms < NEGLIGIBLE * float(np.median(problem.survey.reference)):
+        if power < (REMNANT * max((h.signal_to_noise for h in named), default=0.0)) ** 2:
+            return None
+        ratio, size = power, rms(slow / problem.reference_jacobian)
+    elif far and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference)):
+        power, freedom = found.means * found.samples * found.slow, found.means
+        ratio, size = (
+            power * (found.rms / max(found.white, 1e-9)) ** 2,
+            found.rms * float(np.sqrt(found.slow)),
+        )
+    else:
         return None
-    power = found.means * found.samples * found.slow
-    ratio = power * (found.rms / max(found.white, 1e-9)) ** 2
-    channel = seen(problem, residual).channel
-    return Leftover("drift", float(np.sqrt(ratio)), float(chi2.sf(power, found.means)), 0.0, None, channel)
+    p_value, channel = float(chi2.sf(power, freedom)), seen(problem, residual).channel
+    return Leftover("drift", float(np.sqrt(ratio)), p_value, 0.0, None, channel, size=size)
 
 
 def _verdict(

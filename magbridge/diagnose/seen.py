@@ -41,6 +41,8 @@ CLEARLY = 0.1
 WAVES, SLOW = 48, 0.5
 """Half waves per log by which the axis of a slow signal that follows no series is found, and the share of its
 power, constants aside, that they must explain."""
+WHITE = 0.9
+"""Share of a residual's RMS that changes from one sample to the next, from which on it lasts no time."""
 EVERY = slice(None)
 AXES = ("field", "x", "y", "z")
 ROWS = 20_000
@@ -94,6 +96,11 @@ class Memory(NamedTuple):
     slow: float
     samples: int
     means: int
+
+    @property
+    def lasts(self) -> bool:
+        """Whether it is more than what changes from one sample to the next."""
+        return self.white < WHITE * self.rms
 
 
 def seen(problem: Problem, signal: FloatArray) -> Seen:

@@ -144,7 +144,7 @@ def test_what_no_cause_explains_is_called_unexplained() -> None:
     """A ship: in two hours a relay that nobody logs is a correlated noise, in theory, too."""
     row = blind("foreign", ("ship",), 15.0, number=27)
     assert row["unexplained"].keys() == {
-        "kind", "signal_to_noise", "period_s", "best_channel", "alternatives", "correlation_time_s",
+        "kind", "signal_to_noise", "period_s", "best_channel", "alternatives", "correlation_time_s", "rms_nT",
         "follows",
     }  # fmt: skip
     assert not row["found"]

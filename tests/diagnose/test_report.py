@@ -92,17 +92,19 @@ def test_the_command_names_every_cause_that_may_be_it_on_a_line_of_its_own() -> 
     clock = {"cause": "clock_offset", "channel": None, "signal_to_noise": 9.04, "follows": seen}
     current = {"cause": "current_field", "channel": "pitch_current"}
     rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [clock, current]}
-    rest |= {"follows": seen | {"channel": None}, "correlation_time_s": 112.3}
+    rest |= {"follows": seen | {"channel": None}, "correlation_time_s": 112.3, "rms_nT": 19.96}
     found = {"verdict": "explained", "findings": [clock | {"alternatives": [current]}], "unexplained": None}
     assert causes_of(found) == [
         "clock_offset, S/N 9.0, follows battpos 2 s late along z; or current_field (pitch_current)"
     ]
     nameless = {"verdict": "unexplained", "findings": [], "unexplained": rest}
-    nameless |= {"assessment": {"residual": {"rms_nT": 21.71}}}
+    nameless |= {"assessment": {"residual": {"rms_nT": 21.71, "white_nT": 3.0}}}
     words = "resembles clock_offset, current_field (pitch_current)"
     assert causes_of(nameless) == [
-        f"left without a name: drift, S/N 7.0, 21.7 nT RMS that lasts 112 s, along z; {words}"
+        f"left without a name: drift, S/N 7.0, 20.0 of 21.7 nT RMS, lasts 112 s, along z; {words}"
     ]
+    white = {"assessment": {"residual": {"rms_nT": 21.71, "white_nT": 21.6}}}
+    assert "20.0 of 21.7 nT RMS, along z" in causes_of(nameless | white)[0]
     assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == ["no cause"]
 
 

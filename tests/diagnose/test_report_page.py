@@ -138,7 +138,8 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
     assert "amps&lt;b&gt;" in first
     residual = clear.assessment.residual
     last = number(residual.correlation_time, 2)
-    assert f"in all {number(residual.rms)}\N{NO-BREAK SPACE}nT RMS, which last {last} s" in first
+    lasts = f", which last {last} s" * residual.lasts
+    assert f"in all {number(residual.rms)}\N{NO-BREAK SPACE}nT RMS{lasts})" in first
     assert f"None of {len(CAUSES)} causes is named." in below
 
 

@@ -130,7 +130,8 @@ def test_a_residual_far_from_white_is_never_nothing() -> None:
     assert rest["follows"]["channel"] is rest["best_channel"] is None
     assert "does not describe all" in facts["assessment"]["answer"]
     output = "\n".join(causes_of(facts))
-    assert f"{residual['rms_nT']:.1f} nT RMS that lasts {rest['correlation_time_s']:.3g} s" in output
+    assert f"{residual['rms_nT']:.1f} nT RMS, lasts {rest['correlation_time_s']:.3g} s" in output
+    assert 0.5 * residual["rms_nT"] < rest["rms_nT"] <= residual["rms_nT"]
     assert found.unexplained is not None
     page = described(found.unexplained, found.assessment.residual)
     assert f"in all {residual['rms_nT']:.1f} nT RMS, which last" in page

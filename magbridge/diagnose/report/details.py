@@ -154,7 +154,9 @@ def described(rest: Leftover, residual: Memory) -> str:
     goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     size = f"signal-to-noise ratio {rest.signal_to_noise:.1f}"
-    all_of_it = f"in all {number(residual.rms)} nT RMS, which last {number(residual.correlation_time, 2)} s"
+    own = f"{number(rest.size)} nT RMS of its own, " if rest.size is not None else ""
+    lasts = f", which last {number(residual.correlation_time, 2)} s" * residual.lasts
+    all_of_it = f"{own}in all {number(residual.rms)} nT RMS{lasts}"
     return f"<b>{KINDS[rest.kind]}</b>{period} is left ({size}{goes}; {all_of_it})"
 
 

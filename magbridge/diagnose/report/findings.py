@@ -49,6 +49,7 @@ def findings(
             "best_channel": rest.best_channel,
             "follows": follows(diagnosis.assessment.follows),
             "correlation_time_s": _round(diagnosis.assessment.residual.correlation_time),
+            "rms_nT": None if rest.size is None else _round(rest.size),
             "alternatives": alternatives(rest.within),
         },
         "assessment": assessment(diagnosis.assessment),

@@ -105,7 +105,11 @@ def _sentence(diagnosis: Diagnosis) -> str:
         within = f"no name is asserted; it resembles {listed(rest.within)}"
         name = within if rest.within else "none of the known causes explains it"
         more = f"The difference of {number(total.before)} nT RMS is more than noise"
-        return f"{more}, but {name}. {described(rest, residual)}."
+        stated = diagnosis.assessment.budget.predicted
+        allowed = f" It is within the {number(stated)} nT that the calibration states." * (
+            stated > total.before
+        )
+        return f"{more}, but {name}. {described(rest, residual)}.{allowed}"
     names = [
         bold(one.candidate)
         + (f" <span class=faint>or {listed(one.competing[:2], ' or ')}</span>" * bool(one.competing))

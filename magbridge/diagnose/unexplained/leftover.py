@@ -18,9 +18,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.residual import robust_scale
+from magbridge.calibration.residual import rms, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.design_columns import Columns, places
+from magbridge.diagnose.compare.design_columns import Columns, places, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed
@@ -87,6 +87,8 @@ class Leftover(NamedTuple):
         than their margin.
     fitted : tuple of Fitted
         The likeliest descriptions.
+    size : float or None
+        RMS, nT, of the description.
     """
 
     kind: str
@@ -99,6 +101,7 @@ class Leftover(NamedTuple):
     choice: int = 1
     within: tuple[CompetingHypothesis, ...] = ()
     fitted: tuple[Fitted, ...] = ()
+    size: float | None = None
 
     @property
     def among(self) -> float:
@@ -159,7 +162,8 @@ def leftover(
         tried = sorted(scored, key=lambda one: -one.evidence)[:SHORT_LIST]
         weighed = in_threads(len(problem), lambda one: _weighed(problem, columns, fit, one), tried)
         found += zip(weighed, tried, strict=True)
-    (evidence, *_), (_, kind, one, best, _) = max(found, key=lambda entry: entry[0].evidence)
+    likeliest, (_, kind, one, best, _) = max(found, key=lambda entry: entry[0].evidence)
+    evidence = likeliest.evidence
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
     count = sum(len(one.widths) for one in listed)
@@ -169,8 +173,20 @@ def leftover(
         return None
     channel = one.channel or _best_channel(problem, fit)
     fitted = tuple(entry for entry, _ in found)
+    every = slice(0, len(problem))
+    shape = times(likeliest.columns, every, likeliest.fit.coefficients[-len(best.variance) :])
+    size = rms(shape / problem.reference_jacobian)
     return Leftover(
-        kind, best.signal_to_noise, p_value, evidence, one.period, channel, one, count, fitted=fitted
+        kind,
+        best.signal_to_noise,
+        p_value,
+        evidence,
+        one.period,
+        channel,
+        one,
+        count,
+        fitted=fitted,
+        size=size,
     )
 
 
