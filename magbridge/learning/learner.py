@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.field.geodesy import separation
 from magbridge.learning.bank import Bank
@@ -394,7 +395,10 @@ class Learner:
         publication, standing = self._publication, self._standing
         if standing.gone and not self.frozen:
             if standing.tried:
-                self._settle("learned" if publication.learned else "the first calibration holds")
+                now = calibration_id(self.calibration)
+                self._settle(
+                    f"{'learned' if publication.learned else 'the first calibration holds,'} {now:08x}"
+                )
             else:
                 self._gone()
         elif standing.ripe and not self.frozen:
@@ -432,11 +436,10 @@ class Learner:
             if moved is None:
                 return
             self._bank.explained(*moved, strength)
-        change = self._publication.publish(self.learned(), "learned")
+        self._publication.publish(self.learned(), "learned")
         self._doubt.restart()
         if self._standing.learned():
-            self._notify(change)
-            self._notify("explained again: learned")
+            self._notify(f"explained again: learned {calibration_id(self.calibration):08x}")
 
     def _publish(self, how: str) -> None:
         self._notify(self._publication.publish(self.learned(), how))

@@ -102,6 +102,7 @@ class Publication:
         """Let what is published be the first, so that nothing takes it back."""
         self.first = self.calibration
         self._weights[FIRST] = self._weights[LEARNED]
+        self.judge.mean_square[FIRST] = self.judge.mean_square[LEARNED]
         self.judge.restart()
 
     def roll_back(self) -> str:

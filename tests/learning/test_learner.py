@@ -139,9 +139,12 @@ def test_forgetting_goes_back_to_the_first() -> None:
     assert learner.calibration is known
     assert learner.samples == 0
     learn(learner, world, added=added)
+    first, published, _ = learner.state.rms
+    assert published < first
     learner.accept()
     assert learner.first is learner.calibration
     assert learner.first is not known
+    assert learner.state.rms[:2] == (published, published)  # its errors are now the first's
 
 
 def test_forgetting_and_accepting_come_before_any_sample_too() -> None:
