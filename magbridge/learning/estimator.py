@@ -37,6 +37,8 @@ NEAR: Final = 250.0
 rock."""
 LONG: Final = 1000
 """Samples over which the mean derivative of the total field is followed."""
+CHANGED: Final = 2.0
+"""Sigmas by which the level has changed."""
 LASTING: Final = 24.0 * 3600.0
 """s over which what is known of a drift's slope gets less certain by a factor of e in variance: a drift
 changes, but what was found to be none does not begin anew by itself."""
@@ -128,6 +130,18 @@ class Estimator:
         toward = self._P[:K, :K] @ self._mean
         by = float(self._mean @ (published - self.coefficients))
         return np.asarray(self.coefficients + toward * (by / float(self._mean @ toward)))
+
+    def keep_level(self, published: FloatArray) -> None:
+        """Move the state to where the mean field is that of the coefficients `published` (K,).
+
+        As :meth:`at_level_of`, with rock that takes up what the coefficients give; but not where the level
+        drifts, or has changed beyond chance.
+        """
+        K = self.size
+        toward = self._P[:, :K] @ self._mean
+        by, variance = float(self._mean @ (published - self.coefficients)), float(self._mean @ toward[:K])
+        if not self._sloping and by * by < CHANGED * CHANGED * variance:
+            self._x += toward * (by / variance)
 
     def open(self, variance: float, which: IndexArray | None = None) -> None:
         """Let coefficients `which` (3,), by default the offsets, be unknown by a further `variance` each."""

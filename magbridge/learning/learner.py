@@ -412,6 +412,8 @@ class Learner:
         elif self.frozen or not self._trusted:
             return
         elif not publication.learned and publication.judge.adopt:
+            for one in self._bank.all:
+                one.keep_level(publication.coefficients)
             self._publish("learned")
         elif publication.stale(apart):
             publication.renew(self.learned())

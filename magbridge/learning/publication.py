@@ -39,6 +39,8 @@ class Publication:
     ----------
     first, calibration : Calibration
         The one that it began with, or that was accepted; the one to publish.
+    coefficients : (K,) array
+        Of the one to publish.
     judge : Judge
     renewed : bool
         The one to publish has changed last by what was learned since, for no reason of its own.
@@ -53,8 +55,8 @@ class Publication:
     def forget(self, nuisance: Nuisance) -> None:
         """Go back to the first, as if nothing had been judged."""
         self.calibration, self.judge, self.age = self.first, Judge(nuisance), 0
-        self._coefficients = self._model.coefficients(self.first)[0]
-        self._weights = [self._model.weights(self._coefficients)] * 2
+        self.coefficients = self._model.coefficients(self.first)[0]
+        self._weights = [self._model.weights(self.coefficients)] * 2
 
     @property
     def learned(self) -> bool:
@@ -71,7 +73,7 @@ class Publication:
         if first.method == NONE:
             method = "learned"
             if self.learned:
-                coefficients = estimator.at_level_of(self._coefficients)
+                coefficients = estimator.at_level_of(self.coefficients)
         elif "learned" not in method:
             method += ", learned"
         inputs = first.inputs | {f"calibration {calibration_id(first):08x}": f"{samples} samples later"}
@@ -87,8 +89,8 @@ class Publication:
     def renew(self, calibration: Calibration) -> None:
         """Publish what is learned so far."""
         self.calibration = calibration
-        self._coefficients = self._model.coefficients(calibration)[0]
-        self._weights[LEARNED] = self._model.weights(self._coefficients)
+        self.coefficients = self._model.coefficients(calibration)[0]
+        self._weights[LEARNED] = self._model.weights(self.coefficients)
         self.age, self.renewed = 0, True
 
     def publish(self, calibration: Calibration, how: str) -> str:
@@ -108,6 +110,7 @@ class Publication:
     def roll_back(self) -> str:
         """Publish the first again; return what to say of that."""
         self.calibration, self.age = self.first, 0
+        self.coefficients = self._model.coefficients(self.first)[0]
         self._weights[LEARNED] = self._weights[FIRST]
         return self._change("rolled back: the first calibration predicts better", LEARNED, FIRST)
 

@@ -10,7 +10,7 @@ from magbridge.calibration.correct import Corrector
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.model import Calibration
 from magbridge.learning.bank import Bank
-from magbridge.learning.estimator import Estimator
+from magbridge.learning.estimator import LONG, Estimator
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
 from magbridge.learning.observation import observe
@@ -44,6 +44,7 @@ def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[Bank, Model]
             one.propagate(1.4, 4.0)
             seen = observe((x, y, z), phi @ model.weights(one.coefficients), FIELD, FIELD)
             one.predict(seen.e, seen.s, model.derivative(phi, seen.by_nine))
+            one.follow(seen.s)
         bank.judge(0.0)
         for one in bank.all:
             one.update(learn=one.telling)
@@ -106,3 +107,23 @@ def test_no_drift_gets_less_certain_than_the_steepest() -> None:
     for _ in range(30 * 24):
         drifting.propagate(5000.0, 3600.0)
     assert 19.0 < np.sqrt(drifting._P[drifting.slope, drifting.slope]).max() * 3600.0 < 30.0
+
+
+def test_a_level_that_nobody_has_seen_is_kept() -> None:
+    """Rock takes up what the coefficients give; but a level that has changed beyond chance is learned."""
+    bank, _ = flown(np.full(400, 4.0), PER_DEGREE)
+    quiet = bank.quiet
+    learned, rock = quiet.coefficients.copy(), quiet.rock
+
+    def level(coefficients: np.ndarray) -> float:
+        return float(quiet._mean @ coefficients)
+
+    quiet.keep_level(learned + 200.0)
+    np.testing.assert_array_equal(quiet.coefficients, learned)
+    published = learned + np.random.default_rng(6).normal(size=len(learned))
+    quiet.keep_level(published)
+    by = level(published) - level(learned)
+    assert abs(by) > 0.5
+    assert level(quiet.coefficients) == pytest.approx(level(published), abs=1e-6)
+    share = 1.0 - (1.0 - 1.0 / LONG) ** 400  # of the mean derivative that is followed by now
+    assert quiet.rock - rock == pytest.approx(by / share, rel=0.1)
