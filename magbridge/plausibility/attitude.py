@@ -6,9 +6,9 @@ direction u of the corrected field in body axes, wrong offsets o and gains g cha
 :mod:`magbridge.plausibility.level`). The five numbers theta are found by least squares from the changes
 within half a minute, ``F - F_a = (r - r_a) theta + e``: a ridge regression, whose prior is what a sensor may
 be off by (Hoerl & Kennard 1970, Technometrics 12:55), with Huber's weights (1964, Ann. Math. Stat. 35:73),
-which forgets in half an hour. Changes that overlap count as one, and the variance of e is learned, rock
-included. ``theta' A theta`` is chi-squared where nothing follows the attitude. Beyond :data:`ALARM` sigma
-spans ``r theta`` and its own doubt.
+which forgets by half in twenty minutes. Changes that overlap count as one, and the variance of e is learned,
+rock included. ``theta' A theta`` is chi-squared where nothing follows the attitude. Beyond :data:`ALARM`
+sigma spans ``r theta`` and its own doubt.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ LONGEST_US: Final = 32_500_000
 """µs over which a change is taken."""
 FORGET: Final = 1800.0
 """s."""
-PRIOR: Final = np.diag(1.0 / np.array([50.0, 50.0, 50.0, 500.0, 500.0]) ** 2)
-"""1/nT²: offsets of 50 nT, gains of 1 % in the Earth's field; 1-sigma."""
+PRIOR: Final = np.diag(1.0 / np.array([100.0, 100.0, 20.0, 1000.0, 1000.0]) ** 2)
+"""1/nT²: offsets of 100 nT, gains of 2 % in the Earth's field; 1-sigma. That of z is nearly a constant."""
 START: Final = 100.0
 LEARNED: Final = 1
 MEMORY: Final = 128
@@ -40,8 +40,8 @@ MEMORY: Final = 128
 CLIP: Final = 16.0
 """Times the usual that a square counts as, at most."""
 HUBER: Final = 3.0
-ALARM: Final = 15.0
-CALM: Final = 7.5
+ALARM: Final = 12.0
+CALM: Final = 6.0
 UNSTEADY: Final = int(
     Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN | Quality.IMPLAUSIBLE
 )
