@@ -8,13 +8,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.deprecated import old_argument
 from magbridge.diagnose.accept import accept
 from magbridge.diagnose.causes import Cause, known
@@ -36,8 +34,8 @@ from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.search import search
-from magbridge.diagnose.seen import memory, seen
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
+from magbridge.diagnose.unexplained.unlisted import unlisted
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 
@@ -46,12 +44,6 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose"]
 
-LOUD = 2.0
-"""Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
-SLOW, SMOOTH, NEGLIGIBLE = 0.4, 5.0, 1e-5
-"""A residual is far from white if so much of its power is left in means over 64 samples, or if its RMS is so
-many times what changes from one sample to the next (autoregressive noise of 0.96); and its RMS, as a share of
-the field, below which that does not matter."""
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 
@@ -148,7 +140,7 @@ def _examine(
             # the dives left out speak 20:1 against these names
             named, competing, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
-    rest = rest or _passing(off) or _slow(problem, fit, named) or _loud(problem, after, counts)
+    rest = rest or unlisted(problem, fit, named, off, after, counts)
     chances = chances_alone(candidates, outcome.info, named, outcome.look_elsewhere, len(causes))
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
@@ -233,50 +225,6 @@ def _findings(
         covariance = fit.effects_covariance[own, own]
         found.append(Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, chance))
     return tuple(found)
-
-
-def _passing(off: Outliers | None) -> Leftover | None:
-    """Describe wrong samples that are not isolated: something passed by, or rang, for a few samples."""
-    if off is None or off.isolated:
-        return None
-    return Leftover("transient", float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None)
-
-
-def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | None:
-    """Describe a structureless residual beyond the calibration's stated noise and coefficient errors."""
-    power = float(np.sum(after[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
-    n = int(counts.sum())
-    if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:
-        return None
-    return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
-
-
-def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
-    """Describe a residual that is far from white, though no description of the list stands out of it.
-
-    Noise of a long memory can describe anything slow: what it describes is still no noise of the sensor. So
-    can noise that grows towards low frequencies, unless it may be a remnant of the strongest cause.
-    """
-    slow = problem.slow_noise(fit.z)
-    residual = (fit.residual + slow) / problem.reference_jacobian
-    found = memory(problem, residual)
-    far = found.slow >= SLOW or found.rms >= SMOOTH * found.white
-    if problem.waves.size:
-        known = fit.prior[problem.slow] * np.diag(fit.covariance)[problem.slow]
-        power, freedom = float(np.sum(fit.noise.whiten(slow) ** 2)), float(np.sum(1.0 - known))
-        if power < (REMNANT * max((h.signal_to_noise for h in named), default=0.0)) ** 2:
-            return None
-        ratio, size = power, rms(slow / problem.reference_jacobian)
-    elif far and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference)):
-        power, freedom = found.means * found.samples * found.slow, found.means
-        ratio, size = (
-            power * (found.rms / max(found.white, 1e-9)) ** 2,
-            found.rms * float(np.sqrt(found.slow)),
-        )
-    else:
-        return None
-    p_value, channel = float(chi2.sf(power, freedom)), seen(problem, residual).channel
-    return Leftover("drift", float(np.sqrt(ratio)), p_value, 0.0, None, channel, size=size)
 
 
 def _verdict(

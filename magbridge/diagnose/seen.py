@@ -26,7 +26,7 @@ from magbridge.calibration.residual import rms
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import LEVEL
 
-__all__ = ["Memory", "Seen", "memory", "seen"]
+__all__ = ["WHITE", "Memory", "Seen", "memory", "seen"]
 
 LAGS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, lags that are tried."""

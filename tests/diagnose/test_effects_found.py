@@ -23,7 +23,8 @@ from magbridge.calibration.mass_effects import (
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.problem import effect_columns, pose, samples_of
+from magbridge.diagnose.compare.effect_columns import effect_columns
+from magbridge.diagnose.compare.problem import pose, samples_of
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.errors import FormatError
 

@@ -15,8 +15,9 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.design_columns import Columns, size_of
+from magbridge.diagnose.compare.effect_columns import effect_columns
 from magbridge.diagnose.compare.interpolation import rates
-from magbridge.diagnose.compare.problem import Problem, effect_columns
+from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.unexplained import shapes
