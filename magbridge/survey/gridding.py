@@ -17,10 +17,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_doubt import plausible
-from magbridge.calibration.fitting.field_nodes import ladder, nodes_for
+from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
@@ -194,18 +194,9 @@ def _groups(samples: Samples) -> tuple[Group, ...]:
     return tuple(groups)
 
 
-def _about_the_middle(samples: Samples) -> BoolArray:
-    """Return the samples nearest to the middle one, whole stretches of lines among them: (n,)."""
-    n = len(samples.value)
-    if n <= SEARCHED:
-        return np.ones(n, bool)
-    from_middle = np.abs(samples.place - np.median(samples.place, axis=0)).max(axis=1)
-    return np.asarray(from_middle <= np.partition(from_middle, SEARCHED)[SEARCHED])
-
-
 def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, Roughness]:
     """Return the field that a part of the samples, with noise of about `sigma` nT, is likeliest with."""
-    few = samples.part(_about_the_middle(samples))
+    few = samples.part(about_the_middle(samples.place, SEARCHED))
     groups, rows = _groups(few), np.arange(len(few.value))
     family = with_groups(NOTHING, groups)
     weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))

@@ -11,9 +11,11 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
+from magbridge.calibration.fitting import in_place
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
+from magbridge.calibration.fitting.joint import Sums
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Noise, identity
@@ -142,6 +144,29 @@ def test_straight_line_is_not_supported() -> None:
     error, sigma = error_of(found, data, true)
     assert error < 1.5 * sigma
     assert any("never crossed your own track" in line for line in found.warnings)
+
+
+def test_a_long_survey_is_searched_with_the_part_about_its_middle(
+    survey: Survey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rock's size and length are that part's, the calibration and the nodes those of all samples."""
+    used, few = [], in_place._Rounds._few
+
+    def counted(rounds: in_place._Rounds, field: Matern) -> Sums:
+        sums = few(rounds, field)
+        used.append(sums.samples)
+        return sums
+
+    monkeypatch.setattr(in_place, "SEARCHED", 600)
+    monkeypatch.setattr(in_place, "WIDE", 0.0)
+    monkeypatch.setattr(in_place._Rounds, "_few", counted)
+    data, true, _ = survey
+    found = fit(data)
+    assert 500 < max(used) <= 601
+    assert 300.0 < found.details["rock"]["length_m"] < 2000.0
+    error, sigma = error_of(found, data, true)
+    assert error < 1.15 * NOISE
+    assert 0.8 < error / sigma < 1.25
 
 
 def test_a_zigzag_tells_rock_from_heading_without_a_crossing() -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.field.place.nodes import Nodes, nodes_near
 
-__all__ = ["NODES", "SMOOTH", "fine_enough", "ladder", "nodes_for"]
+__all__ = ["NODES", "SMOOTH", "about_the_middle", "fine_enough", "ladder", "nodes_for"]
 
 RUNGS = 7
 """Lengths that are tried first."""
@@ -46,6 +46,17 @@ def nodes_for(place: FloatArray, length: float, alpha: int, most: int = NODES) -
     while (nodes := nodes_near(place, spacing, PAD * length)).size > 1.05 * most:
         spacing *= (nodes.size / most) ** 0.5
     return nodes
+
+
+def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolArray:
+    """Return which of places (n, 2), m, are the `number` nearest to the middle one, or within `wide` m: (n,).
+
+    They lie in a square, so that whole stretches of lines are among them.
+    """
+    if len(place) <= number:
+        return np.ones(len(place), bool)
+    from_middle = np.abs(place - np.nanmedian(place, axis=0)).max(axis=1)
+    return np.asarray(from_middle <= max(np.partition(from_middle, number)[number], wide))
 
 
 def ladder(place: FloatArray) -> FloatArray:

@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_doubt import plausible
-from magbridge.calibration.fitting.field_nodes import ladder
+from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
@@ -81,8 +81,11 @@ OVERSHOT = 10.0
 """Growth of the objective by which a step goes too far; less may be the track that is bent only after it."""
 SHORTEST = 1e-3
 """Part of a step, below which it is not shortened further."""
-SEARCHED = 12_000
-"""Samples that the field's size and length are searched with, at most."""
+SEARCHED, WIDE = 12_000, 5_000.0
+"""Samples about the middle that the field's size and length are searched with; where there are more within so
+many m north and east, every second or third of these."""
+MOST = 40_000
+"""Nodes about all samples, at most."""
 
 
 def fit_in_place(
@@ -164,6 +167,7 @@ def _drift(data: Observations, sigma: float) -> Drift | None:
 
 
 def _details(found: _Answer, survey: SurveySamples) -> dict[str, Any]:
+    part = about_the_middle(survey.place, SEARCHED, WIDE)
     choice, field, names = found.choice, found.choice.field, found.family.names
     latent = found.z[len(found.z) - sum(len(group.shape) for group in survey.groups) :]
     return {
@@ -177,7 +181,7 @@ def _details(found: _Answer, survey: SurveySamples) -> dict[str, Any]:
             "size_nT": choice.ratio * found.widths.sigma,
             "length_m": field.length,
             "smoothness": field.alpha - 1,
-            "shortest_m": float(ladder(survey.place)[0]),
+            "shortest_m": float(ladder(survey.place[part])[0]),
             "falls_off_upwards": field.harmonic,
             "nodes": field.nodes.size,
         },
@@ -206,10 +210,11 @@ class _Rounds:
         self.until = GUESSED + SEARCHES
         self.weigh_offers = self.until + 1 if survey.offsets else -1
         self.family = with_groups(own, survey.groups)
-        self.step = max(len(survey.samples.field) // SEARCHED, 1)
+        self.part = about_the_middle(survey.place, SEARCHED, WIDE)
+        self.step = max(int(self.part.sum()) // SEARCHED, 1)
         self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
-        self.middle = float(np.median(ladder(survey.place)))
-        self.choice = first_guess(survey.place)
+        self.middle = float(np.median(ladder(survey.place[self.part])))
+        self.choice = self._everywhere(first_guess(survey.place[self.part]))
         self.z, self.sigma = _start(survey, self.family)
         self.eta, self.w = self.family.centre, np.zeros(self.choice.field.nodes.size)
         self.nodes = self.choice.field.nodes
@@ -244,19 +249,11 @@ class _Rounds:
 
     def _round(self, turn: int) -> _Answer:
         """Search the field where it is time to, and solve for all that is linear about the last answer."""
-        place, weighed = self.survey.place, Weighed(self.family, self.eta, self.sigma, self.middle)
-        few = self.step > 1
-        if turn == self.until - SEARCHES:
-            self.choice = choose(self._few, place, weighed, self.choice.ratio, harmonic=self.harmonic)
-        elif self.until - SEARCHES < turn <= self.until:
-            start = replace(self.choice, rho=self.choice.rho**self.step)
-            self.choice = refined(self._few, place, start, weighed)
-        else:
-            few = False
-        if few:
-            self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / self.step))
-        sums = self._sums(self.choice.field, 1)
-        if few:
+        weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
+        if searched := self.until - SEARCHES <= turn <= self.until:
+            self._search(weighed, anew=turn == self.until - SEARCHES)
+        sums = self._sums(self.choice.field)
+        if searched and self.step > 1:
             self.choice = same_noise(sums, self.choice, weighed)
         choice, reduced = self.choice, eliminate(sums, self.choice.field, self.choice.ratio, self.choice.rho)
         widths = maximise(reduced.quadratic, self.family, self.eta, self.sigma)
@@ -273,10 +270,33 @@ class _Rounds:
         score = widths.log_evidence + reduced.log_evidence
         return _Answer(self.z, self.w, reduced, choice, widths, self.family, lacking, score)
 
+    def _search(self, weighed: Weighed, *, anew: bool) -> None:
+        """Choose the field with a part of the samples, and put it on nodes about them all."""
+        place, before = self.survey.place[self.part], self.choice
+        if anew:
+            found = choose(self._few, place, weighed, before.ratio, harmonic=self.harmonic)
+        else:
+            start = replace(before, rho=before.rho**self.step)
+            if not self.part.all():
+                field = before.field
+                start = replace(
+                    start, field=replace(field, nodes=nodes_for(place, field.length, field.alpha))
+                )
+            found = refined(self._few, place, start, weighed)
+        self.choice = self._everywhere(replace(found, rho=found.rho ** (1.0 / self.step)))
+
+    def _everywhere(self, choice: Choice) -> Choice:
+        """Return a choice that was made with a part of the samples on nodes about them all."""
+        if self.part.all():
+            return choice
+        field = choice.field
+        nodes = nodes_for(self.survey.place, field.length, field.alpha, MOST)
+        return replace(choice, field=replace(field, nodes=nodes))
+
     def _weigh_offers(self) -> None:
         """Keep the offsets that the log needs; where it does not need all, the search goes on without."""
         survey, choice = self.survey, self.choice
-        reduced = eliminate(self._sums(choice.field, 1), choice.field, choice.ratio, choice.rho)
+        reduced = eliminate(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
         kept = likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma)
         if len(kept) < len(survey.groups):
             self._regroup(kept)
@@ -298,7 +318,7 @@ class _Rounds:
     def covariance(self, answer: _Answer) -> FloatArray:
         """Return that of z (q, q), with what the data leave open of the field's size and length."""
         start, z = answer.choice, answer.z
-        sums, s2 = self._sums(start.field, 1), self.sigma**2
+        sums, s2 = self._sums(start.field), self.sigma**2
         precision = self.family.at(self.eta).precision
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
 
@@ -336,14 +356,19 @@ class _Rounds:
         return np.asarray(self._slow(z) + moved + B @ reduced.field(z))
 
     def _few(self, field: Matern) -> Sums:
-        return self._sums(field, self.step)
+        return self._sums(field, np.flatnonzero(self.survey.kept & self.part)[:: self.step], self.step)
 
-    def _sums(self, field: Matern, step: int) -> Sums:
-        """Return the sums of every `step`-th sample about the last answer; about none where nodes are new."""
+    def _sums(self, field: Matern, rows: IndexArray | None = None, step: int = 1) -> Sums:
+        """Return the sums of all samples, or of `rows`, every `step`-th one, about the last answer.
+
+        Where the nodes are new they are about a field of 0.
+        """
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
         self.survey.bend(field, w, self.z[self.q :])
-        B = self.survey.basis(field)
-        return add_up(self.survey.linear(self.family, self.z, self._slow(self.z) + B @ w, w, B, step))
+        rows = np.flatnonzero(self.survey.kept) if rows is None else rows
+        B = self.survey.basis(field, rows)
+        lacking = self._slow(self.z)[rows] + B @ w
+        return add_up(self.survey.linear(self.family, self.z, lacking, w, B, rows, step))
 
     def _slow(self, z: FloatArray) -> FloatArray:
         """Return level and slow changes at every sample with z (q,), nT."""

@@ -89,9 +89,10 @@ class SurveySamples:
                 out += group.functions @ d.reshape(3, -1).T
         return out
 
-    def basis(self, field: Matern) -> csr_array:
-        """Return what the field's coefficients add to the reference (n, nodes)."""
-        return csr_array(diags_array(self.unmapped) @ field.basis(self.place, self.deeper))
+    def basis(self, field: Matern, rows: IndexArray | slice = slice(None)) -> csr_array:
+        """Return what the field's coefficients add to the reference, at all samples or `rows`: (m, nodes)."""
+        known = field.basis(self.place[rows], self.deeper[rows])
+        return csr_array(diags_array(self.unmapped[rows]) @ known)
 
     def bend(self, field: Matern, w: FloatArray, latent: FloatArray) -> None:
         """Move the track to where it is with the unknowns `latent` (p,), and take the field's slope there.
@@ -113,18 +114,18 @@ class SurveySamples:
         lacking: FloatArray,
         w: FloatArray,
         B: csr_array,
+        rows: IndexArray,
         step: int = 1,
     ) -> Iterator[Linear]:
-        """Yield every `step`-th sample, linearised about z (q,) and w, as :class:`~.joint.Linear` has them.
+        """Yield every `step`-th sample, `rows` (m,), linearised about z (q,), w as :class:`~.joint.Linear`.
 
-        `lacking` (n,), nT, is all that the reference lacks at that answer, B w among it.
+        `lacking` (m,), nT, is all that the reference lacks there at that answer, B w among it.
         """
-        rows = np.flatnonzero(self.kept)[::step]
         samples = self.samples.part(rows)
         q = family.E.shape[1] - sum(len(group.shape) for group in self.groups)
         samples = replace(
             samples,
-            reference=samples.reference + lacking[rows],
+            reference=samples.reference + lacking,
             field=samples.field - self.offset(z[q:])[rows],
         )
         follows = np.zeros(len(rows), bool)
@@ -143,7 +144,7 @@ class SurveySamples:
             D = np.hstack(
                 [jacobian(piece.phi, g) @ E, -self.steady[mine] / size, *offsets, -self.slopes[mine] / size]
             )
-            here = csr_array(diags_array(-1.0 / s) @ B[mine])
+            here = csr_array(diags_array(-1.0 / s) @ B[part])
             y = e - D @ z - here @ w
             yield Linear(np.column_stack([y, D]), here, follows[part], overlap=start > 0)
 
