@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import isnan
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -51,6 +51,20 @@ AGREE: Final = 3
 """An innovation beyond so many sigmas is not learned from, unless it is the third in a row."""
 SHORT_US: Final = 3_600_000_000
 """µs without a sample to learn from after which that is told."""
+
+
+class Sample(NamedTuple):
+    """What :meth:`Learner.sample` is given."""
+
+    time_us: int
+    field: Vector
+    regressors: list[float]
+    values: tuple[float, ...]
+    quality: int
+    faulty: bool
+    reference: float
+    where: tuple[float, float] | None
+    watched: tuple[float, ...]
 
 
 class Learner:
@@ -172,6 +186,7 @@ class Learner:
         self._last_us = self._looked_us = self._reported_us = 0
         self._where: tuple[float, float] | None = None
         self._before: FloatArray | None = None
+        self._waiting: Sample | None = None
 
     def _restart(self) -> None:
         """Begin to learn from the first calibration, whose offsets may have changed at this power-on."""
@@ -194,6 +209,9 @@ class Learner:
 
     def restarted(self) -> None:
         """Take note that the sensor was powered anew: its offsets may have changed."""
+        if self._waiting is not None:
+            self._take(self._waiting)
+            self._waiting = None
         self._bank.open(self._turn_on**2)
 
     def sample(
@@ -209,7 +227,10 @@ class Learner:
         where: tuple[float, float] | None,
         watched: Sequence[float],
     ) -> None:
-        """Take a sample that was corrected.
+        """Take the sample that waits, and let this one wait.
+
+        A mass may have begun to move since its telemetry was sent last, and then the field is off without a
+        flag. So a sample is judged once the next does not say that a mass moves.
 
         Parameters
         ----------
@@ -233,7 +254,21 @@ class Learner:
             As :attr:`watched`; NaN where unknown.
         """
         if not self.enabled:
+            self._waiting = None
             return
+        waiting = self._waiting
+        if waiting is not None:
+            moves = quality & MOVING and not waiting.quality & MOVING
+            if not moves and 0 <= time_us - waiting.time_us < 0.99 * self._period_us:
+                return
+            self._take(waiting._replace(quality=waiting.quality | MOVING) if moves else waiting)
+        self._waiting = Sample(
+            time_us, field, list(regressors), values, quality, faulty, reference, where, tuple(watched)
+        )
+
+    def _take(self, sample: Sample) -> None:
+        """Learn from a sample, and judge it."""
+        time_us, field, regressors, values, quality, faulty, reference, where, watched = sample
         self._now_us, unfit = time_us, quality & self._unfit
         if unfit & ~MOVING or isnan(reference) or where is None:
             self._nothing(time_us)
@@ -268,7 +303,7 @@ class Learner:
         if before is not None and 0.0 < seconds < 30.0:  # what it would be, were telemetry a second late
             clock = (self._by(quiet)(field, before, reference).e - observed.e) / seconds
         signs = Signs(
-            time_us * 1e-6, observed.by_nine[6:], tuple(positions), tuple(watched), clock, -1.0 / observed.s
+            time_us * 1e-6, observed.by_nine[6:], tuple(positions), watched, clock, -1.0 / observed.s
         )
         by_first, by_published = self._publication.nine(phi)
         first = self._observe(field, by_first, reference)

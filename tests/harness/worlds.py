@@ -66,7 +66,7 @@ def learn(
     world: World,
     *,
     added: np.ndarray | None = None,
-    quality: int = 0,
+    quality: int | np.ndarray = 0,
     watched: np.ndarray | None = None,
     faulty: np.ndarray | None = None,
     seen: Callable[[int], None] | None = None,
@@ -74,6 +74,7 @@ def learn(
     """Give the learner a world's samples, and call `seen` after each; return where it doubted."""
     corrector, doubted = Corrector(learner.first), []
     field = world.field if added is None else world.field + added
+    flags = np.broadcast_to(quality, len(field)).tolist()
     for n, reading in enumerate(field.tolist()):
         values = (float(world.mass[n]),)
         corrector.numbers(0, (reading[0], reading[1], reading[2]), values, 0)
@@ -82,7 +83,7 @@ def learn(
             (reading[0], reading[1], reading[2]),
             corrector.regressors,
             values,
-            quality,
+            flags[n],
             faulty=faulty is not None and bool(faulty[n]),
             reference=FIELD,
             where=world.where[n],
