@@ -19,7 +19,7 @@ from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.varying import varying
 
-__all__ = ["accept"]
+__all__ = ["accept", "settle"]
 
 AGAINST = 2.0
 """Log odds by which dives left out must speak against names. They say it with noise: of 14 right names of S/N
@@ -65,6 +65,20 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     if behind <= 0.0:
         return True, rest
     return False, free._replace(within=_within(outcome, behind))
+
+
+def settle(outcome: Outcome, tone: Candidate | None) -> tuple[Outcome, bool, Leftover | None]:
+    """Return the outcome that counts, and what :func:`accept` says of it.
+
+    Slow noise takes part of what descriptions stand for, too, and so makes names look better beside them. So
+    names found beside it are asserted only if those found without it are.
+    """
+    asserted, rest = accept(outcome.problem, outcome, tone)
+    if asserted and outcome.plain is not None:
+        plain, described = accept(outcome.plain.problem, outcome.plain, tone)
+        if not plain:
+            return outcome.plain, False, described
+    return outcome, asserted, rest
 
 
 def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, best: Leftover | None) -> float:

@@ -14,7 +14,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.deprecated import old_argument
-from magbridge.diagnose.accept import accept
+from magbridge.diagnose.accept import settle
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.causes.time_dependent import interference_tone
@@ -114,10 +114,10 @@ def _examine(
     candidates, untestable = _put_forward(problem, causes)
     progress("searching")
     outcome = search(problem, candidates, len(causes))
-    problem = outcome.problem
     progress("what is left")
     tone = _strongest_tone(problem, candidates)
-    stand, rest = accept(problem, outcome, tone)
+    outcome, stand, rest = settle(outcome, tone)
+    problem = outcome.problem
     named, competing, fit = (
         (outcome.chosen, outcome.competing, outcome.fit) if stand else ((), (), outcome.null)
     )

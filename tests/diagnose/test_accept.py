@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from posed import candidate, missed, right
 
-from magbridge.diagnose.accept import _within, accept
+from magbridge.diagnose.accept import _within, accept, settle
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import GridPoint
 from magbridge.diagnose.compare.problem import Problem
@@ -70,6 +70,20 @@ def test_dives_left_out_overrule_a_name_that_fits() -> None:
             "a", bent + share * bent.std() * rng.normal(size=ROWS), point=GridPoint(likelier=300.0)
         )
         assert accept(problem, search(problem, [alike], 1), None)[0] == named
+
+
+def test_what_is_named_beside_slow_noise_must_stand_without_it() -> None:
+    problem, rng = right(ROWS), np.random.default_rng(10)
+    bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
+    problem = replace(problem, residual=bent + rng.normal(size=ROWS))
+    exact, alike = (
+        search(problem, [candidate("a", shape, point=GridPoint(likelier=300.0))], 1)
+        for shape in (bent, bent + 0.5 * bent.std() * rng.normal(size=ROWS))
+    )
+    assert settle(replace(exact, plain=exact), None)[1]
+    outcome, asserted, rest = settle(replace(exact, plain=alike), None)
+    assert (outcome, asserted) == (alike, False)
+    assert rest is not None
 
 
 @pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])

@@ -24,7 +24,7 @@ that is left, the other causes projected out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +77,8 @@ class Outcome:
         Cause -> number of independent hypotheses behind it.
     evidence : float
         Log evidence of what was found and of its noise, against the null without slow noise.
+    plain : Outcome or None
+        What was found without slow noise, where that was less likely.
     """
 
     problem: Problem
@@ -88,6 +90,7 @@ class Outcome:
     info: Information
     look_elsewhere: dict[str, float]
     evidence: float
+    plain: Outcome | None = None
 
 
 def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:
@@ -110,7 +113,7 @@ def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Ou
     if slow.log_likelihood <= null.log_likelihood:
         return found
     beside = _search(noisy, candidates, causes, null)
-    return beside if beside.evidence > found.evidence else found
+    return replace(beside, plain=found) if beside.evidence > found.evidence else found
 
 
 def _search(
