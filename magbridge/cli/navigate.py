@@ -68,7 +68,8 @@ def navigate(
     map
         The anomaly grid. Without one: localisation in the survey's own field.
     calibration
-        The calibration (cal.json). For a plan it gives the sensor noise; without it 1 nT.
+        The calibration (cal.json). A log with total_field, corrected or of a scalar magnetometer, needs none.
+        For a plan it gives the sensor noise; without it 1 nT.
     config
         A bridge.toml whose [navigation.options] say how well start, current and map are known.
     bound
@@ -99,18 +100,20 @@ def navigate(
             )
         _bound(files, map, output, options, known, every, picture, reading, json)
         return
-    if known is None or calibration is None:
-        raise WrongUse("expected --calibration, which only --bound can do without")
 
     from magbridge.field.read import read_grid
     from magbridge.logs import write
     from magbridge.navigate import Options
     from magbridge.navigate.batch import navigate as find_way
-    from magbridge.navigate.options import informed
+    from magbridge.navigate.options import informed, with_level
 
-    deployment = _corrected(files, known, calibration, heading_reference, reading)
-    if options is None:
-        options = informed(Options(), known, float(deployment["total_field_sigma"].median()))
+    if known is None or calibration is None:
+        deployment = _scalar(files, heading_reference, reading)
+        level = float(deployment["level_sigma"].median()) if "level_sigma" in deployment else 0.0
+        options = options or with_level(Options(), level)
+    else:
+        deployment = _corrected(files, known, calibration, heading_reference, reading)
+        options = options or informed(Options(), known, float(deployment["total_field_sigma"].median()))
     if map is None:
         from magbridge.navigate.own_survey import localise
 
@@ -127,6 +130,20 @@ def navigate(
         complain(finding)
     facts, summary = _judged(track)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+
+
+def _scalar(files: tuple[Path, ...], heading_reference: Heading, reading: Reading) -> xr.Dataset:
+    """Return logs that hold the total field; WrongUse: they hold what must be corrected first."""
+    from magbridge.errors import WrongUse
+    from magbridge.field.declination import with_true_heading
+    from magbridge.logs import read
+
+    with waiting("reading"):
+        whole = read(files, options=reading.options)
+    if "total_field" not in whole:
+        raise WrongUse(f"expected --calibration: {whole.attrs['source']} has no total_field")
+    note_losses(whole.attrs)
+    return with_true_heading(whole, heading_reference)
 
 
 def _corrected(
@@ -227,7 +244,7 @@ def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> t
     if there is not grid and known != options:
         side = "above" if there.altitude > 0.0 else "below"
         complain(
-            f"{grid.name}: at {grid.altitude:.0f} m; continued to {abs(there.altitude):.0f} m {side} the "
+            f"{grid.name}: at {round(grid.altitude)} m; continued to {abs(there.altitude):.0f} m {side} the "
             f"surface; with what that leaves out, the map's error is typically {known.map_sigma:.1f} nT over "
             f"{known.map_length:.0f} m"
         )

@@ -98,6 +98,16 @@ def test_a_plan_that_cannot_be_flown_is_one_line(command: Command, text: str, an
     assert answer in command.refuses(*BOUND, "bad.csv", "--strict")
 
 
+def test_a_log_that_is_corrected_needs_no_calibration(command: Command, here: Path) -> None:
+    """Nor does that of a scalar magnetometer; both are navigated as the raw log is with its calibration."""
+    command("correct", "log.nc", *CALIBRATED, "-o", "corrected.nc")
+    away = [
+        json.loads(command(*TRACK[:1], log, *TRACK[2:], *more, "--json").out)["error_m"]
+        for log, more in (("log.nc", CALIBRATED), ("corrected.nc", ()))
+    ]
+    assert away[1] == pytest.approx(away[0], rel=0.3)
+
+
 def test_wrong_use_is_one_line(command: Command) -> None:
     assert "expected --calibration" in command.refuses(*TRACK, code=2)
     for text, line in (
