@@ -8,7 +8,8 @@ import pytest
 from magbridge.plausibility import Plausibility
 from magbridge.plausibility.jump import GATE, SLOPE_US
 from magbridge.plausibility.level import FAR, LEVEL, NEAR
-from magbridge.plausibility.scatter import QUIETEST
+from magbridge.plausibility.scatter import QUIETEST, Scatter
+from magbridge.plausibility.told import Told
 from magbridge.records import Quality
 
 FIELD, IMPLAUSIBLE, MOVING = 50_000.0, int(Quality.IMPLAUSIBLE), int(Quality.MOVING)
@@ -303,3 +304,25 @@ def test_the_slope_is_measured_over_twenty_seconds() -> None:
             fed(float(off))
         fed(float(off) + 0.8 * gate(1.0, slope=1.0, seconds=120.0), after=120.0)
         assert not fed.flagged
+
+
+def scattered(speed: float, size: float, period: float, places: int = 2, every: float = 0.1) -> float:
+    """Return what a hum adds to sigma, nT, of samples so many s apart with 1 nT of noise."""
+    scatter, noise = Scatter(1.0, Told()), np.random.default_rng(1).normal(0.0, 1.0, 3000)
+    scatter.begin(9.0 * scatter.floor)
+    for k in range(places):
+        scatter.place((1 + k) * 60_000_000, 48.0 + k * speed * 60.0 / 111_200.0, -57.0)
+    for k in range(3000):
+        hum = size * np.sin(2.0 * np.pi * every * k / period)
+        scatter.follow(200_000_000 + round(1e6 * every * k), FIELD + float(hum + noise[k]))
+    return scatter.excess() ** 0.5
+
+
+def test_how_long_a_lag_may_be_is_the_speed_s_to_say() -> None:
+    """12 m at 20 m/s are 0.6 s, of which 0.4 is the longest lag in steps of 0.1 s."""
+    assert 6.0 < scattered(20.0, 10.0, 2.0) < 14.0
+    assert scattered(20.0, 0.0, 2.0) == 0.0
+    assert scattered(200.0, 10.0, 2.0) == 0.0
+    assert scattered(20.0, 10.0, 2.0, places=1) == 0.0, "nobody knows the speed"
+    assert 8.0 < scattered(0.3, 10.0, 60.0) < 20.0, "at 10 Hz, lags of 24 s"
+    assert scattered(0.3, 10.0, 600.0) == 0.0

@@ -43,6 +43,7 @@ TESTS = {
     "calibration/fitting/noise": "calibration/test_noise.py",
     "diagnose/inference/evidence": "diagnose/test_evidence.py",
     "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py",
+    "plausibility/attitude": "test_attitude.py",
     "plausibility/axes": "test_plausibility.py test_plausibility_numbers.py",
     "plausibility/judge": "test_plausibility.py test_plausibility_numbers.py",
     "plausibility/jump": "test_plausibility.py test_plausibility_numbers.py",
