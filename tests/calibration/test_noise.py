@@ -30,6 +30,7 @@ def test_size_and_memory_are_those_that_were_drawn(rho: float) -> None:
 
 
 def test_white_noise_has_no_memory_and_few_samples_tell_of_none() -> None:
+    assert NoiseModel(4.0).shape == (0.0, 0.0)
     assert estimate_noise(drawn(0.0), STEPS, 0.0).autocorrelation == 0.0
     short = slice(0, 30)
     assert estimate_noise(drawn(0.9)[short], STEPS[short], 0.0).autocorrelation == 0.0
