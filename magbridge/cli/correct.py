@@ -44,7 +44,7 @@ KEPT = (
     *("latitude", "longitude", "depth", "roll", "pitch", "heading", "run", "dive", "line", "line_type"),
     *("sensor_temperature", "reference_field", "velocity_north", "velocity_east", "water_speed"),
     *("local_north", "local_east", "dr_latitude", "dr_longitude", "gps_latitude", "gps_longitude"),
-    *("truth_latitude", "truth_longitude", "truth_total_field"),
+    *("truth_latitude", "truth_longitude"),
 )
 """Columns of a log that stay beside the corrected field, with the calibration's parameters."""
 
