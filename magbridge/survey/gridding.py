@@ -44,8 +44,8 @@ LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
 """nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """As in a survey that calibrates itself."""
-SEARCHED = 4_000
-"""Samples about the middle with which the field is searched."""
+SEARCHED, SEARCHED_NODES = 4_000, 12_000
+"""Samples about the middle with which the field is searched, and nodes at most."""
 OUTLIER = 6.0
 """Sigmas beyond which a sample is left out."""
 LARGE, LIKELIER = 100.0, 5.0
@@ -205,7 +205,7 @@ def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, R
     size = max(robust_scale(few.value - problem.mean), 5.0)
     best = choose(
         lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
-        harmonic=bool(np.ptp(problem.deeper) > 5.0), rho=samples.rho, effort=0.5,
+        harmonic=bool(np.ptp(problem.deeper) > 5.0), rho=samples.rho, effort=0.5, most=SEARCHED_NODES,
     )  # fmt: skip
     area = float(np.prod(np.ptp(samples.place, axis=0)))
     if not local or area < LARGE * best.field.length**2:

@@ -14,6 +14,7 @@ from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting import in_place
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import too_rough
+from magbridge.calibration.fitting.field_nodes import nodes_for
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
 from magbridge.calibration.fitting.joint import Sums
 from magbridge.calibration.fitting.level import level_of
@@ -369,6 +370,14 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: 
     assert factor.log_determinant == pytest.approx(field.log_determinant)
     root = factor.draw(np.eye(field.nodes.size))
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(Q), atol=1e-6 * np.abs(np.linalg.inv(Q)).max())
+
+
+def test_nodes_are_as_fine_as_the_area_allows() -> None:
+    """A rough field over 100 km of lines: coarser nodes, and no more of them than asked for."""
+    x = np.arange(0.0, 100e3, 50.0)
+    place = np.concatenate([np.stack([x, 0.0 * x + east], axis=1) for east in np.arange(0.0, 60e3, 1e3)])
+    assert 0.7 * 4_000 < nodes_for(place, 300.0, 2, 4_000).size < 1.06 * 4_000
+    assert nodes_for(place[:100], 300.0, 2).spacing == pytest.approx(300.0 / 8.0)
 
 
 @pytest.mark.parametrize("waves", [1.0, 1.5, 2.0, 3.0])

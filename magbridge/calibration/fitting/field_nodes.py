@@ -19,6 +19,8 @@ PAD = 1.0
 """Lengths around the track that have nodes."""
 NODES = 4_000
 """Nodes at most, unless more are asked for."""
+SIDE = 1_500
+"""Nodes along a side of the area's box at most, where it is a square."""
 SHORTEST = 60.0
 """m, least length."""
 
@@ -42,7 +44,8 @@ def nodes_for(place: FloatArray, length: float, alpha: int, most: int = NODES) -
     most : int
         Nodes at most, about.
     """
-    spacing = length / FINE.get(alpha, ENOUGH)
+    box = np.ptp(place, axis=0) + 4.0 * PAD * length
+    spacing = max(length / FINE.get(alpha, ENOUGH), float(np.sqrt(box.prod())) / SIDE)
     while (nodes := nodes_near(place, spacing, PAD * length)).size > 1.05 * most:
         spacing *= (nodes.size / most) ** 0.5
     return nodes

@@ -29,6 +29,8 @@ RESOLVED = 2.0
 """Nodes a length at least: a shorter one is not tried on so large an area."""
 FEWER = 1_500
 """Nodes at most of the smoothest fields, whose precisions are nearly full."""
+CLEAR = 30.0
+"""Nats by which one kind of field is likelier than the other at any smoothness."""
 BENDS = 0.25
 """Fields look alike where the length times this power of alpha - 1 is the same."""
 SMALL = 0.03
@@ -84,6 +86,7 @@ def choose(
     harmonic: bool,
     rho: float | None = None,
     effort: float = 1.0,
+    most: int = NODES,
 ) -> Choice:
     """Choose the field from nothing: lengths from a ladder, then smoothness and all the rest about the best.
 
@@ -103,12 +106,14 @@ def choose(
         Autocorrelation of the noise, where it is known.
     effort : float
         Share of the usual steps.
+    most : int
+        Nodes at most.
     """
     best: Choice | None = None
     worse, move_rho = 0, rho is None
     ratio, rho = start, 0.3 if rho is None else rho
     for length in ladder(place)[::-1]:
-        nodes = nodes_for(place, length, SMOOTH)
+        nodes = nodes_for(place, length, SMOOTH, most)
         if length < RESOLVED * nodes.spacing:
             continue
         field = Matern(nodes, float(length), SMOOTH, harmonic)
@@ -125,15 +130,15 @@ def choose(
 
     def tried(one: Choice, alpha: int, harmonic: bool) -> Choice:
         length = one.field.length * ((one.field.alpha - 1) / (alpha - 1)) ** BENDS
-        most = NODES if alpha <= SMOOTH else FEWER
-        field = Matern(nodes_for(place, length, alpha, most), length, alpha, harmonic)
+        nodes = nodes_for(place, length, alpha, most if alpha <= SMOOTH else FEWER)
+        field = Matern(nodes, length, alpha, harmonic)
         begin = replace(one, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 
-    kinds = (True, False) if harmonic else (False,)
-    best = max((tried(best, SMOOTH, kind) for kind in kinds), key=lambda one: one.score)
-    best = _smoothness(best, tried)
-    if harmonic:
+    kinds = [tried(best, SMOOTH, kind) for kind in ((True, False) if harmonic else (False,))]
+    kinds.sort(key=lambda one: one.score)
+    best = _smoothness(kinds[-1], tried)
+    if harmonic and kinds[1].score - kinds[0].score < CLEAR:
         other = tried(best, best.field.alpha, not best.field.harmonic)
         best = _smoothness(other, tried) if other.score > best.score else best
     return best

@@ -33,8 +33,8 @@ VARIES = 0.5
 """degC, standard deviation of a temperature, from which on it can tell anything."""
 PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
 """nT/degC and nT along an axis (fluxgates' data sheets: 0.1 to 3 nT/degC), 1-sigma of their logarithms."""
-LIKELIER = 3.0
-"""Nats that a term must gain (20:1)."""
+LIKELIER = 6.0
+"""Nats that a term must gain (400:1: the best of several lags gains 3 where there is nothing)."""
 
 
 @dataclass(frozen=True, eq=False)
