@@ -176,6 +176,7 @@ class Correction:
             faulty=self.plausibility is not None and self.plausibility.fault,
             reference=main_field,
             where=where,
+            age=sample.age,
             watched=[self.aligner.by_name[name].at(sample.time_us)[0] for name in self.learner.watched],
         )
         return self.learner.flags

@@ -34,8 +34,8 @@ NEAR: Final = 0.25
 """By how much of d a later report may be off."""
 SHARE: Final = 0.4
 """w: the next d is the double."""
-MOST: Final = 49.0
-"""v²/S at most: two samples are needed in any case."""
+MOST: Final = 36.0
+"""v²/S at most: two samples are needed in any case, and the last before a motion is none of them."""
 MANY: Final = 41
 """Samples kept, at most one a second."""
 MOVED: Final = 0.01

@@ -5,6 +5,7 @@ What is published of it is :mod:`.publication`'s, how a doubt stands :mod:`.stan
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from math import isnan
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -48,23 +49,24 @@ GONE: Final = 9.0
 """Log-likelihood ratio below which it is not learned any more, but gone."""
 OUTLIER: Final = 5.0
 AGREE: Final = 3
-"""An innovation beyond so many sigmas is not learned from, unless it is the third in a row."""
+"""An innovation beyond so many sigmas says nothing, unless it is the third in a row."""
+MOST_HELD: Final = 64
+"""Samples that wait for newer telemetry, at most: the first are then left out."""
 SHORT_US: Final = 3_600_000_000
 """µs without a sample to learn from after which that is told."""
 
 
-class Sample(NamedTuple):
-    """What :meth:`Learner.sample` is given."""
+class Taken(NamedTuple):
+    """A sample that may be learned from, unless it is `faulty`."""
 
     time_us: int
     field: Vector
-    regressors: list[float]
-    values: tuple[float, ...]
-    quality: int
-    faulty: bool
     reference: float
-    where: tuple[float, float] | None
+    phi: FloatArray
+    positions: list[float]
+    where: tuple[float, float]
     watched: tuple[float, ...]
+    faulty: bool
 
 
 class Learner:
@@ -183,10 +185,10 @@ class Learner:
     def _begin(self) -> None:
         self._restart()
         self.samples = 0
-        self._last_us = self._looked_us = self._reported_us = 0
+        self._last_us = self._looked_us = self._taken_us = self._reported_us = 0
+        self._held: deque[Taken] = deque(maxlen=MOST_HELD)
         self._where: tuple[float, float] | None = None
         self._before: FloatArray | None = None
-        self._waiting: Sample | None = None
 
     def _restart(self) -> None:
         """Begin to learn from the first calibration, whose offsets may have changed at this power-on."""
@@ -209,9 +211,6 @@ class Learner:
 
     def restarted(self) -> None:
         """Take note that the sensor was powered anew: its offsets may have changed."""
-        if self._waiting is not None:
-            self._take(self._waiting)
-            self._waiting = None
         self._bank.open(self._turn_on**2)
 
     def sample(
@@ -226,11 +225,11 @@ class Learner:
         reference: float,
         where: tuple[float, float] | None,
         watched: Sequence[float],
+        age: float = 0.0,
     ) -> None:
-        """Take the sample that waits, and let this one wait.
+        """Take a sample that was corrected.
 
-        A mass may have begun to move since its telemetry was sent last, and then the field is off without a
-        flag. So a sample is judged once the next does not say that a mass moves.
+        It is judged once newer telemetry has come: had a mass begun to move meanwhile, it is left out.
 
         Parameters
         ----------
@@ -252,29 +251,17 @@ class Learner:
             deg, latitude and longitude.
         watched : sequence of float
             As :attr:`watched`; NaN where unknown.
+        age : float
+            s, of the parameters' oldest telemetry.
         """
         if not self.enabled:
-            self._waiting = None
             return
-        waiting = self._waiting
-        if waiting is not None:
-            moves = quality & MOVING and not waiting.quality & MOVING
-            if not moves and 0 <= time_us - waiting.time_us < 0.99 * self._period_us:
-                return
-            self._take(waiting._replace(quality=waiting.quality | MOVING) if moves else waiting)
-        self._waiting = Sample(
-            time_us, field, list(regressors), values, quality, faulty, reference, where, tuple(watched)
-        )
-
-    def _take(self, sample: Sample) -> None:
-        """Learn from a sample, and judge it."""
-        time_us, field, regressors, values, quality, faulty, reference, where, watched = sample
         self._now_us, unfit = time_us, quality & self._unfit
         if unfit & ~MOVING or isnan(reference) or where is None:
             self._nothing(time_us)
             return
         fit = not (unfit or faulty)
-        if 0 <= time_us - (self._last_us if fit else self._looked_us) < 0.99 * self._period_us:
+        if 0 <= time_us - (self._taken_us if fit else self._looked_us) < 0.99 * self._period_us:
             return
         if self._grid is not None:
             reference += self._grid.look_up(where[1], where[0]).anomaly
@@ -283,12 +270,28 @@ class Learner:
             self._nothing(time_us)
             return
         self._look_back(time_us, phi, positions)
-        quiet = self._bank.quiet
-        if not unfit and faulty:
-            missed = self._by(quiet)(field, phi, reference).e - quiet.expected
-            self._hindsight.keep(Kept(time_us, field, reference, phi, positions, missed, quiet.variance))
+        if unfit:
+            self._held.clear()
+        while self._held and self._held[0].time_us < time_us - age * 1e6:
+            self._take(self._held.popleft())
         if not fit:
             self._nothing(time_us)
+        if unfit:
+            return
+        self._taken_us = time_us if fit else self._taken_us
+        one = Taken(time_us, field, reference, phi, positions, where, tuple(watched), faulty)
+        if positions:
+            self._held.append(one)
+        else:
+            self._take(one)
+
+    def _take(self, sample: Taken) -> None:
+        """Predict a sample, judge by it, and learn from it."""
+        time_us, field, reference, phi, positions, where, watched, faulty = sample
+        quiet = self._bank.quiet
+        if faulty:
+            missed = self._by(quiet)(field, phi, reference).e - quiet.expected
+            self._hindsight.keep(Kept(time_us, field, reference, phi, positions, missed, quiet.variance))
             return
         metres, seconds = self._moved(time_us, where)
         before, self._before = self._before, phi
@@ -305,6 +308,9 @@ class Learner:
         signs = Signs(
             time_us * 1e-6, observed.by_nine[6:], tuple(positions), watched, clock, -1.0 / observed.s
         )
+        if self._start is None and self._outlying(best):
+            self._standing.count(best.residual, best.variance, telling=False)
+            return
         by_first, by_published = self._publication.nine(phi)
         first = self._observe(field, by_first, reference)
         nuisance = self._mapless if doubted and self._mapless else self._nuisance
@@ -319,6 +325,12 @@ class Learner:
             self._compare(time_us * 1e-6, apart)
             self._learn(signs)
         self._decide(apart * live[id(best)].s)
+
+    def _outlying(self, best: Estimator) -> bool:
+        """Whether the sample is an outlier that no other agrees with so far, and no doubt explains."""
+        far = abs(best.residual) > OUTLIER * best.sigma
+        self._outliers = self._outliers + 1 if far else 0
+        return far and self._outliers < AGREE and not self._standing.learnable
 
     def _compare(self, time: float, apart: float) -> None:
         """Follow which estimator predicts best, and how well what is published does, `apart` (nT) from it."""
@@ -373,12 +385,8 @@ class Learner:
 
     def _learn(self, signs: Signs) -> None:
         """Doubt what was predicted, and learn from it."""
-        quiet, best = self._bank.quiet, self._bank.best
-        far = abs(best.residual) > OUTLIER * best.sigma
-        self._outliers = self._outliers + 1 if far else 0
+        quiet = self._bank.quiet
         self._raise(self._doubt.test(quiet, signs))
-        if far and self._outliers < AGREE and not self._standing.learnable:
-            return
         for other in self._bank.all[1:]:
             other.update(learn=other.telling and not self.frozen)
         learn = quiet.telling and not self.frozen

