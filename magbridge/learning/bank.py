@@ -34,7 +34,8 @@ __all__ = ["Bank"]
 MEMORY: Final = 2000.0
 """Samples over which predictions count."""
 AHEAD: Final = 3.0
-"""By which log w has to be ahead to change whom to believe."""
+"""By which log w has to be ahead to change whom to believe. To leave the quiet one, :data:`BEYOND_CHANCE`:
+what no change is seen of, as the level, is at the mercy of what is supposed."""
 MOST: Final = 25.0
 """v²/S of one sample at most: an outlier says nothing of which is better."""
 CLOSE: Final = 10.0
@@ -116,7 +117,7 @@ class Bank:
             self._weights[k] -= 0.5 * (min(one.residual * one.residual / S, MOST) + log(S))
         with_map = [k for k, one in enumerate(self.all) if one is not self.without_map]
         ahead = max(with_map, key=self._weights.__getitem__)
-        if self._weights[ahead] > self._weights[self._best] + AHEAD:
+        if self._weights[ahead] > self._weights[self._best] + (AHEAD if self._best else BEYOND_CHANCE):
             self._best = ahead
         return None if self.without_map is None else self._doubt_map(time, self.without_map, ahead)
 
