@@ -66,7 +66,7 @@ def fly(
 
 def drifted(log: xr.Dataset, by: float) -> xr.Dataset:
     """Return a log whose positions are slowly off by `by` m north and east, as dead-reckoned ones."""
-    t = (log["time"] - log["time"][0]) / float(np.ptp(log["time"]))
+    t = (log["time"] - log["time"][0]) / float(log["time"][-1] - log["time"][0])
     per_latitude, per_longitude = metres_per_degree(float(log["latitude"].mean()))
     north, east = by * np.sin(2.2 * np.pi * t + 0.3), by * (np.cos(1.7 * np.pi * t) - 1.0)
     return log.assign(

@@ -69,8 +69,8 @@ GUESSED = 2
 """Rounds before the field is searched: while the coefficients are far off, they look like rock and noise."""
 SEARCHES = 2
 """Rounds after that in which the search goes on."""
-ROUNDS = 12
-"""Rounds at most; six are usual."""
+ROUNDS = 40
+"""Rounds at most; six are usual, and some twenty from a start 10,000 nT off, whose steps are shortened."""
 STILL = 0.05
 """Of the noise: a round that moves no residual by more (RMS) is the last."""
 OUTLIER = 5.0
