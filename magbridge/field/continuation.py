@@ -98,8 +98,6 @@ def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatAr
 
 ALIKE = 0.25
 """Share of the wavelength that is smoothed away, within which what was taken out has one sign."""
-AROUND = 4.0
-"""Such wavelengths over which its RMS is taken: over one, the RMS is of a wave or two, and chance."""
 
 
 def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
@@ -114,21 +112,16 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
 
     Notes
     -----
-    The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The sigma added at a node
-    is the RMS of what was taken out around it, by such a Gaussian too: it is positive everywhere.
+    The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The sigma added is the RMS
+    of what was taken out, over the map: around a node it is that of a wave or two, and chance.
     """
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 
-    waves = _wavenumber(grid) * wavelength / (2.0 * np.pi)
-
-    def mean(values: FloatArray, over: float = 1.0) -> FloatArray:
-        return np.asarray(idctn(dctn(values, norm="ortho") * np.exp2(-((over * waves) ** 2)), norm="ortho"))
-
+    gain = np.exp2(-((_wavenumber(grid) * wavelength / (2.0 * np.pi)) ** 2))
     hole = np.isnan(grid.anomaly)
-    whole = filled(grid.anomaly)
-    long = mean(whole)
-    removed = np.sqrt(np.maximum(mean((whole - long) ** 2, AROUND), 0.0))
-    anomaly, sigma = np.where(hole, np.nan, long), np.hypot(np.nan_to_num(grid.sigma), removed)
+    anomaly = np.where(hole, np.nan, idctn(dctn(filled(grid.anomaly), norm="ortho") * gain, norm="ortho"))
+    removed = np.sqrt(np.nanmean((grid.anomaly - anomaly) ** 2))
+    sigma = np.hypot(np.nan_to_num(grid.sigma), removed)
     length = max(grid.sigma_length, ALIKE * wavelength)
     return grid.replaced(anomaly=anomaly, sigma=sigma, vertical=None, sigma_length=length)
 
