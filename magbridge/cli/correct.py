@@ -120,6 +120,8 @@ def correct(
                 note_no_date(part)
                 learner = _learner(known, part, settings) if learn else None
                 correction = Correction(known, learner=learner)
+            if not whole:
+                refuse_unsuited(known, part)
             pieces.append(part.attrs)
             sampled = part[list(CHANNELS)].to_array().notnull()
             corrected = _beside(part, correct_rows(correction, part), known, source)
@@ -130,7 +132,6 @@ def correct(
                 drawn.append(corrected[list(CORRECTED)])
             tally.add(corrected, part.sizes["time"])
             if not whole:
-                refuse_unsuited(known, part)
                 whole = bool(sampled.all("variable").any())
         if not whole:
             raise DataError(

@@ -33,7 +33,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.model import TEMPERATURE, Model
 
-__all__ = ["CAUSES", "Alarm", "Doubt", "Signs"]
+__all__ = ["CAUSES", "LEAST", "NO_COEFFICIENT", "Alarm", "Doubt", "Signs"]
 
 CAUSES: Final = {
     "offset_step": 20.0,

@@ -26,7 +26,7 @@ from magbridge.learning.doubt import LEAST, Alarm
 from magbridge.learning.observation import Observation
 from magbridge.records import Vector
 
-__all__ = ["Hindsight"]
+__all__ = ["Hindsight", "Kept"]
 
 LATE_US: Final = (8_000_000, 16_000_000, 32_000_000)
 """µs, d: shorter ones are those of telemetry that comes seldom."""

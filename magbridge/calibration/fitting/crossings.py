@@ -43,6 +43,8 @@ AHEAD, LEGS = 0.8, 6
 """Mean resultant length of the courses (Mardia & Jupp 2000, eq. 2.3.3) below which legs lead different ways,
 and places of the widest kind to which they must: rock that is smooth beside a leg is then no heading's. A
 zigzag of 3 h that crosses nothing has 0 to 0.6, dives along one line 0.93; runs stay at one place."""
+AREA = 120.0
+"""m across, below which rock is much the same everywhere: its level, and for the rest the vehicle's."""
 LEAP = 100.0
 """m beyond what the vehicle can have moved: a jump in position."""
 BETWEEN = 0.5
@@ -65,7 +67,7 @@ def tells_rock(data: Observations) -> bool:
         places = len(np.unique(np.floor(place / cell), axis=0))
         return sum(crossed(place, course, cell)) >= max(OFTEN * places, TWICE)
 
-    if not len(place):
+    if not len(place) or np.hypot(*np.ptp(place, axis=0)) < AREA:
         return False
     legs = len(np.unique(np.floor(place / PLACES[-1]), axis=0)) >= LEGS
     return (legs and abs(np.exp(1j * course).mean()) < AHEAD) or any(map(often, PLACES))

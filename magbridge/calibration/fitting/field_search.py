@@ -109,24 +109,33 @@ def choose(
     most : int
         Nodes at most.
     """
-    best: Choice | None = None
-    worse, move_rho = 0, rho is None
-    ratio, rho = start, 0.3 if rho is None else rho
-    for length in ladder(place)[::-1]:
-        nodes = nodes_for(place, length, SMOOTH, most)
-        if length < RESOLVED * nodes.spacing:
-            continue
-        field = Matern(nodes, float(length), SMOOTH, harmonic)
-        found = climb(
-            sums_of(field), Choice(field, ratio, rho), weighed,
-            move_length=False, move_rho=move_rho, steps=int(24 * effort),
-        )  # fmt: skip
-        ratio, rho = found.ratio, found.rho
-        if best is None or found.score > best.score:
-            best, worse = found, 0
-        elif (worse := worse + 1) == 2:
-            break  # shorter ones take more nodes, and would be worse still
-    assert best is not None
+    move_rho, memory = rho is None, 0.3 if rho is None else rho
+
+    def down(alpha: int) -> tuple[Choice, bool]:
+        """Return the best of the lengths, from the longest on, and whether shorter ones are worse."""
+        best: Choice | None = None
+        worse, ratio, rho = 0, start, memory
+        for length in ladder(place)[::-1]:
+            nodes = nodes_for(place, length, alpha, most)
+            if length < RESOLVED * nodes.spacing:
+                continue
+            field = Matern(nodes, float(length), alpha, harmonic)
+            found = climb(
+                sums_of(field), Choice(field, ratio, rho), weighed,
+                move_length=False, move_rho=move_rho, steps=int(24 * effort),
+            )  # fmt: skip
+            ratio, rho = found.ratio, found.rho
+            if best is None or found.score > best.score:
+                best, worse = found, 0
+            elif (worse := worse + 1) == 2:
+                break  # shorter ones take more nodes, and would be worse still
+        assert best is not None
+        return best, worse > 0
+
+    best, enclosed = down(SMOOTH)
+    if not enclosed:  # rock is rougher than any of these
+        rough, _ = down(SMOOTHNESS[0])
+        best = rough if rough.score > best.score else best
 
     def tried(one: Choice, alpha: int, harmonic: bool) -> Choice:
         length = one.field.length * ((one.field.alpha - 1) / (alpha - 1)) ** BENDS
@@ -135,7 +144,7 @@ def choose(
         begin = replace(one, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 
-    kinds = [tried(best, SMOOTH, kind) for kind in ((True, False) if harmonic else (False,))]
+    kinds = [tried(best, best.field.alpha, kind) for kind in ((True, False) if harmonic else (False,))]
     kinds.sort(key=lambda one: one.score)
     best = _smoothness(kinds[-1], tried)
     if harmonic and kinds[1].score - kinds[0].score < CLEAR:

@@ -42,6 +42,7 @@ METHODS: dict[str, str] = {
 
 ONE_ATTITUDE = 5.0
 """deg: all samples within that of their mean direction are one attitude."""
+NOT_FOUND = "the rock could not be found with the calibration: what it does is left in the errors"
 UNKNOWN_LENGTH = 500.0
 """m, taken for the rock's where no field in place was fitted."""
 LEVEL = 145.0
@@ -147,16 +148,15 @@ def fit(
     Raises
     ------
     CalibrationError
-        The data do not support the fit, or there is no such method.
+        The data do not support the fit, or there is no such method. Where ``auto`` is ``survey`` and that fit
+        has no answer, it is one without a field in place, and the calibration warns of it.
     """
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
     bias = _default_bias(data) if site_bias is None else site_bias
-    if method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order):
+    in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
+    if in_place:
         method = "survey"
-    if method == "survey":
-        options["level"] = bias
-    chosen = _function(method)
     # one thread: for matrices this small threads cost more than they gain, and the order of sums is fixed
     with threadpool_limits(1, "blas"):
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
@@ -167,7 +167,14 @@ def fit(
             known = np.isfinite(data.place[:, :2]).all(axis=1) | (method == "survey")
             away = tuple(jumped(data.place[known, :2], data.time[known]))
             data = data.part(~(far_off(data.place[:, :2]) & known))
-        found = chosen(data, order, **options)
+        try:
+            level = {"level": bias} if method == "survey" else {}
+            found = _function(method)(data, order, **level, **options)
+        except CalibrationError:
+            if not in_place or "position_sigma" in options:
+                raise
+            method, away = "auto", (*away, NOT_FOUND)
+            found = _function(method)(data, order, **options)
         if method == "auto":
             found = replace(found, open=tuple(left_open(data, UNKNOWN_LENGTH)))
         found = replace(found, open=(*away, *found.open))

@@ -126,7 +126,10 @@ def fit_in_place(
     groups = (*_groups(data, level), *offered(data))
     survey = SurveySamples(data, samples, groups, _drift(data, position_sigma))
     rounds = _Rounds(survey, posed.family)
-    found = rounds.settle()
+    try:
+        found = rounds.settle()
+    except np.linalg.LinAlgError as problem:
+        raise CalibrationError("the fit to the survey has no answer: rock cannot be told apart") from problem
     prior, z = found.family.at(found.widths.eta), found.z
     coefficients = prior.coefficients(z)
     check_scales(samples, coefficients)
