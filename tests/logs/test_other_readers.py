@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from math import degrees
 from pathlib import Path
 from typing import Any
@@ -148,8 +149,9 @@ def _pymavlink(path: Path) -> Iterator[tuple[float, Any]]:
     from pymavlink import mavutil  # noqa: PLC0415 - beside the project's own dialect, only here
 
     connection: Any = mavutil.mavlink_connection(str(path), dialect="ardupilotmega")
-    while (message := connection.recv_match()) is not None:
-        yield float(message._timestamp), message
+    with closing(connection):
+        while (message := connection.recv_match()) is not None:
+            yield float(message._timestamp), message
 
 
 @pytest.mark.real
