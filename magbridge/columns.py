@@ -135,6 +135,8 @@ _SAME = {
     "tesla": "T",
     "gauss": "G",
     "Gauss": "G",
+    "Oe": "G",  # of the same size in air
+    "oersted": "G",
     "microtesla": "uT",
     "milligauss": "mG",
     "radian": "rad",

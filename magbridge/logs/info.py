@@ -162,7 +162,7 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
                 unit for unit, factor in NT_PER_UNIT.items() if EARTHS[0] < length * factor < EARTHS[1]
             ]
             lines = [
-                f'; in {unit} it would be the Earth\'s: --column mag_x="mag_x [{unit}]" and so on'
+                f'; in {unit} it would be the Earth\'s: --column mag_x="THEIRS [{unit}]" and so on'
                 for unit in fitting[:1]
             ]
             hints.append(f"the vector's length is {length:.4g} nT (median){''.join(lines)}")

@@ -1,8 +1,10 @@
 """How a text file is laid out: what its first lines say, and what has to be guessed from them.
 
 Comments (``#``, ``%``, ``//``) and lines of a preamble come first, then the headings, perhaps a row of units,
-then the rows. A heading may itself be a comment. The separator is the one by which headings and rows have the
-same number of fields; decimal commas are known by cells like ``-12,5``. What was guessed is kept, to be told.
+then the rows. A heading may itself be a comment. A file without headings is read where its columns are
+declared by their numbers: ``column_1`` is the first. The separator is the one by which headings and rows have
+the same number of fields; decimal commas are known by cells like ``-12,5``. What was guessed is kept, to be
+told.
 """
 
 from __future__ import annotations
@@ -33,6 +35,8 @@ BLANKS = " "
 """Stands for any number of blanks between fields."""
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AP]M)?", re.IGNORECASE)
+COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
+"""What is declared to be the time where a file has none: the rows, so many a second."""
 DATED = re.compile("date|datum|fecha|jour", re.IGNORECASE)
 """What in a heading says that the column holds dates."""
 NMEA = "GgaSentence"
@@ -64,6 +68,8 @@ class Layout:
         Number of the line with the headings, from 1.
     first : int
         Which of the lines is the first row, counted from 0.
+    rate : float or None
+        Rows a second, of a file that has no column of times.
     attrs : dict
         What the comments declare.
     fill : float
@@ -82,6 +88,7 @@ class Layout:
     open_ended: bool = False
     row: int = 1
     first: int = 0
+    rate: float | None = None
     attrs: dict[str, str | float] = field(default_factory=dict)
     fill: float = nan
     guesses: list[str] = field(default_factory=list)
@@ -112,7 +119,7 @@ def layout_of(path: Path, lines: Sequence[str], declared: Declared) -> Layout:
     headings = cells(lines[start], found.separator)
     found.first = start + 1
     if all(NUMBER.fullmatch(cell) for cell in headings):
-        start, headings = _commented(path, lines, comments, start, len(headings), found)
+        start, headings = _headings_elsewhere(path, lines, comments, start, declared, found)
     found.row = row = start + 1
     units = _units_row(lines, found)
     rows = [cells(line, found.separator) for line in lines[found.first :] if line.strip()]
@@ -186,18 +193,25 @@ def _preamble(lines: Sequence[str], found: Layout) -> int:
     return first
 
 
-def _commented(
-    path: Path, lines: Sequence[str], comments: int, start: int, width: int, found: Layout
+def _headings_elsewhere(
+    path: Path, lines: Sequence[str], comments: int, start: int, declared: Declared, found: Layout
 ) -> tuple[int, list[str]]:
-    """Return where the headings are, and they, if they stand in a comment above the rows."""
+    """Return where the headings of rows without any are, and they: in a comment above, or as declared."""
+    width = _count(lines[start], found.separator)
     for k in reversed(range(comments)):
         headings = cells(lines[k].lstrip("#%/ "), found.separator)
         if len(headings) == width and not ATTRIBUTE.fullmatch(lines[k].strip()):
             found.first = start
             found.guesses.append(f"headings from the comment in line {k + 1}")
             return k, headings
+    numbered = [f"column_{k + 1}" for k in range(width)]
+    if any(split(source.heading or "")[0] in numbered for source in declared.columns.values()):
+        found.first = start
+        return start, numbered
     there = lines[start].strip()[:40]
-    raise FormatError(path, f"expected a header row with the columns' names, not {there!r}", row=start + 1)
+    otherwise = 'without one, say what each column is, as --column time="column_1 [s]"'
+    expected = f"expected a header row with the columns' names, not {there!r}; {otherwise}"
+    raise FormatError(path, expected, row=start + 1)
 
 
 def _units_row(lines: Sequence[str], found: Layout) -> list[str]:
@@ -273,6 +287,11 @@ def _declared(
     taken: dict[int, str] = {}
     for name, source in declared.columns.items():
         theirs = source.heading or name
+        if name == "time" and (match := COUNTED.fullmatch(theirs)):
+            found.rate = float(match[1])
+            if not found.rate:
+                raise FormatError(path, "expected a rate other than 0 Hz", column="time")
+            continue
         for candidates in (found.headings, list(names)):
             for wanted in (theirs, split(theirs)[0]):
                 if wanted in candidates:

@@ -13,7 +13,7 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
-from magbridge.logs.clocks import clock_of, seconds
+from magbridge.logs.clocks import Clock, clock_of, seconds
 from magbridge.logs.faults import Faults
 from magbridge.logs.layout import BLANKS, Layout, cells
 from magbridge.records import Quality
@@ -40,23 +40,34 @@ class Table:
     def __init__(self, path: Path, layout: Layout, first_lines: Sequence[str], *, strict: bool) -> None:
         self._path, self._layout, self._declared = path, layout, layout.declared
         self.faults = Faults(path, strict=strict)
-        if "time" not in layout.names:
-            raise FormatError(path, absent("time", layout.headings), row=layout.row, column="time")
-        self._time = layout.names.index("time")
-        heading, unit = layout.headings[self._time].strip(), layout.units.pop("time", "")
-        first = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
-        texts = [self._stamp(row) for row in first if max(self._time, layout.date or 0) < len(row)]
-        try:
-            self._clock = clock_of(heading, unit, texts, self._declared.zone)
-        except ValueError as error:
-            raise FormatError(path, str(error), column="time") from None
-        self.guesses = [f"time: {self._clock.assumed}"] if self._clock.assumed else []
-        if layout.date is not None:
-            self.guesses.append(f"date and time from {layout.headings[layout.date]!r} and {heading!r}")
+        self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
+        self.guesses: list[str] = []
+        self._time = layout.names.index("time") if "time" in layout.names else -1
+        if layout.rate:
+            self._clock = Clock("s", f"{layout.rate:g} rows a second", boot=True)
+        elif self._time >= 0:
+            self._clock = self._clock_by(first_lines)
+        else:
+            missing = f'{absent("time", layout.headings)}; if none is: --column time="row [20 Hz]", its rate'
+            raise FormatError(path, missing, row=layout.row, column="time")
+        if self._clock.assumed:
+            self.guesses.insert(0, f"time: {self._clock.assumed}")
         self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._clock.boot else {}
         if self._declared.heading_reference:
             self.attrs["heading_reference"] = self._declared.heading_reference
-        self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
+
+    def _clock_by(self, first_lines: Sequence[str]) -> Clock:
+        """Return how the column of times is read, by its heading, its unit and its first cells."""
+        layout = self._layout
+        heading, unit = layout.headings[self._time].strip(), layout.units.pop("time", "")
+        first = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
+        texts = [self._stamp(row) for row in first if max(self._time, layout.date or 0) < len(row)]
+        if layout.date is not None:
+            self.guesses.append(f"date and time from {layout.headings[layout.date]!r} and {heading!r}")
+        try:
+            return clock_of(heading, unit, texts, self._declared.zone)
+        except ValueError as error:
+            raise FormatError(self._path, str(error), column="time") from None
 
     def _stamp(self, row: Sequence[str]) -> str:
         date = self._layout.date
@@ -143,6 +154,9 @@ class Table:
 
     def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:
         """Return the times, and which of the rows have something else there."""
+        if self._layout.rate:  # a row that was left out keeps its time
+            lines = np.asarray(numbers, np.float64) - 1.0 - self._layout.first
+            return lines / self._layout.rate, np.zeros(len(lines), bool)
         column = frame[self._time]
         if self._layout.date is not None:
             column = frame[self._layout.date].str.strip() + " " + column.str.strip()

@@ -167,6 +167,48 @@ def test_columns_are_declared_one_by_one(tmp_path: Path) -> None:
     assert float(log["mag_x"][0]) == 5_000.0
 
 
+def test_columns_without_headings_are_called_by_their_numbers(tmp_path: Path) -> None:
+    """As an AUV's lines are published: place, Unix time, depth, height, attitude, the field in oersted."""
+    rows = "".join(f"-104.29 9.83 {NOON + k} 2450 70 1.5 -3 359 0.25 -0.02 0.3{k}\n" for k in range(3))
+    theirs = {"longitude": 1, "latitude": 2, "time": 3, "depth": 4, "roll": 6, "pitch": 7, "heading": 8}
+    column = [f"{name}=column_{number}" for name, number in theirs.items()]
+    axes = [f"mag_{axis}=column_{number} [Oe]" for axis, number in zip("xyz", (9, 10, 11), strict=True)]
+    log = read(tmp_path, rows, name="dive.txt", column=column + axes)
+    assert log["time"].values.tolist() == [NOON, NOON + 1, NOON + 2]
+    assert log["mag_z"].values == pytest.approx([30_000.0, 31_000.0, 32_000.0])
+    assert log["mag_x"].attrs["units"] == "nT"
+    assert (log["longitude"].values[0], log["heading"].values[0]) == (-104.29, 359.0)
+    assert log["column_5"].values.tolist() == [70.0, 70.0, 70.0]
+
+
+def test_rows_without_times_come_at_a_rate_and_a_bad_one_leaves_its_place(tmp_path: Path) -> None:
+    column = ["time=row [20 Hz]", *(f"mag_{axis}=column_{k}" for k, axis in enumerate("xyz", 1))]
+    log = read(tmp_path, "187\t-420\t-538\n187\t-420\n190\t-410\t-530\n", name="sphere.txt", column=column)
+    assert log["time"].values.tolist() == [0.0, 0.1]
+    assert log["mag_x"].values.tolist() == [187.0, 190.0]
+    assert log.attrs["time_reference"] == "boot"
+    with_headings = read(tmp_path, "mx,my,mz\n1,2,3\n4,5,6\n", column=["time=row [4 Hz]"])
+    assert with_headings["time"].values.tolist() == [0.0, 0.25]
+    assert with_headings["mag_y"].values.tolist() == [2.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    ("column", "expected"),
+    [
+        ([], "row 1: expected a header row .* without one, say what each column is"),
+        (["time=column_9"], "row 1: expected a header row"),
+        (["mag_x=column_1"], "column 'time': expected this column; there are: column_1 .*row \\[20 Hz\\]"),
+        (["time=row [0 Hz]", "mag_x=column_1"], "column 'time': expected a rate other than 0 Hz"),
+        (["time=row [20 Hz]", "mag_x=column_4"], "column 'column_4': expected this column"),
+    ],
+)
+def test_a_file_without_headings_says_what_to_declare(
+    column: list[str], expected: str, tmp_path: Path
+) -> None:
+    with pytest.raises(FormatError, match=expected):
+        read(tmp_path, "1\t2\t3\n4\t5\t6\n", column=column)
+
+
 def test_a_blackbox_as_csv(tmp_path: Path) -> None:
     """What blackbox_decode writes: an index in brackets is no unit."""
     header = "loopIteration,time (us),magADC[0],magADC[1],magADC[2],amperageLatest (A),motor[0]\n"
