@@ -204,10 +204,9 @@ def _headings_elsewhere(
             found.first = start
             found.guesses.append(f"headings from the comment in line {k + 1}")
             return k, headings
-    numbered = [f"column_{k + 1}" for k in range(width)]
-    if any(split(source.heading or "")[0] in numbered for source in declared.columns.values()):
+    if any((source.heading or "").startswith("column_") for source in declared.columns.values()):
         found.first = start
-        return start, numbered
+        return start, [f"column_{k + 1}" for k in range(width)]
     there = lines[start].strip()[:40]
     otherwise = 'without one, say what each column is, as --column time="column_1 [s]"'
     expected = f"expected a header row with the columns' names, not {there!r}; {otherwise}"
