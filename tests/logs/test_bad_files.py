@@ -26,9 +26,10 @@ BAD_CSV = {
     "\n1,2\n": "row 1: expected a header row, the file is empty",
     "time,mag_x\n": "row 2: expected rows after the header",
     "s,mag_x\n1,2\n": "row 1, column 'time': expected this column; there are: s mag_x; "
-    'if one is it: --column time="THEIRS [unit]"',
+    'if one is it: --column time="THEIRS [unit]"; if none is: --column time="row [20 Hz]", its rate',
     "Timestamp;NavState;": "row 2: expected rows after the header",
-    "1,2\n3,4\n": "row 1: expected a header row with the columns' names, not '1,2'",
+    "1,2\n3,4\n": "row 1: expected a header row with the columns' names, not '1,2'; without one, say what "
+    'each column is, as --column time="column_1 [s]"',
     "time,water_speed [kn]\n1,2\n": "column 'water_speed': expected m/s, not kn",
     "time,,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 2, not ''",
     "time,mag_x,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 3, not 'mag_x'",
