@@ -78,56 +78,36 @@ class Channel(IntEnum):
 
 
 class Reading(msgspec.Struct, frozen=True, gc=False):
-    """One measurement of the three channels, as the instrument sent it.
-
-    Attributes
-    ----------
-    field : tuple of 3 float
-        nT, sensor axes, uncorrected.
-    counts : tuple of 3 int or None
-        The converter's own numbers, where the instrument sends counts.
-    sequence : int or None
-        Frame number, wrapping at the driver's ``SEQUENCE_MODULO``.
-    device_time : float
-        s on the instrument's clock; NaN where it has none.
-    channel_delay : tuple of 3 float
-        s after `device_time` at which each channel was sampled.
-    temperature, supply : float
-        degC at the fluxgate and V; NaN where unknown.
-    power_cycle : int or None
-        How often the instrument was powered on.
-    saturated : bool
-        A channel was at the end of its range.
-    """
+    """One measurement of the three channels, as the instrument sent it."""
 
     field: Vector
+    """nT, sensor axes, uncorrected."""
     counts: tuple[int, int, int] | None = None
+    """The converter's own numbers, where the instrument sends counts."""
     sequence: int | None = None
+    """Frame number, wrapping at the driver's ``SEQUENCE_MODULO``."""
     device_time: float = nan
+    """s on the instrument's clock; NaN where it has none."""
     channel_delay: Vector = (0.0, 0.0, 0.0)
+    """s after `device_time` at which each channel was sampled."""
     temperature: float = nan
     supply: float = nan
+    """`temperature`, `supply`: degC at the fluxgate and V; NaN where unknown."""
     power_cycle: int | None = None
+    """How often the instrument was powered on."""
     saturated: bool = False
+    """A channel was at the end of its range."""
 
 
 class Corrected(msgspec.Struct, frozen=True, gc=False):
-    """One sample after calibration.
-
-    Attributes
-    ----------
-    total_field, total_field_sigma : float
-        nT, magnitude and its 1-sigma.
-    field : tuple of 3 float
-        nT, body axes (sensor axes while ``no_boresight`` is set).
-    field_sigma : tuple of 3 float
-        nT, 1-sigma of each component.
-    quality : int
-        :class:`Quality` bits.
-    """
+    """One sample after calibration."""
 
     total_field: float
     total_field_sigma: float
+    """`total_field`, `total_field_sigma`: nT, magnitude and its 1-sigma."""
     field: Vector
+    """nT, body axes (sensor axes while ``no_boresight`` is set)."""
     field_sigma: Vector
+    """nT, 1-sigma of each component."""
     quality: int
+    """:class:`Quality` bits."""

@@ -20,58 +20,41 @@ Vector = tuple[float, float, float]
 
 
 class Instrument(Table, frozen=True):
-    """``[instrument]``: a three-axis fluxgate and its digitiser.
-
-    Attributes
-    ----------
-    rate : float
-        Hz, triples a second.
-    scale, offset : tuple of 3 float
-        Gain of each axis, and nT.
-    orthogonality : tuple of 3 float
-        deg by which the angles xy, xz, yz differ from 90.
-    mounting : tuple of 3 float
-        deg roll, pitch, heading of the sensor in the body.
-    turn_on_sigma : float
-        nT an axis; the offset settles anew at every power-on.
-    power_on : tuple of float
-        s after the start at which the instrument is powered on again.
-    offset_per_degree, scale_per_degree : tuple of 3 float
-        nT/degC and 1/degC, about `reference_temperature`.
-    reference_temperature : float
-        degC at which offset and scale are as given.
-    start_temperature : float or None
-        degC of the fluxgate at the start; None has it settled in the water.
-    thermal_lag : float
-        s, time constant with which the fluxgate's temperature follows the water's.
-    corner : float
-        Hz of the RC anti-alias filter; 0 leaves it out.
-    channel_delay : tuple of 3 float
-        s after the triple's time at which the converter reaches each channel.
-    bits, full_scale : int, float
-        Converter: bits, and nT either side of zero.
-    noise_sigma, noise_memory : float
-        nT of a channel's noise, and samples over which its correlation falls by e (0: white).
-    """
+    """``[instrument]``: a three-axis fluxgate and its digitiser."""
 
     rate: Positive = 0.25
+    """Hz, triples a second."""
     scale: Vector = (1.0, 1.0, 1.0)
     offset: Vector = (0.0, 0.0, 0.0)
+    """`scale`, `offset`: Gain of each axis, and nT."""
     orthogonality: Vector = (0.0, 0.0, 0.0)
+    """deg by which the angles xy, xz, yz differ from 90."""
     mounting: Vector = (0.0, 0.0, 0.0)
+    """deg roll, pitch, heading of the sensor in the body."""
     turn_on_sigma: NotNegative = 0.0
+    """nT an axis; the offset settles anew at every power-on."""
     power_on: tuple[float, ...] = ()
+    """s after the start at which the instrument is powered on again."""
     offset_per_degree: Vector = (0.0, 0.0, 0.0)
     scale_per_degree: Vector = (0.0, 0.0, 0.0)
+    """`offset_per_degree`, `scale_per_degree`: nT/degC and 1/degC, about `reference_temperature`."""
     reference_temperature: float = 2.0
+    """degC at which offset and scale are as given."""
     start_temperature: float | None = None
+    """degC of the fluxgate at the start; None has it settled in the water."""
     thermal_lag: NotNegative = 3600.0
+    """s, time constant with which the fluxgate's temperature follows the water's."""
     corner: NotNegative = 0.33
+    """Hz of the RC anti-alias filter; 0 leaves it out."""
     channel_delay: Vector = (0.0, 0.0, 0.0)
+    """s after the triple's time at which the converter reaches each channel."""
     bits: Annotated[int, Meta(ge=2, le=32)] = 24
     full_scale: Positive = 100_000.0
+    """`bits`, `full_scale`: float: Converter: bits, and nT either side of zero."""
     noise_sigma: NotNegative = 1.0
     noise_memory: NotNegative = 0.0
+    """`noise_sigma`, `noise_memory`: nT of a channel's noise, and samples over which its correlation falls by
+    e (0: white)."""
 
     def matrix(self) -> FloatArray:
         """Return the matrix (3, 3) from the field in body axes to the channels, without noise and offset.
@@ -143,24 +126,16 @@ class Instrument(Table, frozen=True):
 
 @dataclass(frozen=True)
 class Samples:
-    """What an :class:`Instrument` gave.
-
-    Attributes
-    ----------
-    channels : array (m, 3)
-        nT.
-    times : array (m, 3)
-        s after the grid's first point, when each channel was sampled.
-    temperature : array (m,)
-        degC at the fluxgate.
-    power_cycle : array (m,)
-        How many times it was powered on again.
-    """
+    """What an :class:`Instrument` gave."""
 
     channels: FloatArray
+    """(m, 3), nT."""
     times: FloatArray
+    """(m, 3), s after the grid's first point, when each channel was sampled."""
     temperature: FloatArray
+    """(m,), degC at the fluxgate."""
     power_cycle: FloatArray
+    """(m,): How many times it was powered on again."""
 
 
 def rotation(roll: float | FloatArray, pitch: float | FloatArray, heading: float | FloatArray) -> Rotation:

@@ -46,31 +46,21 @@ LIMITS = {name: Limit(low=m.low, high=m.high, rate=m.rate, unit=m.unit) for name
 
 
 class Leg(Table, frozen=True):
-    """One descent, ascent or level stretch with every commanded value held.
-
-    Attributes
-    ----------
-    duration : float
-        s.
-    pitch, roll : float
-        deg.
-    turn : float
-        deg/s, clockwise seen from above.
-    heading : float or None
-        deg at its start; None keeps the heading at which the last leg ended.
-    parameters : dict of float
-        Positions of the moving masses; one that is not named stays where it is.
-    segment : str
-        Consecutive legs of one name are one segment of the deployment.
-    """
+    """One descent, ascent or level stretch with every commanded value held."""
 
     duration: Positive
+    """s."""
     pitch: Annotated[float, Meta(ge=-80, le=80)]
     roll: Annotated[float, Meta(ge=-80, le=80)] = 0.0
+    """`pitch`, `roll`: deg."""
     turn: float = 0.0
+    """deg/s, clockwise seen from above."""
     heading: float | None = None
+    """deg at its start; None keeps the heading at which the last leg ended."""
     parameters: dict[str, float] = msgspec.field(default_factory=dict)
+    """Positions of the moving masses; one that is not named stays where it is."""
     segment: str = "mission"
+    """Consecutive legs of one name are one segment of the deployment."""
 
 
 class Run(Table, frozen=True):
@@ -85,28 +75,18 @@ class Run(Table, frozen=True):
 
 
 class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
-    """Calibration runs: spirals, clockwise, each a descent or an ascent with every mass at rest.
-
-    Attributes
-    ----------
-    trial : int
-        1 or 2, which of the columns of :data:`TABLE_1` is flown.
-    runs : tuple of Run
-        Flown instead of the table.
-    duration : float
-        s of one descent or ascent; the paper's pair took about 30 minutes.
-    turns : float
-        Full turns in a descent or ascent.
-    roll : tuple of 2 float
-        deg, mean and spread of the bank.
-    segment : str
-    """
+    """Calibration runs: spirals, clockwise, each a descent or an ascent with every mass at rest."""
 
     trial: Literal[1, 2] = 1
+    """1 or 2, which of the columns of :data:`TABLE_1` is flown."""
     runs: tuple[Run, ...] = ()
+    """Flown instead of the table."""
     duration: Positive = 900.0
+    """s of one descent or ascent; the paper's pair took about 30 minutes."""
     turns: float = 4.0
+    """Full turns in a descent or ascent."""
     roll: tuple[float, NotNegative] = (6.0, 1.0)
+    """deg, mean and spread of the bank."""
     segment: str = "calibration"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
@@ -127,33 +107,23 @@ class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
 
 
 class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
-    """The survey: straight dives and climbs, zigzagging out along an axis and back again.
-
-    Attributes
-    ----------
-    hours : float
-        Its length.
-    pitch, roll : tuple of 2 float
-        deg, mean and spread from leg to leg; the pitch changes sign between dives and climbs.
-    axis, zigzag : float
-        deg, the way out, and how far legs run to either side of it.
-    yos_per_leg : int
-        Dives and climbs between two changes of heading.
-    duration : float
-        s of one descent or ascent.
-    battery_spread : float
-        in, spread of the battery's position about Table 1's at this pitch.
-    segment : str
-    """
+    """The survey: straight dives and climbs, zigzagging out along an axis and back again."""
 
     hours: Positive = 6.0
+    """Its length."""
     pitch: tuple[float, NotNegative] = (26.0, 1.0)
     roll: tuple[float, NotNegative] = (0.0, 2.0)
+    """`pitch`, `roll`: deg, mean and spread from leg to leg; the pitch changes sign between dives and climbs.
+    """
     axis: float = 150.0
     zigzag: float = 45.0
+    """`axis`, `zigzag`: deg, the way out, and how far legs run to either side of it."""
     yos_per_leg: Annotated[int, Meta(ge=1)] = 3
+    """Dives and climbs between two changes of heading."""
     duration: Positive = 900.0
+    """s of one descent or ascent."""
     battery_spread: NotNegative = 0.02
+    """in, spread of the battery's position about Table 1's at this pitch."""
     segment: str = "survey"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:

@@ -34,22 +34,16 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 class Mounting(NamedTuple):
-    """Where a kind of mass usually sits, and how it moves.
-
-    Attributes
-    ----------
-    at, travel : tuple of 3 float
-        m from the sensor in body axes when the parameter is 0, and m per unit of the parameter.
-    low, high, rate : float
-        The vehicle's limits, units and units/s.
-    unit : str
-    """
+    """Where a kind of mass usually sits, and how it moves."""
 
     at: Vector
     travel: Vector
+    """`at`, `travel`: m from the sensor in body axes when the parameter is 0, and m per unit of the
+    parameter."""
     low: float
     high: float
     rate: float
+    """`low`, `high`, `rate`: The vehicle's limits, units and units/s."""
     unit: str
 
 
@@ -73,22 +67,16 @@ PLACE_SPREAD = (0.06, 0.03, 0.03)
 
 
 class Mass(Table, frozen=True):
-    """``[vehicle.mass.NAME]``: a mass that the parameter NAME moves.
-
-    Attributes
-    ----------
-    at, travel : tuple of 3 float
-        m from the sensor in body axes when the parameter is 0, and m per unit of the parameter.
-    moment : tuple of 3 float
-        A m², the permanent magnetisation.
-    volume : tuple of 3 float
-        m³, apparent susceptibility times volume along each axis: the induced moment is ``volume * B / µ0``.
-    """
+    """``[vehicle.mass.NAME]``: a mass that the parameter NAME moves."""
 
     at: Vector
     travel: Vector
+    """`at`, `travel`: m from the sensor in body axes when the parameter is 0, and m per unit of the
+    parameter."""
     moment: Vector
+    """A m², the permanent magnetisation."""
     volume: Vector = (0.0, 0.0, 0.0)
+    """m³, apparent susceptibility times volume along each axis: the induced moment is ``volume * B / µ0``."""
 
     def field(self, ambient: FloatArray, position: FloatArray) -> FloatArray:
         r"""Return the mass's field at the sensor.
@@ -116,21 +104,14 @@ class Mass(Table, frozen=True):
 
 
 class Vehicle(Table, frozen=True):
-    """``[vehicle]``: a vehicle whose magnetism is known.
-
-    Attributes
-    ----------
-    hard_iron : tuple of 3 float
-        nT, of all that does not move.
-    soft_iron : 3x3 tuple
-        Field that fixed iron adds per unit of the Earth's field, body axes.
-    mass : dict of Mass
-        By the name of the parameter that moves it.
-    """
+    """``[vehicle]``: a vehicle whose magnetism is known."""
 
     hard_iron: Vector = (0.0, 0.0, 0.0)
+    """nT, of all that does not move."""
     soft_iron: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    """Field that fixed iron adds per unit of the Earth's field, body axes."""
     mass: dict[str, Mass] = msgspec.field(default_factory=dict)
+    """By the name of the parameter that moves it."""
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -37,84 +37,56 @@ class Place(Table, frozen=True):
 
 
 class Telemetry(Table, frozen=True):
-    """``[telemetry]``: errors of the vehicle's own attitude and position, and the reference.
-
-    Attributes
-    ----------
-    roll_pitch_sigma, heading_sigma : float
-        deg, white.
-    drift : float
-        m/s an axis, standard deviation of a steady current that the logged position lacks.
-    reference : str
-        What ``reference_field`` holds: ``none`` leaves it out, ``true`` is the true total field, ``map`` is
-        the IGRF with the anomaly of the map that an aeromagnetic survey would have made.
-    map_altitude : float
-        m of that survey.
-    """
+    """``[telemetry]``: errors of the vehicle's own attitude and position, and the reference."""
 
     roll_pitch_sigma: NotNegative = 0.1
     heading_sigma: NotNegative = 1.0
+    """`roll_pitch_sigma`, `heading_sigma`: deg, white."""
     drift: NotNegative = 0.0
+    """m/s an axis, standard deviation of a steady current that the logged position lacks."""
     reference: Literal["none", "true", "map"] = "none"
+    """What ``reference_field`` holds: ``none`` leaves it out, ``true`` is the true total field, ``map`` is
+    the IGRF with the anomaly of the map that an aeromagnetic survey would have made."""
     map_altitude: NotNegative = 90.0
+    """m of that survey."""
 
 
 class Hidden(Table, frozen=True):
-    """``[[hidden]]``: something happens that the calibration does not know.
-
-    Attributes
-    ----------
-    effect : str
-        Of :data:`sitl.inject.EFFECTS`.
-    size : float
-        In the effect's own unit: see its function.
-    segment : str
-        The part of the mission that it shows in.
-    """
+    """``[[hidden]]``: something happens that the calibration does not know."""
 
     effect: str
+    """Of :data:`sitl.inject.EFFECTS`."""
     size: NotNegative
+    """In the effect's own unit: see its function."""
     segment: str = "survey"
+    """The part of the mission that it shows in."""
 
 
 class Scenario(Table, frozen=True):
-    """A whole scenario file.
-
-    Attributes
-    ----------
-    name : str
-    start : datetime
-        With its offset from UTC (TOML: ``2013-12-11T12:00:00Z``).
-    masses : tuple of str
-        Kinds of moving mass (keys of :data:`sitl.platform.MOUNTINGS`) of a vehicle that is drawn
-        from the seed.
-    vehicle : Vehicle or None
-        A vehicle whose magnetism is given; nothing is drawn then.
-    calibration : str or None
-        A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument, in place of a
-        vehicle.
-    limits : dict of Limit
-        The vehicle's limits where they differ from those of its kind of mass.
-    world, motion, instrument, telemetry
-        The tables of these names.
-    hidden : tuple of Hidden
-        What happens besides.
-    mission : tuple
-        Spirals, surveys and legs, one after the other; empty where a log is to drive the scenario.
-    """
+    """A whole scenario file."""
 
     name: str
     start: Annotated[datetime, Meta(tz=True)] = datetime(2013, 12, 11, 12, tzinfo=UTC)
+    """With its offset from UTC (TOML: ``2013-12-11T12:00:00Z``)."""
     masses: tuple[str, ...] = ("battpos", "ballast")
+    """Kinds of moving mass (keys of :data:`sitl.platform.MOUNTINGS`) of a vehicle that is drawn from the
+    seed."""
     vehicle: Vehicle | None = None
+    """A vehicle whose magnetism is given; nothing is drawn then."""
     calibration: str | None = None
+    """A ``cal.json`` (relative to the scenario's file) that describes vehicle and instrument, in place of a
+    vehicle."""
     limits: dict[str, Limit] = msgspec.field(default_factory=dict)
+    """The vehicle's limits where they differ from those of its kind of mass."""
     world: Place = Place()
     motion: Motion = Motion()
     instrument: Instrument = Instrument()
     telemetry: Telemetry = Telemetry()
+    """`world`, `motion`, `instrument`, `telemetry`: The tables of these names."""
     hidden: tuple[Hidden, ...] = ()
+    """What happens besides."""
     mission: tuple[Part, ...] = ()
+    """Spirals, surveys and legs, one after the other; empty where a log is to drive the scenario."""
 
     @property
     def all_limits(self) -> dict[str, Limit]:

@@ -20,33 +20,22 @@ __all__ = ["Motion", "Track", "fly"]
 
 
 class Motion(Table, frozen=True):
-    """``[motion]``: how the vehicle follows its commands.
-
-    Attributes
-    ----------
-    speed : float
-        m/s through the water.
-    angle_of_attack : float
-        deg by which the path is steeper than the pitch.
-    settle : float
-        s of the first-order approach to a commanded attitude.
-    wander : tuple of 3 float
-        deg, standard deviation of roll, pitch and heading about the command; as a Slocum's log shows them.
-    wander_memory : float
-        s over which the wander's correlation falls.
-    current : tuple of 2 float
-        m/s north, east of the water.
-    max_depth : float
-        m, where the vehicle stays until it climbs.
-    """
+    """``[motion]``: how the vehicle follows its commands."""
 
     speed: Positive = 0.35
+    """m/s through the water."""
     angle_of_attack: float = 3.0
+    """deg by which the path is steeper than the pitch."""
     settle: NotNegative = 15.0
+    """s of the first-order approach to a commanded attitude."""
     wander: tuple[float, float, float] = (0.3, 0.6, 5.0)
+    """deg, standard deviation of roll, pitch and heading about the command; as a Slocum's log shows them."""
     wander_memory: Positive = 20.0
+    """s over which the wander's correlation falls."""
     current: tuple[float, float] = (0.0, 0.0)
+    """m/s north, east of the water."""
     max_depth: Positive = 200.0
+    """m, where the vehicle stays until it climbs."""
 
 
 STEADY = Motion()
@@ -55,38 +44,29 @@ STEADY = Motion()
 
 @dataclass(frozen=True)
 class Track:
-    """What the vehicle really did, on a uniform grid.
-
-    Attributes
-    ----------
-    start, step : float
-        s since 1970, and s between points.
-    latitude, longitude, depth : array (n,)
-        deg, deg, m.
-    roll, pitch, heading : array (n,)
-        deg; the heading runs on past 360 (so that it can be interpolated).
-    parameters : dict of array (n,)
-        Positions of the moving masses, and other logged channels on which the vehicle's magnetism depends.
-    run : array (n,) or None
-        Number of the leg, from 1.
-    segments : tuple of (name, first, last)
-        s after the start.
-    water : array (n,) or None
-        degC around the vehicle, where it was measured.
-    """
+    """What the vehicle really did, on a uniform grid."""
 
     start: float
     step: float
+    """`start`, `step`: s since 1970, and s between points."""
     latitude: FloatArray
     longitude: FloatArray
     depth: FloatArray
+    """`latitude`, `longitude`, `depth`, (n,), deg, deg, m."""
     roll: FloatArray
     pitch: FloatArray
     heading: FloatArray
+    """`roll`, `pitch`, `heading`, (n,), deg; the heading runs on past 360 (so that it can be interpolated).
+    """
     parameters: dict[str, FloatArray]
+    """(n,) each: Positions of the moving masses, and other logged channels on which the vehicle's magnetism
+    depends."""
     run: FloatArray | None = None
+    """(n,): Number of the leg, from 1."""
     segments: tuple[tuple[str, float, float], ...] = ()
+    """(name, first, last) each, s after the start."""
     water: FloatArray | None = None
+    """(n,), degC around the vehicle, where it was measured."""
 
     @property
     def elapsed(self) -> FloatArray:

@@ -39,34 +39,19 @@ FIELD_STEP = 4.0
 
 
 class Ambient(NamedTuple):
-    """What an instrument is exposed to, on a track's grid of n points.
-
-    Attributes
-    ----------
-    earth : array (n, 3)
-        nT north-east-down, of the Earth alone.
-    field : array (n, 3)
-        nT at the sensor, body axes, the vehicle's included.
-    water : array (n,)
-        degC.
-    """
+    """What an instrument is exposed to, on a track's grid of n points."""
 
     earth: FloatArray
+    """(n, 3), nT north-east-down, of the Earth alone."""
     field: FloatArray
+    """(n, 3), nT at the sensor, body axes, the vehicle's included."""
     water: FloatArray
+    """(n,), degC."""
 
 
 @dataclass(frozen=True)
 class Twin:
-    """A world and a vehicle, drawn from a seed, that a scenario can be run in.
-
-    Attributes
-    ----------
-    scenario : Scenario
-    seed : int
-    world : World
-    vehicle : Vehicle or Calibrated
-    """
+    """A world and a vehicle, drawn from a seed, that a scenario can be run in."""
 
     scenario: Scenario
     seed: int

@@ -46,25 +46,18 @@ def dipole_field(r: FloatArray, m: FloatArray) -> FloatArray:
 
 
 class Geology(Table, frozen=True):
-    """``[world.geology]``: how rough the rock is.
-
-    Attributes
-    ----------
-    sources : int
-        How many magnetised bodies; 0 leaves the Earth's main field alone.
-    extent : float
-        m, half the side of the square that holds them, about the first position.
-    top, bottom : float
-        m below the surface, where the bodies lie: as many in each octave of depth. The vehicle stays above.
-    rms : float
-        nT of the total-field anomaly at the surface.
-    """
+    """``[world.geology]``: how rough the rock is."""
 
     sources: int = 600
+    """How many magnetised bodies; 0 leaves the Earth's main field alone."""
     extent: float = 12_000.0
+    """m, half the side of the square that holds them, about the first position."""
     top: float = 350.0
     bottom: float = 3_000.0
+    """`top`, `bottom`: m below the surface, where the bodies lie: as many in each octave of depth. The
+    vehicle stays above."""
     rms: float = 100.0
+    """nT of the total-field anomaly at the surface."""
 
 
 class Water(Table, frozen=True):
@@ -83,18 +76,12 @@ class Water(Table, frozen=True):
 
 @dataclass(frozen=True)
 class Rock:
-    """Point dipoles below the sea floor: harmonic everywhere above them.
-
-    Attributes
-    ----------
-    position : array (m, 3)
-        m north, east, down of the world's origin.
-    moment : array (m, 3)
-        A m², the same axes.
-    """
+    """Point dipoles below the sea floor: harmonic everywhere above them."""
 
     position: FloatArray
+    """(m, 3), m north, east, down of the world's origin."""
     moment: FloatArray
+    """(m, 3): A m², the same axes."""
 
     @classmethod
     def draw(cls, geology: Geology, main_field: FloatArray, rng: np.random.Generator) -> Rock:
@@ -136,17 +123,10 @@ class Rock:
 
 @dataclass(frozen=True)
 class World:
-    """The magnetic field at any place and time.
-
-    Attributes
-    ----------
-    origin : tuple
-        Latitude and longitude (deg) of the local axes.
-    rock : Rock
-    water : Water
-    """
+    """The magnetic field at any place and time."""
 
     origin: tuple[float, float]
+    """Latitude and longitude (deg) of the local axes."""
     rock: Rock
     water: Water
 

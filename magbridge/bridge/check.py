@@ -33,18 +33,12 @@ ROOM = 100e6
 
 
 class Finding(NamedTuple):
-    """Something that would go wrong.
-
-    Attributes
-    ----------
-    fatal : bool
-        The bridge would not start; otherwise it would start and wait, or run worse.
-    text : str
-        One line with the file, the key, and what was expected.
-    """
+    """Something that would go wrong."""
 
     fatal: bool
+    """The bridge would not start; otherwise it would start and wait, or run worse."""
     text: str
+    """One line with the file, the key, and what was expected."""
 
 
 def findings(path: Path) -> list[Finding]:

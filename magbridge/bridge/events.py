@@ -13,41 +13,26 @@ __all__ = ["Clock", "Event", "Start"]
 
 
 class Start(msgspec.Struct, frozen=True):
-    """What a run depends on besides its configuration, its calibration and its events.
-
-    Attributes
-    ----------
-    time_us : int
-        µs since 1970 UTC, a multiple of 4.
-    parameters : dict of str to float
-        Values that a ground station set in earlier runs.
-    signing_timestamp : int
-        The last that may have been used (units of 10 µs since 2015-01-01).
-    signing_streams : list of Stream
-        The last time stamp accepted of each signed stream.
-    """
+    """What a run depends on besides its configuration, its calibration and its events."""
 
     time_us: int
+    """µs since 1970 UTC, a multiple of 4."""
     parameters: dict[str, float] = {}
+    """Values that a ground station set in earlier runs."""
     signing_timestamp: int = 0
+    """The last that may have been used (units of 10 µs since 2015-01-01)."""
     signing_streams: list[Stream] = []
+    """The last time stamp accepted of each signed stream."""
 
 
 class Event(msgspec.Struct, frozen=True, gc=False):
-    """One input of the bridge: bytes from a port, a change of state, or only the passing of time.
-
-    Attributes
-    ----------
-    time_us : int
-        µs since 1970 UTC, when the live edge read it; a multiple of 4, never decreasing.
-    channel : Channel
-        ``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect
-        that says what changed (a port, the host's clock, the log), or nothing when only time has passed.
-    data : bytes
-    """
+    """One input of the bridge: bytes from a port, a change of state, or only the passing of time."""
 
     time_us: int
+    """µs since 1970 UTC, when the live edge read it; a multiple of 4, never decreasing."""
     channel: Channel
+    """``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect
+    that says what changed (a port, the host's clock, the log), or nothing when only time has passed."""
     data: bytes
 
 

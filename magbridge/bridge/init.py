@@ -18,33 +18,22 @@ NEEDED = "FILL IN"
 
 @dataclass(frozen=True)
 class Answers:
-    """What a vehicle's bridge must be told.
-
-    Attributes
-    ----------
-    driver, port : str
-        The sensor's.
-    baudrate : int
-    link : str
-        The MAVLink URL.
-    system : int
-        The vehicle's system id.
-    parameters : tuple of str
-        ``name`` or ``name [unit]`` of each moving mass.
-    options : dict
-        Of the driver.
-    calibration : str or None
-        Its file.
-    """
+    """What a vehicle's bridge must be told."""
 
     driver: str
     port: str
+    """`driver`, `port`: The sensor's."""
     baudrate: int = 9600
     link: str = "udpout:127.0.0.1:14550"
+    """The MAVLink URL."""
     system: int = 1
+    """The vehicle's system id."""
     parameters: tuple[str, ...] = ()
+    """``name`` or ``name [unit]`` of each moving mass."""
     options: dict[str, Any] = field(default_factory=dict)
+    """Of the driver."""
     calibration: str | None = None
+    """Its file."""
 
 
 def bridge_toml(answers: Answers, calibration: Calibration | None = None) -> str:

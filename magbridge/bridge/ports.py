@@ -28,32 +28,20 @@ ENOUGH = 3
 
 
 class Recognised(NamedTuple):
-    """What a line sends.
-
-    Attributes
-    ----------
-    who : str
-        ``mavlink``, ``nmea``, the name of a driver, ``text``, ``bytes``; empty where nothing came.
-    text : str
-        More of it, for people: rates, systems, the first line that cannot be parsed.
-    """
+    """What a line sends."""
 
     who: str
+    """``mavlink``, ``nmea``, the name of a driver, ``text``, ``bytes``; empty where nothing came."""
     text: str
+    """More of it, for people: rates, systems, the first line that cannot be parsed."""
 
 
 class Port(NamedTuple):
-    """A serial port of this computer.
-
-    Attributes
-    ----------
-    device : str
-    description : str
-        What the USB says of it.
-    """
+    """A serial port of this computer."""
 
     device: str
     description: str
+    """What the USB says of it."""
 
 
 def ports() -> list[Port]:

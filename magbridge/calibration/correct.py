@@ -48,21 +48,16 @@ MANY = for_arrays()
 
 
 class CorrectedArrays(NamedTuple):
-    """Corrected samples as arrays: nT, and :class:`~magbridge.records.Quality` bits.
-
-    Attributes
-    ----------
-    total, sigma : (n,) arrays
-    vector, vector_sigma : (n, 3) arrays
-        Body axes; sensor axes where ``no_boresight`` is set.
-    quality : (n,) int array
-    """
+    """Corrected samples as arrays: nT, and :class:`~magbridge.records.Quality` bits."""
 
     total: FloatArray
     sigma: FloatArray
+    """`total`, `sigma`: (n,)."""
     vector: FloatArray
     vector_sigma: FloatArray
+    """`vector`, `vector_sigma`, (n, 3): Body axes; sensor axes where ``no_boresight`` is set."""
     quality: IntArray
+    """(n,)."""
 
 
 def _omega(calibration: Calibration) -> tuple[float, ...] | None:

@@ -113,31 +113,21 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
 
 
 class Dipole(PositionTerm, frozen=True, kw_only=True):
-    """One mass as a dipole; coefficients: moment (3, nT), induced moment (3, nT), displacement (3, m).
-
-    Attributes
-    ----------
-    parameter : str
-        Which parameter moves it.
-    at : tuple of 3 float
-        m, body frame from the sensor, where the mass is when the parameter is 0.
-    travel : tuple of 3 float
-        m per unit of the parameter.
-    at_sigma : float
-        m, 1-sigma of `at`: the prior of the displacement.
-    moment : tuple of 3 float
-        nT at the sensor: where the displacement's columns were linearised.
-    induced : tuple of 3 float
-        nT, likewise.
-    """
+    """One mass as a dipole; coefficients: moment (3, nT), induced moment (3, nT), displacement (3, m)."""
 
     kind: ClassVar[str] = "dipole"
     parameter: str
+    """Which parameter moves it."""
     at: Vector
+    """m, body frame from the sensor, where the mass is when the parameter is 0."""
     travel: Vector
+    """m per unit of the parameter."""
     at_sigma: float = 0.0
+    """m, 1-sigma of `at`: the prior of the displacement."""
     moment: Vector = (0.0, 0.0, 0.0)
+    """nT at the sensor: where the displacement's columns were linearised."""
     induced: Vector = (0.0, 0.0, 0.0)
+    """nT, likewise."""
 
     @property
     def size(self) -> int:

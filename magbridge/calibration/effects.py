@@ -91,15 +91,10 @@ def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
 
 
 class SingleChannelEffect(Effect, frozen=True, kw_only=True):
-    """An effect that depends on one telemetry channel.
-
-    Attributes
-    ----------
-    channel : str
-        Name of the telemetry series.
-    """
+    """An effect that depends on one telemetry channel."""
 
     channel: str
+    """Name of the telemetry series."""
 
     @property
     def size(self) -> int:
@@ -112,27 +107,19 @@ class SingleChannelEffect(Effect, frozen=True, kw_only=True):
 
 
 class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
-    """Offset or scale proportional to a channel, at once or through lags in series.
-
-    Attributes
-    ----------
-    origin : float
-        Value of the channel at which the effect is zero (the temperature at calibration; 0 A).
-    lag : float
-        s, sum of the time constants of equal first-order lags in series, each
-        ``dy/dt = (x - y) / (lag / stages)``; 0: no lag.
-    stages : int
-        Number of lags in series: 1 for a single heat store, 2 for one that is heated through another.
-    on : {"offset", "scale"}
-        ``offset``: three coefficients, nT per unit of the channel, added to T. ``scale``: three,
-        added to the diagonal of ``a``, nT at F_0 per unit.
-    """
+    """Offset or scale proportional to a channel, at once or through lags in series."""
 
     kind: ClassVar[str] = "channel"
     origin: float = 0.0
+    """Value of the channel at which the effect is zero (the temperature at calibration; 0 A)."""
     lag: Annotated[float, Meta(ge=0.0)] = 0.0
+    """s, sum of the time constants of equal first-order lags in series, each ``dy/dt = (x - y) / (lag /
+    stages)``; 0: no lag."""
     stages: Power = 1
+    """Number of lags in series: 1 for a single heat store, 2 for one that is heated through another."""
     on: Literal["offset", "scale"] = "offset"
+    """``offset``: three coefficients, nT per unit of the channel, added to T. ``scale``: three, added to the
+    diagonal of ``a``, nT at F_0 per unit."""
 
     def columns(self, field: float) -> FloatArray:
         """One regressor, one slot for each axis."""

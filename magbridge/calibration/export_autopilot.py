@@ -37,24 +37,16 @@ LIMIT = 1_800.0
 
 @dataclass(frozen=True)
 class Compass:
-    """What an autopilot's compass model holds of a calibration.
-
-    Attributes
-    ----------
-    matrix : (3, 3) array
-        Symmetric.
-    offset : (3,) array
-        nT, T at the middle of each parameter's range, at no current.
-    current : (3,) array or None
-        nT/A, dT/dI.
-    lost : tuple of str
-        What it cannot hold, and what that costs.
-    """
+    """What an autopilot's compass model holds of a calibration."""
 
     matrix: FloatArray
+    """(3, 3): Symmetric."""
     offset: FloatArray
+    """(3,), nT, T at the middle of each parameter's range, at no current."""
     current: FloatArray | None
+    """(3,), nT/A, dT/dI."""
     lost: tuple[str, ...]
+    """What it cannot hold, and what that costs."""
 
 
 def compass_of(calibration: Calibration) -> Compass:

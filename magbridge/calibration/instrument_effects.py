@@ -18,28 +18,20 @@ __all__ = ["RateEffect", "ResponseEffect", "TimeEffect"]
 
 
 class TimeEffect(Effect, frozen=True, kw_only=True):
-    """An offset that depends on time alone.
-
-    Attributes
-    ----------
-    shape : {"step", "drift", "tone"}
-        Step: ``H(t - t_0)``. Drift: ``x = (t - t_0) / period`` and its powers, with x held at -1 and 1 beyond
-        them, because nothing is known of a drift outside the time it was fitted to. Tone: ``cos`` and ``sin``
-        of ``2 pi (t - t_0) / period``.
-    start : float
-        t_0, s since 1970 UTC.
-    period : float
-        s.
-    order : int
-        Highest power of a drift.
-    """
+    """An offset that depends on time alone."""
 
     kind: ClassVar[str] = "time"
     remembers: ClassVar[bool] = False
     shape: Literal["step", "drift", "tone"]
+    """Step: ``H(t - t_0)``. Drift: ``x = (t - t_0) / period`` and its powers, with x held at -1 and 1 beyond
+    them, because nothing is known of a drift outside the time it was fitted to. Tone: ``cos`` and ``sin`` of
+    ``2 pi (t - t_0) / period``."""
     start: Annotated[float, Meta(ge=-1e12, le=1e12)]
+    """t_0, s since 1970 UTC."""
     period: Width = 86_400.0
+    """s."""
     order: Power = 1
+    """Highest power of a drift."""
 
     @property
     def regressors(self) -> int:
@@ -83,13 +75,6 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
 class RateEffect(Effect, frozen=True, kw_only=True):
     """Offsets proportional to the rate of change of the reading, ``dH_r/dt``; coefficients in s.
 
-    Attributes
-    ----------
-    on : {"skew", "eddy"}
-        ``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three
-        coefficients. ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six
-        coefficients xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961).
-
     Notes
     -----
     Live, later samples are not known, so the rate is the second-order backward difference of three samples.
@@ -97,6 +82,9 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = "rate"
     on: Literal["skew", "eddy"]
+    """``skew``: each channel is sampled tau_i later than the log says, ``T_i = tau_i dH_i/dt``: three
+    coefficients. ``eddy``: currents that a changing field drives, ``T_i = k_ij dH_j/dt``, i != j: six
+    coefficients xy, xz, yx, yz, zx, zy (Tolles & Lawson 1950, in the notation of Leliak 1961)."""
 
     @property
     def size(self) -> int:
@@ -152,27 +140,19 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
 
 class ResponseEffect(Effect, frozen=True, kw_only=True):
-    """A nonlinear response: a power of each channel's reading, or one channel with a knee.
-
-    Attributes
-    ----------
-    power : int
-        ``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead.
-    unit : float
-        nT.
-    axis : int
-        Index of the channel that has the knee.
-    knee : float
-        nT, either sign s. Where ``s H > s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``: two coefficients,
-        nT.
-    """
+    """A nonlinear response: a power of each channel's reading, or one channel with a knee."""
 
     kind: ClassVar[str] = "response"
     remembers: ClassVar[bool] = False
     unit: Annotated[float, Meta(ge=1.0, le=1e9)]
+    """nT."""
     power: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
+    """``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead."""
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
+    """Index of the channel that has the knee."""
     knee: float = 0.0
+    """nT, either sign s. Where ``s H > s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``: two coefficients,
+    nT."""
 
     @property
     def size(self) -> int:

@@ -45,37 +45,27 @@ COLUMNS = 81
 
 @dataclass(frozen=True, eq=False)
 class Kernel:
-    """A calibration compiled to what :mod:`.correct` needs.
-
-    Attributes
-    ----------
-    centre, scale : tuple of float
-        Of each parameter.
-    field : float
-        nT, F_0.
-    parents : tuple of (int, int)
-        Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``.
-    weights : (m, 9) array
-        W, with ``A`` itself (not ``a``) in the first six; the rows of monomials, then those of effects.
-    units : tuple of float or None
-        Powers of two that the regressors are multiplied by; None where all are 1.
-    first, second : (q,) int arrays
-        Product q is ``phi[first[q]] * phi[second[q]]``, of regressors in their units; the first m products
-        are the regressors themselves.
-    coarse, fine : (81, q) arrays
-        The table in two parts.
-    """
+    """A calibration compiled to what :mod:`.correct` needs."""
 
     centre: tuple[float, ...]
     scale: tuple[float, ...]
+    """`centre`, `scale`: Of each parameter."""
     field: float
+    """nT, F_0."""
     parents: tuple[tuple[int, int], ...]
+    """Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``."""
     weights: FloatArray
+    """(m, 9): W, with ``A`` itself (not ``a``) in the first six; the rows of monomials, then those of
+    effects."""
     units: tuple[float, ...] | None
+    """Powers of two that the regressors are multiplied by; None where all are 1."""
     first: IndexArray
     second: IndexArray
+    """`first`, `second`, (q,): Product q is ``phi[first[q]] * phi[second[q]]``, of regressors in their units;
+    the first m products are the regressors themselves."""
     coarse: FloatArray
     fine: FloatArray
+    """`coarse`, `fine`, (81, q): The table in two parts."""
 
     def sums(self, phi: FloatArray) -> FloatArray:
         """Return ``table psi`` (81, n) of many samples' regressors (m, n)."""

@@ -34,16 +34,11 @@ Factors = list[tuple[int, float, float, list[float]]]
 
 
 class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
-    """Offsets from a mass whose position is one telemetry channel.
-
-    Attributes
-    ----------
-    centre, scale : float
-        In the channel's unit.
-    """
+    """Offsets from a mass whose position is one telemetry channel."""
 
     centre: float
     scale: Width
+    """`centre`, `scale`: In the channel's unit."""
 
     def columns(self, field: float) -> FloatArray:
         """Offsets."""
@@ -80,15 +75,11 @@ class PowersEffect(PathEffect, frozen=True, kw_only=True):
     """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
 
     A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
-
-    Attributes
-    ----------
-    order : int
-        Highest power.
     """
 
     kind: ClassVar[str] = "powers"
     order: Power = 1
+    """Highest power."""
 
     @property
     def size(self) -> int:
@@ -137,16 +128,12 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
 
     P_e is Legendre's polynomial of degree e: of x^e it is what a fit of all lower powers leaves, over the
     travel that the calibration saw.
-
-    Attributes
-    ----------
-    exponents : tuple of int
-        Degrees, one for each parameter, of positions scaled as the calibration scales them.
     """
 
     kind: ClassVar[str] = "legendre"
     remembers: ClassVar[bool] = False
     exponents: Exponents
+    """Degrees, one for each parameter, of positions scaled as the calibration scales them."""
 
     @property
     def size(self) -> int:
@@ -283,15 +270,11 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
     """Telemetry that is late: ``theta += delay * dtheta/dp * dp/dt``, for all nine coefficients theta.
 
     The only coefficient is the delay: the time (s) by which the telemetry lags behind the field's samples.
-
-    Attributes
-    ----------
-    sign : float
-        1; or -1 if the delay is that of the field's samples behind the telemetry, as after a filter.
     """
 
     kind: ClassVar[str] = "clock"
     sign: float = 1.0
+    """1; or -1 if the delay is that of the field's samples behind the telemetry, as after a filter."""
 
     @property
     def size(self) -> int:

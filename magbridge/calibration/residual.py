@@ -51,30 +51,20 @@ SETTLED = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """The samples that a fit compares with their reference.
-
-    Attributes
-    ----------
-    field : (n, 3) array
-        nT, raw.
-    reference : (n,) array
-        nT, H_e.
-    phi : (n, m) array
-        Monomials of the positions.
-    steps : (n,) array
-        Sampling intervals since the previous sample; infinite where that belongs to another run.
-    F_0 : float
-        nT, the total field that the coefficients of A refer to: ``A = I + a / F_0``.
-    kappa : float
-        Noise of the reference divided by the sensor's.
-    """
+    """The samples that a fit compares with their reference."""
 
     field: FloatArray
+    """(n, 3), nT, raw."""
     reference: FloatArray
+    """(n,), nT, H_e."""
     phi: FloatArray
+    """(n, m): Monomials of the positions."""
     steps: FloatArray
+    """(n,): Sampling intervals since the previous sample; infinite where that belongs to another run."""
     F_0: float
+    """nT, the total field that the coefficients of A refer to: ``A = I + a / F_0``."""
     kappa: float = 0.0
+    """Noise of the reference divided by the sensor's."""
 
     def part(self, rows: slice | BoolArray | IndexArray) -> Samples:
         """Pick samples: an (n,) mask, places or a slice."""

@@ -73,39 +73,26 @@ TERMS: dict[str, str] = {
 
 
 class Parameter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A telemetry channel that moves a mass.
-
-    Attributes
-    ----------
-    name, unit : str
-        As in the deployment's columns.
-    low, high : float
-        The range that the calibration has seen.
-    centre, scale : float
-        ``x = (p - centre) / scale``.
-    """
+    """A telemetry channel that moves a mass."""
 
     name: str
     unit: str
+    """`name`, `unit`: As in the deployment's columns."""
     low: float
     high: float
+    """`low`, `high`: The range that the calibration has seen."""
     centre: float
     scale: float
+    """`centre`, `scale`: ``x = (p - centre) / scale``."""
 
 
 class Expansion(msgspec.Struct, frozen=True):
-    """A position term as a polynomial: ``theta(x) = sum_k c_k sum_m x^m columns[k, m]``.
-
-    Attributes
-    ----------
-    exponents : tuple of tuple of int
-        m monomials; one exponent for each parameter.
-    columns : (K, m, 9) array
-        What one unit of coefficient k adds to the nine :data:`SLOTS`, nT.
-    """
+    """A position term as a polynomial: ``theta(x) = sum_k c_k sum_m x^m columns[k, m]``."""
 
     exponents: tuple[Exponents, ...]
+    """m monomials; one exponent for each parameter."""
     columns: FloatArray
+    """(K, m, 9): What one unit of coefficient k adds to the nine :data:`SLOTS`, nT."""
 
 
 class _Interface(msgspec.StructMeta, ABCMeta):
@@ -138,15 +125,11 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
     """Each of the nine coefficients a polynomial in the scaled positions (paper, eq. 8).
 
     Coefficient ``9 m + s`` multiplies monomial m in slot s.
-
-    Attributes
-    ----------
-    exponents : tuple of tuple of int
-        The monomials; the constant one first.
     """
 
     kind: ClassVar[str] = "polynomial"
     exponents: tuple[Exponents, ...]
+    """The monomials; the constant one first."""
 
     @property
     def size(self) -> int:
@@ -171,24 +154,16 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
 
 
 class Series(NamedTuple):
-    """A log of n samples, as the array form of an effect takes it.
-
-    Attributes
-    ----------
-    time : (n,) array
-        s since 1970 UTC, ascending.
-    reading : (n, 3) array
-        nT, the raw axes.
-    values : mapping of str to (n,) array
-        Telemetry by name, the parameters first; NaN where it is not known.
-    kernel : Kernel
-        That of the calibration.
-    """
+    """A log of n samples, as the array form of an effect takes it."""
 
     time: FloatArray
+    """(n,), s since 1970 UTC, ascending."""
     reading: FloatArray
+    """(n, 3), nT, the raw axes."""
     values: Mapping[str, FloatArray]
+    """(n,) each: Telemetry by name, the parameters first; NaN where it is not known."""
     kernel: Kernel
+    """That of the calibration."""
 
     @property
     def time_us(self) -> FloatArray:

@@ -242,25 +242,17 @@ def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Pa
 
 @dataclass
 class _Tally:
-    """What has come of a log so far.
-
-    Attributes
-    ----------
-    samples, left_out : int
-        Rows corrected, and those that are no samples.
-    flagged : int
-        Samples whose total field is in doubt.
-    flags : Counter
-        Name of a flag -> samples that carry it.
-    unearthly : int
-        Samples whose total field is none of the Earth's.
-    """
+    """What has come of a log so far."""
 
     samples: int = 0
     left_out: int = 0
+    """`samples`, `left_out`: Rows corrected, and those that are no samples."""
     flagged: int = 0
+    """Samples whose total field is in doubt."""
     flags: Counter[str] = field(default_factory=Counter)
+    """Name of a flag -> samples that carry it."""
     unearthly: int = 0
+    """Samples whose total field is none of the Earth's."""
 
     def add(self, corrected: xr.Dataset, rows: int) -> None:
         """Count a piece of the log that had so many rows, with its samples corrected."""

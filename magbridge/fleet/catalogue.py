@@ -72,18 +72,12 @@ result is made of, and its last `attempt` is the one that counts."""
 
 
 class Catalogue(ABC):
-    """A catalogue, wherever it is.
-
-    Attributes
-    ----------
-    name : str
-        As people know it.
-    results : Path
-        Folder of corrected logs and maps.
-    """
+    """A catalogue, wherever it is."""
 
     name: str
+    """As people know it."""
     results: Path
+    """Folder of corrected logs and maps."""
 
     @abstractmethod
     def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:

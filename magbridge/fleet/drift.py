@@ -31,54 +31,36 @@ ALARM = 1e-3
 
 @dataclass(frozen=True)
 class Change:
-    """One coefficient that left its band.
-
-    Attributes
-    ----------
-    what : str
-        As a technician would say it.
-    by : float
-        nT.
-    sigmas : float
-        Of the move.
-    chance : float
-        Of one as large in any coefficient of a deployment like the others.
-    cause : str
-        What does such a thing, and whether a refit was on record.
-    """
+    """One coefficient that left its band."""
 
     what: str
+    """As a technician would say it."""
     by: float
+    """nT."""
     sigmas: float
+    """Of the move."""
     chance: float
+    """Of one as large in any coefficient of a deployment like the others."""
     cause: str
+    """What does such a thing, and whether a refit was on record."""
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """A vehicle's coefficients from deployment to deployment.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of the k that are looked at: hard iron, and what each mass changes over half its range.
-    lessons : tuple of Lesson
-        In the order of time.
-    expected, expected_sigma : (n, k) arrays
-        nT, from what was before.
-    found, found_sigma : (n, k) arrays
-        nT, with its own data.
-    changes : tuple of tuple of Change
-        Of each deployment.
-    """
+    """A vehicle's coefficients from deployment to deployment."""
 
     names: tuple[str, ...]
+    """Of the k that are looked at: hard iron, and what each mass changes over half its range."""
     lessons: tuple[Lesson, ...]
+    """In the order of time."""
     expected: FloatArray
     expected_sigma: FloatArray
+    """`expected`, `expected_sigma`, (n, k), nT, from what was before."""
     found: FloatArray
     found_sigma: FloatArray
+    """`found`, `found_sigma`, (n, k), nT, with its own data."""
     changes: tuple[tuple[Change, ...], ...]
+    """Of each deployment."""
 
 
 def history(fleet: Fleet, vehicle: str) -> History:

@@ -62,30 +62,20 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """A fleet's variances, and what all but each vehicle say of the fleet's mean.
-
-    Attributes
-    ----------
-    variances : Variances
-        Of the differences at each of :data:`.LEVELS`.
-    shapes : Shapes
-        How refits move the coefficients of each vehicle.
-    total : Information
-        Of the fleet's mean, its prior included.
-    each : dict
-        Vehicle -> its part of that.
-    log_likelihood : float
-        With the variances' prior, up to a constant.
-    rounds : int
-        Of expectation-maximisation.
-    """
+    """A fleet's variances, and what all but each vehicle say of the fleet's mean."""
 
     variances: Variances
+    """Of the differences at each of :data:`.LEVELS`."""
     shapes: Shapes
+    """How refits move the coefficients of each vehicle."""
     total: Information
+    """Of the fleet's mean, its prior included."""
     each: dict[str, Information]
+    """Vehicle -> its part of that."""
     log_likelihood: float
+    """With the variances' prior, up to a constant."""
     rounds: int = 0
+    """Of expectation-maximisation."""
 
     def expected(self, vehicle: str, past: Iterable[Observed], refit: str) -> tuple[FloatArray, FloatArray]:
         """Return mean (K,) and covariance (K, K) of the next deployment's z.

@@ -78,32 +78,21 @@ def unpacked(row: Mapping[str, bytes]) -> Information:
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
-    """What a fleet of vehicles with the same moving masses has taught.
-
-    Attributes
-    ----------
-    parameters : tuple of Parameter
-        The scale that all are brought to: the whole range seen.
-    exponents : tuple of tuple of int
-        The m monomials.
-    basis : (9 m, 9 m) array
-        nT; coefficients of z, which is in units of the physical widths.
-    population : Population
-    mounted : mapping
-        Vehicle -> where its masses sit.
-    lessons : tuple of Lesson
-        In the order of time.
-    observed : tuple of Observed
-        The same, of z.
-    """
+    """What a fleet of vehicles with the same moving masses has taught."""
 
     parameters: tuple[Parameter, ...]
+    """The scale that all are brought to: the whole range seen."""
     exponents: tuple[Exponents, ...]
+    """The m monomials."""
     basis: FloatArray
+    """(9 m, 9 m), nT; coefficients of z, which is in units of the physical widths."""
     population: Population
     mounted: Mapping[str, Mapping[str, Mounting]]
+    """Vehicle -> where its masses sit."""
     lessons: tuple[Lesson, ...]
+    """In the order of time."""
     observed: tuple[Observed, ...]
+    """The same, of z."""
 
     def known(self, vehicle: str, refit: str, before: float = np.inf) -> Known:
         """Return what is expected of a vehicle's next deployment.

@@ -26,21 +26,14 @@ WORTH = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """How refits move coefficients together.
-
-    Attributes
-    ----------
-    of : dict
-        Vehicle -> D (K, s); one that is not there has none.
-    groups : (s,) array
-        Number of the group that each column shares its variance with.
-    rest : float or (K,) array
-        Share of the physical widths by which coefficients are expected to vary besides.
-    """
+    """How refits move coefficients together."""
 
     of: Mapping[str, FloatArray]
+    """Vehicle -> D (K, s); one that is not there has none."""
     groups: IndexArray
+    """(s,): Number of the group that each column shares its variance with."""
     rest: FloatArray | float = EXPECTED[1]
+    """(K,): Share of the physical widths by which coefficients are expected to vary besides."""
 
     def expected(self, K: int) -> FloatArray:
         """Return the shares (3, K) by which coefficients are expected to vary, before any fleet is seen."""
@@ -48,18 +41,12 @@ class Shapes:
 
 
 class Variances(NamedTuple):
-    """How far members differ from their parents.
-
-    Attributes
-    ----------
-    own : (3, K) array
-        Of each coefficient, at each of :data:`LEVELS`.
-    shaped : (s,) array
-        Of the size of each shape, from refit to refit.
-    """
+    """How far members differ from their parents."""
 
     own: FloatArray
+    """(3, K): Of each coefficient, at each of :data:`LEVELS`."""
     shaped: FloatArray
+    """(s,): Of the size of each shape, from refit to refit."""
 
     @classmethod
     def expected(cls, K: int, shapes: Shapes) -> Variances:

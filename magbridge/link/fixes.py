@@ -37,50 +37,34 @@ WALK = 1e-3
 
 
 class Pose(NamedTuple):
-    """What ODOMETRY holds besides the position: from the vehicle's own telemetry.
-
-    Attributes
-    ----------
-    north, east, down : float
-        m, from the origin of the autopilot's local frame.
-    attitude : tuple of float
-        Quaternion w, x, y, z from body to north-east-down.
-    """
+    """What ODOMETRY holds besides the position: from the vehicle's own telemetry."""
 
     north: float
     east: float
     down: float
+    """`north`, `east`, `down`: m, from the origin of the autopilot's local frame."""
     attitude: tuple[float, float, float, float]
+    """Quaternion w, x, y, z from body to north-east-down."""
 
 
 class Fix(msgspec.Struct, frozen=True, gc=False):
-    """A position at the moment of sending, with its covariance.
-
-    Attributes
-    ----------
-    time_us : int
-        µs since 1970 UTC at which it holds: that of sending.
-    latitude, longitude : float
-        deg.
-    covariance_nn, covariance_ne, covariance_ee : float
-        m².
-    altitude : float
-        m above the sea; NaN where not known.
-    pose : Pose or None
-        Where the message is in a local frame.
-    resets : int
-        How often the estimate has jumped.
-    """
+    """A position at the moment of sending, with its covariance."""
 
     time_us: int
+    """µs since 1970 UTC at which it holds: that of sending."""
     latitude: float
     longitude: float
+    """`latitude`, `longitude`: deg."""
     covariance_nn: float
     covariance_ne: float
     covariance_ee: float
+    """`covariance_nn`, `covariance_ne`, `covariance_ee`: m²."""
     altitude: float = nan
+    """m above the sea; NaN where not known."""
     pose: Pose | None = None
+    """Where the message is in a local frame."""
     resets: int = 0
+    """How often the estimate has jumped."""
 
     @property
     def sigma(self) -> float:
@@ -204,33 +188,22 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
 
 
 class Kind(NamedTuple):
-    """How a fix is sent, and what its receiver makes of it.
-
-    Attributes
-    ----------
-    send : callable
-        Sends a :class:`Fix` to a system and component.
-    rate : float
-        Hz by default; 0 is with every update.
-    refused_by : mapping
-        Autopilots that cannot use it, and what to set instead.
-    fused : bool
-        The receiver weighs it against what it knows; else it puts its position there.
-    local : bool
-        It holds a :class:`Pose`.
-    trusted_to : float
-        m: ArduPilot takes a larger sigma for this one.
-    least : float
-        Hz below which the receiver takes the source for dead.
-    """
+    """How a fix is sent, and what its receiver makes of it."""
 
     send: Callable[[Outbox, Fix, int, int], Any]
+    """Sends a :class:`Fix` to a system and component."""
     rate: float
+    """Hz by default; 0 is with every update."""
     refused_by: dict[int, str]
+    """Autopilots that cannot use it, and what to set instead."""
     fused: bool
+    """The receiver weighs it against what it knows; else it puts its position there."""
     local: bool = False
+    """It holds a :class:`Pose`."""
     trusted_to: float = inf
+    """m: ArduPilot takes a larger sigma for this one."""
     least: float = 0.0
+    """Hz below which the receiver takes the source for dead."""
 
     def overrated(self, fix: Fix) -> bool:
         """Return whether ArduPilot, given such fixes at this rate, will claim to know its position better."""

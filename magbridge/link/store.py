@@ -19,21 +19,14 @@ Byte = Annotated[int, Meta(ge=0, le=255)]
 
 
 class Kept(msgspec.Struct, frozen=True):
-    """The contents of the file.
-
-    Attributes
-    ----------
-    parameters : dict of str to float
-        Values that differ from the configuration's.
-    signing_timestamp : int
-        The last that may have been used (10 µs since 2015-01-01); 48 bits on the link.
-    signing_streams : list of Stream
-        The last time stamp accepted of each stream.
-    """
+    """The contents of the file."""
 
     parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
+    """Values that differ from the configuration's."""
     signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 47)] = 0
+    """The last that may have been used (10 µs since 2015-01-01); 48 bits on the link."""
     signing_streams: list[tuple[Byte, Byte, Byte, bool, Annotated[int, Meta(ge=0, lt=1 << 48)]]] = []
+    """The last time stamp accepted of each stream."""
 
 
 def load(path: str | Path) -> Kept:

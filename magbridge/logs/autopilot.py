@@ -33,38 +33,24 @@ BETWEEN = 60.0
 
 
 class Magnetometer(NamedTuple):
-    """The samples of a magnetometer.
-
-    Attributes
-    ----------
-    compass : Compass
-    time : (n,) array
-        s of the log.
-    field : dict of str to (n,) array
-        nT, by axis (``x``, ``y``, ``z``).
-    """
+    """The samples of a magnetometer."""
 
     compass: Compass
     time: FloatArray
+    """(n,), s of the log."""
     field: Table
+    """(n,) each, nT, by axis (``x``, ``y``, ``z``)."""
 
 
 class Run(NamedTuple):
-    """What was logged from one boot to the next.
-
-    Attributes
-    ----------
-    magnetometers : list of Magnetometer
-        At least one.
-    telemetry : iterable of Series
-        The first of several with one name is taken.
-    offset : float or None
-        UTC minus the log's time, s; None where it is not known.
-    """
+    """What was logged from one boot to the next."""
 
     magnetometers: list[Magnetometer]
+    """At least one."""
     telemetry: Iterable[Series]
+    """The first of several with one name is taken."""
     offset: float | None
+    """UTC minus the log's time, s; None where it is not known."""
 
 
 def values_of(

@@ -60,21 +60,14 @@ HOURS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p")
 
 
 class Clock(NamedTuple):
-    """How a column's times are read.
-
-    Attributes
-    ----------
-    kind : str
-        A key of :data:`EPOCHS`, ``iso``, or a pattern of :meth:`datetime.strptime`.
-    assumed : str
-        What was taken for granted; empty where the file says it all.
-    boot : bool
-        Times count from a start that nobody knows.
-    """
+    """How a column's times are read."""
 
     kind: str
+    """A key of :data:`EPOCHS`, ``iso``, or a pattern of :meth:`datetime.strptime`."""
     assumed: str = ""
+    """What was taken for granted; empty where the file says it all."""
     boot: bool = False
+    """Times count from a start that nobody knows."""
 
     @property
     def is_text(self) -> bool:

@@ -39,38 +39,25 @@ ATTRIBUTE = "compasses"
 
 
 class Compass(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One compass of a log.
-
-    Attributes
-    ----------
-    number : int
-        From 0, as the log counts; the option ``--compass`` takes it.
-    samples : int
-    rate : float
-        Hz, the median.
-    id : str
-        The device's id or topic; the option takes it, too. Empty where the log does not say.
-    enabled : bool or None
-        Whether the vehicle's settings allow its use; None where the log does not say.
-    healthy : float or None
-        Share of its samples that the vehicle found healthy.
-    priority : int or None
-        The vehicle's own: of ArduPilot 1 is the first, of PX4 100 the highest.
-    in_use : bool
-        The log says that the vehicle used this one.
-    chosen : bool
-        It is ``mag_x`` of the deployment.
-    """
+    """One compass of a log."""
 
     number: int
+    """From 0, as the log counts; the option ``--compass`` takes it."""
     samples: int
     rate: float
+    """Hz, the median."""
     id: str = ""
+    """The device's id or topic; the option takes it, too. Empty where the log does not say."""
     enabled: bool | None = None
+    """Whether the vehicle's settings allow its use; None where the log does not say."""
     healthy: float | None = None
+    """Share of its samples that the vehicle found healthy."""
     priority: int | None = None
+    """The vehicle's own: of ArduPilot 1 is the first, of PX4 100 the highest."""
     in_use: bool = False
+    """The log says that the vehicle used this one."""
     chosen: bool = False
+    """It is ``mag_x`` of the deployment."""
 
     @property
     def fit(self) -> bool:

@@ -65,39 +65,25 @@ LAYOUT = np.dtype([("", "u1", HEADER), *zip(("type", "length", "name", "letters"
 
 
 class Records(NamedTuple):
-    """The records of one kind.
-
-    Attributes
-    ----------
-    at : (n,) array of int
-        Where each stands in the file, increasing: its byte, or its line.
-    fields : dict of str to (n,) array of float
-        In the unit of the field.
-    texts : dict of str to list of str
-        The fields of letters.
-    """
+    """The records of one kind."""
 
     at: IndexArray
+    """(n,): Where each stands in the file, increasing: its byte, or its line."""
     fields: dict[str, FloatArray]
+    """(n,) each: In the unit of the field."""
     texts: dict[str, list[str]]
+    """The fields of letters."""
 
 
 class Flash(NamedTuple):
-    """What was read of a log.
-
-    Attributes
-    ----------
-    records : dict of str to Records
-        By the name of the kind.
-    letters : dict of (str, str) to str
-        Kind and field to the letter of its type.
-    skipped : int
-        Bytes, or lines, that belonged to no record.
-    """
+    """What was read of a log."""
 
     records: dict[str, Records]
+    """By the name of the kind."""
     letters: dict[tuple[str, str], str]
+    """Kind and field to the letter of its type."""
     skipped: int
+    """Bytes, or lines, that belonged to no record."""
 
 
 class _Kind(NamedTuple):

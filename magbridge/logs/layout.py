@@ -46,52 +46,35 @@ DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 
 @dataclass
 class Layout:
-    """The layout of a file.
-
-    Attributes
-    ----------
-    separator, decimal : str
-        Between fields (:data:`BLANKS` for any number of blanks), and in a number.
-    names : list of str
-        One for each field, ours where it is known; '' for a field that is not read.
-    units : dict
-        Name -> unit, where one is declared.
-    headings : list of str
-        As the file has them.
-    declared : Declared
-        What the user says of the columns, or their maker.
-    date : int or None
-        Which field has the date, where ``time`` is a time of day.
-    open_ended : bool
-        Rows may have more fields, which are not read.
-    row : int
-        Number of the line with the headings, from 1.
-    first : int
-        Which of the lines is the first row, counted from 0.
-    rate : float or None
-        Rows a second, of a file that has no column of times.
-    attrs : dict
-        What the comments declare.
-    fill : float
-        The number that stands for a missing value.
-    guesses : list of str
-        What the file does not say and was taken for granted.
-    """
+    """The layout of a file."""
 
     separator: str = ","
     decimal: str = "."
+    """`separator`, `decimal`: Between fields (:data:`BLANKS` for any number of blanks), and in a number."""
     names: list[str] = field(default_factory=list)
+    """One for each field, ours where it is known; '' for a field that is not read."""
     units: dict[str, str] = field(default_factory=dict)
+    """Name -> unit, where one is declared."""
     headings: list[str] = field(default_factory=list)
+    """As the file has them."""
     declared: Declared = field(default_factory=Declared)
+    """What the user says of the columns, or their maker."""
     date: int | None = None
+    """Which field has the date, where ``time`` is a time of day."""
     open_ended: bool = False
+    """Rows may have more fields, which are not read."""
     row: int = 1
+    """Number of the line with the headings, from 1."""
     first: int = 0
+    """Which of the lines is the first row, counted from 0."""
     rate: float | None = None
+    """Rows a second, of a file that has no column of times."""
     attrs: dict[str, str | float] = field(default_factory=dict)
+    """What the comments declare."""
     fill: float = nan
+    """The number that stands for a missing value."""
     guesses: list[str] = field(default_factory=list)
+    """What the file does not say and was taken for granted."""
 
 
 def cells(line: str, separator: str) -> list[str]:

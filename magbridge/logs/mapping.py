@@ -23,25 +23,18 @@ class Source(Table, frozen=True, rename={"heading": "from"}):
     """``[columns.NAME]`` of a mapping file: where the column NAME comes from.
 
     The value is ``scale * theirs + offset``, in `unit`.
-
-    Attributes
-    ----------
-    heading : str or None
-        Their name of the column (key ``from``), as the file has it; by default our own.
-    unit : str or None
-        Its unit after scaling, where the file does not say it or is wrong. Of ``time`` also: excel, julian,
-        mjd, gps, matlab, iso, or a pattern as ``%d.%m.%Y %H:%M:%S``.
-    scale, offset : float
-        By which their number becomes one in `unit`.
-    valid : str or None
-        Their name of a column that is 0 where there is no value.
     """
 
     heading: str | None = None
+    """Their name of the column (key ``from``), as the file has it; by default our own."""
     unit: str | None = None
+    """Its unit after scaling, where the file does not say it or is wrong. Of ``time`` also: excel, julian,
+    mjd, gps, matlab, iso, or a pattern as ``%d.%m.%Y %H:%M:%S``."""
     scale: float = 1.0
     offset: float = 0.0
+    """`scale`, `offset`: By which their number becomes one in `unit`."""
     valid: str | None = None
+    """Their name of a column that is 0 where there is no value."""
 
     def __post_init__(self) -> None:
         if not (isfinite(self.scale) and self.scale and isfinite(self.offset)):
@@ -49,28 +42,19 @@ class Source(Table, frozen=True, rename={"heading": "from"}):
 
 
 class Declared(Table, frozen=True):
-    """A mapping file, ``columns.toml``, whole.
-
-    Attributes
-    ----------
-    columns : dict
-        Our name of a column -> its :class:`Source`.
-    heading_reference : str or None
-        What headings refer to.
-    fill_value : float or None
-        The number that stands for a missing value.
-    separator, decimal : str or None
-        Of a text file; found by looking where they are not given.
-    zone : str or None
-        Time zone (``Europe/Berlin``) of times of day that do not say theirs; UTC if not given.
-    """
+    """A mapping file, ``columns.toml``, whole."""
 
     columns: dict[str, Source] = msgspec.field(default_factory=dict)
+    """Our name of a column -> its :class:`Source`."""
     heading_reference: Literal["true", "magnetic"] | None = None
+    """What headings refer to."""
     fill_value: float | None = None
+    """The number that stands for a missing value."""
     separator: str | None = None
     decimal: Literal[".", ","] | None = None
+    """`separator`, `decimal`: Of a text file; found by looking where they are not given."""
     zone: str | None = None
+    """Time zone (``Europe/Berlin``) of times of day that do not say theirs; UTC if not given."""
 
 
 def declared(column: Sequence[str], file: Path | None) -> Declared:

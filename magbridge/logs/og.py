@@ -55,21 +55,14 @@ UNKNOWN = "the log does not say which positions are fixes"
 
 
 class Metadata(Table, frozen=True):
-    """A ``metadata.toml``.
-
-    Attributes
-    ----------
-    attributes : dict of str to str
-        Global attributes, any.
-    platform : dict of str to str
-        Variables of the platform, as ``WMO_IDENTIFIER``.
-    sensor : dict of str to str
-        Attributes of the magnetometer's variable, as ``sensor_model``.
-    """
+    """A ``metadata.toml``."""
 
     attributes: dict[str, str]
+    """Global attributes, any."""
     platform: dict[str, str]
+    """Variables of the platform, as ``WMO_IDENTIFIER``."""
     sensor: dict[str, str]
+    """Attributes of the magnetometer's variable, as ``sensor_model``."""
 
 
 def read_metadata(path: Path) -> Metadata:

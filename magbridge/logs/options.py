@@ -13,27 +13,18 @@ __all__ = ["Options"]
 
 @dataclass(frozen=True)
 class Options:
-    """How logs are to be read.
-
-    Attributes
-    ----------
-    strict : bool
-        A log of which anything would be dropped is refused.
-    date : float or None
-        s since 1970 UTC of the boot, for logs whose times count from it.
-    compass : str or None
-        Number (from 0) or device id of the compass to use, of several; None: the one that was in use.
-    column : tuple of str
-        Columns under our names, each ``NAME="THEIRS [unit]"``.
-    columns : path or None
-        A mapping file (:class:`magbridge.logs.mapping.Declared`), which does so for a whole file.
-    """
+    """How logs are to be read."""
 
     strict: bool = False
+    """A log of which anything would be dropped is refused."""
     date: float | None = None
+    """s since 1970 UTC of the boot, for logs whose times count from it."""
     compass: str | None = None
+    """Number (from 0) or device id of the compass to use, of several; None: the one that was in use."""
     column: tuple[str, ...] = ()
+    """Columns under our names, each ``NAME="THEIRS [unit]"``."""
     columns: Path | None = None
+    """A mapping file (:class:`magbridge.logs.mapping.Declared`), which does so for a whole file."""
 
     @cached_property
     def declared(self) -> Declared:

@@ -32,28 +32,19 @@ Columns = Iterator[tuple[str, str, FloatArray]]
 
 
 class Kind(NamedTuple):
-    """A type of message.
-
-    Attributes
-    ----------
-    name : str
-        Of the type.
-    row : callable
-        Returns the values of a message by name.
-    columns : callable
-        Returns column, unit and values of the topic's name, its number among those of this type (from 0), and
-        the values of all messages. Of several topics that have a column, the first is taken.
-    header : bool
-        It begins with a ``std_msgs/Header``.
-    doubles : int
-        How many float64 the message ends with, of which the first are those of `row`; 0 where it does not.
-    """
+    """A type of message."""
 
     name: str
+    """Of the type."""
     row: Callable[[Any], dict[str, float]]
+    """Returns the values of a message by name."""
     columns: Callable[[str, int, Values], Columns]
+    """Returns column, unit and values of the topic's name, its number among those of this type (from 0), and
+    the values of all messages. Of several topics that have a column, the first is taken."""
     header: bool = True
+    """It begins with a ``std_msgs/Header``."""
     doubles: int = 0
+    """How many float64 the message ends with, of which the first are those of `row`; 0 where it does not."""
 
 
 def _name(topic: str, *more: str) -> str:

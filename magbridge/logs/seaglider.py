@@ -72,30 +72,21 @@ MASSES = {"pitchCtl": ("pitch", "C_PITCH"), "rollCtl": ("roll", "C_ROLL_DIVE"), 
 
 @dataclass
 class Dive:
-    """What a glider tells of a dive.
-
-    Attributes
-    ----------
-    time : (n,) array
-        s since 1970 UTC, of the compass samples.
-    sampled : dict of str to (n,) array
-        Engineering columns by their own names, the depth in m.
-    settings : dict of str to float
-        Parameters of the log, as ``COMPASS_DEVICE``.
-    manoeuvres : dict of str to (m,) array
-        ``st_secs`` and ``end_secs``, s since 1970, and what was logged of each, as ``pitch_ctl``.
-    elsewhere : dict of str to a pair of (k,) arrays
-        Times, s, and values of what has its own times: positions, CTD.
-    max_gap : float
-        s between two of those times across which nothing is interpolated.
-    """
+    """What a glider tells of a dive."""
 
     time: FloatArray
+    """(n,), s since 1970 UTC, of the compass samples."""
     sampled: dict[str, FloatArray]
+    """(n,) each: Engineering columns by their own names, the depth in m."""
     settings: dict[str, float] = field(default_factory=dict)
+    """Parameters of the log, as ``COMPASS_DEVICE``."""
     manoeuvres: dict[str, FloatArray] = field(default_factory=dict)
+    """(m,) each: ``st_secs`` and ``end_secs``, s since 1970, and what was logged of each, as ``pitch_ctl``.
+    """
     elsewhere: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    """(k,) each: Times, s, and values of what has its own times: positions, CTD."""
     max_gap: float = MAX_GAP
+    """s between two of those times across which nothing is interpolated."""
 
 
 def dive(path: Path, known: Dive) -> xr.Dataset:

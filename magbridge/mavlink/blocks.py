@@ -34,18 +34,7 @@ KNOWN[[number for number in EXTRA if number < len(KNOWN)]] = [EXTRA[n] for n in 
 
 
 class Block(NamedTuple):
-    """Records that follow each other.
-
-    Attributes
-    ----------
-    data : bytes
-    time_us, channel, number, system, component : (n,) array of int
-        The stamp and its low two bits, the message's id, and its sender.
-    frame, payload, end : (n,) array of int
-        Where in `data` the frame and the payload begin, and where the payload ends.
-    bytes_skipped, damages : int
-        Bytes between them that belong to no record, and the places.
-    """
+    """Records that follow each other."""
 
     data: bytes
     time_us: IndexArray
@@ -53,11 +42,16 @@ class Block(NamedTuple):
     number: IndexArray
     system: IndexArray
     component: IndexArray
+    """`time_us`, `channel`, `number`, `system`, `component`, (n,): The stamp and its low two bits, the
+    message's id, and its sender."""
     frame: IndexArray
     payload: IndexArray
     end: IndexArray
+    """`frame`, `payload`, `end`, (n,): Where in `data` the frame and the payload begin, and where the payload
+    ends."""
     bytes_skipped: int
     damages: int
+    """`bytes_skipped`, `damages`: Bytes between them that belong to no record, and the places."""
 
     def payloads(self, which: IndexArray) -> NDArray[np.uint8]:
         """Return the payloads (n, size) of records of one message, with the zeros that were cut off."""

@@ -136,29 +136,20 @@ def spec(message: int | str) -> Spec:
 
 
 class Message(msgspec.Struct, frozen=True, gc=False):
-    """A received message. Its fields are read when asked for: ``message["roll"]``.
-
-    Attributes
-    ----------
-    id : int
-        Message id; `BAD_DATA` and `REFUSED` for what is not to be read.
-    system, component, sequence : int
-        The sender's.
-    payload : bytes
-        Zeros that the sender cut off are put back.
-    frame : bytes
-        The whole frame as it came.
-    known : bool
-        The message is in the dialect, and its checksum was right.
-    """
+    """A received message. Its fields are read when asked for: ``message["roll"]``."""
 
     id: int
+    """Message id; `BAD_DATA` and `REFUSED` for what is not to be read."""
     system: int
     component: int
     sequence: int
+    """`system`, `component`, `sequence`: The sender's."""
     payload: bytes
+    """Zeros that the sender cut off are put back."""
     frame: bytes
+    """The whole frame as it came."""
     known: bool
+    """The message is in the dialect, and its checksum was right."""
 
     @property
     def name(self) -> str:

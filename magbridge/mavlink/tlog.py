@@ -22,21 +22,14 @@ STEP: Final = 4096
 
 
 class Record(msgspec.Struct, frozen=True, gc=False):
-    """One record of a log.
-
-    Attributes
-    ----------
-    time_us : int
-        µs of UNIX time; a multiple of 4.
-    channel : int
-        The stamp's low two bits: :class:`magbridge.records.Channel` in our logs, a link number in others'.
-    frame : bytes
-        The MAVLink frame.
-    """
+    """One record of a log."""
 
     time_us: int
+    """µs of UNIX time; a multiple of 4."""
     channel: int
+    """The stamp's low two bits: :class:`magbridge.records.Channel` in our logs, a link number in others'."""
     frame: bytes
+    """The MAVLink frame."""
 
     @property
     def message(self) -> Message:

@@ -13,29 +13,20 @@ MOST = 100
 
 @dataclass(slots=True)
 class Alarm:
-    """Something that began at `since` (s of the receiver's clock).
-
-    Attributes
-    ----------
-    key, text : str
-        What it is, for us and for a reader.
-    since, last : float
-        When it last began, and when it was last so.
-    active : bool
-        It is so at present.
-    count : int
-        How often it has begun.
-    acknowledged : bool
-        Somebody has seen it since it last began.
-    """
+    """Something that began at `since` (s of the receiver's clock)."""
 
     key: str
     text: str
+    """`key`, `text`: What it is, for us and for a reader."""
     since: float
     last: float
+    """`since`, `last`: When it last began, and when it was last so."""
     active: bool = True
+    """It is so at present."""
     count: int = 1
+    """How often it has begun."""
     acknowledged: bool = False
+    """Somebody has seen it since it last began."""
 
 
 class Alarms:

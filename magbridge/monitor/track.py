@@ -35,21 +35,14 @@ PICTURE = """(params, api) => {
 
 @dataclass(frozen=True)
 class Background:
-    """An anomaly grid as a picture.
-
-    Attributes
-    ----------
-    box : tuple of 4 float
-        deg: west, south, east, north.
-    picture : str
-        A PNG as a ``data:`` address; north is up.
-    span : float
-        nT at the darkest red; the darkest blue is as far below zero.
-    """
+    """An anomaly grid as a picture."""
 
     box: tuple[float, float, float, float]
+    """deg: west, south, east, north."""
     picture: str
+    """A PNG as a ``data:`` address; north is up."""
     span: float
+    """nT at the darkest red; the darkest blue is as far below zero."""
 
 
 def read_background(path: Path) -> Background:

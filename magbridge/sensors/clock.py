@@ -41,24 +41,16 @@ KEEP_PHASE: Final = 3
 
 
 class Stamp(msgspec.Struct, frozen=True, gc=False):
-    """When a reading was taken.
-
-    Attributes
-    ----------
-    time_us : int
-        µs since 1970 UTC, a multiple of 4, increasing unless `stepped`.
-    restarted : bool
-        The instrument's own clock restarted: it was powered on again.
-    stepped : bool
-        One of the two clocks was set; the relation between them is learned anew.
-    missing : int
-        Readings that are missing before this one.
-    """
+    """When a reading was taken."""
 
     time_us: int
+    """µs since 1970 UTC, a multiple of 4, increasing unless `stepped`."""
     restarted: bool = False
+    """The instrument's own clock restarted: it was powered on again."""
     stepped: bool = False
+    """One of the two clocks was set; the relation between them is learned anew."""
     missing: int = 0
+    """Readings that are missing before this one."""
 
 
 class DeviceClock:

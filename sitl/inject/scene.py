@@ -22,43 +22,28 @@ Generator = np.random.Generator
 
 @dataclass
 class Scene:
-    """What an effect may change, on the simulation's fine grid of n points; m rows are logged.
-
-    Attributes
-    ----------
-    track : Track
-    when : array (m,)
-        s after the start, of the rows.
-    field : array (n, 3)
-        nT at the sensor, body axes.
-    earth : array (n, 3)
-        nT north-east-down, added to the Earth's field but not to the reference.
-    water : array (n,)
-        degC.
-    instrument : Instrument
-    reference : array (m,)
-        nT by which the reference is too small.
-    late : float
-        s by which the telemetry's timestamps are behind.
-    logged : dict of (array (n,), unit)
-        Further telemetry.
-    bend : list of callable
-        Functions applied to the channels (m, 3) after the analogue chain.
-    truth : dict
-        Numbers that a perfect diagnosis would print, by the name it would print them under.
-    """
+    """What an effect may change, on the simulation's fine grid of n points; m rows are logged."""
 
     track: Track
     when: Array
+    """(m,), s after the start, of the rows."""
     field: Array
+    """(n, 3), nT at the sensor, body axes."""
     earth: Array
+    """(n, 3), nT north-east-down, added to the Earth's field but not to the reference."""
     water: Array
+    """(n,), degC."""
     instrument: Instrument
     reference: Array
+    """(m,), nT by which the reference is too small."""
     late: float = 0.0
+    """s by which the telemetry's timestamps are behind."""
     logged: dict[str, tuple[Array, str]] = attribute(default_factory=dict)
+    """(n,) each: Further telemetry."""
     bend: list[Callable[[Array], Array]] = attribute(default_factory=list)
+    """Functions applied to the channels (m, 3) after the analogue chain."""
     truth: dict[str, float] = attribute(default_factory=dict)
+    """Numbers that a perfect diagnosis would print, by the name it would print them under."""
 
     @property
     def t(self) -> Array:

@@ -38,41 +38,26 @@ SETTLE_TIME = 4.0
 
 
 class Part(NamedTuple):
-    """A part of the deployment: a file, or a third of the only one.
-
-    Attributes
-    ----------
-    name : str
-    begin, end : float
-        s since 1970 UTC.
-    """
+    """A part of the deployment: a file, or a third of the only one."""
 
     name: str
     begin: float
     end: float
+    """`begin`, `end`: s since 1970 UTC."""
 
 
 class ReplaySetup(NamedTuple):
-    """A deployment ready to be replayed.
-
-    Attributes
-    ----------
-    config : Path
-        A ``bridge.toml``.
-    deployment : Dataset (time)
-    parts : list of Part
-        The last one was not used by the calibration.
-    calibration : str
-        How the calibration was made, or why there is none.
-    simulated : bool
-        The log has no magnetometer: its field is simulated, its telemetry real.
-    """
+    """A deployment ready to be replayed."""
 
     config: Path
+    """A ``bridge.toml``."""
     deployment: xr.Dataset
     parts: list[Part]
+    """The last one was not used by the calibration."""
     calibration: str
+    """How the calibration was made, or why there is none."""
     simulated: bool
+    """The log has no magnetometer: its field is simulated, its telemetry real."""
 
 
 def prepare(files: Sequence[Path], folder: Path, options: Options) -> ReplaySetup:

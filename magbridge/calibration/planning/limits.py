@@ -33,29 +33,20 @@ class PlannedRun:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the vehicle can do.
-
-    Attributes
-    ----------
-    roll : tuple of float
-        deg, banks that it can hold in a spiral.
-    pitch : tuple of float
-        deg, smallest and largest, of dives and climbs alike.
-    parameters : tuple of (float, float)
-        Ends of each position.
-    pitch_at : callable, optional
-        Positions (k,) -> pitch that they trim the vehicle to (deg), see :func:`trim_of`; without it
-        pitch is free.
-    flown : (m, k) array, optional
-        Positions that the vehicle is known to fly with: a run keeps within :data:`REACH` of some of them. (No
-        glider dives with its ballast out.)
-    """
+    """What the vehicle can do."""
 
     roll: tuple[float, float] = (-10.0, 10.0)
+    """deg, banks that it can hold in a spiral."""
     pitch: tuple[float, float] = (14.0, 30.0)
+    """deg, smallest and largest, of dives and climbs alike."""
     parameters: tuple[tuple[float, float], ...] = ()
+    """Ends of each position."""
     pitch_at: Callable[[FloatArray], float] | None = None
+    """Positions (k,) -> pitch that they trim the vehicle to (deg), see :func:`trim_of`; without it pitch is
+    free."""
     flown: FloatArray | None = None
+    """(m, k): Positions that the vehicle is known to fly with: a run keeps within :data:`REACH` of some of
+    them. (No glider dives with its ballast out.)."""
 
 
 def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:

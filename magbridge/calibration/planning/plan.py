@@ -45,18 +45,12 @@ POWER = 4
 
 @dataclass(frozen=True)
 class Plan:
-    """Runs to fly, in order of worth, and what they are expected to bring.
-
-    Attributes
-    ----------
-    runs : tuple of PlannedRun
-    rms, worst : tuple of float
-        nT, expected error over the mission before any run, after the first, after two ...
-    """
+    """Runs to fly, in order of worth, and what they are expected to bring."""
 
     runs: tuple[PlannedRun, ...]
     rms: tuple[float, ...]
     worst: tuple[float, ...]
+    """`rms`, `worst`: nT, expected error over the mission before any run, after the first, after two ..."""
 
 
 def expected_calibration(

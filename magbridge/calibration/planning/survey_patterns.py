@@ -43,22 +43,14 @@ SPIRAL = 1_800.0
 
 @dataclass(frozen=True)
 class Proposal:
-    """A pattern, what is expected after it, and what it leaves open.
-
-    Attributes
-    ----------
-    name : str
-    rms, worst : float
-        nT, 1-sigma of the corrected field over the mission, about its mean.
-    crossings : int
-        Places met again on another course.
-    open : tuple of str
-    """
+    """A pattern, what is expected after it, and what it leaves open."""
 
     name: str
     rms: float
     worst: float
+    """`rms`, `worst`: nT, 1-sigma of the corrected field over the mission, about its mean."""
     crossings: int
+    """Places met again on another course."""
     open: tuple[str, ...]
 
 
