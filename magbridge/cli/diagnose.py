@@ -144,8 +144,10 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
     from magbridge.diagnose.seen import WHITE
 
     causes = []
-    for one in facts["findings"]:
-        others = " or ".join(map(_plain, one["alternatives"]))
+    warnings = [*facts["assessment"]["warnings"], []]  # none of outliers, which stand last
+    for one, notes in zip(facts["findings"], warnings, strict=False):
+        walks = ["noise that wanders"] * any(note["code"] == "random_walk" for note in notes)
+        others = " or ".join([*map(_plain, one["alternatives"]), *walks])
         lines = f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}{_followed(one['follows'])}"
         causes.append(lines + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:

@@ -18,6 +18,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.inference.competing import CompetingHypothesis
+from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import Isolability
 from magbridge.diagnose.inference.joint import Joint
@@ -54,6 +55,9 @@ class Finding:
     covariance : (k, k) array
     chance_alone : float
         That such a cause is named alone in such a log, by theory (:mod:`~.inference.naming`).
+    over_random_walk : float
+        Log odds over a sensor whose offsets wander (:mod:`~.inference.random_walk`); infinite for a cause
+        that is not slow.
     """
 
     hypothesis: Hypothesis
@@ -62,6 +66,7 @@ class Finding:
     coefficients: FloatArray
     covariance: FloatArray
     chance_alone: float
+    over_random_walk: float = np.inf
     gain = old_name("gain", "improvement")
     rivals = old_name("rivals", "competing")
 
@@ -80,17 +85,20 @@ class Finding:
         """With the calibration refitted."""
         return self.hypothesis.signal_to_noise
 
+    @property
+    def may_be_noise(self) -> bool:
+        """Whether offsets that wander would do nearly as well."""
+        return self.over_random_walk < ODDS
+
     def field(self, problem: Problem) -> FloatArray:
         """(n,) nT, what it adds to the total field; its columns are in the sensor's nanotesla."""
         columns = self.candidate.columns(slice(0, len(problem)))
         return np.asarray(columns @ self.coefficients / problem.reference_jacobian)
 
     def follows(self, problem: Problem, fit: Joint) -> Seen:
-        """Say what is seen of it in what all other causes leave, or if noise hides it, in its fit."""
+        """Say what is seen of it in what all other causes leave: nothing where noise hides it."""
         field = self.field(problem)
-        found = seen(problem, field + fit.residual / problem.reference_jacobian)
-        known = found if found.channel else seen(problem, field)
-        return known._replace(size=rms(field), share=found.share)
+        return seen(problem, field + fit.residual / problem.reference_jacobian)._replace(size=rms(field))
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,9 @@ from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
-from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.inference.random_walk import odds_over_random_walk
+from magbridge.diagnose.inference.search import Outcome, search
+from magbridge.diagnose.seen import memory
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.unlisted import unlisted
 from magbridge.errors import DataError
@@ -46,6 +48,8 @@ __all__ = ["diagnose"]
 
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
+SLOW = 0.5
+"""Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
 
 
 @old_argument("learned_from", "training_logs")
@@ -145,7 +149,7 @@ def _examine(
     total = paired(before, after, problem.survey.dive, counts)
     return Diagnosis(
         problem=problem, outcome=outcome,
-        findings=_findings(problem, named, competing, fit, after, counts, chances),
+        findings=_findings(problem, named, competing, fit, after, counts, chances, outcome),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
@@ -210,6 +214,7 @@ def _findings(
     after: FloatArray,
     counts: BoolArray,
     chances: Sequence[float],
+    outcome: Outcome,
 ) -> tuple[Finding, ...]:
     """Collect each cause's results; its gain is that over a fit of the others without it."""
     found, q = [], len(fit.z)
@@ -223,7 +228,10 @@ def _findings(
         without = held_out(problem, columns, alone).residual
         improvement = paired(without, after, problem.survey.dive, counts)
         covariance = fit.effects_covariance[own, own]
-        found.append(Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, chance))
+        one = Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, chance)
+        if memory(problem, one.field(problem)).slow >= SLOW:
+            one = replace(one, over_random_walk=odds_over_random_walk(outcome, hypothesis))
+        found.append(one)
     return tuple(found)
 
 

@@ -58,11 +58,11 @@ def test_two_packets_are_found_where_they_are_in_noise_of_any_correlation(
 def test_noise_has_no_packet_that_is_worth_its_place(problem: Problem, rho: float) -> None:
     rng = np.random.default_rng(4)
     worth = []
-    for _ in range(10):
+    for _ in range(30):
         given = replace(problem, residual=drawn(problem, rho, rng))
         found = packets(given, fit_joint(given, [], 1))
         worth.append(found is not None)
-    assert sum(worth) <= 2
+    assert sum(worth) <= 6
 
 
 @pytest.mark.parametrize("kept", ["seven of eight", "a hole", "half at half the rate"])

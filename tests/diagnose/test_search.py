@@ -14,7 +14,9 @@ from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.reference import reference_bias
 from magbridge.diagnose.compare.problem import pose
+from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.exchange import exchanged
+from magbridge.diagnose.inference.random_walk import odds_over_random_walk
 from magbridge.diagnose.inference.search import search
 from magbridge.diagnose.inference.state import State
 
@@ -121,3 +123,18 @@ def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
         for size in (10.0, 140.0)
     )
     assert small - 2.0 < large < small
+
+
+@pytest.mark.parametrize("walks", [True, False])
+def test_a_slow_cause_is_told_from_a_random_walk_only_where_it_is_clear(walks: bool) -> None:
+    """A walk that passes for a drift may be noise; a step of S/N 40 in white noise is none."""
+    n, rng = 3000, np.random.default_rng(0)
+    turn, t = np.linspace(0.0, 6.0 * np.pi, n), np.linspace(0.0, 1.0, n)
+    directions = np.column_stack([0.4 * np.cos(turn), 0.4 * np.sin(turn), np.full(n, 0.9)])
+    problem = pose(surveyed(directions, np.linspace(-1.0, 1.0, n)), calibrated(np.zeros(9), 1e-6))
+    noise, walk = rng.normal(size=n), np.cumsum(rng.normal(size=n)) / np.sqrt(n)
+    problem = replace(problem, residual=noise + (walk if walks else 80.0 / np.sqrt(n) * (t > 0.5)))
+    steps = [fault("offset_step", (t > at).astype(float), 10.0) for at in np.arange(0.05, 1.0, 0.05)]
+    outcome = search(problem, [fault("offset_drift", t, 10.0), *steps], 2)
+    (named,) = outcome.chosen
+    assert (odds_over_random_walk(outcome, named) > ODDS) != walks

@@ -35,6 +35,7 @@ def notes(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[Note]:
     return [
         *_of_shape(finding),
         *_of_size(finding),
+        *_of_noise(finding),
         *_of_motion(diagnosis, finding),
         *not_separated(finding.candidate, cause, finding.competing, finding.chance_alone),
         *_of_use(diagnosis, finding),
@@ -70,6 +71,17 @@ def _of_size(finding: Finding) -> Iterator[Note]:
             "other can grow this large: check the extended calibration against another reference before it "
             "is used.",
             {"times_usual": times},
+        )
+
+
+def _of_noise(finding: Finding) -> Iterator[Note]:
+    """Say so when a sensor whose offsets wander would explain a slow cause as well."""
+    if finding.may_be_noise:
+        yield Note(
+            "random_walk",
+            "It may as well be noise: a sensor whose offsets wander (a random walk, of power 1/f^2) would "
+            "look the same in this log, within odds of 20:1. To tell: log the sensor at rest for as long.",
+            {"log_odds": finding.over_random_walk},
         )
 
 

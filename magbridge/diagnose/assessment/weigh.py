@@ -187,6 +187,9 @@ def _against(
             f"{'; '.join(tests)}."
         )
         found.append(Note("contested", text))
+    if slow := [_name(one) for one in made if one.may_be_noise]:
+        text = f"A sensor whose offsets wander would look the same in this log: {', '.join(slow)}, or noise."
+        found.append(Note("random_walk", text))
     found += _place_or_time(diagnosis, track)
     for one, other, a, b, both in cancelling(diagnosis):
         text = (

@@ -83,7 +83,8 @@ class Problem:
     unseen : (K, K) array
         nT², covariance in the directions that these data cannot see.
     waves : (k,) array
-        Half waves per log of each coefficient of slow noise; there are none where the noise has no such part.
+        Of each coefficient of slow noise, what its variance falls with: the number of half waves per log, or
+        a power of it. There are none where the noise has no such part.
     """
 
     survey: Survey
@@ -204,25 +205,22 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     delay_jacobian = -DELAY * g[:, 6:] * interpolation_error(survey, reading.T).T
     directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
     return Problem(
-        survey,
-        calibration,
-        reading,
-        e,
-        g,
-        reference_jacobian,
-        delay_jacobian,
-        directions,
-        centre,
+        survey, calibration, reading, e, g, reference_jacobian, delay_jacobian, directions, centre,
         rest @ rest.T,
-    )
+    )  # fmt: skip
 
 
-def with_slow_noise(problem: Problem) -> Problem:
-    """Return the problem with slow noise: its coefficients are places of z that move no calibration."""
+def with_slow_noise(problem: Problem, power: int = 1) -> Problem:
+    """Return the problem with slow noise, its power 1/f or that to a higher `power`.
+
+    Its coefficients are places of z that move no calibration.
+    """
+    if problem.waves.size:
+        return replace(problem, waves=waves() ** power)
     at, more = problem.known.stop, np.zeros(waves().size)
     return replace(
         problem,
         directions=np.insert(problem.directions, at, more[:, None], axis=1),
         centre=np.insert(problem.centre, at, more),
-        waves=waves(),
+        waves=waves() ** power,
     )

@@ -9,8 +9,7 @@ cause. So the noise of axis i may also have a slow part (Keshner 1982, Proc. IEE
 .. math:: o_i(t) = \sum_k c_{ki} \cos(\pi k t / T), \qquad \operatorname{var} c_{ki} = g / k
 
 of one common size g (:mod:`~magbridge.diagnose.inference.statistic`). It is that of many frequencies, of
-which no slow cause has all. With 1/k^2, a random walk, it would be that of the lowest, and would describe a
-step or a drift of S/N 8 as well as their names do.
+which no slow cause has all. A random walk has 1/k^2 (:mod:`~magbridge.diagnose.inference.random_walk`).
 """
 
 from __future__ import annotations

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from scipy.special import chdtri, chndtrinc
 
-from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
@@ -42,15 +42,14 @@ class Visible:
     Attributes
     ----------
     cause, channel : str, str or None
-    half, sure : float
-        Signal-to-noise that is found with a chance of 50 and of 95 %.
+    sure : float
+        Signal-to-noise that is found with a chance of 95 %.
     sizes : dict
         Coefficient -> (size that is found with 95 %, unit); infinite where the log cannot show it.
     """
 
     cause: str
     channel: str | None
-    half: float
     sure: float
     sizes: dict[str, tuple[float, str]]
 
@@ -66,20 +65,11 @@ class Isolability:
         Causes that look alike, with their correlation.
     untestable : dict
         Cause that this log cannot test -> what a log would need for it.
-    correlation : (m, m) array
-        Between the causes of `visible`.
     """
 
     visible: tuple[Visible, ...]
     pairs: tuple[tuple[Visible, Visible, float], ...]
     untestable: dict[str, str]
-    correlation: FloatArray
-
-
-def _threshold(freedom: int, hypotheses: float, chance: float) -> float:
-    """Signal-to-noise at which an effect of `freedom` numbers, among so many, is found with `chance`."""
-    limit = chdtri(freedom, LEVEL / hypotheses)
-    return float(np.sqrt(chndtrinc(limit, freedom, 1.0 - chance)))
 
 
 def isolability(
@@ -92,25 +82,15 @@ def isolability(
     """Evaluate `info`; the candidate that the log shows best stands for the whole grid of its cause."""
     at = slices(candidates)
     picked = _most_visible(candidates, info, at)
-    visible = [
-        _visible(
-            candidates[k],
-            info,
-            at[k],
-            candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0),
-        )
-        for k in picked
-    ]
-    R = np.eye(len(picked))
-    for i, a in enumerate(picked):
-        for j, b in enumerate(picked[:i]):
-            R[i, j] = R[j, i] = _likeness(info, candidates[a], at[a], candidates[b], at[b])
+    among = [candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0) for k in picked]
+    visible = [_visible(candidates[k], info, at[k], count) for k, count in zip(picked, among, strict=True)]
     pairs = [
-        (visible[j], visible[i], float(R[i, j]))
-        for i, j in zip(*np.tril_indices(len(R), -1), strict=True)
-        if R[i, j] > CONFOUNDED and visible[i].cause != visible[j].cause
+        (one, other, _likeness(info, candidates[a], at[a], candidates[b], at[b]))
+        for (one, a), (other, b) in combinations(zip(visible, picked, strict=True), 2)
+        if one.cause != other.cause
     ]
-    return Isolability(tuple(visible), tuple(sorted(pairs, key=lambda p: -p[2])), dict(untestable), R)
+    alike = sorted((pair for pair in pairs if pair[2] > CONFOUNDED), key=lambda pair: -pair[2])
+    return Isolability(tuple(visible), tuple(alike), dict(untestable))
 
 
 def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
@@ -126,7 +106,7 @@ def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequen
 def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: float) -> Visible:
     """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
     freedom = max(score(info, own, candidate).freedom, 1)
-    half, sure = _threshold(freedom, hypotheses, 0.5), _threshold(freedom, hypotheses, 0.95)
+    sure = float(np.sqrt(chndtrinc(chdtri(freedom, LEVEL / hypotheses), freedom, 0.05)))
     power = np.diag(info.matrix[own, own])
     if candidate.spectra is not None:  # what counts is what all of them do together
         x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
@@ -137,7 +117,7 @@ def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: fl
             name: (_plausible(float(x)) * float(w), unit)
             for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
         }
-    return Visible(candidate.cause, candidate.channel, half, sure, sizes)
+    return Visible(candidate.cause, candidate.channel, sure, sizes)
 
 
 def _plausible(size: float) -> float:

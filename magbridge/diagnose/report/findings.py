@@ -46,7 +46,7 @@ def findings(
             "kind": rest.kind,
             "signal_to_noise": _round(rest.signal_to_noise),
             "period_s": None if rest.period_s is None else _round(rest.period_s),
-            "best_channel": rest.best_channel,
+            "best_channel": rest.best_channel or diagnosis.assessment.follows.channel,
             "follows": follows(diagnosis.assessment.follows),
             "correlation_time_s": _round(diagnosis.assessment.residual.correlation_time),
             "rms_nT": None if rest.size is None else _round(rest.size),

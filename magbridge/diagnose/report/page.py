@@ -166,7 +166,7 @@ def _overview(diagnosis: Diagnosis) -> str:
     rows = [
         f'<tr><td>{bold(one.candidate)}<br><span class="faint">'
         f"{escape(diagnosis.causes[one.candidate.cause].meaning)}</span></td>"
-        f"<td>{goes_with(one.follows(diagnosis.problem, diagnosis.fit))}</td>"
+        f"<td>{goes_with(one.follows(diagnosis.problem, diagnosis.fit)) or 'noise hides it'}</td>"
         f'<td class="n">{number(rms(one.field(diagnosis.problem)))} nT</td>'
         f'<td class="n">{one.signal_to_noise:.1f}</td>'
         f'<td class="n">× {1 / max(one.improvement.ratio, 1e-9):.2f}</td>'

@@ -65,7 +65,7 @@ class Fitted(NamedTuple):
 
 
 class Leftover(NamedTuple):
-    """Unexplained structure: its kind, its size, and the channel it correlates with.
+    """Unexplained structure: its kind, its size, and the channel it follows.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Leftover(NamedTuple):
     period_s : float or None
         Of a tone.
     best_channel : str or None
-        The telemetry that correlates with it best.
+        The telemetry that its description is a function of.
     description : Description, optional
         The description that found it.
     choice : int
@@ -171,23 +171,13 @@ def leftover(
     # stricter where no cause was found: the distribution is only asymptotic
     if p_value >= (LEVEL if model else 0.1 * LEVEL):
         return None
-    channel = one.channel or _best_channel(problem, fit)
-    fitted = tuple(entry for entry, _ in found)
     every = slice(0, len(problem))
     shape = times(likeliest.columns, every, likeliest.fit.coefficients[-len(best.variance) :])
     size = rms(shape / problem.reference_jacobian)
     return Leftover(
-        kind,
-        best.signal_to_noise,
-        p_value,
-        evidence,
-        one.period,
-        channel,
-        one,
-        count,
-        fitted=fitted,
-        size=size,
-    )
+        kind, best.signal_to_noise, p_value, evidence, one.period, one.channel, one, count,
+        fitted=tuple(entry for entry, _ in found), size=size,
+    )  # fmt: skip
 
 
 def _scored(
@@ -238,35 +228,15 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
         c, columns = curves @ direction, lambda rows: _along(one.columns(rows), direction)
     coefficients = np.append(fit.coefficients + moved[q:], c)
     prior = np.append(fit.prior, 1.0 / best.variance)
-    likelihood = fit.log_likelihood + gained
     # no more than the description itself can gain: the rest is of a noise that found another optimum
     evidence = min(scored.evidence, gained - best.price - float(np.log(one.look_elsewhere)))
     made = replace(
-        fit,
-        log_likelihood=likelihood,
-        z=z,
-        coefficients=coefficients,
-        prior=prior,
-        noise=noise,
-        residual=residual,
-    )
+        fit, log_likelihood=fit.log_likelihood + gained, z=z, coefficients=coefficients, prior=prior,
+        noise=noise, residual=residual,
+    )  # fmt: skip
     return Fitted(evidence, columns, made, one.look_elsewhere)
 
 
 def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
     """(m, k) columns along one direction of (m, 3 k) along each axis."""
     return np.asarray(part.reshape(len(part), -1, 3) @ direction)
-
-
-def _best_channel(problem: Problem, fit: Joint) -> str | None:
-    """Return the channel whose means in ten bins explain most of what is left; None below 2 %."""
-    best: tuple[float, str | None] = (0.02, None)
-    total = float(fit.residual @ fit.residual)
-    for name, channel in problem.survey.channels.items():
-        edges = np.unique(np.quantile(channel.values, np.linspace(0.1, 0.9, 9)))
-        bins = np.searchsorted(edges, channel.values)
-        count = np.maximum(np.bincount(bins), 1)
-        explained = float(np.sum(np.bincount(bins, fit.residual) ** 2 / count)) / total
-        if explained > best[0]:
-            best = (explained, name)
-    return best[1]

@@ -14,7 +14,7 @@ from magbridge.diagnose.inference.evidence import REMNANT
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.seen import memory, seen
+from magbridge.diagnose.seen import memory
 from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["unlisted"]
@@ -82,5 +82,5 @@ def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover
         )
     else:
         return None
-    p_value, channel = float(chi2.sf(power, freedom)), seen(problem, residual).channel
-    return Leftover("drift", float(np.sqrt(ratio)), p_value, 0.0, None, channel, size=size)
+    p_value = float(chi2.sf(power, freedom))
+    return Leftover("drift", float(np.sqrt(ratio)), p_value, 0.0, None, None, size=size)
