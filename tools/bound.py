@@ -8,6 +8,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import xarray as xr
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import LEVEL
@@ -17,7 +19,7 @@ from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 DENSE = 2_700
 """Samples of a covariance at most."""
 
-__all__ = ["BestFit", "oracle", "survey_bound"]
+__all__ = ["BestFit", "SurveyBound", "oracle"]
 
 
 def oracle(vehicle: Vehicle, deployment: xr.Dataset) -> FloatArray:
@@ -112,26 +114,17 @@ class BestFit:
         return np.where(follows, innovations, values)
 
 
-def survey_bound(
-    vehicle: Vehicle,
-    survey: xr.Dataset,
-    other: xr.Dataset,
-    place: FloatArray,
-    rock: tuple[float, float],
-    noise: tuple[float, float],
-) -> float:
-    r"""Return the least error about its mean, over the floor, of another survey after this one alone.
+class SurveyBound:
+    r"""The least errors after a survey alone: of the field on another one, and of the map.
 
     Parameters
     ----------
     vehicle : Vehicle
         The truth, as for :class:`BestFit`.
     survey : Dataset (time)
-        From which it is learned, of n samples.
-    other : Dataset (time)
-        The other day's.
+        From which vehicle and rock are learned, of n samples.
     place : (n, 2) array
-        m, of the survey's samples.
+        m, of its samples.
     rock : tuple of 2 float
         nT and m, of a Gaussian field with a Gaussian covariance, which is known.
     noise : tuple of 2 float
@@ -140,28 +133,58 @@ def survey_bound(
     Notes
     -----
     As :class:`BestFit`, with rock and level in the covariance K of the magnitudes:
-    :math:`P = (I + G^T K^{-1} G)^{-1}`. Neighbouring samples are averaged until :data:`DENSE` are left.
+    :math:`P = (I + G^T K^{-1} G)^{-1}`. The map is the posterior of a Gaussian field whose data have the
+    covariance :math:`K + G G^T`. Neighbouring samples are averaged until :data:`DENSE` are left.
     """
-    sigma, memory = noise
-    scale = _widths(vehicle, 0.05)
-    (g, floor), (h, after) = (_sensitivity(vehicle, one, sigma) for one in (survey, other))
-    step = -(-len(g) // DENSE)
-    n = len(g) // step
-    g, place, floor = (
-        one[: n * step].reshape(n, step, -1).mean(axis=1) for one in (g, place, floor[:, None])
-    )
 
-    def alike(samples: int, apart: int) -> FloatArray:
-        lag = apart * np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
-        return np.asarray(np.exp(-lag / memory) if memory else 1.0 * (lag == 0))
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        survey: xr.Dataset,
+        place: FloatArray,
+        rock: tuple[float, float],
+        noise: tuple[float, float],
+    ) -> None:
+        self._vehicle, self._sigma, self._rock = vehicle, noise[0], rock
+        self._scale, memory = _widths(vehicle, 0.05), noise[1]
+        g, floor = _sensitivity(vehicle, survey, self._sigma)
+        step = -(-len(g) // DENSE)
+        n = len(g) // step
+        g, self._place, floor = (
+            one[: n * step].reshape(n, step, -1).mean(axis=1) for one in (g, place, floor[:, None])
+        )
 
-    R = alike(n, step)
-    np.fill_diagonal(R, alike(step, 1).mean())
-    far = ((place[:, None] - place) ** 2).sum(axis=2)
-    K = floor * floor.T * R + rock[0] ** 2 * np.exp(-0.5 * far / rock[1] ** 2) + LEVEL**2
-    G, H = g * scale, (h - h.mean(axis=0)) * scale
-    P = np.linalg.inv(G.T @ np.linalg.solve(K, G) + np.eye(len(scale)))
-    return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (after**2).sum()))
+        def alike(samples: int, apart: int) -> FloatArray:
+            lag = apart * np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+            return np.asarray(np.exp(-lag / memory) if memory else 1.0 * (lag == 0))
+
+        R = alike(n, step)
+        np.fill_diagonal(R, alike(step, 1).mean())
+        self._G = g * self._scale
+        self._K = floor * floor.T * R + self._alike(self._place, self._place) + LEVEL**2
+
+    def of_field(self, other: xr.Dataset) -> float:
+        """Return the least error about its mean of another survey, over the noise floor."""
+        h, floor = _sensitivity(self._vehicle, other, self._sigma)
+        G, H = self._G, (h - h.mean(axis=0)) * self._scale
+        P = np.linalg.inv(G.T @ np.linalg.solve(self._K, G) + np.eye(len(self._scale)))
+        return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (floor**2).sum()))
+
+    def of_map(self, at: FloatArray, apart_from: int, *, vehicle_known: bool) -> FloatArray:
+        """Return the least error (m,), nT, of the map at places (m, 2), m.
+
+        It is apart from the mean error at the first `apart_from` of them.
+        """
+        K = self._K if vehicle_known else self._K + self._G @ self._G.T
+        C = self._alike(at, self._place)
+        S = self._alike(at, at) - C @ cho_solve(cho_factor(K), C.T)
+        level = S[:apart_from].mean(axis=0)
+        return np.asarray(np.sqrt(np.diag(S) - 2.0 * level + level[:apart_from].mean()))
+
+    def _alike(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Return the rock's covariance (n, m), nT², between places (n, 2) and (m, 2), m."""
+        size, length = self._rock
+        return np.asarray(size**2 * np.exp(-0.5 * cdist(a, b, "sqeuclidean") / length**2))
 
 
 def _widths(vehicle: Vehicle, at_sigma: float) -> FloatArray:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import harmonica as hm
 import numpy as np
 import xarray as xr
+from bound import SurveyBound
 from survey_world import GaussianRock
 
 from magbridge.arrays import FloatArray
@@ -34,21 +35,26 @@ DEPTHS, DAMPINGS = (0.5, 1.0, 2.0), (1e-3, 1e-1, 1.0, 10.0)
 
 
 class MapScore(NamedTuple):
-    """RMS over the oracle's and standardised error, along the track and off it; harmonica's RMS over ours."""
+    """RMS over the oracle's, the least it could be, standardised error; harmonica's RMS over ours."""
 
     along: float
     off: float
+    bound_along: float
+    bound_off: float
     sigma_along: float
     sigma_off: float
     peer: float
 
 
-def score_map(twin: Twin, log: xr.Dataset, calibration: Calibration, size: float, length: float) -> MapScore:
-    """Draw the map of a survey, and compare it with the rock, of that size (nT) and length (m).
+def score_map(
+    twin: Twin, log: xr.Dataset, calibration: Calibration, rock_is: tuple[float, float], best: SurveyBound
+) -> MapScore:
+    """Draw the map of a survey, and compare it with the rock, of a size (nT) and length (m).
 
-    The level, which no survey knows, is each map's mean error along the track.
+    What `best` says is the least error of one who knows all that an oracle knows but the vehicle. The level,
+    which no survey knows, is each map's mean error along the track.
     """
-    done = survey(from_vector(log, calibration, 0))
+    done, (size, length) = survey(from_vector(log, calibration, 0)), rock_is
     rock, shift = twin.world.rock, np.array(separation(*twin.world.origin, *done.samples.origin))
     assert isinstance(rock, GaussianRock)
     rng, place = np.random.default_rng(0), done.samples.place
@@ -57,12 +63,16 @@ def score_map(twin: Twin, log: xr.Dataset, calibration: Calibration, size: float
     at = np.concatenate([along, off])
     true = rock.anomaly(at + shift)
     anomaly, sigma = done.gridded.at(at)
-    best = _oracle(twin, done, at, size, length, rock.anomaly(place + shift))
-    ours, oracle, peer = (_apart(one - true) for one in (anomaly, best, _equivalent(done, at, length)))
+    known = _oracle(twin, done, at, size, length, rock.anomaly(place + shift))
+    ours, oracle, peer = (_apart(one - true) for one in (anomaly, known, _equivalent(done, at, length)))
     halves = slice(PLACES), slice(PLACES, None)
     along_ratio, off_ratio = (rms(ours[half]) / rms(oracle[half]) for half in halves)
     along_sigma, off_sigma = (rms((ours / sigma)[half]) for half in halves)
-    return MapScore(along_ratio, off_ratio, along_sigma, off_sigma, rms(peer) / rms(ours))
+    least = best.of_map(at + shift, PLACES, vehicle_known=False)
+    along_bound, off_bound = (rms(least[half]) / rms(oracle[half]) for half in halves)
+    return MapScore(
+        along_ratio, off_ratio, along_bound, off_bound, along_sigma, off_sigma, rms(peer) / rms(ours)
+    )
 
 
 def _apart(error: FloatArray) -> FloatArray:
