@@ -28,7 +28,7 @@ from magbridge.calibration.fitting.field_search import (
     climb,
 )
 from magbridge.calibration.fitting.joint import Linear, Reduced, Sums, add_up, eliminate
-from magbridge.calibration.fitting.latent import NOTHING, Group, slow_functions, with_groups
+from magbridge.calibration.fitting.latent import NOTHING, Group, likeliest, slow_functions, with_groups
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
@@ -44,6 +44,9 @@ LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
 """nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """As in a survey that calibrates itself."""
+UNSEEN = 0.25
+"""nT of slow changes where the samples show none. On a track that never crosses itself a slow change is as
+likely as rock: with a width of their own they took up to 6 nT of it."""
 SEARCHED, SEARCHED_NODES = 4_000, 12_000
 """Samples about the middle with which the field is searched, and nodes at most."""
 OUTLIER = 6.0
@@ -112,9 +115,9 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     choice, roughness = _searched(samples, sigma, local=local)
     nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MOST)
     choice = replace(choice, field=replace(choice.field, nodes=nodes))
-    groups = _groups(samples)
-    problem, family = _Problem(samples, groups, roughness), with_groups(NOTHING, groups)
     every = np.arange(len(samples.value))
+    groups = _needed(samples, choice, roughness, sigma)
+    problem, family = _Problem(samples, groups, roughness), with_groups(NOTHING, groups)
     weighed = Weighed(family, family.centre, sigma, choice.field.length)
     for turn in range(2):
         sums = problem.sums(choice.field, every)
@@ -190,8 +193,19 @@ def _groups(samples: Samples) -> tuple[Group, ...]:
     if np.isfinite(samples.time).all():
         waves, shape = slow_functions(samples.time)
         if len(shape):
-            groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD))
+            groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
     return tuple(groups)
+
+
+def _needed(samples: Samples, choice: Choice, roughness: Roughness, sigma: float) -> tuple[Group, ...]:
+    """Return levels and slow changes; these are small unless larger ones make the samples likelier."""
+    groups = _groups(samples)
+    if not any(one.offered for one in groups):
+        return groups
+    sums = _Problem(samples, groups, roughness).sums(choice.field, np.arange(len(samples.value)))
+    reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
+    kept = likeliest(reduced.quadratic, NOTHING, groups, with_groups(NOTHING, groups).centre, sigma)
+    return tuple(one if one in kept else replace(one, width=UNSEEN, spread=0.0) for one in groups)
 
 
 def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, Roughness]:

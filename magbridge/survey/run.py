@@ -11,7 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.crossings import far_off, too_rough
+from magbridge.calibration.fitting.crossings import SHARE, courses, crossed, far_off, too_rough
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
@@ -108,20 +108,25 @@ def survey(samples: Samples) -> Result:
             found = gridded(samples)
         except np.linalg.LinAlgError as problem:
             raise CalibrationError(f"the survey cannot be gridded: {problem}") from problem
-    crossed = crossovers(samples.place, samples.line)
+    ties = crossovers(samples.place, samples.line)
     B = found.at_samples(samples)
     residual = samples.value - found.levels - B
-    before = crossed.misties(samples.value)
-    after = crossed.misties(samples.value - found.levels)
-    if not len(before):
+    before = ties.misties(samples.value)
+    after = ties.misties(samples.value - found.levels)
+    if not len(before) and samples.line.any():
         warnings.append(
             "no line crosses another: what is level of a line and what is rock rests on its smoothness"
+        )
+    elif not samples.line.any() and not sum(crossed(*courses(samples.place), SHARE * found.field.length)):
+        warnings.append(
+            "the track never crosses itself: what changes slowly with time cannot be told from rock, and is "
+            "in the map"
         )
     if found.size > found.sigma:
         warnings += too_rough(samples.place, found.field.length)
     if (out := int((~found.kept).sum())) > 0.02 * len(residual):
         warnings.append(f"{out} of {len(residual)} samples are outliers and were left out of the map")
-    return Result(samples, found, crossed, before, after, residual, tuple(warnings))
+    return Result(samples, found, ties, before, after, residual, tuple(warnings))
 
 
 def _has_vector(log: xr.Dataset) -> bool:

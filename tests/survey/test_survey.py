@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import Command
-from msgspec.structs import replace
+from msgspec import structs
 from navigation_studies.simulated import GLIDER, PLACE, Map, sail, synthetic, track_over
 
 from magbridge.arrays import FloatArray
@@ -135,6 +136,40 @@ def test_map_of_a_vehicle_that_dives_is_right_between_its_tracks() -> None:
     assert np.sqrt(np.mean(error**2)) < 2.2
 
 
+def zigzag(rng: np.random.Generator, *, back: bool) -> tuple[Samples, FloatArray, FloatArray]:
+    """Return three hours of a zigzag over rock of 30 nT, as corrected; the rock, and a quiet day's change."""
+    n, legs = 1200, 6
+    leg = np.arange(n) * legs // n
+    course = np.radians(np.where(leg % 2, 50.0, -50.0) + 180.0 * (back & (leg >= legs // 2)))
+    place: FloatArray = 4.0 * np.cumsum(np.stack([np.cos(course), np.sin(course)], axis=1), axis=0)
+    k, phase = rng.normal(0, 1 / 900.0, (300, 2)), rng.uniform(0, 2 * np.pi, 300)
+    rock = 30.0 * np.sqrt(2 / 300) * np.cos(place @ k.T + phase).sum(axis=1)
+    time, zero = np.linspace(0.0, 10_800.0, n), np.zeros(n, int)
+    value = rock + rng.normal(0, 1.0, n)
+    change = 4.0 * np.cos(np.pi * time / time[-1])
+    return Samples(place, np.zeros(n), time, value, zero, zero > 0, ORIGIN), rock, change
+
+
+def test_rock_along_a_track_that_never_crosses_itself_is_no_change_with_time() -> None:
+    """One is as likely as the other there: with changes of any size the map was off by 6 nT."""
+    samples, rock, _ = zigzag(np.random.default_rng(4), back=False)
+    done = survey(samples)
+    anomaly, sigma = done.gridded.at(samples.place)
+    assert np.std(anomaly - rock) < 0.3
+    assert np.std(anomaly - rock) < 1.25 * np.median(sigma)
+    assert any("never crosses itself" in line for line in done.warnings)
+
+
+def test_a_change_with_time_that_crossings_show_is_not_in_the_map() -> None:
+    samples, rock, change = zigzag(np.random.default_rng(4), back=True)
+    done = survey(replace(samples, value=samples.value + change))
+    found = done.gridded
+    anomaly, sigma = found.at(samples.place)
+    assert not done.warnings
+    assert np.std(found.levels - change) < 0.2 * np.std(change)
+    assert np.std(anomaly - rock) < 1.25 * np.median(sigma)
+
+
 def test_crossing_is_where_the_lines_cross() -> None:
     """Two straight lines; the value there is interpolated on each."""
     t = np.linspace(0.0, 100.0, 11)
@@ -222,7 +257,7 @@ def test_a_vehicle_finds_itself_on_the_map_that_its_own_survey_drew() -> None:
     )  # fmt: skip
     drawn = anomaly_map(survey(samples).gridded, samples)
     assert np.mean(drawn.at(longitude, latitude)) == pytest.approx(np.mean(value), abs=0.3)
-    found = sail(flown, drawn, replace(GLIDER, start_sigma=50.0)).score()
+    found = sail(flown, drawn, structs.replace(GLIDER, start_sigma=50.0)).score()
     assert not found.lost
     assert found.drms < 0.4 * found.unaided
     assert found.nees < 2.0

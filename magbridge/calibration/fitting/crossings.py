@@ -13,6 +13,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.observations import Observations
 
 __all__ = [
+    "SHARE",
     "courses",
     "crossed",
     "far_off",

@@ -41,14 +41,13 @@ from magbridge.calibration.fitting.field_search import (
 from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
 from magbridge.calibration.fitting.known import Known
-from magbridge.calibration.fitting.latent import Group, slow_functions, with_groups
+from magbridge.calibration.fitting.latent import Group, likeliest, slow_functions, with_groups
 from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.nominal import check_scales, starts
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import (
     Creep,
-    likeliest,
     offered,
     with_creep,
     with_temperature,
@@ -159,7 +158,7 @@ def _groups(data: Observations, level: float) -> tuple[Group, ...]:
     groups = [Group("level", np.ones((len(data), 1)), np.ones(1), max(level, 1e-3))]
     waves, shape = slow_functions(data.time)
     if len(shape):
-        groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD))
+        groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
     return tuple(groups)
 
 
@@ -211,7 +210,7 @@ class _Rounds:
     def __init__(self, survey: SurveySamples, own: PriorFamily) -> None:
         self.survey, self.own, self.q = survey, own, own.E.shape[1]
         self.until = GUESSED + SEARCHES
-        self.weigh_offers = self.until + 1 if survey.offsets else -1
+        self.weigh_offers = self.until + 1 if any(one.offered for one in survey.groups) else -1
         self.family = with_groups(own, survey.groups)
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
         self.step = max(int(self.part.sum()) // SEARCHED, 1)
@@ -297,7 +296,7 @@ class _Rounds:
         return replace(choice, field=replace(field, nodes=nodes))
 
     def _weigh_offers(self) -> None:
-        """Keep the offsets that the log needs; where it does not need all, the search goes on without."""
+        """Keep of what is offered what the log needs; where that is not all, the search goes on without."""
         survey, choice = self.survey, self.choice
         reduced = eliminate(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
         kept = likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma)

@@ -1,19 +1,24 @@
 """What a joint fit finds beside the coefficients: level, slow changes with time, offsets, a bent track.
 
 Each is a few functions of time with a Gaussian prior whose width the evidence chooses, and enters the fit as
-further unknowns behind the coefficients' own.
+further unknowns behind the coefficients' own. Of those that are offered only such stay that make the log
+likelier: on a track that never crosses itself what changes slowly with time is as likely as rock, and its
+width may be any.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.evidence import Quadratic, maximise
 from magbridge.calibration.fitting.prior import PriorFamily
 
-__all__ = ["NOTHING", "Group", "Offset", "slow_functions", "with_groups"]
+__all__ = ["NOTHING", "Group", "Offset", "likeliest", "slow_functions", "with_groups"]
 
 APART = 3.0 * 3600.0
 """s without a sample, after which what changes slowly starts anew."""
@@ -21,6 +26,8 @@ FASTEST = 1.5 * 3600.0
 """s, half the period of the fastest slow change."""
 MOST = 60
 """Slow functions of one stretch of a log, at most."""
+LIKELIER = 6.0
+"""Nats that what is offered must gain (400:1: the best of several lags gains 3 where there is nothing)."""
 NOTHING = PriorFamily(
     np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
 )
@@ -40,6 +47,8 @@ class Group:
         Width of each over the group's.
     width, spread : float
         The group's width, in the unknowns' unit, and the 1-sigma of its logarithm; 0: it is given.
+    offered : bool
+        Whether it stays only where the log needs it.
     """
 
     name: str
@@ -47,6 +56,7 @@ class Group:
     shape: FloatArray
     width: float
     spread: float = 0.0
+    offered: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +136,54 @@ def with_groups(family: PriorFamily, groups: tuple[Group, ...]) -> PriorFamily:
         names=family.names + tuple(group.name for group in free),
         renew=renew if family.renew is not None else None,
     )
+
+
+def likeliest(
+    quadratic: Quadratic,
+    own: PriorFamily,
+    groups: tuple[Group, ...],
+    eta: FloatArray,
+    sigma: float,
+) -> tuple[Group, ...]:
+    """Return the groups without those that are offered and that the log does not need; one lag at most.
+
+    Parameters
+    ----------
+    quadratic : Quadratic
+        In the unknowns of all groups, behind those of `own`.
+    own : PriorFamily
+        Of the coefficients.
+    groups : tuple of Group
+        All that are in the fit.
+    eta, sigma : (h,) array, float
+        Widths and noise (nT), from which to climb.
+    """
+    first, free = _starts(own, groups)
+
+    def score(kept: tuple[Group, ...]) -> float:
+        rows = [np.arange(own.E.shape[1])]
+        rows += [first[one.name] + np.arange(len(one.shape)) for one in kept]
+        i = np.concatenate(rows)
+        part = Quadratic(quadratic.H[np.ix_(i, i)], quadratic.b[i], quadratic.c_0, quadratic.n)
+        widths = [*range(len(own.centre)), *(free[one.name] for one in kept if one.spread)]
+        terms = sum(one.offered for one in kept)
+        return maximise(part, with_groups(own, kept), eta[widths], sigma).log_evidence - LIKELIER * terms
+
+    return max(_choices(groups), key=score)
+
+
+def _choices(groups: tuple[Group, ...]) -> Iterator[tuple[Group, ...]]:
+    """Yield all choices: none first, so that it is taken where nothing is likelier."""
+    lags = [one for one in groups if isinstance(one, Offset) and one.lag is not None]
+    others = [one for one in groups if one.offered and one not in lags]
+    for chosen in product([None, *lags], *([None, one] for one in others)):
+        yield tuple(one for one in groups if not one.offered or one in chosen)
+
+
+def _starts(own: PriorFamily, groups: tuple[Group, ...]) -> tuple[dict[str, int], dict[str, int]]:
+    """Return where the unknowns of each group begin, and where its width stands."""
+    first, free, row, column = {}, {}, own.E.shape[1], len(own.centre)
+    for one in groups:
+        first[one.name], free[one.name] = row, column
+        row, column = row + len(one.shape), column + bool(one.spread)
+    return first, free

@@ -11,19 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, held, lagged
-from magbridge.calibration.fitting.evidence import Quadratic, maximise
-from magbridge.calibration.fitting.latent import Group, Offset, slow_functions, with_groups
+from magbridge.calibration.fitting.latent import Group, Offset, slow_functions
 from magbridge.calibration.fitting.observations import TEMPERATURE, Observations
-from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.model import Calibration
 
-__all__ = ["Creep", "in_words", "likeliest", "offered", "with_creep", "with_temperature"]
+__all__ = ["Creep", "in_words", "offered", "with_creep", "with_temperature"]
 
 LAGS = (0.0, 600.0, 2400.0)
 """s, by which the offset may follow the temperature: a sensor by itself, in its housing, in a hull."""
@@ -33,8 +30,6 @@ VARIES = 0.5
 """degC, standard deviation of a temperature, from which on it can tell anything."""
 PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
 """nT/degC and nT along an axis (fluxgates' data sheets: 0.1 to 3 nT/degC), 1-sigma of their logarithms."""
-LIKELIER = 6.0
-"""Nats that a term must gain (400:1: the best of several lags gains 3 where there is nothing)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,63 +64,11 @@ def offered(data: Observations) -> tuple[Offset, ...]:
             if np.std(warm) > VARIES:
                 column = (warm - warm.mean())[:, None]
                 name = f"offset by temperature, lag {lag:.0f} s"
-                groups.append(Offset(name, column, np.ones(3), PER_DEGREE, SPREAD, lag))
+                groups.append(Offset(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag))
     waves, shape = slow_functions(data.time, FASTEST)
     if len(shape):
-        groups.append(Offset("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD))
+        groups.append(Offset("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD, offered=True))
     return tuple(groups)
-
-
-def likeliest(
-    quadratic: Quadratic,
-    own: PriorFamily,
-    groups: tuple[Group, ...],
-    eta: FloatArray,
-    sigma: float,
-) -> tuple[Group, ...]:
-    """Return the groups without the offsets that the log does not need: one lag at most, and creep or none.
-
-    Parameters
-    ----------
-    quadratic : Quadratic
-        In the unknowns of all groups, behind those of `own`.
-    own : PriorFamily
-        Of the coefficients.
-    groups : tuple of Group
-        All that are in the fit.
-    eta, sigma : (h,) array, float
-        Widths and noise (nT), from which to climb.
-    """
-    first, free = _starts(own, groups)
-
-    def score(kept: tuple[Group, ...]) -> float:
-        rows = [np.arange(own.E.shape[1])]
-        rows += [first[one.name] + np.arange(len(one.shape)) for one in kept]
-        i = np.concatenate(rows)
-        part = Quadratic(quadratic.H[np.ix_(i, i)], quadratic.b[i], quadratic.c_0, quadratic.n)
-        widths = [*range(len(own.centre)), *(free[one.name] for one in kept if one.spread)]
-        terms = sum(isinstance(one, Offset) for one in kept)
-        return maximise(part, with_groups(own, kept), eta[widths], sigma).log_evidence - LIKELIER * terms
-
-    return max(_choices(groups), key=score)
-
-
-def _choices(groups: tuple[Group, ...]) -> Iterator[tuple[Group, ...]]:
-    """Yield all choices: none first, so that it is taken where nothing is likelier."""
-    offsets = [one for one in groups if isinstance(one, Offset)]
-    lags: list[Offset | None] = [None, *(one for one in offsets if one.lag is not None)]
-    creep: list[Offset | None] = [None, *(one for one in offsets if one.lag is None)]
-    for chosen in product(lags, creep):
-        yield tuple(one for one in groups if not isinstance(one, Offset) or one in chosen)
-
-
-def _starts(own: PriorFamily, groups: tuple[Group, ...]) -> tuple[dict[str, int], dict[str, int]]:
-    """Return where the unknowns of each group begin, and where its width stands."""
-    first, free, row, column = {}, {}, own.E.shape[1], len(own.centre)
-    for one in groups:
-        first[one.name], free[one.name] = row, column
-        row, column = row + len(one.shape), column + bool(one.spread)
-    return first, free
 
 
 def _temperature(data: Observations, lag: float) -> FloatArray:
