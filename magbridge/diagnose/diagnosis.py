@@ -123,6 +123,8 @@ class Diagnosis:
     total : Improvement
         Of all findings together.
     isolability : Isolability
+    refitted : float
+        nT, RMS held out where only the calibration's own numbers are fitted anew.
     verdict : str
         As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain.
     causes : mapping
@@ -140,6 +142,7 @@ class Diagnosis:
     after: FloatArray
     total: Improvement
     isolability: Isolability
+    refitted: float
     verdict: str
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
 

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
 from magbridge.deprecated import old_argument
 from magbridge.diagnose.accept import settle
 from magbridge.diagnose.causes import Cause, known
@@ -137,10 +138,11 @@ def _examine(
     progress("measuring the gain")
     counts = counted(problem, wrong)
     before = after = problem.straight(outcome.null.z)
+    alone = held_out(problem, [], outcome.null)
     if model:
         after, score = held_out(settled, columns, fit)
         settled.let_go()
-        if score < held_out(problem, [], outcome.null).score - ODDS:
+        if score < alone.score - ODDS:
             # the dives left out speak 20:1 against these names
             named, competing, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
@@ -153,7 +155,7 @@ def _examine(
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
-        verdict=_verdict(named, wrong, rest, total), causes=causes,
+        refitted=rms(alone.residual[counts]), verdict=_verdict(named, wrong, rest, total), causes=causes,
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.report.findings import FORMAT, findings_json
 from magbridge.diagnose.report.page import report_html
 from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.words import number
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "findings.schema.json").read_text(encoding="utf-8"))
 
@@ -82,7 +83,10 @@ def test_what_is_seen_stands_apart_from_what_it_may_be(clear: Diagnosis) -> None
 
 
 def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
-    """It says how much is left, and how long that remembers."""
-    page = report_html(clear, CAUSES)
+    """It says how much is left, how long that remembers unless it is white, and what a refit would do."""
+    page, last = report_html(clear, CAUSES), clear.assessment.residual
     assert "Nothing else" not in page
-    assert re.search(r"What is left, [\d.]+\xa0nT RMS, .* remembers [\d.]+ s", page)
+    assert re.search(r"What is left, [\d.]+\xa0nT RMS, fits no .* noise", page)
+    assert ("remembers" in page) == last.lasts
+    assert clear.total.after < clear.refitted <= 1.01 * clear.total.before
+    assert f"fitted anew would leave {number(clear.refitted)}\xa0nT" in page

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from magbridge.diagnose.compare.past import FAR, Past
-from magbridge.diagnose.inference.fit_noise import LONGEST, autoregressive_order, certainty, fit_noise
+from magbridge.diagnose.inference.evidence import certainty
+from magbridge.diagnose.inference.fit_noise import LONGEST, autoregressive_order, fit_noise
 from magbridge.diagnose.inference.noise import Noise
 
 

@@ -188,7 +188,7 @@ def case(entry: Row) -> Row:
             [one["cause"], one["channel"], one["signal_to_noise"], [a["cause"] for a in one["alternatives"]]]
             for one in found["findings"]
         ],
-        "p_value": min((p for p, _ in result.outcome.tested.values()), default=1.0),
+        "p_value": result.outcome.p_value,
         "scores": _scores(found, names, whole),
         "theory": _theory(entry["part"], hidden, background, ds, result),
     }

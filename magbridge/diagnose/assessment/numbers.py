@@ -66,10 +66,11 @@ class Motion(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """RMS of measured less simulated, nT: predicted, before, after (held out), and left in the fit."""
+    """RMS of measured less simulated, nT: predicted, before, by a refit and after (held out), fitted."""
 
     predicted: float
     before: float
+    refitted: float | None
     after: float | None
     fitted: float
 
@@ -170,5 +171,5 @@ def budget(diagnosis: Diagnosis) -> Budget:
     """Compare the residual that the calibration predicts with those that were found."""
     counts, total = diagnosis.counts, diagnosis.total
     predicted = float(np.sqrt(np.mean(diagnosis.problem.stated[counts])))
-    after = total.after if diagnosis.findings else None
-    return Budget(predicted, total.before, after, rms(diagnosis.residual[counts]))
+    refitted, after = (diagnosis.refitted, total.after) if diagnosis.findings else (None, None)
+    return Budget(predicted, total.before, refitted, after, rms(diagnosis.residual[counts]))

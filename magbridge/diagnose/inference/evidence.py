@@ -32,8 +32,10 @@ from scipy.stats import chi2
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import FLAT
+from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = [
@@ -45,6 +47,7 @@ __all__ = [
     "SMOOTH",
     "Score",
     "bayes_factor_threshold",
+    "certainty",
     "evidence_of",
     "log_bayes",
     "log_odds",
@@ -71,6 +74,8 @@ SMOOTH, MOST_REMAINING = 0.1, 8.0
 """The same of a Gaussian process, and the most that it leaves: it takes any shape, but not any equally, and
 what a map's error leaves of itself is slow in time, too."""
 SIMULATIONS = 400
+PIECE, PIECES = 600, 64
+"""Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,3 +199,41 @@ def log_odds(
     known = sum(c.point.likelier + float(np.log(2.0)) * c.positive for c in model)
     worth = float(log_bayes(shaped, free)) if free else 0.5 * shaped
     return 0.5 * (ratio - shaped) + worth + known - further - prices
+
+
+def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) -> list[float]:
+    r"""Degrees of freedom of the noise's level at the frequencies where each of `columns` has its power.
+
+    `residual` (n,) is what the noise was fitted to, nT.
+
+    Notes
+    -----
+    The fitted coefficients a have the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding
+    residuals in units of s. A column x has the information ``|w|^2``,
+    ``w_t = x_t - sum_k a_k x_(t-k)``:
+
+    .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
+              \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
+
+    The log of a variance estimated with f degrees of freedom has the variance 2 / f. At low frequencies the
+    level is known worst.
+    """
+    n, p = len(residual), len(noise.ar)
+    rows = np.flatnonzero(noise.past.whole)
+    if len(rows) <= 2 * p:
+        return [float(n)] * len(columns)
+    before = np.array([residual[rows - k] for k in range(1, p + 1)]) / noise.scale[rows]
+    C = np.linalg.pinv(before @ before.T)
+    pieces = range(0, max(n - PIECE, 0) + 1, max(PIECE, n // PIECES))
+    found = []
+    for column in columns:
+        power, slope = 1e-300, np.zeros(p)
+        for start in pieces:
+            x = column(slice(start, start + PIECE))
+            lags = np.array([x[p - k : len(x) - k] for k in range(1, p + 1)])
+            w = x[p:] - np.tensordot(noise.ar, lags, 1)
+            power += float(np.sum(w * w))
+            slope += np.tensordot(lags, w, 2)
+        D = -2.0 * slope / power
+        found.append(2.0 / float(2.0 / n + D @ C @ D))
+    return found

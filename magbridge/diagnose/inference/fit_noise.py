@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import gammaln
@@ -11,11 +9,10 @@ from scipy.special import gammaln
 from magbridge.arrays import FloatArray, IntArray
 from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.compare.derivatives import CHUNK
-from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
 
-__all__ = ["BRIEFEST", "LONGEST", "TAILS", "autoregressive_order", "certainty", "fit_noise"]
+__all__ = ["BRIEFEST", "LONGEST", "TAILS", "autoregressive_order", "fit_noise"]
 
 TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
 BLOCK = 150
@@ -40,8 +37,6 @@ TIMES = 20.0
 repetitions cannot show its level."""
 BRIEFEST, SLOWEST = 20.0, 2000.0
 """Samples, the least and the most of the longest time constant, in short and in long logs."""
-PIECE, PIECES = 600, 64
-"""Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
 
 
 def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
@@ -74,44 +69,6 @@ def _product(r: FloatArray, slots: IntArray, lag: int) -> float:
     before = np.searchsorted(slots, slots - lag)
     pair = slots[before] == slots - lag
     return float(np.mean(r[pair] * r[before[pair]])) if pair.any() else 0.0
-
-
-def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) -> list[float]:
-    r"""Degrees of freedom of the noise's level at the frequencies where each of `columns` has its power.
-
-    `residual` (n,) is what the noise was fitted to, nT.
-
-    Notes
-    -----
-    The fitted coefficients a have the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding
-    residuals in units of s. A column x has the information ``|w|^2``,
-    ``w_t = x_t - sum_k a_k x_(t-k)``:
-
-    .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
-              \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
-
-    The log of a variance estimated with f degrees of freedom has the variance 2 / f. At low frequencies the
-    level is known worst.
-    """
-    n, p = len(residual), len(noise.ar)
-    rows = np.flatnonzero(noise.past.whole)
-    if len(rows) <= 2 * p:
-        return [float(n)] * len(columns)
-    before = np.array([residual[rows - k] for k in range(1, p + 1)]) / noise.scale[rows]
-    C = np.linalg.pinv(before @ before.T)
-    pieces = range(0, max(n - PIECE, 0) + 1, max(PIECE, n // PIECES))
-    found = []
-    for column in columns:
-        power, slope = 1e-300, np.zeros(p)
-        for start in pieces:
-            x = column(slice(start, start + PIECE))
-            lags = np.array([x[p - k : len(x) - k] for k in range(1, p + 1)])
-            w = x[p:] - np.tensordot(noise.ar, lags, 1)
-            power += float(np.sum(w * w))
-            slope += np.tensordot(lags, w, 2)
-        D = -2.0 * slope / power
-        found.append(2.0 / float(2.0 / n + D @ C @ D))
-    return found
 
 
 def fit_noise(

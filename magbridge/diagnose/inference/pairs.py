@@ -43,15 +43,7 @@ TOGETHER = 128
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two candidates that could replace one or two of a model.
-
-    Attributes
-    ----------
-    first, second : Candidate
-        In the place of the first and of the second.
-    behind : float
-        Log evidence by which they lose, each averaged over its grid.
-    """
+    """Two candidates in the places of one or two of a model; the log evidence that their grids lack."""
 
     first: Candidate
     second: Candidate
@@ -96,20 +88,10 @@ class _Stack:
 def pairs_of(
     state: State, info: Information, model: Sequence[Candidate], base: Joint, *places: int
 ) -> list[Pair]:
-    """Return the pairs that could replace one or two causes of `model`, the likeliest first.
+    """Return the pairs that could replace the causes of `model` at one or two places, the likeliest first.
 
-    Parameters
-    ----------
-    state : State
-        Of the search.
-    info : Information
-        Of all candidates and of `model`, whose columns are the last: :meth:`~.state.State.conditional_on`.
-    model : sequence of Candidate
-        The causes found so far.
-    base : Joint
-        The model's fit.
-    *places : int
-        In `model`, of the one or two that are replaced.
+    `info` is that of all candidates and of `model`, whose columns are the last
+    (:meth:`~.state.State.conditional_on`), and `base` the model's fit.
     """
     table = _Table(state, info, model, base, places)
     groups = list(table.members)

@@ -9,13 +9,11 @@ on while one does. A cause that is found again needs more than one regressor: th
 causes are exchanged for competing hypotheses (:mod:`.exchange`). Last, causes that later findings have made
 needless are dropped.
 
-Noise that ends up as slow as it may be may have absorbed what several causes do together: then none alone
-stands out from it. So a second start finds causes beside noise of a short correlation. What they are worth is
-judged beside noise of any.
+Noise that ends up slow may have absorbed what several causes do together: then none alone stands out from it.
+So a second start finds causes beside noise of a short correlation, and weighs them beside noise of any.
 
 What is found is then searched for beside noise that grows towards low frequencies, where that gains anything
-(:mod:`~.compare.slow_noise`), and the likelier of the two is kept: a cause that only stands for
-such noise is no longer found.
+(:mod:`~.compare.slow_noise`), and the likelier is kept: a cause that only stands for such noise is not found.
 
 The competing hypotheses are read off one matrix at the end: the information of all candidates under the noise
 that is left, the other causes projected out.
@@ -69,8 +67,8 @@ class Outcome:
         For each chosen one, all others that it does not beat by :func:`~.evidence.margin`, the best first.
     null, fit : Joint
         Fits without any cause, and with the chosen ones.
-    tested : dict
-        Cause -> (smallest p-value, ratio) of the first round.
+    p_value : float
+        The smallest of the first round.
     info : Information
         Of all candidates under the noise that is left, only the calibration projected out.
     look_elsewhere : dict
@@ -86,7 +84,7 @@ class Outcome:
     competing: tuple[tuple[CompetingHypothesis, ...], ...]
     null: Joint
     fit: Joint
-    tested: dict[str, tuple[float, float]]
+    p_value: float
     info: Information
     look_elsewhere: dict[str, float]
     evidence: float
@@ -94,17 +92,7 @@ class Outcome:
 
 
 def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:
-    """Find the causes that the data support.
-
-    Parameters
-    ----------
-    problem : Problem
-        The survey, and the calibration's prior.
-    candidates : sequence of Candidate
-        Of all causes.
-    causes : int
-        How many causes were asked about.
-    """
+    """Find the causes that the data support, among the candidates of so many `causes`."""
     found = _search(problem, candidates, causes)
     if not found.chosen or problem.waves.size:
         return found
@@ -124,10 +112,7 @@ def _search(
     order = autoregressive_order(rough.residual, problem.survey.slots)
     state = State(problem, candidates, order, causes)
     first = state.round([], state.null) if candidates else []
-    tested: dict[str, tuple[float, float]] = {}
-    for h in first:
-        if h.p_value <= tested.get(h.candidate.cause, (np.inf, 0.0))[0]:
-            tested[h.candidate.cause] = (h.p_value, h.ratio)
+    p_value = min((h.p_value for h in first), default=1.0)
     model, base = _likeliest(state, first) if first else ([], state.null)
     chosen, base = _backward_elimination(state, model, base)
     model = [h.candidate for h in chosen]
@@ -138,7 +123,7 @@ def _search(
     needed = autoregressive_order(base.residual, problem.survey.slots)
     evidence = state.value(model, base, plain) - 0.5 * (order + needed)
     return Outcome(
-        problem, tuple(chosen), competing, state.null, base, tested, info, state.look_elsewhere, evidence
+        problem, tuple(chosen), competing, state.null, base, p_value, info, state.look_elsewhere, evidence
     )
 
 

@@ -20,13 +20,13 @@ from magbridge.diagnose.compare.design_columns import Columns, Mixture, parts, t
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import in_threads, precomputed
 from magbridge.diagnose.inference.evidence import (
+    certainty,
     evidence_of,
     log_odds,
     look_elsewhere_factors,
     regressor_error,
     score,
 )
-from magbridge.diagnose.inference.fit_noise import certainty
 from magbridge.diagnose.inference.hypothesis import Best, Hypothesis, shaped_ratio, wald_ratio
 from magbridge.diagnose.inference.information import Information, information
 from magbridge.diagnose.inference.joint import RIDGE, Joint, fit_joint

@@ -105,7 +105,8 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     rows = {
         "predicted by the calibration as given: noise and its own uncertainty": budget.predicted,
         "found with the calibration as given": budget.before,
-        f"found with the extended calibration, on {parts} left out of its fit": budget.after,
+        f"found with its own numbers fitted anew, on {parts} left out": budget.refitted,
+        f"found with the extended calibration, on {parts} left out": budget.after,
         "left in the fit to the whole log": budget.fitted,
     }
     lines = (
@@ -120,7 +121,8 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     )
     how = (
         f"<p>It is {number(residual.rms)} nT RMS, {number(residual.white)} nT from one sample to the next, "
-        f"remembers {number(residual.correlation_time, 2)} s, {_goes(diagnosis.assessment.follows)}. "
+        + f"remembers {number(residual.correlation_time, 2)} s, " * residual.lasts
+        + f"{_goes(diagnosis.assessment.follows)}. "
         f"{_noise(diagnosis)}</p>"
     )
     return [
@@ -136,7 +138,8 @@ def _goes(what: Seen) -> str:
     reported = goes_with(what, share=True)
     if what.channel:
         return f"and follows {reported}"
-    return f"lies {reported}, and follows nothing logged" if reported else "and follows nothing logged"
+    nothing = "and no logged series explains a tenth of it"
+    return f"lies {reported}, {nothing}" if reported else nothing
 
 
 def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
@@ -151,7 +154,7 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
 
 def described(rest: Leftover, residual: Memory) -> str:
     """Return what is left, its size and how long it lasts, as a sentence without its full stop, as HTML."""
-    goes = f"; it follows <code>{escape(rest.best_channel)}</code> best" if rest.best_channel else ""
+    goes = f"; best described by <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     size = f"signal-to-noise ratio {rest.signal_to_noise:.1f}"
     own = f"{number(rest.size)} nT RMS of its own, " if rest.size is not None else ""

@@ -128,9 +128,12 @@ def _sentence(diagnosis: Diagnosis) -> str:
     other = (
         f"Something {'stronger' if louder else 'else'} is left that no known cause explains."
         if rest
-        else f"What is left, {number(residual.rms)} nT RMS, fits no description of the list better than "
-        f"noise that remembers {number(residual.correlation_time, 2)} s."
+        else f"What is left, {number(residual.rms)} nT RMS, fits no description of the list better than noise"
+        + f" that remembers {number(residual.correlation_time, 2)} s" * residual.lasts
+        + "."
     )
+    if (refitted := diagnosis.assessment.budget.refitted) is not None:
+        worth += f" The calibration's own numbers fitted anew would leave {number(refitted)} nT."
     return f"Found: {'; '.join(names)}. {worth} {other}"
 
 

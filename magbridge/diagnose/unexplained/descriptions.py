@@ -18,7 +18,6 @@ from magbridge.diagnose.compare.design_columns import Columns, size_of
 from magbridge.diagnose.compare.effect_columns import effect_columns
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.unexplained import shapes
 from magbridge.diagnose.unexplained.packets import packets
@@ -60,8 +59,8 @@ class Description(NamedTuple):
         The effect is in proportion to each reading: a change of sensitivity, not of offset. Only of heat is
         that told apart: of other channels either description says what a cause does with more numbers.
     wider : bool
-        It is much more general than a cause that it holds: what it finds beside that cause is no remnant, and
-        it is an alternative to that cause together with another.
+        It is much more general than a cause that it holds: what it finds beside that is no remnant, and it is
+        an alternative to that cause together with another.
     """
 
     columns: Columns
@@ -109,25 +108,15 @@ def _moves(own: set[str]) -> Callable[[Candidate], bool]:
     )
 
 
-def _is_constant(candidate: Candidate) -> bool:
-    return candidate.about == "constant"
-
-
 def _bends(candidate: Candidate) -> bool:
     return any(isinstance(effect, ResponseEffect) and effect.power for effect in candidate.effects)
 
 
 def descriptions(problem: Problem, fit: Joint, tone: Candidate | None = None) -> list[Description]:
-    """List the descriptions with which structure of any kind is searched for.
+    """List the descriptions with which structure of any kind is searched for in a survey.
 
-    Parameters
-    ----------
-    problem : Problem
-        The survey to be described.
-    fit : Joint
-        A fit without any cause; passages and packets are searched for in its residual.
-    tone : Candidate, optional
-        The strongest tone, where tones are not among the causes.
+    Passages and packets are searched for in the residual of a `fit` without any cause; `tone` is the
+    strongest, where tones are not among the causes.
     """
     return [
         *_in_time(problem, fit),
@@ -142,7 +131,7 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
     """Slow curves in body axes and along the field, a constant, a passing source."""
     time = problem.survey.time
     whole = max(float(time[-1] - time[0]), 1.0)
-    fresh = ~problem.survey.learned
+    constant = problem.reference_jacobian * ~problem.survey.learned
 
     def waves(count: int) -> Columns:
         return lambda rows: (
@@ -156,14 +145,18 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
             lambda rows: problem.reference_jacobian[rows, None] * waves(EARTH)(rows),
             (*shapes.spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
-        _of("drift", lambda rows: (problem.reference_jacobian * fresh)[rows, None], 1.0, holds=_is_constant),
+        _of("drift", lambda rows: constant[rows, None], 1.0, holds=lambda one: one.about == "constant"),
         _of("transient", passing, look_elsewhere=times),
     ]
 
 
 def _of_reading(problem: Problem) -> list[Description]:
     """Functions of the field's direction, its rates of change, each axis' reading; one common delay."""
-    body, rates = _body(problem), field_rates(problem)
+    rates = field_rates(problem)
+
+    def body(rows: slice) -> FloatArray:
+        return -problem.jacobian[rows, 6:]
+
     listed = [
         _of("broadband", shapes.direction(body), holds=_bends, wider=True),
         _of(
@@ -182,7 +175,10 @@ def _of_reading(problem: Problem) -> list[Description]:
 
 
 def _of_channels(problem: Problem) -> list[Description]:
-    """For each telemetry channel, a curve of its value, functions of its past, and what follows it late."""
+    """For each telemetry channel, a curve of its value, functions of its past, and what follows it late.
+
+    Late, as heat soaks into a hull: an offset, or a sensitivity.
+    """
     own = {parameter.name for parameter in problem.calibration.parameters}
     listed = []
     for name, channel in problem.survey.channels.items():
@@ -192,18 +188,13 @@ def _of_channels(problem: Problem) -> list[Description]:
             listed += [
                 _of("broadband", _along_axes(problem, now), channel=name, turned=True, holds=held),
                 _of("broadband", _along_axes(problem, before), channel=name, turned=True, remembers=True),
-                *_late(problem, name, channel),
             ]
-    return listed
-
-
-def _late(problem: Problem, name: str, channel: Channel) -> list[Description]:
-    """Return what follows a channel late, as heat soaks into a hull: an offset, or a sensitivity."""
-    late, listed = shapes.delayed(problem.survey.time, channel.values), []
-    for scales in (False, True):
-        columns = _along_axes(problem, late, scales=scales)
-        held = _soaks(scales=scales) if "temperature" in channel.kinds else _is()
-        listed.append(_of("broadband", columns, channel=name, turned=True, scales=scales, holds=held))
+            late = shapes.delayed(problem.survey.time, channel.values)
+            for scales in (False, True):
+                columns = _along_axes(problem, late, scales=scales)
+                held = _soaks(scales=scales) if "temperature" in channel.kinds else _is()
+                more = _of("broadband", columns, channel=name, turned=True, scales=scales, holds=held)
+                listed.append(more)
     return listed
 
 
@@ -237,21 +228,9 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
     if rings is not None:
         listed.append(_of("tone", rings.columns, look_elsewhere=rings.look_elsewhere, period=rings.period))
     if tone is not None:
-        listed.append(
-            _of(
-                "tone",
-                tone.columns,
-                1.0,
-                look_elsewhere=tone.look_elsewhere,
-                period=tone.point.shape["period"][0],
-            )
-        )
+        period = tone.point.shape["period"][0]
+        listed.append(_of("tone", tone.columns, 1.0, look_elsewhere=tone.look_elsewhere, period=period))
     return listed
-
-
-def _body(problem: Problem) -> Columns:
-    """(m, 3) what an offset of one nT along each axis of the body adds to the residual."""
-    return lambda rows: -problem.jacobian[rows, 6:]
 
 
 def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Columns:
