@@ -22,7 +22,6 @@ from terminal import command_line, table
 from magbridge.calibration.model import Parameter
 from magbridge.learning import Learner
 from magbridge.learning.start import class_prior
-from magbridge.records import Quality
 
 EDGES = (0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.5, 2.25, 3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0)
 """h."""
@@ -32,7 +31,7 @@ FLOOR = 1.0
 
 def run(seed: int, hours: float) -> np.ndarray:
     """Return, of each stretch, the error about its mean, the mean error, the claimed sigma; nT."""
-    _, log = live.fly("nothing", seed, hours)
+    log = live.sampled(live.fly("nothing", seed, hours)[1])
     parameters = []
     for name in MASSES:
         low, high = float(log[name].min()), float(log[name].max())
@@ -40,7 +39,7 @@ def run(seed: int, hours: float) -> np.ndarray:
     prior = class_prior(tuple(parameters))
     seen = live.learn(Learner(prior), prior, log)
     time, error = hours_of(log), seen.total - log["truth_total_field"].to_numpy()
-    rest = (seen.quality & int(Quality.MOVING | Quality.STALE_TELEMETRY)) == 0
+    rest = live.at_rest(seen.quality)
     rows = np.full((len(EDGES) - 1, 3), np.nan)
     for row, low, high in zip(rows, EDGES[:-1], EDGES[1:], strict=True):
         here = rest & (time >= low) & (time < high)

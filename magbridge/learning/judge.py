@@ -29,6 +29,10 @@ BEYOND_CHANCE: Final = 13.5
 """h: once in 30 days of 0.25 Hz."""
 MOST: Final = 4.0
 """That one sample counts at most: an outlier says nothing of which is better."""
+MARGIN: Final = 0.01
+"""By which what is learned has to be better, a sample, to count at all: an error of 0.14 sigma that the first
+calibration makes and it does not. No calibration is exact: over thousands of like samples, less than that is
+beyond chance, but does not hold for others, and what predictions do not show, as the level, may get worse."""
 MEMORY: Final = 500
 """Samples over which mean squares are followed."""
 
@@ -43,7 +47,8 @@ class Judge:
     Attributes
     ----------
     better, worse : float
-        Log-likelihood ratio of what is learned over the first calibration, and of that over it.
+        Log-likelihood ratio of what is learned over the first calibration, less the margin, and of that one
+        over it.
     mean_square : (2,) array
         nT², of the errors of prediction lately.
     last : tuple of 2 float
@@ -100,7 +105,7 @@ class Judge:
         self._noisier += share * (np.minimum(square, 25.0) - self._noisier)
         first, learned = (square / max(1.0, float(self._noisier.min()))).tolist()
         won = min(max(0.5 * (first - learned + log(S / variance)), -MOST), MOST)
-        self.better = max(0.0, self.better + won)
+        self.better = max(0.0, self.better + won - MARGIN)
         self.worse = max(0.0, self.worse - won)
 
     @property

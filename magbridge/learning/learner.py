@@ -211,6 +211,7 @@ class Learner:
 
     def restarted(self) -> None:
         """Take note that the sensor was powered anew: its offsets may have changed."""
+        self._held.clear()
         self._bank.open(self._turn_on**2)
 
     def sample(
