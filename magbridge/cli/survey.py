@@ -146,6 +146,7 @@ def _samples(
     """Return the corrected samples of all files."""
     from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS
+    from magbridge.field.reference import placed
     from magbridge.logs import read_each
     from magbridge.survey.read import is_table, joined, read_table, without_creep
     from magbridge.survey.run import samples_of
@@ -160,6 +161,9 @@ def _samples(
     note_losses(*(one.attrs for one in deployments))
     raw = [one for one in deployments if all(name in one for name in CHANNELS)]
     known = [load(path) for path in calibration]
+    for log in deployments if known else []:
+        if {"latitude", "longitude"} <= set(log.variables) and (holes := int((~placed(log)).sum())):
+            complain(f"{log.attrs['source']}: {holes} samples without a position: left out")
     for path, one in zip(calibration, known, strict=True):
         for doubt in warnings_of(one, path):
             complain(doubt)

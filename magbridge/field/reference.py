@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import counts_from_boot
 from magbridge.errors import FormatError
 from magbridge.field.continuation import continued
@@ -23,6 +23,7 @@ __all__ = [
     "earth_field",
     "main_field",
     "other_units",
+    "placed",
     "positions",
     "reference_field",
     "require_date",
@@ -31,6 +32,8 @@ __all__ = [
 
 EARTHS = 20_000.0, 70_000.0
 """nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""
+HOLE, SHORT, FEWEST = 20.0, 60.0, 3
+"""Intervals between positions that make a hole in them, s that never do, and fewest positions."""
 
 
 def reference_field(
@@ -198,6 +201,26 @@ def positions(deployment: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArra
     longitude = _between(time, deployment, "longitude", turn=360.0)
     depth = _between(time, deployment, "depth") if "depth" in deployment else np.zeros(time.size)
     return wrap(longitude), _between(time, deployment, "latitude"), np.nan_to_num(depth)
+
+
+def placed(deployment: xr.Dataset) -> BoolArray:
+    """Return at which samples (n,) a track's position is known.
+
+    It is not in a hole of the positions that is far longer than those between the others, where a straight
+    line may lead anywhere. Where most samples lie in such holes, as between a glider's surfacings, the line
+    is all there is, and they count as known.
+    """
+    time = deployment["time"].to_numpy().astype(float)
+    known = np.isfinite(deployment["latitude"].to_numpy().astype(float))
+    if known.sum() < FEWEST:
+        return np.ones(len(time), bool)
+    at = time[known]
+    longest = max(HOLE * float(np.median(np.diff(at))), SHORT)
+    after = np.searchsorted(at, time)
+    before = np.where(known, time, at[np.maximum(after - 1, 0)])
+    next_one = np.where(known, time, at[np.minimum(after, len(at) - 1)])
+    near = np.maximum(next_one - before, np.maximum(before - time, time - next_one)) <= longest
+    return np.asarray(near if near.mean() > 0.5 else np.ones(len(time), bool))
 
 
 def _between(time: FloatArray, deployment: xr.Dataset, column: str, turn: float | None = None) -> FloatArray:

@@ -18,7 +18,7 @@ from magbridge.correction import Correction
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
-from magbridge.field.reference import main_field, positions
+from magbridge.field.reference import main_field, placed, positions
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 from magbridge.survey.samples import Samples
@@ -141,7 +141,7 @@ def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples
     corrected = correct_rows(Correction(calibration), ds)
     value = np.where(_doubtful(corrected), np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
     samples = _placed(ds, value, np.zeros(len(value)), label)
-    known = np.isfinite(value) & np.isfinite(positions(ds)[1])
+    known = np.isfinite(value) & np.isfinite(positions(ds)[1]) & placed(ds)
     field = np.stack([ds[name].to_numpy() for name in CHANNELS], axis=1)[known]
     channels = [
         ds[name].to_numpy() if name in ds else np.full(len(value), np.nan) for name in calibration.channels
@@ -203,7 +203,7 @@ def _daily(ds: xr.Dataset) -> FloatArray | float:
 
 def _placed(ds: xr.Dataset, value: FloatArray, lines: FloatArray, label: int) -> Samples:
     longitude, latitude, depth = positions(ds)
-    known = np.isfinite(value) & np.isfinite(latitude)
+    known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
     if known.sum() < 10:
         source = ds.attrs.get("source", "the log")
         raise FormatError(source, f"only {int(known.sum())} samples have a field and a position")

@@ -244,7 +244,7 @@ def over(data: Observations, length: float) -> Observations:
 
 def test_rock_rougher_than_the_tracks_is_not_supported(survey: Survey) -> None:
     """Rock that changes over 35 m, tracks 90 m apart: one line says so, and the sigma holds."""
-    smooth, true = flown(legs=3)
+    smooth, true = flown(legs=2)
     data, every_second = over(smooth, 35.0), np.arange(len(smooth)) % 2 == 0
     true = true * (np.linalg.norm(data.field, axis=1) / np.linalg.norm(smooth.field, axis=1))
     seen = data.part(every_second)

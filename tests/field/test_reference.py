@@ -7,13 +7,13 @@ import pytest
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field import reference as module
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf, total_field
-from magbridge.field.reference import earth_field, positions, reference_field
+from magbridge.field.reference import earth_field, placed, positions, reference_field
 from sitl import Twin, load
 
 TIME = 1386201600.0 + np.arange(6.0)
@@ -90,3 +90,20 @@ def test_says_what_is_missing() -> None:
         reference_field(deployment(**PLACE), elsewhere)
     with pytest.raises(OutOfRange, match="the IGRF covers"):
         reference_field(deployment(**PLACE).assign_coords(time=TIME + 3e9))
+
+
+def test_a_hole_in_the_positions_is_no_track_and_surfacings_are_one() -> None:
+    time = np.arange(0.0, 4000.0, 4.0)
+    latitude = np.linspace(49.0, 49.1, len(time))
+    latitude[300:500] = np.nan
+    latitude[700:710] = np.nan
+
+    def of(column: FloatArray) -> BoolArray:
+        return placed(xr.Dataset({"latitude": ("time", column)}, {"time": time}))
+
+    np.testing.assert_array_equal(np.flatnonzero(~of(latitude)), np.arange(300, 500))
+    late = np.where(time < 1000.0, np.nan, latitude)
+    np.testing.assert_array_equal(np.flatnonzero(~of(late)), [*range(230), *range(300, 500)])
+    surfaced = np.where(np.arange(len(time)) % 400 < 20, latitude, np.nan)
+    assert of(surfaced).all()
+    assert of(np.full(len(time), np.nan)).all()

@@ -15,7 +15,7 @@ from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading
 from magbridge.field.geodesy import separation
-from magbridge.field.reference import earth_field, positions
+from magbridge.field.reference import earth_field, placed, positions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -115,6 +115,7 @@ def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple
     longitude, latitude, depth = positions(ds)
     if not np.isfinite(latitude).any():
         return None, None, (0.0, 0.0)
+    latitude = np.where(placed(ds), latitude, np.nan)
     origin = float(np.nanmedian(latitude)), float(np.nanmedian(longitude))
     north, east = separation(*origin, latitude, longitude)
     unmapped = np.broadcast_to(np.where(known, 0.0, 1.0), len(north))
