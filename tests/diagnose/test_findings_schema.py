@@ -35,7 +35,7 @@ def variants(clear: Diagnosis) -> dict[str, Diagnosis]:
         "contested": replace(clear, findings=(contested,)),
         "nothing": replace(clear, findings=(), verdict="nothing_found"),
         "rest": replace(clear, unexplained=rest._replace(within=(competitor,)), verdict="partly_explained"),
-        "wrong": replace(clear, wrong=Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0)),
+        "wrong": replace(clear, wrong=Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0, lasting=False)),
     }
 
 

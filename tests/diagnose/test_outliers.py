@@ -28,9 +28,13 @@ def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float 
     residual = lfilter([1.0], [1.0, -rho], rng.standard_t(nu, N))
     for row in rows:
         residual[row - 1 : row + 2] += shape * rng.choice([-1.0, 1.0])
+    return tested(residual, 2)
+
+
+def tested(residual: np.ndarray, order: int) -> Outliers | None:
     steps = np.ones(N, int)
     steps[[0, N // 3]] = FAR
-    noise = fit_noise(residual, Past(steps, 2))
+    noise = fit_noise(residual, Past(steps, order))
     none = np.zeros(0)
     return outliers(Joint(noise.log_likelihood, none, none, np.zeros((0, 0)), noise, residual, none), 18)
 
@@ -57,6 +61,22 @@ def test_good_neighbours_are_rarely_doubted(nu: float, rho: float) -> None:
     assert len(reported) == 25
     assert 0.3 < np.mean(reported) < 0.75
     assert np.mean(np.array(reported) < 0.1) < 0.25
+
+
+@pytest.mark.parametrize("order", [2, 13])
+@pytest.mark.parametrize("rho", [0.0, 0.95])
+def test_what_switches_is_no_wrong_sample(rho: float, order: int) -> None:
+    """Noise of a long memory absorbs a relay but for its switching, which was called outliers."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        noise = lfilter([1.0], [1.0, -rho], rng.standard_t(50.0, N))
+        relay = np.searchsorted(np.sort(rng.integers(0, N, 14)), np.arange(N)) % 2
+        wrong = np.isin(np.arange(N), np.arange(400, N, 700))
+        switches, spikes = (tested(noise + x, order) for x in (8.0 * relay, 12.0 * wrong))
+        assert switches is not None
+        assert spikes is not None
+        assert (switches.lasting, switches.isolated) == (True, False)
+        assert (spikes.lasting, spikes.isolated) == (False, True)
 
 
 def test_beside_a_gap_there_is_none_to_ask() -> None:

@@ -145,7 +145,7 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
 
 def test_wrong_samples_alone_promise_no_gain(clear: Diagnosis) -> None:
     """They are left out of every RMS, and nothing is added that could gain."""
-    wrong = Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0)
+    wrong = Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0, lasting=False)
     alone = replace(clear, findings=(), wrong=wrong, verdict="explained")
     page = report_html(alone, CAUSES)
     assert "(2 wrong samples). Without them, " in page

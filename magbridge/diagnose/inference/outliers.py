@@ -12,11 +12,14 @@ from scipy.stats import chi2, rankdata
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.residual import robust_scale
-from magbridge.diagnose.inference.evidence import LEVEL
+from magbridge.diagnose.inference.evidence import LEVEL, ODDS
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint
 
 __all__ = ["Outliers", "outliers"]
+
+AFTERWARDS = 16
+"""Samples beyond the noise's order in which a shift of the level is looked for."""
 
 
 class Outliers(NamedTuple):
@@ -30,17 +33,20 @@ class Outliers(NamedTuple):
     p_value : float
     neighbours : float
         Chance that good samples beside them would be off as far as theirs are.
+    lasting : bool
+        From them on the level stays shifted: something switched.
     """
 
     rows: IndexArray
     ratio: float
     p_value: float
     neighbours: float
+    lasting: bool
 
     @property
     def isolated(self) -> bool:
-        """Whether the samples beside them are good: beside what passes by, or rings, they are not."""
-        return self.neighbours >= LEVEL
+        """Whether the samples beside them are good: beside what passes, rings, or switches, they are not."""
+        return self.neighbours >= LEVEL and not self.lasting
 
 
 def outliers(fit: Joint, causes: int) -> Outliers | None:
@@ -62,7 +68,25 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
         return None
     # through the noise's autoregression a wrong sample also spoils the innovations after it
     first = rows[np.insert(np.diff(rows) > 1, 0, True)]
-    return Outliers(first, ratio, p_value, _neighbours(fit, first))
+    return Outliers(first, ratio, p_value, _neighbours(fit, first), _lasting(fit, first))
+
+
+def _lasting(fit: Joint, rows: IndexArray) -> bool:
+    r"""Say whether shifts of the level at `rows` (k,) are likelier than impulses there.
+
+    Notes
+    -----
+    Noise of a long memory absorbs what switches but for the switching itself. Whitened by the filter
+    ``h = (1, -a)`` an impulse is h and a shift its running sum s; of either, x, with the innovations v from
+    the row on (Chen & Liu 1993, J. Am. Stat. Assoc. 88:284),
+
+    .. math:: \lambda_x = \left(\sum_l x_l v_{i+l}\right)^2 \Big/ \sum_l x_l^2
+    """
+    impulse = np.concatenate([[1.0], -fit.noise.ar, np.zeros(AFTERWARDS)])
+    both = np.stack([impulse, np.cumsum(impulse)])
+    v = np.append(fit.noise.innovations, np.zeros(impulse.size))[rows[:, None] + np.arange(impulse.size)]
+    impulses, shifts = ((v @ both.T) ** 2 / np.sum(both**2, axis=1)).sum(axis=0)
+    return bool(0.5 * (shifts - impulses) > ODDS)
 
 
 def _neighbours(fit: Joint, rows: IndexArray) -> float:

@@ -39,14 +39,18 @@ def unlisted(
 
     `off` are wrong samples, `after` (n,) is the residual on parts left out, nT, of which `counts` (n,) count.
     """
-    return _passing(off) or _slow(problem, fit, named) or _loud(problem, after, counts)
+    slow = _slow(problem, fit, named)
+    if slow and off is not None and off.lasting:
+        return slow._replace(kind="switching")
+    return _passing(off) or slow or _loud(problem, after, counts)
 
 
 def _passing(off: Outliers | None) -> Leftover | None:
-    """Describe wrong samples that are not isolated: something passed by, or rang, for a few samples."""
+    """Describe wrong samples that are not isolated: something passed by, rang for a few samples, switched."""
     if off is None or off.isolated:
         return None
-    return Leftover("transient", float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None)
+    kind = "switching" if off.lasting else "transient"
+    return Leftover(kind, float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None)
 
 
 def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | None:
