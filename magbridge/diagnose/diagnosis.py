@@ -40,33 +40,23 @@ def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A cause that is named, with its part of the joint fit of all named causes.
-
-    Attributes
-    ----------
-    hypothesis : Hypothesis
-        The cause tested against the model without it.
-    competing : tuple of CompetingHypothesis
-        The causes that could take its place, the likeliest first.
-    improvement : Improvement
-        What this cause gains beside the others.
-    coefficients : (k,) array
-        In units of their prior width.
-    covariance : (k, k) array
-    chance_alone : float
-        That such a cause is named alone in such a log, by theory (:mod:`~.inference.naming`).
-    over_random_walk : float
-        Log odds over a sensor whose offsets wander (:mod:`~.inference.random_walk`); infinite for a cause
-        that is not slow.
-    """
+    """A cause that is named, with its part of the joint fit of all named causes."""
 
     hypothesis: Hypothesis
+    """The cause tested against the model without it."""
     competing: tuple[CompetingHypothesis, ...]
+    """The causes that could take its place, the likeliest first."""
     improvement: Improvement
+    """What this cause gains beside the others."""
     coefficients: FloatArray
+    """(k,) in units of their prior width."""
     covariance: FloatArray
+    """(k, k)."""
     chance_alone: float
+    """That such a cause is named alone in such a log, by theory (:mod:`~.inference.naming`)."""
     over_random_walk: float = np.inf
+    """Log odds over a sensor whose offsets wander (:mod:`~.inference.random_walk`); infinite for a cause that
+    is not slow."""
     gain = old_name("gain", "improvement")
     rivals = old_name("rivals", "competing")
 
@@ -103,48 +93,32 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """Everything that was found out.
-
-    Attributes
-    ----------
-    problem : Problem
-    outcome : Outcome
-    findings : tuple of Finding
-        The causes that are named.
-    wrong : Outliers or None
-        Isolated wrong samples.
-    unexplained : Leftover or None
-    calibration : Calibration
-        Extended.
-    fit : Joint
-        At the extended calibration.
-    before, after : (n,) array
-        nT, residuals with the calibration as it was given, and with the extended one, held out.
-    total : Improvement
-        Of all findings together.
-    isolability : Isolability
-    refitted : float
-        nT, RMS held out where only the calibration's own numbers are fitted anew.
-    verdict : str
-        As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain.
-    causes : mapping
-        The table of causes that were asked about.
-    """
+    """Everything that was found out."""
 
     problem: Problem
     outcome: Outcome
     findings: tuple[Finding, ...]
+    """The causes that are named."""
     wrong: Outliers | None
+    """Isolated wrong samples."""
     unexplained: Leftover | None
     calibration: Calibration
+    """Extended."""
     fit: Joint
+    """At the extended calibration."""
     before: FloatArray
     after: FloatArray
+    """`before`, `after` (n,): nT, residuals with the calibration as it was given, and with the extended one,
+    held out."""
     total: Improvement
+    """Of all findings together."""
     isolability: Isolability
     refitted: float
+    """nT, RMS held out where only the calibration's own numbers are fitted anew."""
     verdict: str
+    """As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain."""
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
+    """The table of causes that were asked about."""
 
     @cached_property
     def assessment(self) -> Assessment:

@@ -50,52 +50,35 @@ ROWS = 20_000
 
 
 class Seen(NamedTuple):
-    """What a signal follows.
-
-    Attributes
-    ----------
-    channel : str or None
-        The series that explains most of it: telemetry, ``time``, ``roll``, ``pitch`` or ``heading``; None
-        if none explains a tenth, or as much as that may be chance: what is slow goes with anything slow.
-    lag : float
-        s, by which it follows.
-    axis : str or None
-        ``x y z`` of the body, ``field`` along the field; None where several take part, or the signal neither
-        follows a series nor is slow.
-    size : float
-        RMS of the signal in the total field.
-    share : float
-        Of its power, that the series explains.
-    """
+    """What a signal follows."""
 
     channel: str | None
+    """The series that explains most of it: telemetry, ``time``, ``roll``, ``pitch`` or ``heading``; None if
+    none explains a tenth, or as much as that may be chance: what is slow goes with anything slow."""
     lag: float
+    """s, by which it follows."""
     axis: str | None
+    """``x y z`` of the body, ``field`` along the field; None where several take part, or the signal neither
+    follows a series nor is slow."""
     size: float
+    """RMS of the signal in the total field."""
     share: float
+    """Of its power, that the series explains."""
 
 
 class Memory(NamedTuple):
-    """How far from white a residual is.
-
-    Attributes
-    ----------
-    rms, white : float
-        RMS; and what of it changes from one sample to the next.
-    correlation_time : float
-        s, after which its autocorrelation has fallen to 1/e.
-    slow : float
-        Share of its power that is left in means over :attr:`samples` samples.
-    samples, means : int
-        Samples of a mean, and how many means there are.
-    """
+    """How far from white a residual is."""
 
     rms: float
     white: float
+    """`rms`, `white`: RMS; and what of it changes from one sample to the next."""
     correlation_time: float
+    """s, after which its autocorrelation has fallen to 1/e."""
     slow: float
+    """Share of its power that is left in means over :attr:`samples` samples."""
     samples: int
     means: int
+    """`samples`, `means`: samples of a mean, and how many means there are."""
 
     @property
     def lasts(self) -> bool:

@@ -55,45 +55,30 @@ ANSWERS: dict[Fitness, str] = {
 
 @dataclass(frozen=True)
 class Assessment:
-    """All that a reader gets beside the findings themselves.
-
-    Attributes
-    ----------
-    fit_for_use : str
-        ``yes``, ``once_settled``, ``no``, ``nothing_added`` or ``reference_only`` (no new term).
-    answer : str
-        The same as a sentence.
-    reasons_for, reasons_against : tuple of Note
-    manoeuvres : tuple of str
-        What to fly to settle the doubts.
-    notes : tuple of tuple of Note
-        What to know before believing each finding.
-    level : Level or None
-        Shift of the whole corrected field that may be the reference's.
-    delays : Delays or None
-        Of the sensor's axes, where they look interpolated.
-    budget : Budget
-        RMS predicted, before, after, fitted.
-    residual : Memory
-        How far from white it is, of what is left.
-    follows : Seen
-        What it follows.
-    returns : Returns or None
-        Whether the track tells place from time; None without positions.
-    """
+    """All that a reader gets beside the findings themselves."""
 
     fit_for_use: Fitness
+    """``yes``, ``once_settled``, ``no``, ``nothing_added`` or ``reference_only`` (no new term)."""
     answer: str
+    """The same as a sentence."""
     reasons_for: tuple[Note, ...]
     reasons_against: tuple[Note, ...]
     manoeuvres: tuple[str, ...]
+    """What to fly to settle the doubts."""
     notes: tuple[tuple[Note, ...], ...]
+    """What to know before believing each finding."""
     level: Level | None
+    """Shift of the whole corrected field that may be the reference's."""
     delays: Delays | None
+    """Of the sensor's axes, where they look interpolated."""
     budget: Budget
+    """RMS predicted, before, after, fitted."""
     residual: Memory
+    """How far from white it is, of what is left."""
     follows: Seen
+    """What it follows."""
     returns: Returns | None
+    """Whether the track tells place from time; None without positions."""
 
 
 def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:

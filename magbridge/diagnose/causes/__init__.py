@@ -33,24 +33,16 @@ GROUP = "magbridge.causes"
 
 
 class Cause(NamedTuple):
-    """A row of the table.
-
-    Attributes
-    ----------
-    candidates : callable
-        ``Problem -> list of Candidate``.
-    needs : str
-        What a log must contain for it to be tested.
-    separated_by : str
-        The manoeuvre that tells it from its competing hypotheses.
-    meaning : str
-        What it means, as a clause.
-    """
+    """A row of the table."""
 
     candidates: Callable[[Problem], list[Candidate]]
+    """``Problem -> list of Candidate``."""
     needs: str
+    """What a log must contain for it to be tested."""
     separated_by: str
+    """The manoeuvre that tells it from its competing hypotheses."""
     meaning: str = ""
+    """What it means, as a clause."""
 
 
 CAUSES: dict[str, Cause] = {

@@ -24,78 +24,53 @@ Group = tuple[str, str | None]
 
 @dataclass(frozen=True, eq=False)
 class GridPoint:
-    """The nonlinear parameters of a candidate: a point of its cause's grid, and what profiling made of it.
-
-    Attributes
-    ----------
-    shape : dict
-        Name -> (value, unit).
-    rebuild : callable or None
-        Shape's values -> the same candidate with those: for profiling.
-    likelier : float
-        Log of its prior probability, relative to the mean of its grid.
-    narrow : float
-        Log of how much narrower than their grid's cells the parameters are by the data.
-    cells : tuple of float
-        How far apart the grid's points are, in each parameter.
-    """
+    """The nonlinear parameters of a candidate: a point of its cause's grid, and what profiling made of it."""
 
     shape: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    """Name -> (value, unit)."""
     rebuild: Callable[..., Candidate] | None = None
+    """Shape's values -> the same candidate with those: for profiling."""
     likelier: float = 0.0
+    """Log of its prior probability, relative to the mean of its grid."""
     narrow: float = 0.0
+    """Log of how much narrower than their grid's cells the parameters are by the data."""
     cells: tuple[float, ...] = ()
+    """How far apart the grid's points are, in each parameter."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One hypothesis.
-
-    Attributes
-    ----------
-    cause : str
-        As in ``findings.json``.
-    channel : str or None
-        Telemetry that it follows.
-    columns : Columns
-        What its coefficients add to the residual, each in units of its width.
-    width : (k,) array
-        Plausible size (1-sigma) of each coefficient, in its unit.
-    names, units : tuple of str
-        Of the coefficients.
-    effects : tuple of Effect
-        What it adds to the calibration; none where the reference is wrong, or what it was fitted to.
-    point : GridPoint
-        Its nonlinear parameters.
-    look_elsewhere : float
-        Number of independent hypotheses that this one was picked from (frequencies searched).
-    positive : bool
-        Its coefficients cannot be negative.
-    parts : tuple of Candidate
-        Those that it was put together from, one after the other.
-    spectra : (l, k) array or None
-        Where its coefficients have one common free size (:mod:`~magbridge.diagnose.inference.statistic`): l
-        alternatives for their prior variances, in units of the widths squared and up to a common factor.
-    since : bool
-        It is absent from the logs that the calibration was fitted to.
-    about : str
-        ``vehicle`` with its sensor; or how the reference is wrong: ``constant``, by ``place`` or ``time``.
-    """
+    """One hypothesis."""
 
     cause: str
+    """As in ``findings.json``."""
     channel: str | None
+    """Telemetry that it follows."""
     columns: Columns
+    """What its coefficients add to the residual, each in units of its width."""
     width: FloatArray
+    """(k,) plausible size (1-sigma) of each coefficient, in its unit."""
     names: tuple[str, ...]
     units: tuple[str, ...]
+    """`names`, `units`: of the coefficients."""
     effects: tuple[Effect, ...] = ()
+    """What it adds to the calibration; none where the reference is wrong, or what it was fitted to."""
     point: GridPoint = GridPoint()
+    """Its nonlinear parameters."""
     look_elsewhere: float = 1.0
+    """Number of independent hypotheses that this one was picked from (frequencies searched)."""
     positive: bool = False
+    """Its coefficients cannot be negative."""
     parts: tuple[Candidate, ...] = ()
+    """Those that it was put together from, one after the other."""
     spectra: FloatArray | None = None
+    """(l, k) where its coefficients have one common free size
+    (:mod:`~magbridge.diagnose.inference.statistic`): l alternatives for their prior variances, in units of
+    the widths squared and up to a common factor."""
     since: bool = False
+    """It is absent from the logs that the calibration was fitted to."""
     about: About = "vehicle"
+    """``vehicle`` with its sensor; or how the reference is wrong: ``constant``, by ``place`` or ``time``."""
 
     @property
     def group(self) -> Group:

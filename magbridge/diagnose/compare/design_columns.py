@@ -35,14 +35,10 @@ class Mixture:
 
     Many hypotheses share few parts: one lagged temperature serves all the origins that it is tried with.
     Sums over a log are therefore taken once for each different ``X_i``.
-
-    Attributes
-    ----------
-    parts : tuple of (Columns, (k_i, k) array)
-        X_i and M_i.
     """
 
     parts: tuple[tuple[Columns, FloatArray], ...]
+    """X_i and M_i."""
 
     def __call__(self, rows: slice) -> FloatArray:
         """(m, k) these rows."""
@@ -55,18 +51,12 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class Interpolated:
-    """Columns interpolated from their values at a few nodes: ``W V``.
-
-    Attributes
-    ----------
-    weights : (n, c) sparse array
-        W, the weights of each row's nodes.
-    values : (c, k) array
-        V, the columns at the nodes.
-    """
+    """Columns interpolated from their values at a few nodes: ``W V``."""
 
     weights: csr_array
+    """(n, c) W, the weights of each row's nodes."""
     values: FloatArray
+    """(c, k) V, the columns at the nodes."""
 
     def __call__(self, rows: slice) -> FloatArray:
         """(m, k) these rows."""

@@ -17,20 +17,13 @@ __all__ = ["effect_columns"]
 
 @dataclass(frozen=True)
 class Products:
-    """Products of functions of time and slopes, from which the columns of effects are made.
-
-    Attributes
-    ----------
-    problem : Problem
-    phi : callable or None
-        Rows -> (r, m) functions; 1 if there is none.
-    pairs : tuple of (int, int)
-        For each column, the place of its function and the slot of its slope.
-    """
+    """Products of functions of time and slopes, from which the columns of effects are made."""
 
     problem: Problem
     phi: Callable[[slice], FloatArray] | None
+    """Rows -> (r, m) functions; 1 if there is none."""
     pairs: tuple[tuple[int, int], ...]
+    """For each column, the place of its function and the slot of its slope."""
 
     def __call__(self, rows: slice) -> FloatArray:
         """(m, pairs) these rows."""

@@ -60,44 +60,31 @@ SEEN = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A survey compared with a calibration and linearised: what a search works on.
-
-    Attributes
-    ----------
-    survey : Survey
-    calibration : Calibration
-    reading : (n, 3) array
-        nT, ``H_r - e w / |w|^2``: for effects that depend on the reading, which must not contain its noise.
-    residual : (n,) array
-        e, in the sensor's nanotesla.
-    jacobian : (n, 9) array
-        g.
-    reference_jacobian : (n,) array
-        1/s of :mod:`magbridge.calibration.residual`: e per nT by which the true field exceeds the reference.
-    delay_jacobian : (n, 3) array
-        ``-de/dz`` of the delays, in units of :data:`DELAY`.
-    directions : (K, q) array
-        L; zero for slow noise and the delays.
-    centre : (q,) array
-        m, prior mean of z.
-    unseen : (K, K) array
-        nT², covariance in the directions that these data cannot see.
-    waves : (k,) array
-        Of each coefficient of slow noise, what its variance falls with: the number of half waves per log, or
-        a power of it. There are none where the noise has no such part.
-    """
+    """A survey compared with a calibration and linearised: what a search works on."""
 
     survey: Survey
     calibration: Calibration
     reading: FloatArray
+    """(n, 3) nT, ``H_r - e w / |w|^2``: for effects that depend on the reading, which must not contain its
+    noise."""
     residual: FloatArray
+    """(n,) e, in the sensor's nanotesla."""
     jacobian: FloatArray
+    """(n, 9) g."""
     reference_jacobian: FloatArray
+    """(n,) 1/s of :mod:`magbridge.calibration.residual`: e per nT by which the true field exceeds the
+    reference."""
     delay_jacobian: FloatArray
+    """(n, 3) ``-de/dz`` of the delays, in units of :data:`DELAY`."""
     directions: FloatArray
+    """(K, q) L; zero for slow noise and the delays."""
     centre: FloatArray
+    """(q,) m, prior mean of z."""
     unseen: FloatArray
+    """(K, K) nT², covariance in the directions that these data cannot see."""
     waves: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(k,) of each coefficient of slow noise, what its variance falls with: the number of half waves per log,
+    or a power of it. There are none where the noise has no such part."""
 
     def __len__(self) -> int:
         return len(self.residual)

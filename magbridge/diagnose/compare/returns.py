@@ -30,21 +30,14 @@ SEPARABLE = 0.1
 
 
 class Returns(NamedTuple):
-    """The returns of a track.
-
-    Attributes
-    ----------
-    share : float
-        Of the samples, that lie where the track passes again.
-    longest : float
-        s, the longest time between two passes of one place.
-    separable : float
-        Least share of the power of a slow change with time that no function of the place imitates.
-    """
+    """The returns of a track."""
 
     share: float
+    """Of the samples, that lie where the track passes again."""
     longest: float
+    """s, the longest time between two passes of one place."""
     separable: float
+    """Least share of the power of a slow change with time that no function of the place imitates."""
 
     @property
     def apart(self) -> bool:

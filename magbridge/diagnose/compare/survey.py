@@ -49,55 +49,37 @@ class Channel(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A deployment as arrays, of the rows that have field, reference and the position of every mass.
-
-    Attributes
-    ----------
-    time : (n,) array
-        s since 1970 UTC.
-    field : (n, 3) array
-        nT, the sensor's raw axes at `time`.
-    reference : (n,) array
-        nT.
-    channels : dict of Channel
-        All telemetry that varies, and what the calibration needs.
-    still : tuple of str
-        Telemetry that never changes.
-    steps : (n,) int array
-        Intervals since the previous sample; :data:`~.past.FAR` where that is too long ago to predict
-        this one's noise.
-    dive : (n,) int array
-        Number of the dive, the unit of cross-validation.
-    dives : int
-        Dives of the logs that are diagnosed, by themselves; 0 where they have too few.
-    place : (n, 3) array or None
-        m north and east of the middle, and below the surface: 0 in a log without a depth.
-    attitude : (n, 3) array or None
-        deg, roll, pitch, heading.
-    fitted : (n,) bool array
-        The calibration was fitted to this sample.
-    learned : (n,) bool array
-        It was, and the sample is given only to be compared with: its log is not diagnosed.
-    cycles : (c,) array
-        s, when the instrument was power-cycled, as the log says.
-    source : str
-        The logs that are diagnosed, for people to read.
-    """
+    """A deployment as arrays, of the rows that have field, reference and the position of every mass."""
 
     time: FloatArray
+    """(n,) s since 1970 UTC."""
     field: FloatArray
+    """(n, 3) nT, the sensor's raw axes at `time`."""
     reference: FloatArray
+    """(n,) nT."""
     channels: dict[str, Channel]
+    """All telemetry that varies, and what the calibration needs."""
     still: tuple[str, ...]
+    """Telemetry that never changes."""
     steps: IntArray
+    """(n,) intervals since the previous sample; :data:`~.past.FAR` where that is too long ago to predict this
+    one's noise."""
     dive: IntArray
+    """(n,) number of the dive, the unit of cross-validation."""
     dives: int
+    """Dives of the logs that are diagnosed, by themselves; 0 where they have too few."""
     place: FloatArray | None
+    """(n, 3) m north and east of the middle, and below the surface: 0 in a log without a depth."""
     attitude: FloatArray | None
+    """(n, 3) deg, roll, pitch, heading."""
     fitted: BoolArray
+    """(n,) the calibration was fitted to this sample."""
     learned: BoolArray
+    """(n,) it was, and the sample is given only to be compared with: its log is not diagnosed."""
     cycles: FloatArray
+    """(c,) s, when the instrument was power-cycled, as the log says."""
     source: str
+    """The logs that are diagnosed, for people to read."""
 
     def __len__(self) -> int:
         return len(self.time)

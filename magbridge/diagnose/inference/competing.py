@@ -20,17 +20,11 @@ __all__ = ["CompetingHypothesis", "competing_hypotheses", "sets_of"]
 
 @dataclass(frozen=True)
 class CompetingHypothesis:
-    """A competing hypothesis, by the best candidate of its grid.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    behind : float
-        Log evidence by which it loses, averaged over the grid of its nonlinear parameters.
-    """
+    """A competing hypothesis, by the best candidate of its grid."""
 
     candidate: Candidate
     behind: float
+    """Log evidence by which it loses, averaged over the grid of its nonlinear parameters."""
 
 
 def competing_hypotheses(

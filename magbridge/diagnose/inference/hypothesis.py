@@ -18,26 +18,17 @@ __all__ = ["Best", "Hypothesis", "shaped_ratio", "wald_ratio"]
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One cause beside the others of a model.
-
-    Attributes
-    ----------
-    candidate : Candidate
-    ratio : float
-        Twice the gain in log likelihood.
-    evidence : float
-        Log Bayes factor against the model without it.
-    p_value : float
-        With the price of the hypotheses behind the cause (look-elsewhere) and of the number of causes.
-    fit : Joint
-        Of the whole model; this cause's coefficients are the last.
-    """
+    """One cause beside the others of a model."""
 
     candidate: Candidate
     ratio: float
+    """Twice the gain in log likelihood."""
     evidence: float
+    """Log Bayes factor against the model without it."""
     p_value: float
+    """With the price of the hypotheses behind the cause (look-elsewhere) and of the number of causes."""
     fit: Joint
+    """Of the whole model; this cause's coefficients are the last."""
 
     @property
     def signal_to_noise(self) -> float:

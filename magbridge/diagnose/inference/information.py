@@ -27,20 +27,14 @@ __all__ = ["Information", "information"]
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Score and information of all candidates' coefficients, with calibration (and model) projected out.
-
-    Attributes
-    ----------
-    matrix : (m, m) array
-        Fisher information, in units of the prior widths.
-    score : (m,) array
-    shift : (q + k, m) array
-        By how much calibration and model decrease for one unit of each coefficient.
-    """
+    """Score and information of all candidates' coefficients, with calibration (and model) projected out."""
 
     matrix: FloatArray
+    """(m, m) Fisher information, in units of the prior widths."""
     score: FloatArray
+    """(m,)."""
     shift: FloatArray
+    """(q + k, m) by how much calibration and model decrease for one unit of each coefficient."""
 
     def moved(self, base: Joint, at: slice | IndexArray, taken: FloatArray) -> FloatArray:
         """Return the likeliest calibration and model (q + k,) if the coefficients `at` these are `taken`."""

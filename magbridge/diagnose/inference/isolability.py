@@ -37,39 +37,25 @@ one common size."""
 
 @dataclass(frozen=True)
 class Visible:
-    """How large one cause must be to be found.
-
-    Attributes
-    ----------
-    cause, channel : str, str or None
-    sure : float
-        Signal-to-noise that is found with a chance of 95 %.
-    sizes : dict
-        Coefficient -> (size that is found with 95 %, unit); infinite where the log cannot show it.
-    """
+    """How large one cause must be to be found."""
 
     cause: str
     channel: str | None
     sure: float
+    """Signal-to-noise that is found with a chance of 95 %."""
     sizes: dict[str, tuple[float, str]]
+    """Coefficient -> (size that is found with 95 %, unit); infinite where the log cannot show it."""
 
 
 @dataclass(frozen=True)
 class Isolability:
-    """What a log can show, before its residual is looked at.
-
-    Attributes
-    ----------
-    visible : tuple of Visible
-    pairs : tuple of (Visible, Visible, float)
-        Causes that look alike, with their correlation.
-    untestable : dict
-        Cause that this log cannot test -> what a log would need for it.
-    """
+    """What a log can show, before its residual is looked at."""
 
     visible: tuple[Visible, ...]
     pairs: tuple[tuple[Visible, Visible, float], ...]
+    """Causes that look alike, with their correlation."""
     untestable: dict[str, str]
+    """Cause that this log cannot test -> what a log would need for it."""
 
 
 def isolability(

@@ -34,31 +34,22 @@ FLAT = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A hypothesis at its maximum.
-
-    Attributes
-    ----------
-    log_likelihood : float
-        Of the noise model, with the prior of the calibration and of the effects; coefficients of one common
-        size, as the axes' delays and slow noise are, are integrated out (Laplace's approximation).
-    z : (q,) array
-    coefficients : (k,) array
-        Of the effects, in units of their prior width.
-    covariance : (q + k, q + k) array
-    noise : Noise
-    residual : (n,) array
-        nT, what is left of the residual.
-    prior : (q + k,) array
-        Prior precision of every coefficient, effects in units of their widths.
-    """
+    """A hypothesis at its maximum."""
 
     log_likelihood: float
+    """Of the noise model, with the prior of the calibration and of the effects; coefficients of one common
+    size, as the axes' delays and slow noise are, are integrated out (Laplace's approximation)."""
     z: FloatArray
+    """(q,)."""
     coefficients: FloatArray
+    """(k,) of the effects, in units of their prior width."""
     covariance: FloatArray
+    """(q + k, q + k)."""
     noise: Noise
     residual: FloatArray
+    """(n,) nT, what is left of the residual."""
     prior: FloatArray
+    """(q + k,) prior precision of every coefficient, effects in units of their widths."""
 
     @property
     def effects_covariance(self) -> FloatArray:

@@ -44,29 +44,19 @@ SOLVED = 4096
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise as fitted.
-
-    Attributes
-    ----------
-    ar : (p,) array
-        Autoregressive coefficients.
-    scale : (n,) array
-        nT, s of every sample.
-    nu : float
-        Degrees of freedom of the tails; 1e6 is Gaussian.
-    past : Past
-        The samples before each one.
-    log_likelihood : float
-    innovations : (n,) array
-        v / s.
-    """
+    """Noise as fitted."""
 
     ar: FloatArray
+    """(p,) autoregressive coefficients."""
     scale: FloatArray
+    """(n,) nT, s of every sample."""
     nu: float
+    """Degrees of freedom of the tails; 1e6 is Gaussian."""
     past: Past
+    """The samples before each one."""
     log_likelihood: float
     innovations: FloatArray
+    """(n,) v / s."""
 
     @property
     def kappa(self) -> float:

@@ -23,25 +23,17 @@ AFTERWARDS = 16
 
 
 class Outliers(NamedTuple):
-    """Wrong samples, and how surely they are isolated.
-
-    Attributes
-    ----------
-    rows : (k,) int array
-    ratio : float
-        Twice the gain in log likelihood.
-    p_value : float
-    neighbours : float
-        Chance that good samples beside them would be off as far as theirs are.
-    lasting : bool
-        From them on the level stays shifted: something switched.
-    """
+    """Wrong samples, and how surely they are isolated."""
 
     rows: IndexArray
+    """(k,)."""
     ratio: float
+    """Twice the gain in log likelihood."""
     p_value: float
     neighbours: float
+    """Chance that good samples beside them would be off as far as theirs are."""
     lasting: bool
+    """From them on the level stays shifted: something switched."""
 
     @property
     def isolated(self) -> bool:

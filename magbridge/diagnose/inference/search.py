@@ -55,40 +55,27 @@ MOST = 6
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The result of a search.
-
-    Attributes
-    ----------
-    problem : Problem
-        With slow noise, if that is the likelier.
-    chosen : tuple of Hypothesis
-        In the order found; each against the model without it.
-    competing : tuple of tuple of CompetingHypothesis
-        For each chosen one, all others that it does not beat by :func:`~.evidence.margin`, the best first.
-    null, fit : Joint
-        Fits without any cause, and with the chosen ones.
-    p_value : float
-        The smallest of the first round.
-    info : Information
-        Of all candidates under the noise that is left, only the calibration projected out.
-    look_elsewhere : dict
-        Cause -> number of independent hypotheses behind it.
-    evidence : float
-        Log evidence of what was found and of its noise, against the null without slow noise.
-    plain : Outcome or None
-        What was found without slow noise, where that was less likely.
-    """
+    """The result of a search."""
 
     problem: Problem
+    """With slow noise, if that is the likelier."""
     chosen: tuple[Hypothesis, ...]
+    """In the order found; each against the model without it."""
     competing: tuple[tuple[CompetingHypothesis, ...], ...]
+    """For each chosen one, all others that it does not beat by :func:`~.evidence.margin`, the best first."""
     null: Joint
     fit: Joint
+    """`null`, `fit`: fits without any cause, and with the chosen ones."""
     p_value: float
+    """The smallest of the first round."""
     info: Information
+    """Of all candidates under the noise that is left, only the calibration projected out."""
     look_elsewhere: dict[str, float]
+    """Cause -> number of independent hypotheses behind it."""
     evidence: float
+    """Log evidence of what was found and of its noise, against the null without slow noise."""
     plain: Outcome | None = None
+    """What was found without slow noise, where that was less likely."""
 
 
 def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:

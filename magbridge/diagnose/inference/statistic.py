@@ -34,25 +34,17 @@ VISIBLE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
-    """The estimate at the likeliest size and spectrum.
-
-    Attributes
-    ----------
-    ratio : float
-    estimate : (k,) array
-    variance : (k,) array
-        Prior variance of each coefficient.
-    price : float
-        Log evidence that the prior costs: its density at the estimate, and the volume (Occam's factor).
-    signal_to_noise : float
-        Whitened norm of the estimate.
-    """
+    """The estimate at the likeliest size and spectrum."""
 
     ratio: float
     estimate: FloatArray
+    """(k,)."""
     variance: FloatArray
+    """(k,) prior variance of each coefficient."""
     price: float
+    """Log evidence that the prior costs: its density at the estimate, and the volume (Occam's factor)."""
     signal_to_noise: float
+    """Whitened norm of the estimate."""
 
 
 class Statistic:

@@ -35,44 +35,30 @@ def _is(*kinds: type[Effect]) -> Callable[[Candidate], bool]:
 
 
 class Description(NamedTuple):
-    """A description without a name.
-
-    Attributes
-    ----------
-    columns : Columns
-        What its coefficients add to the residual.
-    widths : tuple of (str, array (k,))
-        Kind, and the prior widths (1-sigma) of the coefficients up to a common factor; each is tried.
-    channel : str or None
-        The telemetry that it is a function of.
-    look_elsewhere : float
-        Number of independent descriptions that it was chosen from.
-    period : float or None
-        s, of a tone.
-    holds : callable
-        Whether a candidate's own regressors are among the columns, beside those of the same channel.
-    turned : bool
-        The columns are the same functions along each of the body's axes.
-    remembers : bool
-        It follows the channel's past (from which side it came), not its value.
-    scales : bool
-        The effect is in proportion to each reading: a change of sensitivity, not of offset. Only of heat is
-        that told apart: of other channels either description says what a cause does with more numbers.
-    wider : bool
-        It is much more general than a cause that it holds: what it finds beside that is no remnant, and it is
-        an alternative to that cause together with another.
-    """
+    """A description without a name."""
 
     columns: Columns
+    """What its coefficients add to the residual."""
     widths: tuple[tuple[str, FloatArray], ...]
+    """Kind, and the prior widths (1-sigma) of the coefficients up to a common factor; each is tried."""
     channel: str | None = None
+    """The telemetry that it is a function of."""
     look_elsewhere: float = 1.0
+    """Number of independent descriptions that it was chosen from."""
     period: float | None = None
+    """s, of a tone."""
     holds: Callable[[Candidate], bool] = _is()
+    """Whether a candidate's own regressors are among the columns, beside those of the same channel."""
     turned: bool = False
+    """The columns are the same functions along each of the body's axes."""
     remembers: bool = False
+    """It follows the channel's past (from which side it came), not its value."""
     scales: bool = False
+    """The effect is in proportion to each reading: a change of sensitivity, not of offset. Only of heat is
+    that told apart: of other channels either description says what a cause does with more numbers."""
     wider: bool = False
+    """It is much more general than a cause that it holds: what it finds beside that is no remnant, and it is
+    an alternative to that cause together with another."""
 
     def covers(self, model: Sequence[Candidate]) -> bool:
         """Say whether it contains a cause of `model`, with more coefficients; a wider one, whether all."""

@@ -65,43 +65,28 @@ class Fitted(NamedTuple):
 
 
 class Leftover(NamedTuple):
-    """Unexplained structure: its kind, its size, and the channel it follows.
-
-    Attributes
-    ----------
-    kind : str
-        ``switching drift tone transient broadband``.
-    signal_to_noise, p_value : float
-    evidence : float
-        Log Bayes factor of the description against the model.
-    period_s : float or None
-        Of a tone.
-    best_channel : str or None
-        The telemetry that its description is a function of.
-    description : Description, optional
-        The description that found it.
-    choice : int
-        Number of descriptions that it was chosen from.
-    within : tuple of CompetingHypothesis
-        The causes that remain possible: it is likelier than they are, but by less
-        than their margin.
-    fitted : tuple of Fitted
-        The likeliest descriptions.
-    size : float or None
-        RMS, nT, of the description.
-    """
+    """Unexplained structure: its kind, its size, and the channel it follows."""
 
     kind: str
+    """``switching drift tone transient broadband``."""
     signal_to_noise: float
     p_value: float
     evidence: float
+    """Log Bayes factor of the description against the model."""
     period_s: float | None
+    """Of a tone."""
     best_channel: str | None
+    """The telemetry that its description is a function of."""
     description: Description | None = None
+    """The description that found it."""
     choice: int = 1
+    """Number of descriptions that it was chosen from."""
     within: tuple[CompetingHypothesis, ...] = ()
+    """The causes that remain possible: it is likelier than they are, but by less than their margin."""
     fitted: tuple[Fitted, ...] = ()
+    """The likeliest descriptions."""
     size: float | None = None
+    """RMS, nT, of the description."""
 
     @property
     def among(self) -> float:
