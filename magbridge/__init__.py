@@ -50,25 +50,10 @@ if TYPE_CHECKING:
     from magbridge.version import __version__
 
 __all__ = [
-    "Calibration",
-    "Correction",
-    "Corrector",
-    "MagbridgeError",
-    "__version__",
-    "correct",
-    "correct_rows",
-    "fit",
-    "from_frame",
-    "load",
-    "observations",
-    "plot",
-    "read",
-    "read_grid",
-    "reference_field",
-    "save",
-    "to_frame",
-    "write",
-]
+    "Calibration", "Correction", "Corrector", "MagbridgeError", "__version__", "correct", "correct_rows",
+    "fit", "from_frame", "load", "observations", "plot", "read", "read_grid", "reference_field", "save",
+    "to_frame", "write",
+]  # fmt: skip
 
 _HOMES = {
     "Calibration": "calibration.model",

@@ -14,21 +14,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "AGE",
-    "CHANNELS",
-    "CHANNEL_TIMES",
-    "COLUMNS",
-    "CORRECTED",
-    "NT_PER_UNIT",
-    "Column",
-    "absent",
-    "counts_from_boot",
-    "factor",
-    "may_be",
-    "require",
-    "require_units",
-    "usual",
-]
+    "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "NT_PER_UNIT", "Column", "absent",
+    "counts_from_boot", "factor", "may_be", "require", "require_units", "usual",
+]  # fmt: skip
 
 
 class Column(NamedTuple):
@@ -82,17 +70,9 @@ CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z"
 """What ``magbridge correct`` writes beside ``time``."""
 
 NT_PER_UNIT = {
-    "fT": 1e-6,
-    "pT": 1e-3,
-    "nT": 1.0,
-    "uT": 1e3,
-    "µT": 1e3,
-    "mT": 1e6,
-    "T": 1e9,
-    "uG": 1e-1,
-    "mG": 1e2,
-    "G": 1e5,
-}
+    "fT": 1e-6, "pT": 1e-3, "nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9,
+    "uG": 1e-1, "mG": 1e2, "G": 1e5,
+}  # fmt: skip
 """nT in one unit of magnetic flux density."""
 
 _FACTORS = {
@@ -103,51 +83,29 @@ _FACTORS = {
     ("km", "m"): 1e3,
     ("cm/s", "m/s"): 1e-2,
 }
-_SAME = {
-    "degrees": "deg",
-    "Decimal Degrees": "deg",
-    "decimal degrees": "deg",
-    "degree": "deg",
-    # CF Conventions, sections 4.1 and 4.2
-    **{f"degree{s}{sep}{to}": "deg" for s in ("", "s") for sep in ("_", "") for to in "NE"},
-    **{f"degree{s}_{to}": "deg" for s in ("", "s") for to in ("north", "east", "true")},
-    "angular_degree": "deg",
-    "arc_degree": "deg",
-    "°": "deg",
-    "metres": "m",
-    "meters": "m",
-    "metre": "m",
-    "meter": "m",
-    "m s-1": "m/s",
-    "cm s-1": "cm/s",
-    "seconds": "s",
-    "sec": "s",
-    "Celsius": "degC",
-    "celsius": "degC",
-    "degrees_Celsius": "degC",
-    "degree_Celsius": "degC",
-    "degree_C": "degC",
-    "°C": "degC",
-    "nanotesla": "nT",
-    "nanoteslas": "nT",
-    "gamma": "nT",
-    "gammas": "nT",
-    "tesla": "T",
-    "gauss": "G",
-    "Gauss": "G",
-    "Oe": "G",  # of the same size in air
-    "oersted": "G",
-    "microtesla": "uT",
-    "milligauss": "mG",
-    "radian": "rad",
-    "radians": "rad",
-    "mgauss": "mG",
-    "inch": "in",
-    "inches": "in",
-    "cc": "cm3",
-    "cm^3": "cm3",
-    "cm³": "cm3",
+_SPELLINGS = {
+    "deg": (
+        *("degrees", "degree", "Decimal Degrees", "decimal degrees", "angular_degree", "arc_degree", "°"),
+        # CF Conventions, sections 4.1 and 4.2
+        *(f"degree{s}{sep}{to}" for s in ("", "s") for sep in ("_", "") for to in "NE"),
+        *(f"degree{s}_{to}" for s in ("", "s") for to in ("north", "east", "true")),
+    ),
+    "m": ("metres", "meters", "metre", "meter"),
+    "m/s": ("m s-1",),
+    "cm/s": ("cm s-1",),
+    "s": ("seconds", "sec"),
+    "degC": ("Celsius", "celsius", "degrees_Celsius", "degree_Celsius", "degree_C", "°C"),
+    "nT": ("nanotesla", "nanoteslas", "gamma", "gammas"),
+    "T": ("tesla",),
+    "uT": ("microtesla",),
+    "G": ("gauss", "Gauss", "Oe", "oersted"),  # an oersted is of the same size in air
+    "mG": ("milligauss", "mgauss"),
+    "rad": ("radian", "radians"),
+    "in": ("inch", "inches"),
+    "cm3": ("cc", "cm^3", "cm³"),
 }
+"""A unit of ours, and how others spell it."""
+_SAME = {other: unit for unit, others in _SPELLINGS.items() for other in others}
 
 
 YEAR_1980 = 315_532_800.0

@@ -17,19 +17,9 @@ from magbridge.errors import ConfigError
 from magbridge.toml import Table, check_entries, convert, load_toml
 
 __all__ = [
-    "Align",
-    "CalibrationFile",
-    "Config",
-    "Learning",
-    "Link",
-    "Log",
-    "Navigation",
-    "NotNegative",
-    "Positive",
-    "Sensor",
-    "Telemetry",
-    "load",
-]
+    "Align", "CalibrationFile", "Config", "Learning", "Link", "Log", "Navigation", "NotNegative", "Positive",
+    "Sensor", "Telemetry", "load",
+]  # fmt: skip
 
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 NotNegative = Annotated[float, Meta(ge=0, le=1e9)]

@@ -21,18 +21,9 @@ from __future__ import annotations
 from pathlib import Path
 
 __all__ = [
-    "CalibrationError",
-    "ConfigError",
-    "DataError",
-    "FormatError",
-    "MagbridgeError",
-    "MissingExtra",
-    "OutOfRange",
-    "PluginError",
-    "PortError",
-    "WriteError",
-    "WrongUse",
-]
+    "CalibrationError", "ConfigError", "DataError", "FormatError", "MagbridgeError", "MissingExtra",
+    "OutOfRange", "PluginError", "PortError", "WriteError", "WrongUse",
+]  # fmt: skip
 
 
 class MagbridgeError(Exception):
@@ -80,12 +71,8 @@ class FormatError(DataError, ValueError):
         self, file: str | Path, expected: str, *, row: int | None = None, column: str | None = None
     ) -> None:
         self.file, self.expected, self.row, self.column = Path(file), expected, row, column
-        where = ", ".join(
-            part
-            for part in (f"row {row}" if row is not None else "", f"column {column!r}" if column else "")
-            if part
-        )
-        super().__init__(f"{file}: {where}: {expected}" if where else f"{file}: {expected}")
+        where = ", ".join([f"row {row}"] * (row is not None) + [f"column {column!r}"] * bool(column))
+        super().__init__(": ".join(part for part in (str(file), where, expected) if part))
 
 
 class CalibrationError(DataError, ValueError):

@@ -61,11 +61,7 @@ def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
     except msgspec.ValidationError as error:
         sentence, _, where = str(error).partition(" - at ")
         keys = where.strip("`").removeprefix("$").lstrip(".")
-        for pattern in (
-            r"Object contains unknown field `(?P<key>[^`]*)`",
-            r"Object missing required field `(?P<key>[^`]*)`",
-        ):
-            if match := re.match(pattern, sentence):
-                keys = f"{keys}.{match['key']}".lstrip(".")
-                sentence = "unknown key" if "unknown" in sentence else "missing key"
+        if match := re.match(r"Object (contains unknown|missing required) field `([^`]*)`", sentence):
+            keys = f"{keys}.{match[2]}".lstrip(".")
+            sentence = "unknown key" if "unknown" in match[1] else "missing key"
         raise ConfigError(path, f"{prefix}{keys}".rstrip("."), sentence[0].lower() + sentence[1:]) from error

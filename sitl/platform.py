@@ -16,18 +16,9 @@ from magbridge.toml import Table
 from sitl.world import MU_0_OVER_4_PI, dipole_field
 
 __all__ = [
-    "HARD_IRON",
-    "MOMENT",
-    "MOUNTINGS",
-    "SOFT_IRON",
-    "VOLUME_SPREAD",
-    "Calibrated",
-    "Mass",
-    "Matrix",
-    "Mounting",
-    "Vehicle",
-    "draw_vehicle",
-]
+    "HARD_IRON", "MOMENT", "MOUNTINGS", "SOFT_IRON", "VOLUME_SPREAD", "Calibrated", "Mass", "Matrix",
+    "Mounting", "Vehicle", "draw_vehicle",
+]  # fmt: skip
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]

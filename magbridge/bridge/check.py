@@ -53,9 +53,15 @@ def findings(path: Path) -> list[Finding]:
         table = load_toml(path)
     except ConfigError as error:
         return [Finding(fatal=True, text=str(error))]
-    found = [Finding(fatal=True, text=line) for line in _keys(path, table)]
-    config = _what_is_left(path, table)
-    if config is not None:
+    left = deepcopy(table)
+    found = [
+        Finding(fatal=True, text=str(error)) for error in _errors(left, lambda: convert(left, Config, path))
+    ]
+    try:
+        config = msgspec.structs.replace(convert(left, Config, path), path=path)
+    except ConfigError:  # without sensor or link nothing more can be said
+        pass
+    else:
         found += dict.fromkeys(_contents(config))
     try:
         load(path)
@@ -65,19 +71,16 @@ def findings(path: Path) -> list[Finding]:
     return found
 
 
-def _keys(path: Path, table: dict[str, Any]) -> list[str]:
-    """Return what is wrong with keys and types: each is taken out, so that the next is found, too."""
-    left, lines = deepcopy(table), []
-    for _ in range(1000):
+def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[ConfigError]:
+    """Yield what is wrong with a table: each key is taken out, so that the next is found, too."""
+    while True:
         try:
-            convert(left, Config, path)
+            attempt()
         except ConfigError as error:
-            lines.append(str(error))
-            if not _without(left, error.key):
-                break
-        else:
-            break
-    return lines
+            yield error
+            if _without(table, error.key):
+                continue
+        return
 
 
 def _without(table: dict[str, Any], key: str) -> bool:
@@ -86,18 +89,6 @@ def _without(table: dict[str, Any], key: str) -> bool:
     if rest and isinstance(table.get(first), dict):
         return _without(table[first], rest)
     return table.pop(first, None) is not None
-
-
-def _what_is_left(path: Path, table: dict[str, Any]) -> Config | None:
-    """Return the configuration without what is wrong in it, where sensor and link remain."""
-    left = deepcopy(table)
-    for _ in range(1000):
-        try:
-            return msgspec.structs.replace(convert(left, Config, path), path=path)
-        except ConfigError as error:
-            if not _without(left, error.key):
-                return None
-    return None
 
 
 def _contents(config: Config) -> Iterator[Finding]:
@@ -139,17 +130,11 @@ def _files(config: Config) -> Iterator[Finding]:
 
 
 def _driver(config: Config) -> Iterator[Finding]:
-    """Yield what is wrong with the driver and its options: one taken out, the next is found, too."""
-    options = deepcopy(config.sensor.options)
-    for _ in range(1000):
-        try:
-            open_driver(config.sensor.driver, options, config.path)
-        except ConfigError as error:
-            yield Finding(fatal=True, text=str(error))
-            if not _without({"sensor": {"options": options}}, error.key):
-                return
-        else:
-            return
+    """Yield what is wrong with the driver and its options."""
+    options, sensor = deepcopy(config.sensor.options), config.sensor.driver
+    left = {"sensor": {"options": options}}
+    for error in _errors(left, lambda: open_driver(sensor, options, config.path)):
+        yield Finding(fatal=True, text=str(error))
 
 
 def _tried(attempt: Callable[[], object]) -> Iterator[Finding]:

@@ -145,9 +145,7 @@ class FileServer:
         if rate <= 0:
             self._under_way.clear()
             return
-        while (
-            len(self._ready) >= READY and not self._ending
-        ):  # the link is full, or the live thread has other things to do
+        while len(self._ready) >= READY and not self._ending:  # the link is full, or the live thread busy
             time.sleep(PAUSE)
             self._notify(b"")
         for _ in range(BATCH):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import inf
 
 from magbridge.bridge.frame import Frame
 from magbridge.link.component import Component
 from magbridge.link.fixes import Fix, Kind, widened
-from magbridge.mavlink import Message, spec
+from magbridge.mavlink import Message, by_id, spec
 from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.navigate.record import Reckoned
 
@@ -88,11 +87,7 @@ class Fixing:
         self._before_us: int | None = None
         self._waiting = 0
         self._reboots = component.vehicle.reboots
-        self._handlers: dict[int, Callable[[Message, int], None]] = {
-            spec("COMMAND_ACK").id: self._answer,
-            spec("GPS_RAW_INT").id: self._gps,
-            spec("HEARTBEAT").id: self._heartbeat,
-        }
+        self._handlers = by_id(COMMAND_ACK=self._answer, GPS_RAW_INT=self._gps, HEARTBEAT=self._heartbeat)
         if kind.local:
             component.timers.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import cos, isnan, nan, sin
 
 from magbridge.field.geodesy import separation
 from magbridge.link.fixes import Pose
-from magbridge.mavlink import Message, spec
+from magbridge.mavlink import Message, by_id
 
 __all__ = ["Frame"]
 
@@ -33,13 +32,10 @@ class Frame:
         self.attitude = 1.0, 0.0, 0.0, 0.0
         self._altitude = self._down = nan
         self._altitude_us = self._down_us = self._attitude_us = -FRESH_US
-        self._handlers: dict[int, Callable[[Message, int], None]] = {
-            spec("ATTITUDE").id: self._turn,
-            spec("GLOBAL_POSITION_INT").id: self._rise,
-            spec("GPS_GLOBAL_ORIGIN").id: self._set_origin,
-            spec("LOCAL_POSITION_NED").id: self._sink,
-            spec("ODOMETRY").id: self._sink,
-        }
+        self._handlers = by_id(
+            ATTITUDE=self._turn, GLOBAL_POSITION_INT=self._rise, GPS_GLOBAL_ORIGIN=self._set_origin,
+            LOCAL_POSITION_NED=self._sink, ODOMETRY=self._sink,
+        )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
         """Take in a message of the autopilot."""

@@ -159,7 +159,8 @@ class Learning:
 
     def _send(self, time_us: int) -> None:
         learner, offset_us = self.learner, self._component.codec.utc_offset_us
-        state = learner.state
+        state, first = learner.state, learner.calibration is learner.first
+        going = MAG_LEARNING_STATE.LEARNING if first else MAG_LEARNING_STATE.LEARNED
         self._component.outbox.send(
             "MAG_LEARNING",
             time_usec=time_us + offset_us,
@@ -173,11 +174,7 @@ class Learning:
             better=state.better,
             doubt_size=state.size,
             causes=sum(1 << bit for bit, name in enumerate(CAUSES) if name in state.causes),
-            state=MAG_LEARNING_STATE.FROZEN
-            if learner.frozen
-            else MAG_LEARNING_STATE.LEARNING
-            if learner.calibration is learner.first
-            else MAG_LEARNING_STATE.LEARNED,
+            state=MAG_LEARNING_STATE.FROZEN if learner.frozen else going,
         )
 
 

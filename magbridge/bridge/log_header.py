@@ -78,14 +78,6 @@ def declarations(
         for name, one in telemetry.items()
     ]
     if nt_per_count:
-        columns += [
-            {
-                "column": f"mag_{axis}",
-                "unit": "nT",
-                "message": "MAG_RAW",
-                "field": f"count_{axis}",
-                "scale": nt_per_count,
-            }
-            for axis in "xyz"
-        ]
+        raw = {"unit": "nT", "message": "MAG_RAW", "scale": nt_per_count}
+        columns += [raw | {"column": f"mag_{axis}", "field": f"count_{axis}"} for axis in "xyz"]
     return [codec.pack("MAG_COLUMN", **column) for column in columns]

@@ -15,7 +15,7 @@ from typing import Any
 
 from magbridge.bridge.frame import Frame
 from magbridge.link.component import Component
-from magbridge.mavlink import Message, spec
+from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.dialect import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator
 from magbridge.navigate.deadreckoning import GLIDE
@@ -80,13 +80,10 @@ class Motion:
         self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
         self._jumps = 0.0, 0.0
         self._measured: set[tuple[int, int]] = set()  # streams with a velocity that is not always zero
-        self._handlers: dict[int, Callable[[Message, int], None]] = {
-            spec("ATTITUDE").id: self._attitude,
-            spec("GLOBAL_POSITION_INT").id: self._global,
-            spec("LOCAL_POSITION_NED").id: self._local,
-            spec("ODOMETRY").id: self._odometry,
-            spec("VFR_HUD").id: self._speed,
-        }
+        self._handlers = by_id(
+            ATTITUDE=self._attitude, GLOBAL_POSITION_INT=self._global, LOCAL_POSITION_NED=self._local,
+            ODOMETRY=self._odometry, VFR_HUD=self._speed,
+        )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
         """Take in a message of the vehicle."""
@@ -202,8 +199,4 @@ def rotate(q: tuple[float, float, float, float], v: tuple[float, float, float]) 
     """Return a vector turned by a quaternion w, x, y, z: v + 2 u × (u × v + w v)."""
     w, x, y, z = q
     a, b, c = (y * v[2] - z * v[1] + w * v[0], z * v[0] - x * v[2] + w * v[1], x * v[1] - y * v[0] + w * v[2])
-    return (
-        v[0] + 2.0 * (y * c - z * b),
-        v[1] + 2.0 * (z * a - x * c),
-        v[2] + 2.0 * (x * b - y * a),
-    )
+    return (v[0] + 2.0 * (y * c - z * b), v[1] + 2.0 * (z * a - x * c), v[2] + 2.0 * (x * b - y * a))

@@ -39,6 +39,13 @@ WORDS = {
 }
 
 
+ALIKE = (
+    *("covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate"),
+    *("bias", "bias_sigma", "current_north", "current_east"),
+)
+"""Fields of MAG_NAVIGATION that a record has under the same name."""
+
+
 class Navigation:
     """Feeds the navigator, and sends its updates and fixes.
 
@@ -103,16 +110,7 @@ class Navigation:
                 time_usec=record.time_us + offset_us,
                 lat=round(record.latitude * 1e7),
                 lon=round(record.longitude * 1e7),
-                covariance_nn=record.covariance_nn,
-                covariance_ne=record.covariance_ne,
-                covariance_ee=record.covariance_ee,
-                innovation=record.innovation,
-                innovation_variance=record.innovation_variance,
-                gate=record.gate,
-                bias=record.bias,
-                bias_sigma=record.bias_sigma,
-                current_north=record.current_north,
-                current_east=record.current_east,
+                **{name: getattr(record, name) for name in ALIKE},
                 state=int(record.state),
                 accepted=int(record.accepted),
             )

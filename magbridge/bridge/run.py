@@ -101,11 +101,8 @@ def run(path: Path) -> None:
             if messages:
                 edge.answer(station, pipeline.interleaved(messages))
         keeper.look(pipeline, time_us)
-        if (
-            pipeline.learning is not None
-            and learned is not None
-            and (why := keep(pipeline.learning, learned))
-        ):
+        learning = pipeline.learning
+        if learning is not None and learned is not None and (why := keep(learning, learned)):
             edge.notify(states.notice(why))
         watch.look(time_us)
         if pipeline.sensor.wrong_device:

@@ -28,21 +28,9 @@ from typing import Any, Final
 import numpy as np
 
 __all__ = [
-    "BITS",
-    "COARSE",
-    "FINE",
-    "PAIRS",
-    "Linear",
-    "Numbers",
-    "Prepared",
-    "apply",
-    "for_arrays",
-    "largest",
-    "linear",
-    "monomials",
-    "prepare",
-    "split",
-]
+    "BITS", "COARSE", "FINE", "PAIRS", "Linear", "Numbers", "Prepared", "apply", "for_arrays", "largest",
+    "linear", "monomials", "prepare", "split",
+]  # fmt: skip
 
 BITS: Final = 21
 COARSE: Final = 1.5 * 2.0 ** (52 - BITS)

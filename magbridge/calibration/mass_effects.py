@@ -19,14 +19,8 @@ from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Serie
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "ClockEffect",
-    "LegendreEffect",
-    "PathEffect",
-    "PlayEffect",
-    "PowersEffect",
-    "SourcesEffect",
-    "play",
-]
+    "ClockEffect", "LegendreEffect", "PathEffect", "PlayEffect", "PowersEffect", "SourcesEffect", "play",
+]  # fmt: skip
 
 
 Factors = list[tuple[int, float, float, list[float]]]

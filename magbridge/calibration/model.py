@@ -30,16 +30,8 @@ from magbridge.deprecated import old_name
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "RAISED",
-    "Boresight",
-    "Calibration",
-    "Noise",
-    "Parameter",
-    "Reference",
-    "Run",
-    "Sensor",
-    "identity",
-]
+    "RAISED", "Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity",
+]  # fmt: skip
 
 
 RAISED = 0.01

@@ -29,19 +29,9 @@ from magbridge.calibration.arithmetic import PAIRS
 from magbridge.calibration.terms import symmetric
 
 __all__ = [
-    "NormalEquations",
-    "Samples",
-    "Whitening",
-    "independent",
-    "jacobian",
-    "normal_equations",
-    "residuals",
-    "residuals_of",
-    "rms",
-    "robust_scale",
-    "scales_and_offsets",
-    "whiten",
-]
+    "NormalEquations", "Samples", "Whitening", "independent", "jacobian", "normal_equations", "residuals",
+    "residuals_of", "rms", "robust_scale", "scales_and_offsets", "whiten",
+]  # fmt: skip
 
 CHUNK = 8192
 """Rows of the Jacobian at a time: bounded memory at any number of samples."""

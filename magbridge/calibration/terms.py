@@ -24,24 +24,9 @@ from magbridge.errors import CalibrationError
 from magbridge.plugins import load, plugins
 
 __all__ = [
-    "HIGHEST",
-    "SLOTS",
-    "TERMS",
-    "Effect",
-    "Expansion",
-    "Exponents",
-    "Parameter",
-    "Polynomial",
-    "PositionTerm",
-    "Power",
-    "Series",
-    "Step",
-    "Term",
-    "Width",
-    "full_order",
-    "symmetric",
-    "term_class",
-]
+    "HIGHEST", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "Parameter", "Polynomial",
+    "PositionTerm", "Power", "Series", "Step", "Term", "Width", "full_order", "symmetric", "term_class",
+]  # fmt: skip
 
 Exponents = tuple[int, ...]
 Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]

@@ -9,58 +9,27 @@ import os
 import signal
 import sys
 from contextlib import suppress
+from importlib import import_module
 from io import TextIOWrapper
 from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from magbridge.cli import (
-    ashore,
-    attach,
-    bridge,
-    calibrate,
-    correct,
-    diagnose,
-    export,
-    fleet,
-    info,
-    navigate,
-    plan,
-    survey,
-)
 from magbridge.cli.common import app, complain
 from magbridge.errors import MagbridgeError, MissingExtra
 
-__all__ = [
-    "app",
-    "ashore",
-    "attach",
-    "bridge",
-    "calibrate",
-    "correct",
-    "diagnose",
-    "export",
-    "fleet",
-    "info",
-    "main",
-    "navigate",
-    "plan",
-    "survey",
-]
+__all__ = ["app", "main"]
 
+ROOMS = (
+    *("ashore", "attach", "bridge", "calibrate", "correct", "diagnose"),
+    *("export", "fleet", "info", "navigate", "plan", "survey"),
+)
+"""Modules of commands: importing one makes its functions commands of `app`."""
+for _room in ROOMS:
+    import_module(f"{__name__}.{_room}")
 EXTRAS = {
     **dict.fromkeys(
-        [
-            "scipy",
-            "xarray",
-            "netCDF4",
-            "matplotlib",
-            "ppigrf",
-            "filterpy",
-            "rich",
-            "pandas",
-            "threadpoolctl",
-        ],
+        ["scipy", "xarray", "netCDF4", "matplotlib", "ppigrf", "filterpy", "rich", "pandas", "threadpoolctl"],
         "analysis",
     ),
     "harmonica": "grids",

@@ -74,16 +74,8 @@ def init(
         hint = "as: battpos [in], ballast [cm3]; none: press Enter"
         names = tuple(name.strip() for name in _ask("5. Which masses move?", hint, "", asks, "").split(","))
         names = tuple(name for name in names if name)
-    answers = Answers(
-        driver,
-        port,
-        baudrate,
-        link,
-        number,
-        names,
-        dict(map(_option, option)),
-        _relative(calibration, output),
-    )
+    options, file = dict(map(_option, option)), _relative(calibration, output)
+    answers = Answers(driver, port, baudrate, link, number, names, options, file)
     text = bridge_toml(answers, known)
     with atomic_path(output) as path:
         path.write_text(text, encoding="utf-8")
@@ -102,12 +94,8 @@ def _relative(file: Path | None, output: Path) -> str | None:
     """Return how `output` is to name a file: paths in it are relative to it."""
     if file is None:
         return None
-    folder = output.absolute().parent
-    return (
-        str(file.absolute().relative_to(folder))
-        if file.absolute().is_relative_to(folder)
-        else str(file.absolute())
-    )
+    file, folder = file.absolute(), output.absolute().parent
+    return str(file.relative_to(folder) if file.is_relative_to(folder) else file)
 
 
 def _ask(question: str, hint: str, default: str, asks: bool, flag: str) -> str:
@@ -186,15 +174,8 @@ def ports(
     found = []
     for port in track(asked, "listening", len(asked)):
         recognised, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)
-        found.append(
-            {
-                "port": port.device,
-                "device": port.description,
-                "who": recognised.who,
-                "said": recognised.text,
-                "baudrate": at,
-            }
-        )
+        one = {"device": port.description, "who": recognised.who, "said": recognised.text, "baudrate": at}
+        found.append({"port": port.device, **one})
         if not json:
             speed = f" at {at} bit/s" if at and recognised.who else ""
             about = f" ({port.description})" if port.description else ""

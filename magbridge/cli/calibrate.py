@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
@@ -130,21 +130,11 @@ def calibrate(
     json
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
+    given: dict[str, Any] = dict(locals())
     logs_to_read(files, output, vehicle, grid, base)
     check_inputs((*files, output), picture)
     if reading.compass == ALL:
-        _each_compass(
-            files,
-            output,
-            reading,
-            lambda one, name, of: calibrate(
-                *files, output=name, picture=picture and _of(picture, of), reading=one, parameter=parameter,
-                order=order, method=method, vehicle=vehicle, grid=grid, base=base, about_mean=about_mean,
-                site_bias=site_bias,
-                filter_corner=filter_corner, fleet=fleet, member=member, refit=refit,
-                heading_reference=heading_reference, json=json,
-            ),
-        )  # fmt: skip
+        _each_compass(**given)
         return
 
     from magbridge.calibration.file import save
@@ -181,8 +171,7 @@ def calibrate(
         )
         for line in unused_logs(logs, data):
             complain(line)
-        if filter_corner:
-            data = unfiltered(data, filter_corner)
+        data = unfiltered(data, filter_corner) if filter_corner else data
         options |= _drifting(position_sigma, data, method)
         if began:
             found, doubt, worth = _from_fleet(began, data, order, site_bias=site_bias, **options)
@@ -243,7 +232,7 @@ def _of(path: Path, compass: int) -> Path:
 
 
 def _each_compass(
-    files: tuple[Path, ...], output: Path, reading: Reading, fit: Callable[[Reading, Path, int], None]
+    files: tuple[Path, ...], output: Path, picture: Path | None, reading: Reading, **options: Any
 ) -> None:
     """Calibrate every compass of the logs; DataError: not one could be."""
     from magbridge.logs import read_each
@@ -254,8 +243,9 @@ def _each_compass(
         found = {one.number for log in read_each(files, options=first.options) for one in compasses_in(log)}
     failed = 0
     for number in sorted(found) or [0]:
+        own: dict[str, Any] = {"output": _of(output, number), "picture": picture and _of(picture, number)}
         try:
-            fit(replace(reading, compass=str(number)), _of(output, number), number)
+            calibrate(*files, reading=replace(reading, compass=str(number)), **own, **options)
         except DataError as error:
             failed += 1
             complain(f"compass {number}: {error}")

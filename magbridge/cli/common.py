@@ -26,36 +26,11 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = [
-    "AS_THEY_SAY",
-    "Base",
-    "Day",
-    "Folder",
-    "Grid",
-    "Heading",
-    "Json",
-    "Log",
-    "Output",
-    "Picture",
-    "Reading",
-    "Whole",
-    "app",
-    "by_base_station",
-    "check_inputs",
-    "chosen_parameters",
-    "command",
-    "complain",
-    "file_to_write",
-    "folder_to_write",
-    "logs_to_read",
-    "note_losses",
-    "note_missing",
-    "note_no_date",
-    "note_settings",
-    "note_unused_grid",
-    "print_result",
-    "refuse_unsuited",
-    "warnings_of",
-]
+    "AS_THEY_SAY", "Base", "Day", "Folder", "Grid", "Heading", "Json", "Log", "Output", "Picture", "Reading",
+    "Whole", "app", "by_base_station", "check_inputs", "chosen_parameters", "command", "complain",
+    "file_to_write", "folder_to_write", "logs_to_read", "note_losses", "note_missing", "note_no_date",
+    "note_settings", "note_unused_grid", "print_result", "refuse_unsuited", "warnings_of",
+]  # fmt: skip
 
 
 def _default(value: object) -> object:

@@ -282,12 +282,8 @@ class _Tally:
 
     def facts(self) -> dict[str, Any]:
         """Return the numbers to print as JSON."""
-        return {
-            "rows": self.samples,
-            "flagged": self.flagged,
-            "flags": +self.flags,
-            "left_out": self.left_out,
-        }
+        left_out = {"left_out": self.left_out}
+        return {"rows": self.samples, "flagged": self.flagged, "flags": +self.flags, **left_out}
 
     def summary(self) -> str:
         """Return the numbers in a sentence."""

@@ -217,12 +217,7 @@ def status(*, catalogue: Where = HERE, json: Json = False) -> None:
 
 @fleet.command
 def show(
-    vehicle: str = "",
-    /,
-    *,
-    catalogue: Where = HERE,
-    html: Path | None = None,
-    json: Json = False,
+    vehicle: str = "", /, *, catalogue: Where = HERE, html: Path | None = None, json: Json = False
 ) -> None:
     """Say how a vehicle's coefficients went from deployment to deployment, and when they changed.
 
@@ -264,13 +259,7 @@ def show(
 
 @fleet.command
 def export(
-    vehicle: str,
-    /,
-    *,
-    output: Output,
-    refit: str = "",
-    catalogue: Where = HERE,
-    json: Json = False,
+    vehicle: str, /, *, output: Output, refit: str = "", catalogue: Where = HERE, json: Json = False
 ) -> None:
     """Write what is expected of a vehicle's next deployment as a calibration, before any run is flown.
 

@@ -121,8 +121,7 @@ class Catalogue(ABC):
     def _check_format(self, found: int) -> None:
         if found > FORMAT:
             raise FormatError(
-                self.name,
-                f"a catalogue of format {found}; this magbridge reads up to {FORMAT}: update it",
+                self.name, f"a catalogue of format {found}; this magbridge reads up to {FORMAT}: update it"
             )
 
 

@@ -166,14 +166,8 @@ def _panel(one: History, k: int) -> str:
         moved = np.array([any(change.what == one.names[k] for change in changes) for changes in one.changes])
         # the first deployment's expectation is the fleet's: its band would hide all others
         later = slice(1, None) if len(when) > 1 else slice(None)
-        ax.errorbar(
-            when[later],
-            one.expected[later, k],
-            2.0 * one.expected_sigma[later, k],
-            fmt="none",
-            color=BAND,
-            lw=7,
-        )
+        band = one.expected[later, k], 2.0 * one.expected_sigma[later, k]
+        ax.errorbar(when[later], *band, fmt="none", color=BAND, lw=7)
         ax.errorbar(when, one.found[:, k], 2.0 * one.found_sigma[:, k], fmt="o", ms=4, lw=1.2, color=INK)
         ax.plot(when[moved], one.found[moved, k], "o", ms=7, color=CHANGED)
         for before, after in zip(one.lessons, one.lessons[1:], strict=False):

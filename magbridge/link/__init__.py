@@ -7,11 +7,5 @@ from magbridge.link.parameters import Parameters, Tunable, alignment, telemetry_
 from magbridge.link.telemetry import TelemetryMap
 
 __all__ = [
-    "Component",
-    "Parameters",
-    "TelemetryMap",
-    "Tunable",
-    "alignment",
-    "check_publish",
-    "telemetry_ages",
-]
+    "Component", "Parameters", "TelemetryMap", "Tunable", "alignment", "check_publish", "telemetry_ages",
+]  # fmt: skip

@@ -15,15 +15,8 @@ __all__ = ["Commands"]
 
 OURS = 60100
 """The first message id of our dialect: no other component of the vehicle has these messages."""
-CALIBRATES = (
-    MAV_CMD.PREFLIGHT_CALIBRATION,
-    MAV_CMD.FIXED_MAG_CAL,
-    MAV_CMD.FIXED_MAG_CAL_FIELD,
-    MAV_CMD.FIXED_MAG_CAL_YAW,
-    MAV_CMD.DO_START_MAG_CAL,
-    MAV_CMD.DO_ACCEPT_MAG_CAL,
-    MAV_CMD.DO_CANCEL_MAG_CAL,
-)
+CALIBRATES = {MAV_CMD.PREFLIGHT_CALIBRATION, *(one for one in MAV_CMD if "MAG_CAL" in one.name)}
+ABOUT_MESSAGES = MAV_CMD.REQUEST_MESSAGE, MAV_CMD.SET_MESSAGE_INTERVAL, MAV_CMD.GET_MESSAGE_INTERVAL
 MOST = 100
 """Commands of one sender that are executed within a second; more are rejected for the time being."""
 SENDERS = 64
@@ -122,11 +115,7 @@ class Commands:
         return MAV_RESULT.UNSUPPORTED
 
     def _only_us(self, number: int, first: float) -> bool:
-        about_message = number in (
-            MAV_CMD.REQUEST_MESSAGE,
-            MAV_CMD.SET_MESSAGE_INTERVAL,
-            MAV_CMD.GET_MESSAGE_INTERVAL,
-        )
+        about_message = number in ABOUT_MESSAGES
         return about_message and first >= OURS and first in self._messages
 
     def _request(self, values: list[float]) -> MAV_RESULT:

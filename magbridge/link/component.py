@@ -21,7 +21,7 @@ from magbridge.link.rates import Rate, period_us
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
-from magbridge.mavlink import REFUSED, Codec, FrameLogWriter, Message, Signing, spec
+from magbridge.mavlink import REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 
 __all__ = ["LIMITS", "TIMESYNC_US", "Component", "check_publish"]
@@ -169,17 +169,16 @@ class Component:
             self._authority,
             self.announcer,
         )
-        self._handlers: dict[int, Callable[[Message], None]] = {
-            spec("PARAM_REQUEST_LIST").id: self._if_ours(self._service.list),
-            spec("PARAM_REQUEST_READ").id: self._if_ours(self._service.read),
-            spec("PARAM_SET").id: self._if_ours(self._service.write),
-            spec("COMMAND_LONG").id: self._command,
-            spec("COMMAND_INT").id: self._command,
-            TIMESYNC.id: self._timesync,
-            spec("HEARTBEAT").id: self._heartbeat,
-            spec("LOG_ERASE").id: self._erase,
-            **{spec(name).id: self._file_request for name in FILE_REQUESTS},
-        }
+        self._handlers = by_id(
+            PARAM_REQUEST_LIST=self._if_ours(self._service.list),
+            PARAM_REQUEST_READ=self._if_ours(self._service.read),
+            PARAM_SET=self._if_ours(self._service.write),
+            TIMESYNC=self._timesync,
+            HEARTBEAT=self._heartbeat,
+            LOG_ERASE=self._erase,
+            **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), self._command),
+            **dict.fromkeys(FILE_REQUESTS, self._file_request),
+        )
         for name in self._by_clock:
             self._start_timer(name, start_us)
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)

@@ -56,9 +56,7 @@ class Opcode(IntEnum):
     NAK = 129
 
 
-WRITES = frozenset(
-    (Opcode.CREATE, Opcode.WRITE, Opcode.REMOVE, Opcode.CREATE_FOLDER, Opcode.REMOVE_FOLDER)
-) | {Opcode.OPEN_WRITE, Opcode.TRUNCATE, Opcode.RENAME}
+WRITES = range(Opcode.CREATE, Opcode.CRC32)
 
 
 class Error(IntEnum):

@@ -11,15 +11,8 @@ import msgspec
 from magbridge.config import Align, Telemetry
 
 __all__ = [
-    "Parameters",
-    "Tunable",
-    "alignment",
-    "file_rate",
-    "learning",
-    "rate_name",
-    "rates",
-    "telemetry_ages",
-]
+    "Parameters", "Tunable", "alignment", "file_rate", "learning", "rate_name", "rates", "telemetry_ages",
+]  # fmt: skip
 
 
 class Tunable(msgspec.Struct, frozen=True):
@@ -48,20 +41,14 @@ class Tunable(msgspec.Struct, frozen=True):
 
 def alignment(align: Align) -> list[Tunable]:
     """Return the tunables of ``[align]``."""
+    earths = "the Earth's field about the main field"
     rows = (
         ("MB_FILT_DELAY", "filter_delay", 0, 60, "s", "delay of the anti-alias filter"),
         ("MB_GAP_FACTOR", "gap_factor", 1.01, 1000, "", "sample periods without a sample that are a gap"),
         ("MB_MOVING_RATE", "moving_rate", 1e-6, 10, "1/s", "ranges per second from which on a mass moves"),
         ("MB_SETTLE_TIME", "settle_time", 0, 3600, "s", "how long samples stay flagged after a motion"),
         ("MB_STALE_GROW", "stale_growth", 0, 1e4, "nT/s", "growth of sigma with the age of stale telemetry"),
-        (
-            "MB_REF_SIGMA",
-            "reference_sigma",
-            1e-3,
-            1e9,
-            "nT",
-            "1-sigma of the Earth's field about the main field",
-        ),
+        ("MB_REF_SIGMA", "reference_sigma", 1e-3, 1e9, "nT", f"1-sigma of {earths}"),
         ("MB_TURNON_SIGMA", "turn_on_sigma", 0, 1e5, "nT", "1-sigma of the offset's change at power-on"),
     )
     return [
@@ -108,17 +95,10 @@ def rate_name(message: str) -> str:
 
 def rates(defaults: Mapping[str, float], limits: Mapping[str, tuple[float, float]]) -> list[Tunable]:
     """Return one tunable for the rate of each message of `limits`; one without a default is off."""
+    doc = "rate of {}; 0 with every sample, -1 off"
     return [
-        Tunable(
-            rate_name(message),
-            f"publish.{message}",
-            defaults.get(message, -1.0),
-            low,
-            high,
-            "Hz",
-            f"rate of {message}; 0 with every sample, -1 off",
-        )
-        for message, (low, high) in limits.items()
+        Tunable(rate_name(of), f"publish.{of}", defaults.get(of, -1.0), low, high, "Hz", doc.format(of))
+        for of, (low, high) in limits.items()
     ]
 
 

@@ -135,12 +135,8 @@ class Publisher:
             self._outbox.put(NAMED, NAMED.struct.pack(boot_ms, value, name))
 
     def _vector(self, sample: Sample, corrected: Corrected, _: float) -> None:
-        self._outbox.put(
-            VECTOR,
-            VECTOR.struct.pack(
-                max(sample.time_us + self._codec.utc_offset_us, 0), *corrected.field, b"mag_field"
-            ),
-        )
+        time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
+        self._outbox.put(VECTOR, VECTOR.struct.pack(time_us, *corrected.field, b"mag_field"))
 
 
 PUBLISHED: dict[str, str] = {

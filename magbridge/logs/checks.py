@@ -31,15 +31,9 @@ YEAR_10000 = 253_402_300_800.0
 MOST = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0), "depth": 1e5}
 """Largest magnitude, deg or m, of these columns; 4952.3 is degrees and minutes written together."""
 LEAST = {
-    "degC": -273.15,
-    "K": 0.0,
-    "Pa": -101325.0,
-    "hPa": -1013.25,
-    "mbar": -1013.25,
-    "kPa": -101.325,
-    "bar": -1.01325,
-    "dbar": -10.1325,
-}
+    "degC": -273.15, "K": 0.0, "Pa": -101325.0, "hPa": -1013.25, "mbar": -1013.25, "kPa": -101.325,
+    "bar": -1.01325, "dbar": -10.1325,
+}  # fmt: skip
 """Lowest temperatures and pressures, also of a pressure relative to the surface's: -9999 is a code for
 "not known"."""
 FIELDS = 1e3, 1e6

@@ -35,13 +35,9 @@ EPOCHS = {
 }
 """Kind of a number -> s since 1970 of its zero, and s in its unit."""
 WORDS = {
-    "ms": "millisec",
-    "us": "microsec",
-    "ns": "nanosec",
-    "excel": "excel",
-    "mjd": "mjd|modified",
+    "ms": "millisec", "us": "microsec", "ns": "nanosec", "excel": "excel", "mjd": "mjd|modified",
     "julian": "julian|^jd$",
-}
+}  # fmt: skip
 """Kind -> what in a heading says so."""
 SIZES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e6))
 """Kinds that count days, and between which numbers their times lie (1982 to 2064, 1943 to 2080, 1968 to

@@ -20,16 +20,9 @@ from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import FormatError
 
 __all__ = [
-    "HEALTHY",
-    "Compass",
-    "by_columns",
-    "choose",
-    "compass_notes",
-    "compasses_in",
-    "compasses_of",
-    "listed",
+    "HEALTHY", "Compass", "by_columns", "choose", "compass_notes", "compasses_in", "compasses_of", "listed",
     "rate",
-]
+]  # fmt: skip
 
 OTHER = re.compile(r"mag[1-9]\d*_x$")
 """Name of the first axis of another compass than the first."""

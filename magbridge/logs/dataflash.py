@@ -36,28 +36,10 @@ HEADER = 3
 PASS = 1 << 24
 """Bytes in which headers are searched at once."""
 LETTERS = {
-    "b": "i1",
-    "B": "u1",
-    "M": "u1",
-    "h": "<i2",
-    "H": "<u2",
-    "i": "<i4",
-    "I": "<u4",
-    "q": "<i8",
-    "Q": "<u8",
-    "g": "<f2",
-    "f": "<f4",
-    "d": "<f8",
-    "n": "S4",
-    "N": "S16",
-    "Z": "S64",
-    "a": "V64",
-    "c": "<i2",
-    "C": "<u2",
-    "e": "<i4",
-    "E": "<u4",
-    "L": "<i4",
-}
+    "b": "i1", "B": "u1", "M": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "q": "<i8", "Q": "<u8",
+    "g": "<f2", "f": "<f4", "d": "<f8", "n": "S4", "N": "S16", "Z": "S64", "a": "V64",
+    "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4",
+}  # fmt: skip
 OWN_SCALE = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 """Letters of fields that hold the value times this."""
 LAYOUT = np.dtype([("", "u1", HEADER), *zip(("type", "length", "name", "letters", "columns"),

@@ -16,27 +16,10 @@ from magbridge.errors import FormatError
 from magbridge.records import Quality
 
 __all__ = [
-    "CHANGES",
-    "COUNTERS",
-    "GUESSED",
-    "HISTORY",
-    "LOSSES",
-    "MEANING",
-    "NOTES",
-    "SETTINGS",
-    "deployment",
-    "join",
-    "lasting",
-    "merged",
-    "named_losses",
-    "noted",
-    "passed_over",
-    "plain_attrs",
-    "same_columns",
-    "sliced",
-    "uncounted",
-    "with_losses",
-]
+    "CHANGES", "COUNTERS", "GUESSED", "HISTORY", "LOSSES", "MEANING", "NOTES", "SETTINGS", "deployment",
+    "join", "lasting", "merged", "named_losses", "noted", "passed_over", "plain_attrs", "same_columns",
+    "sliced", "uncounted", "with_losses",
+]  # fmt: skip
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and their defaults."""

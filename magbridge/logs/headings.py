@@ -20,18 +20,9 @@ UNITS = {
 """Units by which a row of units under the headings is known."""
 AXES = "x", "y", "z"
 VECTORS = (
-    *("mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "b{}", "m{}"),
-    *(
-        "h{}",
-        "{}mag",
-        "b1{}",
-        "mag1{}",
-        "rawmag{}",
-        "magraw{}",
-        "imumagmagneticfield{}",
-        "magmagneticfield{}",
-    ),
-)
+    "mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "b{}", "m{}",
+    "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}", "imumagmagneticfield{}", "magmagneticfield{}",
+)  # fmt: skip
 """What the three axes are called elsewhere, with neither capitals nor punctuation."""
 ALIASES = {
     "time": (

@@ -41,21 +41,7 @@ USES: dict[str, Needs] = {
 GAP = 2.5
 """A pause longer than this many sampling intervals is a gap."""
 STATES = {
-    "degC",
-    "K",
-    "Pa",
-    "hPa",
-    "kPa",
-    "mbar",
-    "bar",
-    "dbar",
-    "inHg",
-    "V",
-    "s",
-    "m",
-    "m/s",
-    "nT",
-    "arcmin",
+    *("degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar", "inHg", "V", "s", "m", "m/s", "nT", "arcmin")
 }
 """Units of what a vehicle is in, or drifts by: temperatures, pressures, voltages, speeds."""
 EARTHS = 15_000.0, 90_000.0

@@ -75,10 +75,12 @@ FIELDS: Fields = {
 }
 """Topic to columns; of topics with one column, the first that the log has is taken."""
 FIELDS["vehicle_gps_position"] = FIELDS["sensor_gps"]
+GAUSS = tuple(f"magnetometer_ga[{k}]" for k in range(3))
+"""The three axes in ``vehicle_magnetometer`` and ``sensor_combined``."""
 NEEDED = {
     "sensor_mag": {"timestamp", "x", "y", "z"},
-    "vehicle_magnetometer": {"timestamp", *(f"magnetometer_ga[{k}]" for k in range(3))},
-    "sensor_combined": {"timestamp", *(f"magnetometer_ga[{k}]" for k in range(3))},
+    "vehicle_magnetometer": {"timestamp", *GAUSS},
+    "sensor_combined": {"timestamp", *GAUSS},
     "vehicle_attitude": {"timestamp", "q[0]", "q[1]", "q[2]", "q[3]"},
     "debug_key_value": {"timestamp", "value", "key[0]"},
 }
@@ -143,9 +145,8 @@ def _magnetometers(topics: Topics, parameters: Parameters) -> list[Magnetometer]
             numbers.add(number)
             found.append(_uncalibrated(number, device, part, parameters, in_use=device == current))
     if not found:
-        axes = tuple(f"magnetometer_ga[{k}]" for k in range(3))
         found = [
-            _magnetometer(number, 0.0, table, axes, parameters, True)
+            _magnetometer(number, 0.0, table, GAUSS, parameters, True)
             for number, table in topics.get("sensor_combined", {}).items()
         ]
     return found
@@ -198,7 +199,6 @@ def _uncalibrated(
     off-diagonals. S and the offset are undone; the rotation R, that of the mounting, stays: the axes are the
     vehicle's. The compensation for power (``CAL_MAG_COMP_TYP``) is not in the log, and stays, too.
     """
-    axes = tuple(f"magnetometer_ga[{k}]" for k in range(3))
     slot = _calibration(device, parameters)
     rotated = slot is not None and parameters.get(f"CAL_MAG{slot}_ROT", 0) > 0
     if slot is not None and not rotated:
@@ -207,9 +207,9 @@ def _uncalibrated(
         xy, xz, yz = (parameters.get(f"{header}{axis}ODIAG", 0.0) for axis in "XYZ")
         matrix = np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
         offset = np.array([[parameters.get(f"{header}{axis}OFF", 0.0)] for axis in "XYZ"])
-        raw = np.linalg.solve(matrix, np.stack([table[axis] for axis in axes])) + offset
-        table = {**table, **dict(zip(axes, raw, strict=True))}
-    return _magnetometer(number, device, table, axes, parameters, in_use)
+        raw = np.linalg.solve(matrix, np.stack([table[axis] for axis in GAUSS])) + offset
+        table = {**table, **dict(zip(GAUSS, raw, strict=True))}
+    return _magnetometer(number, device, table, GAUSS, parameters, in_use)
 
 
 def _calibration(device: float, parameters: Parameters) -> int | None:

@@ -71,16 +71,17 @@ def _angles(v: Values) -> Columns:
     yield "heading", "deg", np.degrees(np.arctan2(east_x, north_x)) % 360.0
 
 
+def _axes(prefix: str, vector: Any, axes: str = "xyz") -> dict[str, float]:
+    """Return the components of a vector or a quaternion by name."""
+    return {f"{prefix}{axis}": getattr(vector, axis) for axis in axes}
+
+
 def _imu_row(m: Any) -> dict[str, float]:
-    q = m.orientation
-    return {"qx": q.x, "qy": q.y, "qz": q.z, "qw": q.w, "unknown": float(m.orientation_covariance[0])}
+    return {**_axes("q", m.orientation, "xyzw"), "unknown": float(m.orientation_covariance[0])}
 
 
 def _fix_row(m: Any) -> dict[str, float]:
-    fixed = m.status.status >= 0
-    return (
-        dict(zip(("lat", "lon", "alt"), (m.latitude, m.longitude, m.altitude), strict=True)) if fixed else {}
-    )
+    return {"lat": m.latitude, "lon": m.longitude, "alt": m.altitude} if m.status.status >= 0 else {}
 
 
 def _fix(_: str, __: int, v: Values) -> Columns:
@@ -91,22 +92,10 @@ def _fix(_: str, __: int, v: Values) -> Columns:
 
 
 def _odometry_row(m: Any) -> dict[str, float]:
-    p, q, u = m.pose.pose.position, m.pose.pose.orientation, m.twist.twist.linear
+    pose, linear = m.pose.pose, m.twist.twist.linear
     absolute = float(m.header.frame_id.rpartition("/")[2].lower() in ABSOLUTE)
-    return {
-        "x": p.x,
-        "y": p.y,
-        "z": p.z,
-        "qx": q.x,
-        "qy": q.y,
-        "qz": q.z,
-        "qw": q.w,
-        "ux": u.x,
-        "uy": u.y,
-        "uz": u.z,
-        "absolute": absolute,
-        "unknown": 0.0,
-    }
+    vectors = _axes("", pose.position) | _axes("q", pose.orientation, "xyzw") | _axes("u", linear)
+    return {**vectors, "absolute": absolute, "unknown": 0.0}
 
 
 def _odometry(topic: str, number: int, v: Values) -> Columns:
@@ -161,15 +150,10 @@ def _nothing(_: str, __: int, ___: Values) -> Columns:
     yield from ()
 
 
-def _vector(m: Any) -> dict[str, float]:
-    field = m.magnetic_field
-    return {"x": field.x, "y": field.y, "z": field.z}
-
-
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind(MAGNETIC, _vector, _nothing, doubles=12),
+        Kind(MAGNETIC, lambda m: _axes("", m.magnetic_field), _nothing, doubles=12),
         Kind("sensor_msgs/Imu", _imu_row, lambda _, __, v: _angles(v), doubles=37),
         Kind("sensor_msgs/NavSatFix", _fix_row, _fix),
         Kind("nav_msgs/Odometry", _odometry_row, _odometry),

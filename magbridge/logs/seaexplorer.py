@@ -66,14 +66,7 @@ NAMES = {
     "LEGATO_PRESSURE": ("water_pressure", "dbar", 1.0),
 }
 NAV_ONLY = {
-    "Altitude",
-    "DesiredH",
-    "BallastCmd",
-    "LinCmd",
-    "AngCmd",
-    "NavState",
-    "SecurityLevel",
-    "Declination",
+    *("Altitude", "DesiredH", "BallastCmd", "LinCmd", "AngCmd", "NavState", "SecurityLevel", "Declination")
 }
 """Columns of the navigation that are no telemetry of what is."""
 

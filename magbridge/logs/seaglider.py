@@ -101,9 +101,7 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
     for axis in "xyz":
         if raw and f"mag_{axis}" not in raw:
             raise FormatError(
-                path,
-                "expected this variable, as of a Seaglider with a raw compass",
-                column=f"eng_mag_{axis}",
+                path, "expected this variable, as of a Seaglider with a raw compass", column=f"eng_mag_{axis}"
             )
     columns = {
         ours: known.sampled[theirs] for ours, (theirs, _) in SAMPLED.items() if theirs in known.sampled

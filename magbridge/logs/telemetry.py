@@ -198,10 +198,7 @@ class Rows:
         """Return the first `n` rows; the attributes count the losses since the last call."""
         array, self.rows = np.array(self.rows[:n]), self.rows[n:]
         lost = self.reader.bytes_skipped, self.reader.damages
-        attrs = {
-            "bytes_skipped": lost[0] - self._skipped,
-            "damages": lost[1] - self._damages,
-        }
+        attrs = {"bytes_skipped": lost[0] - self._skipped, "damages": lost[1] - self._damages}
         self._skipped, self._damages = lost
         columns = {name: array[:, k] for name, k in self._slot.items() if k}
         if "heading" in columns:

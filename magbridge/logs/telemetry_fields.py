@@ -16,17 +16,9 @@ from magbridge.mavlink.dialect import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import split_index
 
 __all__ = [
-    "IMUS",
-    "POWER_CYCLE",
-    "SOURCES",
-    "TELEMETRY",
-    "UNKNOWN_INT",
-    "Columns",
-    "Declared",
-    "Value",
-    "correction",
-    "sample",
-]
+    "IMUS", "POWER_CYCLE", "SOURCES", "TELEMETRY", "UNKNOWN_INT", "Columns", "Declared", "Value",
+    "correction", "sample",
+]  # fmt: skip
 
 Columns = dict[str, float]
 

@@ -15,22 +15,9 @@ from magbridge.mavlink.dialect import MESSAGES
 from magbridge.mavlink.messages import Message, spec
 
 __all__ = [
-    "AFTER",
-    "BEFORE_V2",
-    "EXTRA",
-    "HEADER",
-    "LAST",
-    "MAGIC",
-    "MORE",
-    "NOT_A_FRAME",
-    "SIGNATURE",
-    "SIGNED",
-    "V1",
-    "V2",
-    "find_magic",
-    "frame_end",
-    "message",
-]
+    "AFTER", "BEFORE_V2", "EXTRA", "HEADER", "LAST", "MAGIC", "MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED",
+    "V1", "V2", "find_magic", "frame_end", "message",
+]  # fmt: skip
 
 V1: Final = 0xFE
 V2: Final = 0xFD

@@ -5,19 +5,20 @@ from __future__ import annotations
 import re
 from functools import cache
 from struct import Struct
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
 
 from magbridge.mavlink.dialect import MESSAGES
 
-__all__ = ["BAD_DATA", "REFUSED", "Field", "Message", "Spec", "east_e7", "spec", "split_index"]
+__all__ = ["BAD_DATA", "REFUSED", "Field", "Message", "Spec", "by_id", "east_e7", "spec", "split_index"]
 
 BAD_DATA: Final = -1
 """`Message.id` of bytes that belonged to no frame."""
 REFUSED: Final = -2
 """`Message.id` of a frame whose signature is missing, wrong or old."""
 
+T = TypeVar("T")
 TURN_E7 = 3_600_000_000
 """A full circle in 1e-7 deg."""
 IDS = {name: number for number, (name, _, _) in MESSAGES.items()}
@@ -133,6 +134,11 @@ def spec(message: int | str) -> Spec:
         No such message.
     """
     return Spec(message) if isinstance(message, int) else spec(IDS[message])
+
+
+def by_id(**of: T) -> dict[int, T]:
+    """Return what is named after messages, as what handles them, by their ids; KeyError: there is no such."""
+    return {spec(name).id: one for name, one in of.items()}
 
 
 class Message(msgspec.Struct, frozen=True, gc=False):

@@ -98,11 +98,7 @@ class Signing:
     """
 
     def __init__(
-        self,
-        key: bytes,
-        last: int = 0,
-        streams: Iterable[Stream] = (),
-        follow: tuple[int, int] | None = None,
+        self, key: bytes, last: int = 0, streams: Iterable[Stream] = (), follow: tuple[int, int] | None = None
     ) -> None:
         self._key, self._follow = key, follow
         self.last = last

@@ -34,8 +34,12 @@ def bundle(state: State, now: float, link: str) -> bytes:
         Where the bridge was heard.
     """
     wall = time.time() - now
+
+    def utc(when: float) -> str:
+        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall + when))
+
     about: dict[str, Any] = {
-        "made": _utc(wall + now),
+        "made": utc(now),
         "magbridge": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -45,26 +49,19 @@ def bundle(state: State, now: float, link: str) -> bytes:
         "measured": measured(state),
         "health": {name: text for name, (text, _) in health(state, now).items()},
         "navigation": {name: text for name, (text, _) in whereabouts(state, now).items()},
-        "flags": {name: _utc(wall + since) for name, (since, _) in state.flags.items()},
+        "flags": {name: utc(since) for name, (since, _) in state.flags.items()},
         "MAG_STATUS": {name: repr(value) for name, value in state.status.items()},
     }
     files = {
         "about.json": json.dumps(about, indent=1, ensure_ascii=False),
         "texts.csv": _table(
             ["time", "severity", "text"],
-            [[_utc(wall + received.time), received.severity, received.text] for received in state.texts],
+            [[utc(received.time), received.severity, received.text] for received in state.texts],
         ),
         "alarms.csv": _table(
             ["since", "last", "active", "acknowledged", "count", "alarm"],
             [
-                [
-                    _utc(wall + one.since),
-                    _utc(wall + one.last),
-                    one.active,
-                    one.acknowledged,
-                    one.count,
-                    one.text,
-                ]
+                [utc(one.since), utc(one.last), one.active, one.acknowledged, one.count, one.text]
                 for one in state.alarms
             ],
         ),
@@ -89,10 +86,6 @@ def _table(names: list[str], rows: list[list[Any]]) -> str:
     writer.writerow(names)
     writer.writerows(rows)
     return text.getvalue()
-
-
-def _utc(when: float) -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(when))
 
 
 def _version(name: str) -> str:

@@ -65,20 +65,10 @@ def options(name: str, unit: str, *, small: bool = False) -> dict[str, Any]:
         "DIGITS", "3" if small else "2"
     )
     line = {"type": "line", "symbol": "none", "color": BLUE}
-    band = {
-        **line,
-        "stack": "band",
-        "stackStrategy": "all",
-        "lineStyle": {"opacity": 0},
-        "tooltip": {"show": False},
-    }
-    slider = {
-        "type": "slider",
-        "height": 16,
-        "bottom": 2,
-        "borderColor": "transparent",
-        "textStyle": {"color": GREY},
-    }
+    unseen = {"lineStyle": {"opacity": 0}, "tooltip": {"show": False}}
+    band = {**line, **unseen, "stack": "band", "stackStrategy": "all"}
+    grey = {"borderColor": "transparent", "textStyle": {"color": GREY}}
+    slider = {"type": "slider", "height": 16, "bottom": 2, **grey}
     return {
         "useUTC": True,
         "animation": False,

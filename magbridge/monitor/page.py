@@ -102,15 +102,8 @@ class Page:
         self._offer(list(states))
         state, moment = self._state, now()
         self._show_stream(state, moment)
-        for panel in (
-            self._figures,
-            self._flags,
-            self._health,
-            self._navigation,
-            self._learning,
-            self._texts,
-            self._parameters,
-        ):
+        panels = self._figures, self._flags, self._health, self._navigation, self._learning
+        for panel in (*panels, self._texts, self._parameters):
             panel.show(state, moment)
         self._sound = self._alarms.sound
         self._alarms.show(state, moment)
@@ -167,14 +160,8 @@ class Page:
             figures = [f"{name}: {' '.join(texts)} nT" for name, texts in measured(self._state).items()]
             flags = ", ".join(self._state.flags) or "none"
             who = self._from.text
-        lines = [
-            self._name(),
-            who,
-            *figures[:2],
-            ";  ".join(figures[2:]),
-            f"Flags: {flags}",
-            self._stream.text,
-        ]
+        shown = [*figures[:2], ";  ".join(figures[2:]), f"Flags: {flags}", self._stream.text]
+        lines = [self._name(), who, *shown]
         ui.run_javascript(f"magbridge.snapshot({json.dumps(lines)}, {json.dumps(self._name() + '.png')})")
 
     def _report(self) -> None:

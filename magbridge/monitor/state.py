@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import inf, isclose, isfinite, nan
 from typing import Any, NamedTuple
 
-from magbridge.mavlink import Message, spec
+from magbridge.mavlink import Message, by_id
 from magbridge.mavlink.dialect import MAG_NAVIGATION_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
 from magbridge.monitor.alarms import Alarms
 from magbridge.monitor.history import Series, TrackPoint, Trail
@@ -113,26 +113,13 @@ class State:
         self._sequence = sequence
         self._piece = (0, -1)
         self._asked = -inf
-        self._handlers = {
-            spec(name).id: handle
-            for name, handle in {
-                "MAG_FIELD": self._field,
-                "MAG_RAW": self._raw,
-                "MAG_STATUS": self._status,
-                "MAG_NAVIGATION": self._navigation,
-                "MAG_LEARNING": self._learning,
-                "STATUSTEXT": self._text,
-                "PARAM_VALUE": self._value,
-            }.items()
-        }
-        self._overheard = {
-            spec(name).id: handle
-            for name, handle in {
-                "NAMED_VALUE_FLOAT": self._named_value,
-                "GLOBAL_POSITION_INT": self._position,
-                "GPS_RAW_INT": self._position,
-            }.items()
-        }
+        self._handlers = by_id(
+            MAG_FIELD=self._field, MAG_RAW=self._raw, MAG_STATUS=self._status,
+            MAG_NAVIGATION=self._navigation, MAG_LEARNING=self._learning,
+            STATUSTEXT=self._text, PARAM_VALUE=self._value,
+        )  # fmt: skip
+        place = dict.fromkeys(("GLOBAL_POSITION_INT", "GPS_RAW_INT"), self._position)
+        self._overheard = by_id(NAMED_VALUE_FLOAT=self._named_value, **place)
 
     def receive(self, message: Message, now: float) -> None:
         """Take a message of the bridge that came at `now`."""

@@ -152,10 +152,7 @@ def series(
         "lineStyle": {"width": 2},
     }
     shape = ellipse(by_field[-1]) if by_field else []
-    lines = [
-        ("Vehicle's own", ORANGE, _places(own)),
-        ("By the field", BLUE, _places(by_field)),
-    ]
+    lines = [("Vehicle's own", ORANGE, _places(own)), ("By the field", BLUE, _places(by_field))]
     found: list[dict[str, Any]] = [
         {"type": "custom", ":renderItem": PICTURE, "silent": True, "clip": True, "tooltip": {"show": False},
          "data": [list(background.box)] if background else []}

@@ -12,22 +12,9 @@ from nicegui import ui
 from magbridge.monitor.link import now
 
 __all__ = [
-    "AMBER",
-    "FADED",
-    "GREEN",
-    "GRID",
-    "INK",
-    "MUTED",
-    "RED",
-    "STYLE",
-    "Changes",
-    "button",
-    "card",
-    "clock",
-    "fact",
-    "nothing",
-    "slanted",
-]
+    "AMBER", "FADED", "GREEN", "GRID", "INK", "MUTED", "RED", "STYLE", "Changes", "button", "card", "clock",
+    "fact", "nothing", "slanted",
+]  # fmt: skip
 
 STYLE = """
 :root, .q-header {--ink: #1e293b; --good: #15803d; --doubt: #b45309; --bad: #b91c1c; --faded: #64748b}

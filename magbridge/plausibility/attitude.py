@@ -19,8 +19,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from magbridge.plausibility.judge import DOUBTFUL
 from magbridge.plausibility.told import Told
-from magbridge.records import Quality
 
 __all__ = ["Attitude"]
 
@@ -42,9 +42,6 @@ CLIP: Final = 16.0
 HUBER: Final = 3.0
 ALARM: Final = 12.0
 CALM: Final = 6.0
-UNSTEADY: Final = int(
-    Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN | Quality.IMPLAUSIBLE
-)
 
 
 class Attitude:
@@ -87,7 +84,7 @@ class Attitude:
         quality : int
             Flags so far.
         """
-        look = not quality & UNSTEADY and not 0 <= self._next_us - time_us <= EVERY_US
+        look = not quality & DOUBTFUL and not 0 <= self._next_us - time_us <= EVERY_US
         if not (look or self._wrong) or not total > 0.0:
             return 0.0
         x, y, z = x / total, y / total, z / total

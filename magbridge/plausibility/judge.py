@@ -13,10 +13,13 @@ from magbridge.plausibility.scatter import Scatter
 from magbridge.plausibility.told import Told
 from magbridge.records import Quality, Vector
 
-__all__ = ["Plausibility"]
+__all__ = ["DOUBTFUL", "Plausibility"]
 
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 UNSTEADY: Final = int(Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
+"""Flags of a sample by which no level is followed."""
+DOUBTFUL: Final = UNSTEADY | IMPLAUSIBLE
+"""Flags of one from which nothing is learned."""
 
 
 class Plausibility:

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from magbridge.plausibility.judge import DOUBTFUL
 from magbridge.plausibility.told import Told
-from magbridge.records import Quality
 
 __all__ = ["Turns"]
 
@@ -40,9 +40,6 @@ DRIFT: Final = 3.0
 ALARM: Final = 25.0
 MOST: Final = 75.0
 """Of the sum, at most: as many turns without a fault as make it 0 end a doubt."""
-UNSTEADY: Final = int(
-    Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN | Quality.IMPLAUSIBLE
-)
 
 
 class Turns:
@@ -81,7 +78,7 @@ class Turns:
         quality : int
             Flags so far.
         """
-        if quality & UNSTEADY or 0 <= self._next_us - time_us <= EVERY_US or not total > 0.0:
+        if quality & DOUBTFUL or 0 <= self._next_us - time_us <= EVERY_US or not total > 0.0:
             return self._largest if self._wrong else 0.0
         self._next_us = time_us + EVERY_US
         apart_us = time_us - self._anchor_us

@@ -20,18 +20,9 @@ from typing import NamedTuple
 from zlib import crc32
 
 __all__ = [
-    "Column",
-    "Segment",
-    "Stream",
-    "column",
-    "pack",
-    "request",
-    "segment",
-    "slip",
-    "source",
-    "stream",
+    "Column", "Segment", "Stream", "column", "pack", "request", "segment", "slip", "source", "stream",
     "unslip",
-]
+]  # fmt: skip
 
 END = b"\xc0"
 LIMIT = 2 * (512 + 4)
