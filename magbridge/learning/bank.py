@@ -23,7 +23,8 @@ from math import log
 from typing import Final
 
 from magbridge.arrays import FloatArray
-from magbridge.learning.doubt import LEAST, Alarm
+from magbridge.learning.causes import Alarm
+from magbridge.learning.doubt import LEAST
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.judge import BEYOND_CHANCE
 from magbridge.learning.model import TEMPERATURE, Model

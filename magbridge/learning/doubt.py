@@ -25,27 +25,17 @@ A cause is learned by giving the estimator what its test knows: the amplitude is
 from __future__ import annotations
 
 from math import log, sqrt
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
-from magbridge.arrays import FloatArray, IndexArray
+from magbridge.arrays import FloatArray
+from magbridge.learning.causes import CAUSES, FROM_ZERO, NO_COEFFICIENT, Alarm, Cause, Signs
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.model import TEMPERATURE, Model
 
-__all__ = ["CAUSES", "LEAST", "NO_COEFFICIENT", "Alarm", "Doubt", "Signs"]
+__all__ = ["LEAST", "Doubt"]
 
-CAUSES: Final = {
-    "offset_step": 20.0,
-    "offset_drift": 20.0,
-    "temperature_offset": 2.0,
-    "unmodelled_actuator": 20.0,
-    "current_field": 20.0,
-    "clock_offset": 2.0,
-    "map_error": 50.0,
-}
-"""Cause -> the unit of its amplitude: nT, nT/h, nT/degC, nT a half range, nT/A, s, nT. A bit each in
-MAG_LEARNING."""
 LEAST: Final = 18.0
 """h, from which on the data are no longer explained. With eight causes there are 2.7 onsets a sample: by
 chance once in ``e^18 / 2.7`` samples at most, 3 years of 0.25 Hz, while the noise is as stated.
@@ -56,77 +46,10 @@ PROMISING: Final = 6.0
 """L from which on it is not."""
 STANDS_OUT: Final = 3.0
 """Sigmas of an innovation at which the first onset begins anew."""
-FROM_ZERO: Final = ("offset_step", "current_field", "clock_offset", "map_error")
-"""Causes that add as much as their regressor, not as much as it has changed since the onset."""
-NO_COEFFICIENT: Final = frozenset(("clock_offset", "map_error"))
-"""Causes that no coefficient can take up."""
 COMPETING: Final = log(20.0)
 """How far behind the best a cause may be, and still fit."""
 NOISIER_OVER: Final = 3000
 """Samples over which it is followed how much noisier the innovations are than their sigma."""
-
-
-class Signs(NamedTuple):
-    """What a sample's causes would do to its residual.
-
-    Attributes
-    ----------
-    time : float
-        s.
-    offset : (3,) array
-        Derivative of the residual by the offset of each axis.
-    positions : tuple of float
-        Parameters, scaled to their range.
-    watched : tuple of float
-        degC and A: temperature and currents; NaN where unknown.
-    clock : float
-        nT/s: how the residual changes with the telemetry's time.
-    level : float
-        By the reference's level.
-    """
-
-    time: float
-    offset: FloatArray
-    positions: tuple[float, ...]
-    watched: tuple[float, ...]
-    clock: float
-    level: float
-
-
-class Cause(NamedTuple):
-    """One to test: its name, the telemetry it follows, and the states (3,) that would take it up, if any."""
-
-    name: str
-    channel: str
-    states: IndexArray | None
-
-
-class Alarm(NamedTuple):
-    """The model no longer explains the data.
-
-    Attributes
-    ----------
-    causes : tuple of str
-        Which fit, the likeliest first.
-    channels : tuple of str
-        The telemetry that each follows; empty for none.
-    since : float
-        s, when the likeliest began.
-    size : float
-        nT, root mean square of what it adds to the total field.
-    strength : float
-        L of the likeliest.
-    mapless : bool
-        It is only the map that is doubted, and rock that it does not show explains the data: what is
-        corrected is in no doubt, and the alarm stands as long as it is raised.
-    """
-
-    causes: tuple[str, ...]
-    channels: tuple[str, ...]
-    since: float
-    size: float
-    strength: float
-    mapless: bool = False
 
 
 class Doubt:

@@ -22,7 +22,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.learning.doubt import LEAST, Alarm
+from magbridge.learning.causes import Alarm
+from magbridge.learning.doubt import LEAST
 from magbridge.learning.observation import Observation
 from magbridge.records import Vector
 

@@ -44,6 +44,8 @@ class Nuisance:
 
     Attributes
     ----------
+    spread : float
+        As given.
     initial : (3, 3) array
         Covariance at the start, and far from any sample.
     white : float
@@ -52,6 +54,7 @@ class Nuisance:
 
     def __init__(self, noise: Noise, spread: float, length: float = LENGTH) -> None:
         slow = (1.0 - noise.white) * noise.sensor**2 if noise.autocorrelation > 0.0 else 0.0
+        self.spread = spread
         self._decay = noise.autocorrelation, noise.interval or 1.0
         self._lambda = sqrt(3.0) / length
         self.initial = np.diag([spread**2, (spread * self._lambda) ** 2, slow])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from magbridge.learning.doubt import NO_COEFFICIENT, Alarm
+from magbridge.learning.causes import NO_COEFFICIENT, Alarm, named
 from magbridge.records import Quality
 
 __all__ = ["Standing"]
@@ -84,12 +84,9 @@ class Standing:
         self._cover()
         if anew:
             self._doubted, self._sure = 0, alarm.strength + self._slower * SURE
-        names = " or ".join(alarm.causes[:2]).replace("_", " ")
-        if before is None:
-            return f"unexplained{' still' * bool(self.relapses)}: {alarm.size:.0f} nT, {names}"
-        if not self.relapses and before.causes != alarm.causes and len(alarm.causes) == 1:
-            return f"unexplained: it is {names}"
-        return ""
+        if before is not None:
+            return ""
+        return f"unexplained{' still' * bool(self.relapses)}: {alarm.size:.0f} nT, {named(alarm.causes)}"
 
     def learned(self) -> bool:
         """Take note that what is behind the alarm was learned; return whether that ends the doubt."""

@@ -19,7 +19,7 @@ from magbridge.calibration.file import calibration_id, load
 from magbridge.cli import main
 from magbridge.config import load as load_config
 from magbridge.errors import ConfigError
-from magbridge.learning.doubt import CAUSES
+from magbridge.learning.causes import CAUSES
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.mavlink.dialect import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from magbridge.diagnose.causes import CAUSES
-from magbridge.learning import doubt
+from magbridge.learning import causes
 
 
 def test_a_cause_learned_in_flight_has_a_name_of_the_diagnosis() -> None:
-    assert set(doubt.CAUSES) <= set(CAUSES)
-    assert set(doubt.FROM_ZERO) <= set(doubt.CAUSES)
+    assert set(causes.CAUSES) <= set(CAUSES)
+    assert set(causes.FROM_ZERO) <= set(causes.CAUSES)

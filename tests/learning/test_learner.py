@@ -89,13 +89,32 @@ def test_a_step_is_doubted_named_and_ends_when_learned() -> None:
     added[1300:] = [15.0, 15.0, -15.0]
     doubted = learn(learner, World(known, 2400), added=added)
     assert 1300 <= doubted[0] < 1320
-    texts = [notice.text for notice in learner.notices]
-    assert "offset step" in next(text for text in texts if text.startswith("unexplained"))
+    texts = [notice.text for notice in learner.notices if "explained" in notice.text]
+    assert len(texts) == 2
+    assert texts[0].startswith("unexplained: ")
+    assert "offset step" in texts[0]
+    assert texts[1].startswith("explained again: offset step, learned ")
     assert learner.flags == 0
     assert learner.variance == 0.0
     shifted = World(known, 2400)
     shifted.field += added[-1]
     assert error_of(learner.calibration, shifted) < 1.6
+
+
+def test_a_sample_that_waits_is_not_kept_across_a_power_on() -> None:
+    """What was measured before has other offsets: it is as if it had not been."""
+    known, learners = calibration(), (Learner(calibration()), Learner(calibration()))
+    for learner, before in zip(learners, (0.0, 4.0), strict=True):
+
+        def power(n: int, learner: Learner = learner) -> None:
+            if n == 99:
+                learner.restarted()
+
+        world = World(known, 105)
+        world.field[99] += before
+        learn(learner, world, seen=power)
+    one, other = (learner.learned().coefficients for learner in learners)
+    np.testing.assert_array_equal(one, other)
 
 
 def test_sigma_covers_what_is_not_explained() -> None:

@@ -1,0 +1,94 @@
+"""What may be behind data that the model no longer explains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from magbridge.arrays import FloatArray, IndexArray
+
+__all__ = ["CAUSES", "FROM_ZERO", "NO_COEFFICIENT", "Alarm", "Cause", "Signs", "named"]
+
+CAUSES: Final = {
+    "offset_step": 20.0,
+    "offset_drift": 20.0,
+    "temperature_offset": 2.0,
+    "unmodelled_actuator": 20.0,
+    "current_field": 20.0,
+    "clock_offset": 2.0,
+    "map_error": 50.0,
+}
+"""Cause -> the unit of its amplitude: nT, nT/h, nT/degC, nT a half range, nT/A, s, nT. A bit each in
+MAG_LEARNING."""
+FROM_ZERO: Final = ("offset_step", "current_field", "clock_offset", "map_error")
+"""Causes that add as much as their regressor, not as much as it has changed since the onset."""
+NO_COEFFICIENT: Final = frozenset(("clock_offset", "map_error"))
+"""Causes that no coefficient can take up."""
+
+
+def named(causes: Sequence[str]) -> str:
+    """Return the likeliest two of `causes` in words."""
+    return " or ".join(causes[:2]).replace("_", " ")
+
+
+class Signs(NamedTuple):
+    """What a sample's causes would do to its residual.
+
+    Attributes
+    ----------
+    time : float
+        s.
+    offset : (3,) array
+        Derivative of the residual by the offset of each axis.
+    positions : tuple of float
+        Parameters, scaled to their range.
+    watched : tuple of float
+        degC and A: temperature and currents; NaN where unknown.
+    clock : float
+        nT/s: how the residual changes with the telemetry's time.
+    level : float
+        By the reference's level.
+    """
+
+    time: float
+    offset: FloatArray
+    positions: tuple[float, ...]
+    watched: tuple[float, ...]
+    clock: float
+    level: float
+
+
+class Cause(NamedTuple):
+    """One to test: its name, the telemetry it follows, and the states (3,) that would take it up, if any."""
+
+    name: str
+    channel: str
+    states: IndexArray | None
+
+
+class Alarm(NamedTuple):
+    """The model no longer explains the data.
+
+    Attributes
+    ----------
+    causes : tuple of str
+        Which fit, the likeliest first.
+    channels : tuple of str
+        The telemetry that each follows; empty for none.
+    since : float
+        s, when the likeliest began.
+    size : float
+        nT, root mean square of what it adds to the total field.
+    strength : float
+        L of the likeliest.
+    mapless : bool
+        It is only the map that is doubted, and rock that it does not show explains the data: what is
+        corrected is in no doubt, and the alarm stands as long as it is raised.
+    """
+
+    causes: tuple[str, ...]
+    channels: tuple[str, ...]
+    since: float
+    size: float
+    strength: float
+    mapless: bool = False

@@ -1,0 +1,175 @@
+"""What is learned and doubted since the first calibration was begun with: estimators, and tests of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.model import Calibration
+from magbridge.learning.bank import Bank
+from magbridge.learning.causes import Alarm, Signs
+from magbridge.learning.doubt import Doubt
+from magbridge.learning.estimator import Estimator
+from magbridge.learning.hindsight import Hindsight, Kept
+from magbridge.learning.intake import Sample
+from magbridge.learning.model import Model
+from magbridge.learning.nuisance import Nuisance
+from magbridge.learning.observation import Observation, observe
+from magbridge.learning.start import Start
+from magbridge.records import Vector
+
+__all__ = ["Knowledge"]
+
+LINEAR: Final = 300.0
+"""nT, 1-sigma of an axis's offset: from here on it is fitted anew as a whole."""
+CREEP: Final = 3.0 / 86_400.0**0.5
+"""nT per square root of a second: an offset walks by 3 nT a day."""
+OUTLIER: Final = 5.0
+AGREE: Final = 3
+"""An innovation beyond so many sigmas says nothing, unless it is the third in a row."""
+
+
+class Knowledge:
+    """What the samples since have taught.
+
+    Parameters
+    ----------
+    model : Model
+    first : Calibration
+        The one to begin with; its offsets may have changed at this power-on.
+    nuisance : Nuisance
+        About the reference.
+    mapless : Nuisance or None
+        About the main field, where the reference is a map.
+    turn_on : float
+        nT, 1-sigma of that change.
+
+    Attributes
+    ----------
+    bank, doubt
+        The estimators, and what the first of them does not explain.
+    start : Start or None
+        While a filter cannot go on alone.
+    nuisance, noise
+        As found so far.
+    """
+
+    def __init__(
+        self, model: Model, first: Calibration, nuisance: Nuisance, mapless: Nuisance | None, turn_on: float
+    ) -> None:
+        self._model, self._mapless, self.nuisance, self.noise = model, mapless, nuisance, first.noise
+        self._field, offsets = first.reference.field, model.offsets
+        coefficients, covariance = model.coefficients(first)
+        quiet = Estimator(coefficients, covariance, offsets, nuisance, CREEP)
+        quiet.open(turn_on**2)
+        self.bank, self.doubt = Bank(model, quiet, mapless), Doubt(model, quiet)
+        self.hindsight, self._outliers = Hindsight(), 0
+        self._before: FloatArray | None = None
+        self.start: Start | None = None
+        if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * LINEAR**2:
+            self.start = Start(model, coefficients, covariance, self._field)
+        else:
+            self.bank.suppose()
+
+    @property
+    def believed(self) -> Nuisance:
+        """Without the map, while that is doubted."""
+        return self._mapless if self.bank.map_doubted and self._mapless else self.nuisance
+
+    def observe(self, field: Vector, nine: FloatArray, reference: float) -> Observation:
+        """Return what a field (nT) is by nine coefficients (9,)."""
+        return observe(field, nine, self._field, reference)
+
+    def _by(self, one: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
+        """Return what a field, at some regressors (m,), is by an estimator's coefficients."""
+        return lambda field, phi, reference: self.observe(
+            field, phi @ self._model.weights(one.coefficients), reference
+        )
+
+    def look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> Alarm | None:
+        """Test whether the regressors (m,) reported now fit earlier samples better than those of then."""
+        if self.start is not None:
+            return None
+        return self.hindsight.test(time_us, phi, positions, self._by(self.bank.quiet))
+
+    def keep(self, sample: Sample, innovation: float) -> None:
+        """Keep a sample that is wrong by an innovation (nT), to look back at."""
+        self.hindsight.keep(Kept(*sample[:5], innovation, self.bank.quiet.variance))
+
+    def keep_faulty(self, sample: Sample) -> None:
+        """Keep a sample that is not predicted."""
+        quiet = self.bank.quiet
+        now = self._by(quiet)(sample.field, sample.phi, sample.reference)
+        self.keep(sample, now.e - quiet.expected)
+
+    def predict(self, sample: Sample, metres: float, seconds: float) -> tuple[Observation, Signs]:
+        """Let all predict a sample, so far and so late after the one before.
+
+        Returns
+        -------
+        Observation
+            What it is by the estimator to believe.
+        Signs
+            What would move it.
+        """
+        before, self._before = self._before, sample.phi
+        quiet = self.bank.quiet
+        for other in self.bank.all[1:]:
+            other.propagate(metres, seconds)
+        self.doubt.propagate(quiet, quiet.propagate(metres, seconds), seconds)
+        live = {id(one): self._predict(one, sample) for one in self.bank.all}
+        self.keep(sample, quiet.residual)
+        now, clock = live[id(quiet)], 0.0
+        if before is not None and 0.0 < seconds < 30.0:  # what it would be, were telemetry a second late
+            clock = (self._by(quiet)(sample.field, before, sample.reference).e - now.e) / seconds
+        offset, level = now.by_nine[6:], -1.0 / now.s
+        signs = Signs(sample.time_us * 1e-6, offset, tuple(sample.positions), sample.watched, clock, level)
+        return live[id(self.bank.best)], signs
+
+    def _predict(self, one: Estimator, sample: Sample) -> Observation:
+        live = self._by(one)(sample.field, sample.phi, sample.reference)
+        one.predict(live.e, live.s, self._model.derivative(sample.phi, live.by_nine))
+        one.follow(live.s)
+        return live
+
+    def outlying(self, *, learnable: bool) -> bool:
+        """Whether the sample is an outlier that no other agrees with, nor a `learnable` doubt explains."""
+        if self.start is not None:
+            return False
+        best = self.bank.best
+        far = abs(best.residual) > OUTLIER * best.sigma
+        self._outliers = self._outliers + 1 if far else 0
+        return far and self._outliers < AGREE and not learnable
+
+    def learn(self, signs: Signs, *, frozen: bool) -> tuple[Alarm | None, bool]:
+        """Doubt what was predicted, and learn from it; return a doubt, and whether it taught anything."""
+        quiet = self.bank.quiet
+        alarm = self.doubt.test(quiet, signs)
+        for other in self.bank.all[1:]:
+            other.update(learn=other.telling and not frozen)
+        learn = quiet.telling and not frozen
+        self.doubt.updated(quiet.update(learn=learn))
+        return alarm, learn
+
+    def begin(self, sample: Sample, metres: float, seconds: float) -> bool:
+        """Learn from a sample while next to nothing is known; return whether all so far were fitted anew."""
+        assert self.start is not None
+        quiet = self.bank.quiet
+        if not self.start.add(sample.field, sample.phi, sample.reference, metres, seconds):
+            quiet.update(learn=True)
+            return False
+        fitted = self.start.fit(quiet.coefficients, self.nuisance)
+        self.noise = msgspec.structs.replace(self.noise, sensor=fitted.noise)
+        self.nuisance = Nuisance(self.noise, self.nuisance.spread)
+        quiet.know(fitted.coefficients, fitted.nuisances, fitted.covariance, self.nuisance)
+        return True
+
+    def go_on(self) -> None:
+        """Let the filters go on alone, if they can."""
+        if self.start is not None and self.start.over:
+            self.start = None
+            self.bank.suppose()
