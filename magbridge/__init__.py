@@ -35,7 +35,8 @@ here, too, where Ctrl-C would still print a traceback, nothing at all is importe
 TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge import plot
-    from magbridge.calibration.correct import Corrector, correct
+    from magbridge.calibration.correct import correct
+    from magbridge.calibration.corrector import Corrector
     from magbridge.calibration.file import load, save
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.observe import observations
@@ -58,7 +59,7 @@ __all__ = [
 _HOMES = {
     "Calibration": "calibration.model",
     "Correction": "correction",
-    "Corrector": "calibration.correct",
+    "Corrector": "calibration.corrector",
     "MagbridgeError": "errors",
     "__version__": "version",
     "correct": "calibration.correct",

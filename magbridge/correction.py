@@ -12,7 +12,7 @@ from math import inf, isfinite, nan, sqrt
 from typing import Any
 
 from magbridge.align import Aligner, Sample
-from magbridge.calibration.correct import Corrector
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import RAISED, Calibration, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField

@@ -84,10 +84,15 @@ class _Connection(Stream):
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
-        self.drop()
+        self.close()
         self._connection = connection
 
-    def drop(self) -> None:
+    @property
+    def up(self) -> bool:
+        """Whether there is a connection."""
+        return self._connection is not None
+
+    def close(self) -> None:
         """Close the connection and forget what was to be sent on it."""
         if self._connection is not None:
             self._connection.close()
@@ -102,21 +107,12 @@ class TcpClient(_Connection):
         super().__init__(name)
         self._address = address
 
-    @property
-    def up(self) -> bool:
-        """Whether it is connected."""
-        return self._connection is not None
-
     def open(self) -> None:
         """Connect, waiting at most a second; raises :class:`PortError`."""
         try:
             self.adopt(socket.create_connection(self._address, timeout=1.0))
         except OSError as error:
             raise PortError(self.name, error.strerror or str(error)) from error
-
-    def close(self) -> None:
-        """Close the connection."""
-        self.drop()
 
 
 class _Client(_Connection):
@@ -127,18 +123,9 @@ class _Client(_Connection):
         self.since = time.monotonic()
         self.adopt(connection)
 
-    @property
-    def up(self) -> bool:
-        """Whether it is still there."""
-        return self._connection is not None
-
     def open(self) -> None:
         """Raise :class:`PortError`: a client comes by itself."""
         raise PortError(self.name, "not connected")
-
-    def close(self) -> None:
-        """Close the connection."""
-        self.drop()
 
 
 class TcpServer(Port):

@@ -1,49 +1,33 @@
-"""Correct raw samples: one arithmetic for one sample and for a million, with the same bits.
-
-Notes
------
-The equations stand in :mod:`.arithmetic`, and are the same code for one sample and for many.
-
-Where a channel of the field or a position is NaN, or so large that the total field exceeds
-:data:`~magbridge.records.BEYOND`, total and vector are NaN and the sigmas infinite. The flag is ``gap`` if
-the field's channels are the reason, else ``stale_telemetry``. The total is never a guess.
-"""
+"""Correct raw samples, many at once: the bits of :class:`.corrector.Corrector`, whose arithmetic it is."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import inf, isnan, nan, sqrt
-from typing import Any, Final, NamedTuple
+from math import inf
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.arithmetic import (
-    Linear,
-    Numbers,
-    Prepared,
-    apply,
-    for_arrays,
-    largest,
-    linear,
-    prepare,
+from magbridge.calibration.arithmetic import for_arrays
+from magbridge.calibration.corrector import (
+    EXTRAPOLATED,
+    GAP,
+    STALE_TELEMETRY,
+    base_flags,
+    begun,
+    omega,
+    ranges,
 )
-from magbridge.calibration.kernel import FARTHEST, Kernel
+from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Series, Step
 from magbridge.errors import CalibrationError
-from magbridge.records import BEYOND, Corrected, Quality
+from magbridge.records import BEYOND
 
-__all__ = ["CorrectedArrays", "Corrector", "correct", "regressors"]
+__all__ = ["CorrectedArrays", "correct", "regressors"]
 
-Span = tuple[int, float, float]
 CHUNK = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
-GAP: Final = int(Quality.GAP)
-STALE_TELEMETRY: Final = int(Quality.STALE_TELEMETRY)
-EXTRAPOLATED: Final = int(Quality.EXTRAPOLATED)
-MARGIN = 0.02
-"""Share of the half range: telemetry that jitters at the end of its range is not extrapolated."""
 MANY = for_arrays()
 
 
@@ -58,200 +42,6 @@ class CorrectedArrays(NamedTuple):
     """`vector`, `vector_sigma`, (n, 3): Body axes; sensor axes where ``no_boresight`` is set."""
     quality: IntArray
     """(n,)."""
-
-
-def _omega(calibration: Calibration) -> tuple[float, ...] | None:
-    """Six entries of the boresight's covariance, as :func:`.arithmetic.apply` takes them."""
-    if calibration.boresight is None:
-        return None
-    O = calibration.boresight.covariance  # noqa: E741 - Omega, as in the equation
-    return O[0][0], O[1][1], O[2][2], O[0][1], O[0][2], O[1][2]
-
-
-def _begun(calibration: Calibration) -> list[Step]:
-    """Return a stepper for each effect, in a fresh state."""
-    return [effect.begin(calibration.channels, calibration.kernel) for effect in calibration.effects]
-
-
-class Corrector:
-    """Corrects sample after sample, as the bridge does.
-
-    Parameters
-    ----------
-    calibration : Calibration
-
-    Notes
-    -----
-    While positions and the regressors of effects stay the same, only :func:`.arithmetic.apply` runs anew.
-    """
-
-    def __init__(self, calibration: Calibration) -> None:
-        self.calibration = calibration
-        self._kernel = calibration.kernel
-        self._omega = _omega(calibration)
-        self._steps = _begun(calibration)
-        self._base = _base_flags(calibration)
-        self._ranges = _ranges(calibration)
-        self._wanted = len(calibration.channels)
-        self._values: tuple[float, ...] | None = None
-        self._flags = self._base
-        self._last: list[float] = []
-        self._prepared: Prepared = [], []
-        self._weights: list[Linear] = [tuple(row) for row in self._kernel.weights.tolist()]
-        self._positions = len(calibration.parameters)
-        self._asked: tuple[tuple[float, ...], Sequence[Span]] = (), ()
-        self._ends: list[tuple[int, int]] = []
-        self._places: dict[tuple[float, ...], int] = {}
-        self._there: list[Linear] = []
-        self._field = (nan, nan, nan)
-        self._time_us = 0
-
-    @property
-    def regressors(self) -> list[float]:
-        """The regressors at the last sample: the monomials, then those of effects."""
-        return self._last
-
-    def replace(self, calibration: Calibration, values: Sequence[float] = ()) -> float:
-        """Go on with other coefficients of the same terms, or with effects more or fewer at the end.
-
-        Parameters
-        ----------
-        calibration : Calibration
-            Effects that it has in common with the one before keep their state.
-        values : sequence of float
-            Its channels at the last sample; needed where it has effects more.
-
-        Returns
-        -------
-        float
-            nT, by which the total field of the last sample changes; NaN if there was none.
-        """
-        before = apply(*self._field, self._prepared, self._omega)[0] if self._last else nan
-        self.calibration, self._kernel, self._omega = calibration, calibration.kernel, _omega(calibration)
-        self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
-        self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
-        self._wanted, self._base = len(calibration.channels), _base_flags(calibration)
-        del self._steps[len(calibration.effects) :]
-        regressors = self._last[: len(self._weights)]
-        for effect in calibration.effects[len(self._steps) :]:
-            step = effect.begin(calibration.channels, self._kernel)
-            self._steps.append(step)
-            if self._last:
-                regressors += step(self._time_us, *self._field, values)
-        self._last = regressors
-        if not self._last:
-            return nan
-        self._prepared = prepare(self._kernel.sums_of_one(self._last))
-        return apply(*self._field, self._prepared, self._omega)[0] - before
-
-    def step(
-        self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int = 0
-    ) -> Corrected:
-        """Correct one sample; see :meth:`numbers`."""
-        (F, sigma, x, y, z, sx, sy, sz), quality = self.numbers(time_us, field, values, quality)
-        return Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
-
-    def numbers(
-        self, time_us: int, field: tuple[float, float, float], values: Sequence[float], quality: int
-    ) -> tuple[Numbers, int]:
-        """Correct one sample; return total field, its sigma, the vector, its sigmas, and the flags.
-
-        Parameters
-        ----------
-        time_us : int
-            µs since 1970 UTC.
-        field : tuple of 3 float
-            nT, raw, sensor axes.
-        values : sequence of float
-            ``calibration.channels``, in that order; NaN where unknown.
-        quality : int
-            Flags that the sample already carries.
-
-        Raises
-        ------
-        CalibrationError
-            Another number of values than the calibration's channels.
-        """
-        if len(values) != self._wanted:
-            raise CalibrationError(
-                f"expected {self._wanted} values ({', '.join(self.calibration.channels)}), "
-                f"found {len(values)}"
-            )
-        hx, hy, hz = self._field = field
-        self._time_us = time_us
-        values = tuple(values)
-        if values != self._values or self._steps:
-            self._values, self._flags = values, self._flags_of(values)
-            regressors = self._kernel.monomials(values, 1.0)
-            for effect in self._steps:
-                regressors += effect(time_us, hx, hy, hz, values)
-            if regressors != self._last:
-                self._last = regressors
-                self._prepared = prepare(self._kernel.sums_of_one(regressors))
-        F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega)
-        quality |= self._flags
-        if not F < BEYOND:  # also NaN
-            quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < BEYOND else GAP
-            F = x = y = z = nan
-            sigma = sx = sy = sz = inf
-        return (F, sigma, x, y, z, sx, sy, sz), quality
-
-    def _flags_of(self, values: tuple[float, ...]) -> int:
-        flags = self._base
-        for value, (low, high) in zip(values, self._ranges, strict=False):
-            if not low <= value <= high:
-                flags |= STALE_TELEMETRY if isnan(value) else EXTRAPOLATED
-        return flags
-
-    def changes(
-        self, field: tuple[float, float, float], values: tuple[float, ...], spans: Sequence[Span]
-    ) -> list[float]:
-        """Return by how much (nT) the total field changes over each span of a position, without effects.
-
-        Parameters
-        ----------
-        field : tuple of 3 float
-            nT, raw, sensor axes.
-        values : tuple of float
-            ``calibration.channels``, in that order.
-        spans : sequence of (int, float, float)
-            Index of a channel, and the two values between which it lies. Spans of channels that are no
-            positions are left out of the result.
-        """
-        positions = values[: self._positions]
-        asked = positions, spans
-        if asked != self._asked:
-            self._asked = asked
-            known = {place: self._there[n] for place, n in self._places.items()}
-            places: dict[tuple[float, ...], int] = {}  # each once: most spans share an end
-            self._ends = []
-            for index, low, high in spans:
-                if index < self._positions:
-                    before, after = positions[:index], positions[index + 1 :]
-                    start = places.setdefault((*before, low, *after), len(places))
-                    self._ends.append((start, places.setdefault((*before, high, *after), len(places))))
-            self._places = places
-            self._there = [known.get(place) or self._linear_at(place) for place in places]
-        totals = [_total(field, there) for there in self._there]
-        return [totals[high] - totals[low] for low, high in self._ends]
-
-    def _linear_at(self, positions: tuple[float, ...]) -> Linear:
-        """Return A's six entries and T; NaN if the positions are too far off."""
-        phi = self._kernel.monomials(positions, 1.0)
-        if not largest(phi) < FARTHEST:
-            return nan, nan, nan, nan, nan, nan, nan, nan, nan
-        return linear(phi, self._weights)
-
-
-def _total(field: tuple[float, float, float], there: Linear) -> float:
-    """Return ``|A (H_r - T)|``."""
-    xx, yy, zz, xy, xz, yz, tx, ty, tz = there
-    hx, hy, hz = field
-    dx, dy, dz = hx - tx, hy - ty, hz - tz
-    bx = xx * dx + xy * dy + xz * dz
-    by = xy * dx + yy * dy + yz * dz
-    bz = xz * dx + yz * dy + zz * dz
-    return sqrt(bx * bx + by * by + bz * bz)
 
 
 def correct(
@@ -288,17 +78,17 @@ def correct(
             f"found {channels.shape[1]}"
         )
     out = np.empty((8, n))
-    kernel, omega = calibration.kernel, _omega(calibration)
-    steps = _begun(calibration)
+    kernel, turn = calibration.kernel, omega(calibration)
+    steps = begun(calibration)
     with np.errstate(all="ignore"):  # NaN in, NaN out: flagged below
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             prepared = _prepare_many(kernel, phi)
             hx, hy, hz = field[part].T
-            out[:, part] = MANY.apply(hx, hy, hz, prepared, omega)
-        quality = np.full(n, _base_flags(calibration))
-        for value, (low, high) in zip(channels.T, _ranges(calibration), strict=False):
+            out[:, part] = MANY.apply(hx, hy, hz, prepared, turn)
+        quality = np.full(n, base_flags(calibration))
+        for value, (low, high) in zip(channels.T, ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
             quality |= np.where(np.isnan(value), STALE_TELEMETRY, 0)
         lost = ~(out[0] < BEYOND)
@@ -349,15 +139,3 @@ def _prepare_many(kernel: Kernel, phi: FloatArray) -> Any:
     linear, V = MANY.prepare(list(kernel.sums(phi)))
     back = np.cumsum(new) - 1
     return [row[back] for row in linear], [[row[back] for row in entry] for entry in V]
-
-
-def _base_flags(calibration: Calibration) -> int:
-    flags = Quality(0) if calibration.boresight else Quality.NO_BORESIGHT
-    return int(flags | Quality.UNCALIBRATED) if calibration.method == "none" else int(flags)
-
-
-def _ranges(calibration: Calibration) -> list[tuple[float, float]]:
-    return [
-        (parameter.low - MARGIN * parameter.scale, parameter.high + MARGIN * parameter.scale)
-        for parameter in calibration.parameters
-    ]

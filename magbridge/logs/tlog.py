@@ -21,8 +21,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
-from types import TracebackType
-from typing import Self
 
 from magbridge.mavlink import pack_records
 from magbridge.records import Channel
@@ -106,22 +104,8 @@ class TlogWriter:
         """Records dropped so far."""
         return self._refused + self._dropped
 
-    def write(self, time_us: int, channel: int, frame: bytes) -> None:
-        """Log one frame; returns at once and never raises.
-
-        Parameters
-        ----------
-        time_us : int
-            µs since 1970 UTC of the event, a multiple of 4.
-        channel : Channel
-            Where the frame came from.
-        frame : bytes
-            One whole MAVLink frame.
-        """
-        self.extend([(time_us, channel, frame)])
-
     def extend(self, records: Sequence[Record]) -> None:
-        """Log the frames of an event, as :meth:`write` does.
+        """Log the frames of an event, each with its time and channel; returns at once and never raises.
 
         There must be at least one, since none ends the writing thread. The caller must not change the list.
         """
@@ -134,14 +118,6 @@ class TlogWriter:
         """Write the queue and end; wait for a stalled disk at most `timeout` s."""
         self._queue.put(())
         self._thread.join(timeout)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _run(self) -> None:
         """Write what has come, until an event without records ends it."""

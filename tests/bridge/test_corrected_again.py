@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ def test_what_was_set_in_the_course_of_the_log_is_told(
     station = Codec(1, 1)
     log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
     asked = {10: ("MB_SETTLE_TIME", 4.0), 20: ("MB_SETTLE_TIME", -1.0), 30: ("MB_R_HIGHRES_IMU", 1.0)}
-    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as writer:
+    with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as writer:
         for k in range(40):
             if k in asked:
                 name, value = asked[k]
@@ -57,7 +58,7 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
     rng = np.random.default_rng(1)
     pipeline = small_bridge(tmp_path, Start(START, KEPT), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
-    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as log:
+    with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for k in range(400):
             position = np.nan if 300 <= k < 310 else 0.1 * (k // 50)
             if rng.random() < 0.4 and not 200 <= k < 260:
@@ -87,7 +88,7 @@ def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
     """The rows of a log do not tell that the bridge stood still for 5 s, while the mass moved."""
     pipeline = small_bridge(tmp_path, Start(START), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
-    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as log:
+    with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for k in range(20):
             if k == 10:
                 stall = states.standstill(START + k * 1_000_000, 5_000_000)

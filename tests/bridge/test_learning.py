@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pipeline, li
     folder = tmp_path_factory.mktemp("flight")
     pipeline = bridge(folder)
     sent = []
-    with TlogWriter(folder / "logs", header=pipeline.declarations) as log:
+    with closing(TlogWriter(folder / "logs", header=pipeline.declarations)) as log:
         for event in events(folder):
             sent += pipeline.feed(event)
             log.extend(pipeline.recorder.drain())
@@ -151,7 +152,7 @@ def test_the_causes_bits_are_those_of_the_dialect() -> None:
 def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     """Without a calibration, the field is flagged until there is one; the log gives the same again."""
     pipeline, sent = bridge(tmp_path, known=False), []
-    with TlogWriter(tmp_path / "logs", header=pipeline.declarations) as log:
+    with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for event in events(tmp_path):
             sent += pipeline.feed(event)
             log.extend(pipeline.recorder.drain())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from math import cos, pi, sin
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
     pipeline = bridge(tmp_path, Start(START, {"MB_GAP_FACTOR": 2.0}))
     folder, aside = tmp_path / "logs", tmp_path / "aside"
     now = {"MB_GAP_FACTOR": 3.0}
-    with TlogWriter(folder, beginning=pipeline.beginning(now), max_size=0.05) as log:
+    with closing(TlogWriter(folder, beginning=pipeline.beginning(now), max_size=0.05)) as log:
 
         def play(begin: int, end: int) -> None:
             for event in events(pipeline, begin, end):
@@ -94,7 +95,7 @@ def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> No
     fed = list(events(pipeline, 0, 60))
     lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
     header = declarations(1, 191, pipeline._config.telemetry, 0.0)
-    with TlogWriter(tmp_path / "logs", header=header, max_size=1e-3) as log:
+    with closing(TlogWriter(tmp_path / "logs", header=header, max_size=1e-3)) as log:
         sent = pipeline.feed(Event(fed[-1].time_us, Channel.SENSOR, lines))
         log.extend(pipeline.recorder.drain())
     files = sorted((tmp_path / "logs").iterdir())

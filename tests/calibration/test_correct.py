@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from magbridge.calibration.correct import Corrector, correct
+from magbridge.calibration.correct import correct
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.dipole import Dipole
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.forward import forward

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from posed import FIELD, T0, calibrated, regressors_of, surveyed, walk
 
-from magbridge.calibration.correct import Corrector, correct
+from magbridge.calibration.correct import correct
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect

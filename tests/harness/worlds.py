@@ -7,7 +7,7 @@ from math import nan
 
 import numpy as np
 
-from magbridge.calibration.correct import Corrector
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.field.grid import AnomalyGrid

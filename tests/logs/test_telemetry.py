@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -292,10 +293,10 @@ def test_time_that_goes_back_drops_the_row(tmp_path: Path) -> None:
 
 def test_a_live_log_is_read_back(tmp_path: Path) -> None:
     codec = Codec(1, 191)
-    with TlogWriter(tmp_path, max_size=0.01) as log:
+    with closing(TlogWriter(tmp_path, max_size=0.01)) as log:
         for k in range(500):
             frame = codec.pack("MAG_RAW", time_usec=T0 + k * S + 1, x=k, temperature=np.nan, supply=np.nan)
-            log.write(T0 + k * S, Channel.SENT, frame)
+            log.extend([(T0 + k * S, Channel.SENT, frame)])
     files = sorted(tmp_path.iterdir())
     assert len(files) > 2
     with files[-1].open("ab") as file:
@@ -316,10 +317,10 @@ def test_every_file_of_a_live_log_says_what_its_parameters_are(tmp_path: Path) -
         unit="deg",
     )
     codec = Codec(1, 1)
-    with TlogWriter(tmp_path, max_size=0.01, header=declarations(1, 191, {"servo2": servo})) as log:
+    with closing(TlogWriter(tmp_path, max_size=0.01, header=declarations(1, 191, {"servo2": servo}))) as log:
         for k in range(500):
-            log.write(T0 + k * S, Channel.LINK, codec.pack("SERVO_OUTPUT_RAW", servo2_raw=1600))
-            log.write(T0 + k * S, Channel.LINK, codec.pack("RAW_IMU", xmag=1))
+            log.extend([(T0 + k * S, Channel.LINK, codec.pack("SERVO_OUTPUT_RAW", servo2_raw=1600))])
+            log.extend([(T0 + k * S, Channel.LINK, codec.pack("RAW_IMU", xmag=1))])
     files = sorted(tmp_path.iterdir())
     assert len(files) > 2
     for path in files:
@@ -334,15 +335,15 @@ def test_channels_are_what_the_driver_made_of_its_counts(tmp_path: Path) -> None
     counts = np.random.default_rng(1).integers(-(2**22), 2**22, (100, 3))
     field = counts * nt_per_count
     codec = Codec(1, 191)
-    with TlogWriter(tmp_path, header=declarations(1, 191, {}, nt_per_count)) as log:
-        log.write(T0, Channel.STATE, codec.pack("MAG_BRIDGE_START"))
+    with closing(TlogWriter(tmp_path, header=declarations(1, 191, {}, nt_per_count))) as log:
+        log.extend([(T0, Channel.STATE, codec.pack("MAG_BRIDGE_START"))])
         for k, (channels, numbers) in enumerate(zip(field, counts.tolist(), strict=True)):
             values = dict(
                 zip(("x", "y", "z", "count_x", "count_y", "count_z"), (*channels, *numbers), strict=True)
             )
             if k == 99:
                 values |= {"count_x": 0, "count_y": 0, "count_z": 0}
-            log.write(T0 + k * S, Channel.SENT, codec.pack("MAG_RAW", time_usec=T0 + k * S, **values))
+            log.extend([(T0 + k * S, Channel.SENT, codec.pack("MAG_RAW", time_usec=T0 + k * S, **values))])
     back = logs.read(sorted(tmp_path.iterdir()))
     for axis, exact in zip("xyz", field.T, strict=True):
         single = exact.astype(np.float32).astype(float)

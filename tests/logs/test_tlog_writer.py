@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -29,9 +29,9 @@ def records(path: Path, size: int = 8 + len(FRAME)) -> list[tuple[int, bytes]]:
 
 
 def test_records_carry_time_and_channel(tmp_path: Path) -> None:
-    with TlogWriter(tmp_path / "new" / "logs") as log:
+    with closing(TlogWriter(tmp_path / "new" / "logs")) as log:
         for k, channel in enumerate(Channel):
-            log.write(T0 + 4 * k, channel, FRAME)
+            log.extend([(T0 + 4 * k, channel, FRAME)])
     (path,) = (tmp_path / "new" / "logs").iterdir()
     assert path.name == "20231114T221320Z_0001.tlog"
     assert records(path) == [(T0 + 4 * k | channel, FRAME) for k, channel in enumerate(Channel)]
@@ -39,9 +39,9 @@ def test_records_carry_time_and_channel(tmp_path: Path) -> None:
 
 
 def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
-    with TlogWriter(tmp_path) as log:
+    with closing(TlogWriter(tmp_path)) as log:
         for k in range(3):
-            log.write(T0 + 4 * k, 0, FRAME)
+            log.extend([(T0 + 4 * k, 0, FRAME)])
             deadline = time.monotonic() + 5
             while log.records <= k:
                 assert time.monotonic() < deadline
@@ -54,10 +54,13 @@ def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
 def test_two_runs_in_one_folder_keep_apart(tmp_path: Path) -> None:
     """By name, so that each replays although both began in the same second."""
     frames = FRAME, FRAME[::-1]
-    with TlogWriter(tmp_path, max_size=1e-3) as one, TlogWriter(tmp_path, max_size=1e-3) as other:
+    with (
+        closing(TlogWriter(tmp_path, max_size=1e-3)) as one,
+        closing(TlogWriter(tmp_path, max_size=1e-3)) as other,
+    ):
         for k in range(60):
             for log, frame in zip((one, other), frames, strict=True):
-                log.write(T0 + 4_000_000 * k, 0, frame)
+                log.extend([(T0 + 4_000_000 * k, 0, frame)])
                 while log.records <= k:
                     time.sleep(0.001)
     files = sorted(tmp_path.iterdir())
@@ -67,9 +70,9 @@ def test_two_runs_in_one_folder_keep_apart(tmp_path: Path) -> None:
 
 def test_new_file_by_size_and_by_age_loses_nothing(tmp_path: Path) -> None:
     step = 4_000_000
-    with TlogWriter(tmp_path, max_size=1e-3, max_age=0.01) as log:  # 20 records, 36 s
+    with closing(TlogWriter(tmp_path, max_size=1e-3, max_age=0.01)) as log:  # 20 records, 36 s
         for k in range(100):
-            log.write(T0 + step * k, 0, FRAME)
+            log.extend([(T0 + step * k, 0, FRAME)])
     files = sorted(tmp_path.iterdir())
     assert [record for path in files for record in records(path)] == [
         (T0 + step * k, FRAME) for k in range(100)
@@ -81,8 +84,8 @@ def test_new_file_by_size_and_by_age_loses_nothing(tmp_path: Path) -> None:
 
 def test_files_of_an_earlier_run_are_left_alone(tmp_path: Path) -> None:
     for text in (b"one", b"two"):
-        with TlogWriter(tmp_path) as log:
-            log.write(T0, 0, text)
+        with closing(TlogWriter(tmp_path)) as log:
+            log.extend([(T0, 0, text)])
     assert [path.read_bytes()[8:] for path in sorted(tmp_path.iterdir())] == [b"one", b"two"]
 
 
@@ -90,13 +93,13 @@ def test_directory_that_cannot_be_made_is_said_and_tried_again(tmp_path: Path) -
     """As where a disk is there only some seconds after the bridge."""
     directory = tmp_path / "disk" / "logs"
     directory.parent.write_text("")
-    with TlogWriter(directory) as log:
-        log.write(T0, 0, FRAME)
+    with closing(TlogWriter(directory)) as log:
+        log.extend([(T0, 0, FRAME)])
         while not log.failure:
             time.sleep(0.001)
         assert (log.lost, log.failure) == (1, "Not a directory")
         directory.parent.unlink()
-        log.write(T0 + tlog.RETRY_US, 0, FRAME)
+        log.extend([(T0 + tlog.RETRY_US, 0, FRAME)])
     assert (log.records, log.failure) == (1, "")
 
 
@@ -112,7 +115,7 @@ frame, k = bytes({FRAME!r}), 0
 def put(n, step):
     global k
     for _ in range(n):
-        log.write({T0} + step * k, 0, frame)
+        log.extend([({T0} + step * k, 0, frame)])
         k += 1
         time.sleep(0.0005)
     while log.records + log.lost < k:
@@ -143,13 +146,13 @@ def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
 
     def write(time_us: int) -> tuple[int, int, str]:
         before = log.records + log.lost
-        log.write(time_us, Channel.SENT, FRAME)
+        log.extend([(time_us, Channel.SENT, FRAME)])
         while log.records + log.lost == before:
             time.sleep(0.001)
         return log.records, log.lost, log.failure
 
     folder = tmp_path / "logs"
-    with TlogWriter(folder) as log:
+    with closing(TlogWriter(folder)) as log:
         assert write(T0) == (1, 0, "")
         (path,) = folder.iterdir()
         path.unlink()
@@ -163,20 +166,20 @@ def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
 def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(tmp_path: Path) -> None:
     header, begin = bytes([0xFD]) * len(FRAME), bytes([0xFE]) * len(FRAME)
     folder, aside = tmp_path / "logs", tmp_path / "aside"
-    with TlogWriter(folder, header=[header], beginning=[begin], max_age=1e-3) as log:
+    with closing(TlogWriter(folder, header=[header], beginning=[begin], max_age=1e-3)) as log:
         for k in (0, 1, 2):
-            log.write(T0 + k * 4_000_000, 0, FRAME)
+            log.extend([(T0 + k * 4_000_000, 0, FRAME)])
         while log.records < 3:
             time.sleep(0.001)
         folder.rename(aside)
         folder.write_text("no folder")
-        log.write(T0 + 12_000_000, 0, FRAME)
+        log.extend([(T0 + 12_000_000, 0, FRAME)])
         while not log.failure:
             time.sleep(0.001)
         folder.unlink()
         aside.rename(folder)
         for k in (4, 5):
-            log.write(T0 + k * 4_000_000, 0, FRAME)
+            log.extend([(T0 + k * 4_000_000, 0, FRAME)])
     written = [[frame for _, frame in records(path)] for path in sorted(folder.iterdir())]
     assert written == [[FRAME, header]] * 3 + [[begin, header, FRAME], [FRAME, header]]
 
@@ -189,14 +192,14 @@ def test_stalled_disk_drops_and_counts_and_never_blocks(
     monkeypatch.setattr(tlog, "QUEUE", 3_000)
     monkeypatch.setattr(os, "open", lambda *_: outlet)
     log = TlogWriter(tmp_path)
-    log.write(T0, 0, FRAME)
+    log.extend([(T0, 0, FRAME)])
     time.sleep(0.1)
     monkeypatch.undo()
     monkeypatch.setattr(tlog, "QUEUE", 3_000)
     slowest, machine = 0.0, standstill()
     for k in range(20_000):
         begin = time.monotonic()
-        log.write(T0 + 4 * k, 0, FRAME)
+        log.extend([(T0 + 4 * k, 0, FRAME)])
         if (took := time.monotonic() - begin) > slowest:
             slowest = max(slowest, took - machine.seconds(begin, begin + took))
         if k % 1000 == 0:
@@ -206,7 +209,7 @@ def test_stalled_disk_drops_and_counts_and_never_blocks(
     os.set_blocking(inlet, False)
     while log._thread.is_alive():
         log.close(timeout=0.01)
-        with contextlib.suppress(BlockingIOError):
+        with suppress(BlockingIOError):
             os.read(inlet, 1 << 20)
     os.close(inlet)
 
@@ -217,7 +220,7 @@ import sys, time
 from magbridge.logs.tlog import TlogWriter
 log = TlogWriter({str(tmp_path)!r})
 for k in range(100_000):
-    log.write({T0} + 4 * k, 0, bytes({FRAME!r}))
+    log.extend([({T0} + 4 * k, 0, bytes({FRAME!r}))])
     print(k, flush=True)
     time.sleep(0.001)
 """

@@ -13,7 +13,8 @@ from benchmarks.row import Row
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from magbridge.calibration.correct import CHUNK, Corrector, correct
+from magbridge.calibration.correct import CHUNK, correct
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.observe import observations

@@ -157,6 +157,10 @@ def fit(
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
     if in_place:
         method = "survey"
+    if method != "survey" and options.get("position_sigma"):
+        raise CalibrationError(
+            "position_sigma: the log does not show the rock, so its positions do not matter"
+        )
     # one thread: for matrices this small threads cost more than they gain, and the order of sums is fixed
     with threadpool_limits(1, "blas"):
         if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
