@@ -10,6 +10,7 @@ from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.evidence import Widths
+from magbridge.calibration.fitting.latent import in_chunks
 from magbridge.field.place.blocks import Factor, NearInverse
 from magbridge.field.place.matern import Matern
 from magbridge.survey.roughness import Roughness
@@ -144,8 +145,13 @@ class Gridded:
     def at_samples(self, samples: Samples) -> FloatArray:
         """Return the anomaly (n,), nT, at the samples' own places and depths."""
         deeper, rough = np.nan_to_num(samples.depth - self.middle), self.roughness.at(samples.place)
-        parts = [
-            one.weight * (rough * (one.field.basis(samples.place, deeper) @ one.w) - one.mean)
-            for one in self.posteriors
-        ]
-        return np.asarray(self.mean + sum(parts))
+
+        def some(rows: slice) -> FloatArray:
+            parts = [
+                one.weight
+                * (rough[rows] * (one.field.basis(samples.place[rows], deeper[rows]) @ one.w) - one.mean)
+                for one in self.posteriors
+            ]
+            return np.asarray(self.mean + sum(parts))
+
+        return in_chunks(len(rough), some)

@@ -28,7 +28,16 @@ from magbridge.calibration.fitting.field_search import (
     climb,
 )
 from magbridge.calibration.fitting.joint import Linear, Reduced, Sums, add_up, eliminate
-from magbridge.calibration.fitting.latent import NOTHING, Group, likeliest, slow_functions, with_groups
+from magbridge.calibration.fitting.latent import (
+    CHUNK,
+    NOTHING,
+    Columns,
+    Group,
+    in_chunks,
+    likeliest,
+    slow_functions,
+    with_groups,
+)
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
@@ -55,8 +64,6 @@ LARGE, LIKELIER = 100.0, 5.0
 """Areas of a length's square, and nats, from which on the field's size may vary from place to place."""
 MOST = 40_000
 """Nodes at most; their variances take 0.5 GB."""
-CHUNK = 16_384
-"""Rows at a time."""
 
 
 class _Problem:
@@ -67,17 +74,24 @@ class _Problem:
         self.mean = float(np.median(samples.value))
         self.middle = float(np.nanmedian(samples.depth))
         self.deeper = np.nan_to_num(samples.depth - self.middle)
-        self.D = np.concatenate([group.functions for group in groups], axis=1)
+        self.D = Columns(groups)
         self.scale = roughness.at(samples.place)
         self.kept = np.ones(len(samples.value), bool)
 
-    def basis(self, field: Matern, rows: IndexArray) -> csr_array:
+    def basis(self, field: Matern, rows: IndexArray | slice) -> csr_array:
         known = field.basis(self.samples.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.scale[rows]) @ known)
 
     def mean_over_samples(self, field: Matern) -> FloatArray:
         """Return what each of the field's coefficients adds to the samples' mean: (nodes,)."""
-        return np.asarray(self.basis(field, np.flatnonzero(self.kept)).mean(axis=0)).ravel()
+        kept, total = np.flatnonzero(self.kept), np.zeros(field.nodes.size)
+        for start in range(0, len(kept), CHUNK):
+            total += self.basis(field, kept[start : start + CHUNK]).sum(axis=0)
+        return total / len(kept)
+
+    def rock(self, field: Matern, w: FloatArray) -> FloatArray:
+        """Return what coefficients w (nodes,) of a field are at every sample: (n,), nT."""
+        return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def sums(self, field: Matern, rows: IndexArray, modes: bool = False) -> Sums:
         return add_up(self._pieces(field, rows, modes))
@@ -125,7 +139,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         widths = maximise(reduced.quadratic, family, weighed.eta, sigma)
         z, _ = _solved(reduced, widths, family)
         w = reduced.field(z)
-        e = samples.value - problem.mean - problem.D @ z - problem.basis(choice.field, every) @ w
+        e = samples.value - problem.mean - problem.D @ z - problem.rock(choice.field, w)
         e = e / problem.scale  # where the rock is rough, so is what no node resolves
         if turn or not (far := np.abs(e) > OUTLIER * max(robust_scale(e), widths.sigma)).any():
             break
@@ -246,7 +260,7 @@ def _considered(
     rows: IndexArray,
 ) -> FloatArray:
     """Return how the field's coefficients follow the calibration's modes: (nodes, r), 1-sigma each."""
-    q = problem.D.shape[1]
+    q = len(problem.D)
     sums = problem.sums(choice.field, rows, modes=True)
     all_in = eliminate(sums, choice.field, choice.ratio, choice.rho)
     H = all_in.quadratic.H / widths.sigma**2

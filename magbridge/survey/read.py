@@ -218,18 +218,23 @@ def _placed(ds: xr.Dataset, value: FloatArray, lines: FloatArray, label: int) ->
 def _modes(calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray) -> FloatArray:
     """Return what each uncertain combination of coefficients does to the samples (n, r), nT for 1-sigma."""
 
-    def moved(by: FloatArray, rows: slice) -> FloatArray:
+    def total(calibration: Calibration, rows: slice) -> FloatArray:
+        return correct(calibration, field[rows], channels[rows], time[rows]).total
+
+    def moved(by: FloatArray, rows: slice, unmoved: FloatArray) -> FloatArray:
         shifted = replace(calibration, coefficients=calibration.coefficients + by)
-        up = correct(shifted, field[rows], channels[rows], time[rows]).total
-        return np.nan_to_num(up - correct(calibration, field[rows], channels[rows], time[rows]).total)
+        return np.nan_to_num(total(shifted, rows) - unmoved)
 
     values, vectors = np.linalg.eigh(calibration.covariance)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))
     few = slice(None, None, max(len(field) // THINNED, 1))
-    seen = np.stack([moved(root, few) for root in roots.T], axis=1)
+    here = total(calibration, few)
+    seen = np.stack([moved(root, few, here) for root in roots.T], axis=1)
     _, sizes, turned = np.linalg.svd(seen, full_matrices=False)
     kept = [k for k in range(min(MODES, len(sizes))) if sizes[k] / np.sqrt(len(seen)) > FAINT]
-    columns = [moved(roots @ turned[k], slice(None)) for k in kept]
+    every = slice(None)
+    here = total(calibration, every)
+    columns = [moved(roots @ turned[k], every, here) for k in kept]
     return np.stack(columns, axis=1) if columns else np.empty((len(field), 0))
 
 

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.fitting import in_place
+from magbridge.calibration.fitting import rounds
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.field_nodes import nodes_for
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
-from magbridge.calibration.fitting.joint import Sums
+from magbridge.calibration.fitting.joint import Linear, Sums, add_up, eliminate
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Noise, identity
@@ -151,16 +153,16 @@ def test_a_long_survey_is_searched_with_the_part_about_its_middle(
     survey: Survey, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The rock's size and length are that part's, the calibration and the nodes those of all samples."""
-    used, few = [], in_place._Rounds._few
+    used, few = [], rounds._Rounds._few
 
-    def counted(rounds: in_place._Rounds, field: Matern) -> Sums:
-        sums = few(rounds, field)
+    def counted(own: rounds._Rounds, field: Matern) -> Sums:
+        sums = few(own, field)
         used.append(sums.samples)
         return sums
 
-    monkeypatch.setattr(in_place, "SEARCHED", 600)
-    monkeypatch.setattr(in_place, "WIDE", 0.0)
-    monkeypatch.setattr(in_place._Rounds, "_few", counted)
+    monkeypatch.setattr(rounds, "SEARCHED", 600)
+    monkeypatch.setattr(rounds, "WIDE", 0.0)
+    monkeypatch.setattr(rounds._Rounds, "_few", counted)
     data, true, _ = survey
     found = fit(data)
     assert 500 < max(used) <= 601
@@ -170,12 +172,38 @@ def test_a_long_survey_is_searched_with_the_part_about_its_middle(
     assert 0.8 < error / sigma < 1.25
 
 
+def test_a_long_log_comes_to_rest_with_few_samples_and_ends_with_all(
+    survey: Survey, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What every sixth sample tells is a start; calibration and sigma are those of all samples."""
+    data, true, _ = survey
+    whole = fit(data)
+    used, sums = [], rounds._Rounds._sums
+
+    def counted(own: rounds._Rounds, *args: Any) -> Sums:
+        found = sums(own, *args)
+        used.append(found.samples)
+        return found
+
+    monkeypatch.setattr(rounds, "SETTLED", len(data) // 6)
+    monkeypatch.setattr(rounds._Rounds, "_sums", counted)
+    found = fit(data)
+    all_of_them = [number for number in used if number > len(data) // 2]
+    assert used[-1] == all_of_them[-1]
+    assert len(all_of_them) < len(used) / 4
+    error, sigma = error_of(found, data, true)
+    assert error < 1.15 * NOISE
+    assert 0.8 < error / sigma < 1.25
+    assert found.calibration.noise.sensor == pytest.approx(whole.calibration.noise.sensor, rel=0.03)
+
+
 def test_steps_that_are_shortened_get_the_rounds_they_take(
     survey: Survey, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As from a start far off: after a dozen rounds the residuals still move."""
+    damped = rounds._Rounds._damped
     monkeypatch.setattr(
-        in_place._Rounds, "_damped", lambda rounds, step, _reduced, _basis: rounds.z + 0.2 * step
+        rounds._Rounds, "_damped", lambda own, step, reduced, field: damped(own, 0.2 * step, reduced, field)
     )
     data, true, _ = survey
     error, sigma = error_of(fit(data), data, true)
@@ -367,22 +395,77 @@ def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:
     assert error < 1.25 * sigma
 
 
-@pytest.mark.parametrize(("alpha", "harmonic"), [(2, False), (3, False), (4, False), (4, True)])
-def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: bool) -> None:
-    """Away from edges the splines' variance is 1; blocks of the inverse are those of the dense one."""
+@pytest.mark.parametrize(
+    ("alpha", "harmonic", "buried"),
+    [(2, False, False), (3, False, False), (4, False, False), (4, True, False), (4, False, True)],
+)
+def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: bool, buried: bool) -> None:
+    """Away from edges the splines' variance is 1; blocks of the inverse are those of the dense one.
+
+    Of sources at a depth the edge is felt farther.
+    """
     rng = np.random.default_rng(alpha)
     place = np.cumsum(rng.normal(0, 60, (1500, 2)), axis=0)
-    field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha, harmonic)
+    field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha, harmonic, buried)
     Q = field.precision.toarray()
     B = field.basis(place[::9])
     variance = near_inverse(field.precision, field.edges).variances(B)
     np.testing.assert_allclose(variance, np.einsum("ni,ij,nj->n", B.toarray(), np.linalg.inv(Q), B.toarray()))
-    np.testing.assert_allclose(variance, 1.0, atol=0.05)
+    np.testing.assert_allclose(variance, 1.0, atol=0.2 if buried else 0.05)
     assert field.log_determinant == pytest.approx(np.linalg.slogdet(Q)[1])
     factor = Factor(field.precision)
     assert factor.log_determinant == pytest.approx(field.log_determinant)
     root = factor.draw(np.eye(field.nodes.size))
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(Q), atol=1e-6 * np.abs(np.linalg.inv(Q)).max())
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.4, 0.99])
+def test_sums_are_those_of_the_whitened_samples_however_they_are_cut(rho: float) -> None:
+    """A gap in the log, one just where a piece ends, and a sample alone."""
+    rng = np.random.default_rng(4)
+    V, B = rng.normal(size=(12, 3)), rng.normal(size=(12, 5))
+    follows = np.ones(12, bool)
+    follows[[0, 3, 4, 8]] = False
+    pieces = [(0, 4), (3, 9), (8, 12)]
+    sums = add_up(Linear(V[a:b], csr_array(B[a:b]), follows[a:b], overlap=a > 0) for a, b in pieces)
+    both = np.hstack([V, B])
+    white = both.copy()
+    white[follows] = (both[follows] - rho * both[np.flatnonzero(follows) - 1]) / np.sqrt(1.0 - rho**2)
+    found, expected = sums.whitened(rho), white.T @ white
+    assert (sums.samples, sums.pairs) == (12, 8)
+    np.testing.assert_allclose(found.VV, expected[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(found.VB, expected[:3, 3:], atol=1e-9)
+    np.testing.assert_allclose(found.BB.toarray(), expected[3:, 3:], atol=1e-9)
+
+
+def test_sources_at_a_depth_reach_far_and_are_smooth_nearby() -> None:
+    """Their correlation begins to fall as a Gaussian's of the length, and ends as a layer of dipoles'."""
+    length = 600.0
+    place = np.stack([np.linspace(0.0, 4.0 * length, 33), np.zeros(33)], axis=1)
+    field = Matern(nodes_near(place, 120.0, 3000.0), length, 4, buried=True)
+    B = field.basis(place)
+    covariance = B @ Factor(field.precision).solve(B.T.toarray())
+    correlation = covariance[0] / covariance[0, 0]
+    depth = length * np.sqrt(0.75)  # of a layer whose correlation (1 + r²/4d²)^-3/2 begins to fall so
+    layer = (1.0 + place[:, 0] ** 2 / (4.0 * depth**2)) ** -1.5
+    np.testing.assert_allclose(correlation, layer, atol=0.06)
+    assert correlation[24] > 10.0 * np.exp(-0.5 * 3.0**2)
+
+
+def test_nodes_too_fine_for_a_long_field_are_refused() -> None:
+    """Where the prior is singular to rounding, the evidence is noise that a search would climb."""
+    place = np.stack([np.linspace(0.0, 6000.0, 200), np.zeros(200)], axis=1)
+    values = np.sin(place[:, 0] / 900.0)
+
+    def evidence(fine: float) -> float:
+        field = Matern(nodes_near(place, 1500.0 / fine, 1500.0), 1500.0, 16)
+        sums = add_up([Linear(np.ones((200, 1)) * values[:, None], field.basis(place), np.zeros(200, bool))])
+        reduced = eliminate(sums, field, 50.0, 0.0)
+        return reduced.log_evidence - 0.5 * reduced.quadratic.c_0
+
+    assert evidence(5.0) == pytest.approx(evidence(4.0), abs=0.5)
+    with pytest.raises(np.linalg.LinAlgError, match="too fine"):
+        evidence(9.0)
 
 
 def test_nodes_are_as_fine_as_the_area_allows() -> None:

@@ -16,46 +16,32 @@ predicts those better, it is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.climb import Climbed, climb, thinned
 from magbridge.calibration.fitting.ends import flown
-from magbridge.calibration.fitting.evidence import Quadratic, Widths, is_maximum, maximise
-from magbridge.calibration.fitting.fit import Fit, assemble
+from magbridge.calibration.fitting.evidence import is_maximum
 from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.left_out import leave_out, refitted
-from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise, memory
+from magbridge.calibration.fitting.noise import NoiseModel, memory
 from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, nominal, nominal_samples, starts
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import Vehicle, pose
-from magbridge.calibration.fitting.prior import Prior, PriorFamily
-from magbridge.calibration.fitting.solve import Solution, covariance_of, gauss_newton
-from magbridge.calibration.residual import Samples, Whitening, jacobian, residuals, residuals_of
+from magbridge.calibration.fitting.prior import PriorFamily
+from magbridge.calibration.fitting.result import Fit, assemble
+from magbridge.calibration.fitting.solve import covariance_of
+from magbridge.calibration.residual import Samples, residuals_of
 from magbridge.errors import CalibrationError
 
 __all__ = ["fit_auto"]
 
 
-ENOUGH, BLOCK = 6000, 50
-"""Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
-ROUNDS = 16
-"""Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
 SHRUNK = 0.15
 """Departure of the middle scale from 1 that no magnetometer has."""
 USUAL = 3
 """The order that is usually enough: below it, the evidence is asked for one more."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Answer:
-    solution: Solution
-    widths: Widths
-    noise: NoiseModel
-    family: PriorFamily
-    quadratic: Quadratic
-    score: float
 
 
 def fit_auto(
@@ -110,7 +96,7 @@ def fit_auto(
     return (_simpler(data, found, best) if doubtful else None) or found
 
 
-def _simpler(data: Observations, found: Fit, best: _Answer) -> Fit | None:
+def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
     """Return the fit of one ellipsoid, if it predicts the parts left out better.
 
     Where both are one ellipsoid each is fitted again without the part; with parameters the first order tells
@@ -146,123 +132,35 @@ def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
     for n in (order, order + 1):
         posed = pose(data, n, vehicle)
         try:
-            scores.append(_best(_thinned(posed.samples), posed.family).score)
+            scores.append(_best(thinned(posed.samples), posed.family).score)
         except CalibrationError:
             return 0.0
     return scores[1] - scores[0]
 
 
-def _best(samples: Samples, family: PriorFamily) -> _Answer:
+def _best(samples: Samples, family: PriorFamily) -> Climbed:
     """Return the answer with the largest evidence among several starts."""
-    few = _thinned(samples)
+    few = thinned(samples)
     answers = []
     for start in starts(few):
         z = family.near(start)
-        answers += [_climb(few, family, z, family.centre + shift * family.spread) for shift in (0.0, 1.5)]
+        answers += [climb(few, family, z, family.centre + shift * family.spread) for shift in (0.0, 1.5)]
     for answer in sorted(answers, key=lambda answer: -answer.score):
         last = answer
         if few is not samples:
             noise = NoiseModel(answer.noise.sigma, answer.noise.autocorrelation, answer.noise.white)
-            last = _climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise)
+            last = climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise)
         if last.solution.settled and is_maximum(last.quadratic, last.family, last.widths):
             return last
     raise CalibrationError("auto: no start reached a maximum of the evidence; the data contradict themselves")
 
 
-def _remembering(samples: Samples, answer: _Answer) -> _Answer:
+def _remembering(samples: Samples, answer: Climbed) -> Climbed:
     """Return the answer whose noise is a slow part and a white one, where the residuals are of that kind."""
     for _ in range(2):
         e = residuals_of(samples, answer.family.at(answer.widths.eta).coefficients(answer.solution.z))
         noise = memory(e, samples.steps, answer.noise)
         if noise is answer.noise:
             break
-        answer = _climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise, shaped=True)
+        answer = climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise, shaped=True)
     return answer
-
-
-def _thinned(samples: Samples) -> Samples:
-    """Take blocks of neighbours evenly over all samples: enough to choose a start by."""
-    blocks = len(samples.field) // BLOCK
-    if len(samples.field) <= ENOUGH:
-        return samples
-    rows = (
-        np.linspace(0, blocks - 1, ENOUGH // BLOCK).astype(int)[:, None] * BLOCK + np.arange(BLOCK)
-    ).ravel()
-    part = samples.part(rows)
-    part.steps[::BLOCK] = np.inf
-    return part
-
-
-def _climb(
-    samples: Samples,
-    family: PriorFamily,
-    z: FloatArray,
-    eta: FloatArray,
-    noise: NoiseModel | None = None,
-    *,
-    shaped: bool = False,
-) -> _Answer:
-    """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that.
-
-    `shaped`: the memory of `noise` is kept.
-    """
-    score, white = -np.inf, noise is None
-    shape = noise.shape if noise is not None and shaped else None
-    if noise is None:
-        z, noise = _approach(samples, family.at(eta), z)
-    for step in range(ROUNDS):
-        if family.renew is not None and step:
-            family = family.renew(z)
-        # the first widths are a guess, and not worth settling at
-        solution = gauss_newton(samples, family.at(eta), noise, z, steps=50 if step else 3)
-        kept = len(samples.field) - noise.rejected
-        quadratic = Quadratic.about(solution.z, solution.normal, kept)
-        widths = maximise(quadratic, family, eta, noise.sigma)
-        eta, z = widths.eta, solution.z
-        last, score = score, _score(widths, noise, samples)
-        noise = replace(noise, sigma=widths.sigma)
-        still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
-        if still and not white:
-            break
-        # residuals of a wrong model look correlated for long, so the autocorrelation waits until it settles
-        white = white and not still and step < ROUNDS // 2
-        # at last the noise's autocorrelation and outliers are kept, so that the rest settles
-        if step < ROUNDS - 4:
-            prior = family.at(eta)
-            e = residuals_of(samples, prior.coefficients(z))
-            doubt = (0.0, 0.0) if white or shape else _doubt(samples, prior, solution, noise)
-            steps = np.where(white, np.inf, samples.steps)
-            found = estimate_noise(e, steps, widths.determined, doubt, shape)
-            noise = replace(found, sigma=widths.sigma)
-    return _Answer(solution, widths, noise, family, quadratic, score)
-
-
-def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel) -> tuple[float, float]:
-    """Variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
-    few = _thinned(samples)
-    _, g = residuals(few, prior.coefficients(solution.z))
-    J = jacobian(few.phi, g)
-    P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
-    JP = J @ (prior.E @ P @ prior.E.T)
-    next_one = few.steps[1:] == 1
-    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[next_one]))
-
-
-def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
-    """Come near the answer: after each Gauss-Newton step the noise is set to the bulk of the residuals."""
-    apart = np.full(len(samples.field), np.inf)
-    noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
-    for _ in range(ROUNDS):
-        z = gauss_newton(samples, prior, noise, z, steps=1, tolerance=0.1).z
-        last, noise = noise, estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
-        if noise.sigma > 0.8 * last.sigma:
-            break
-    return z, noise
-
-
-def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
-    """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
-    outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
-    variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
-    whitening = 0.5 * np.log(variance).sum()
-    return float(widths.log_evidence - noise.rejected * outlier - whitening)

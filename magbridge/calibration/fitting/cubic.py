@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
 from magbridge.calibration.fitting.nominal import check_scales, nominal
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.prior import Prior
+from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
 from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order

@@ -13,7 +13,7 @@ from magbridge.calibration.fitting.evidence import evidence
 from magbridge.calibration.fitting.field_nodes import NODES, SMOOTH, fine_enough, ladder, nodes_for
 from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
 from magbridge.calibration.fitting.prior import PriorFamily
-from magbridge.field.place.matern import SMOOTHNESS, Matern
+from magbridge.field.place.matern import BURIED, SMOOTHNESS, Matern
 
 __all__ = [
     "Choice",
@@ -122,7 +122,7 @@ def choose(
             field = Matern(nodes, float(length), alpha, harmonic)
             found = climb(
                 sums_of(field), Choice(field, ratio, rho), weighed,
-                move_length=False, move_rho=move_rho, steps=int(24 * effort),
+                move_length=False, move_rho=move_rho, steps=int(24 * effort), near=1.0,
             )  # fmt: skip
             ratio, rho = found.ratio, found.rho
             if best is None or found.score > best.score:
@@ -137,10 +137,10 @@ def choose(
         rough, _ = down(SMOOTHNESS[0])
         best = rough if rough.score > best.score else best
 
-    def tried(one: Choice, alpha: int, harmonic: bool) -> Choice:
+    def tried(one: Choice, alpha: int, harmonic: bool, buried: bool = False) -> Choice:
         length = one.field.length * ((one.field.alpha - 1) / (alpha - 1)) ** BENDS
         nodes = nodes_for(place, length, alpha, most if alpha <= SMOOTH else FEWER)
-        field = Matern(nodes, length, alpha, harmonic)
+        field = Matern(nodes, length, alpha, harmonic, buried)
         begin = replace(one, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 
@@ -150,6 +150,9 @@ def choose(
     if harmonic and kinds[1].score - kinds[0].score < CLEAR:
         other = tried(best, best.field.alpha, not best.field.harmonic)
         best = _smoothness(other, tried) if other.score > best.score else best
+    if best.field.alpha < SMOOTH:  # the spectrum of sources at a depth falls off slowly, too
+        other = tried(best, BURIED, best.field.harmonic, buried=True)
+        best = other if other.score > best.score else best
     return best
 
 
@@ -183,8 +186,12 @@ def climb(
     move_length: bool = True,
     move_rho: bool = True,
     steps: int = 40,
+    near: float = 0.1,
 ) -> Choice:
-    """Climb the evidence from a choice, its nodes kept; its length or its noise's memory, too, if need be."""
+    """Climb the evidence from a choice, its nodes kept, to so many nats from where it is largest, or about.
+
+    Its length or its noise's memory move, too, if need be.
+    """
     share = np.clip(max(start.rho, 0.01) / HIGHEST, 1e-6, 1.0 - 1e-6)
     moves = [0] + [1] * move_rho + [2] * move_length
     first = np.array([0.0, np.log(share / (1.0 - share)), 0.0])
@@ -209,7 +216,7 @@ def climb(
     simplex = begin + np.vstack([np.zeros(len(moves)), np.diag(np.array([0.7, 0.8, 0.3])[moves])])
     found = minimize(
         downhill, begin, method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": steps, "xatol": 0.02, "fatol": 0.05},
+        options={"initial_simplex": simplex, "maxfev": steps, "xatol": 0.05, "fatol": near},
     )  # fmt: skip
     best = at(found.x)
     rho = best.rho if best.rho > SMALL or not move_rho else 0.0

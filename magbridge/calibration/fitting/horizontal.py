@@ -21,10 +21,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import estimate_noise
 from magbridge.calibration.fitting.nominal import HARD_IRON_SIGMA, SCALE_SIGMA, check_scales, nominal_samples
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.residual import residuals_of
 from magbridge.errors import CalibrationError
 

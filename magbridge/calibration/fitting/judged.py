@@ -15,7 +15,7 @@ from magbridge.calibration.fitting.offset_terms import in_words
 from magbridge.errors import CalibrationError
 
 if TYPE_CHECKING:
-    from magbridge.calibration.fitting.fit import Fit
+    from magbridge.calibration.fitting.result import Fit
 
 __all__ = ["judged"]
 

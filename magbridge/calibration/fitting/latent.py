@@ -8,7 +8,7 @@ width may be any.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -18,7 +18,18 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.evidence import Quadratic, maximise
 from magbridge.calibration.fitting.prior import PriorFamily
 
-__all__ = ["NOTHING", "Group", "Offset", "likeliest", "slow_functions", "with_groups"]
+__all__ = [
+    "CHUNK",
+    "NOTHING",
+    "Columns",
+    "Group",
+    "Offset",
+    "Waves",
+    "in_chunks",
+    "likeliest",
+    "slow_functions",
+    "with_groups",
+]
 
 APART = 3.0 * 3600.0
 """s without a sample, after which what changes slowly starts anew."""
@@ -28,6 +39,8 @@ MOST = 60
 """Slow functions of one stretch of a log, at most."""
 LIKELIER = 6.0
 """Nats that what is offered must gain (400:1: the best of several lags gains 3 where there is nothing)."""
+CHUNK = 16_384
+"""Rows at a time."""
 NOTHING = PriorFamily(
     np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
 )
@@ -41,7 +54,7 @@ class Group:
     Attributes
     ----------
     name : str
-    functions : (n, r) array
+    functions : (n, r) array, or Waves
         What they add to the reference at every sample, nT a unit.
     shape : (r,) array
         Width of each over the group's.
@@ -52,7 +65,7 @@ class Group:
     """
 
     name: str
-    functions: FloatArray
+    functions: FloatArray | Waves
     shape: FloatArray
     width: float
     spread: float = 0.0
@@ -70,7 +83,63 @@ class Offset(Group):
     lag: float | None = None
 
 
-def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[FloatArray, FloatArray]:
+class Waves:
+    """Functions of time that change slowly, (n, r) as an array; made for the rows that are asked for.
+
+    `first` (m,) is the first sample of each stretch without a gap, `span` (m,) how long that is, s, and
+    `count` (m,) how many waves it has.
+    """
+
+    def __init__(self, time: FloatArray, fastest: float) -> None:
+        self.time, self.stretch = time, stretches(time)
+        _, first, size = np.unique(self.stretch, return_index=True, return_counts=True)
+        self.start = time[first]
+        self.span = np.maximum(time[first + size - 1] - self.start, 1e-9)
+        self.count = np.minimum(self.span / fastest, MOST).astype(int)
+        self.levels = len(first) > 1
+        """Whether each has a level against the others, too."""
+        self.edges = np.cumsum([0, *(self.count + self.levels)])
+
+    @property
+    def shape(self) -> FloatArray:
+        """The functions' widths (r,)."""
+        level = [1.0] * self.levels
+        return np.concatenate([[*(1.0 / np.arange(1, count + 1)), *level] for count in self.count])
+
+    def __getitem__(self, rows: IndexArray | slice) -> FloatArray:
+        t, of = self.time[rows], self.stretch[rows]
+        out = np.zeros((len(t), int(self.edges[-1])))
+        for k in np.unique(of).tolist():
+            mine, order = of == k, np.arange(1, self.count[k] + 1)
+            phase = np.pi * (t[mine] - self.start[k])[:, None] / self.span[k]
+            columns = [np.sqrt(2.0) * np.cos(order * phase), np.ones_like(phase)[:, : int(self.levels)]]
+            out[mine, self.edges[k] : self.edges[k + 1]] = np.hstack(columns)
+        return out
+
+    def __matmul__(self, weights: FloatArray) -> FloatArray:
+        return in_chunks(len(self.time), lambda rows: self[rows] @ weights)
+
+
+class Columns:
+    """The functions of several groups side by side, (n, p) as an array."""
+
+    def __init__(self, groups: Sequence[Group]) -> None:
+        self.parts = [group.functions for group in groups]
+        self.edges = np.cumsum([0, *(part[:1].size for part in self.parts)])
+
+    def __len__(self) -> int:
+        """How many columns there are."""
+        return int(self.edges[-1])
+
+    def __getitem__(self, rows: IndexArray | slice) -> FloatArray:
+        return np.concatenate([part[rows] for part in self.parts], axis=1)
+
+    def __matmul__(self, weights: FloatArray) -> FloatArray:
+        pieces = zip(self.parts, np.split(weights, self.edges[1:-1]), strict=True)
+        return np.asarray(sum(part @ mine for part, mine in pieces))
+
+
+def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[Waves, FloatArray]:
     """Return functions of time that change slowly (n, r), and their widths (r,) as those of a random walk.
 
     Notes
@@ -78,24 +147,13 @@ def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[FloatArr
     A random walk over a time T is the sum of ``sqrt(2) cos(pi k t/T)`` with independent weights that fall
     as 1/k (Karhunen-Loeve), beside where it starts. After a gap of :data:`APART` it starts anew.
     """
-    stretch = stretches(time)
-    many = int(stretch[-1]) + 1
-    columns, widths = [], []
-    for k in range(many):
-        mine = stretch == k
-        t = time[mine] - time[mine][0]
-        span = max(float(t[-1]), 1e-9)
-        count = min(int(span / fastest), MOST)
-        waves = np.zeros((len(time), count + (many > 1)))
-        order = np.arange(1, count + 1)
-        waves[mine, :count] = np.sqrt(2.0) * np.cos(np.pi * order * t[:, None] / span)
-        shape = 1.0 / order
-        if many > 1:  # against the other stretches, its level
-            waves[mine, -1] = 1.0
-            shape = np.append(shape, 1.0)
-        columns.append(waves)
-        widths.append(shape)
-    return np.concatenate(columns, axis=1), np.concatenate(widths)
+    waves = Waves(time, fastest)
+    return waves, waves.shape
+
+
+def in_chunks(n: int, made: Callable[[slice], FloatArray]) -> FloatArray:
+    """Return what is `made` of n rows, some at a time: bounded memory."""
+    return np.concatenate([made(slice(start, start + CHUNK)) for start in range(0, max(n, 1), CHUNK)])
 
 
 def stretches(time: FloatArray) -> IndexArray:

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.left_out import leave_out
 from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise, memory
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.prior import Prior
+from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
 from magbridge.calibration.residual import Samples, independent, residuals_of, scales_and_offsets
 from magbridge.errors import CalibrationError

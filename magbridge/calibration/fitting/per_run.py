@@ -14,11 +14,11 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.calibration.fitting.cubic import ANYTHING
-from magbridge.calibration.fitting.fit import Fit, assemble
 from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
 from magbridge.calibration.fitting.nominal import check_scales, nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.prior import Prior
+from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
 from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order

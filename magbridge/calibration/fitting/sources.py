@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.fit import Fit
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.result import Fit
 from magbridge.calibration.residual import rms
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.joint import Linear
-from magbridge.calibration.fitting.latent import Group, Offset
+from magbridge.calibration.fitting.latent import CHUNK, Columns, Group, Offset, Waves, in_chunks
 from magbridge.calibration.fitting.level import sizes
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.prior import PriorFamily
@@ -20,14 +21,11 @@ from magbridge.field.place.matern import Matern
 
 __all__ = ["Drift", "SurveySamples"]
 
-CHUNK = 16384
-"""Rows at a time: bounded memory at any number of samples."""
-
 
 class Drift(NamedTuple):
     """How positions drift with time: functions (n, r), their widths (r,) over `sigma`, and that, m."""
 
-    waves: FloatArray
+    waves: FloatArray | Waves
     shape: FloatArray
     sigma: float
 
@@ -65,23 +63,37 @@ class SurveySamples:
             )  # fmt: skip
         self.keep(groups)
 
+    def thinned(self, step: int) -> SurveySamples:
+        """Return every `step`-th sample."""
+        few, rows = copy(self), np.arange(0, len(self.kept), step)
+        for name in ("unmapped", "place", "as_logged", "deeper", "kept"):
+            setattr(few, name, getattr(self, name)[rows])
+        few.samples = replace(self.samples.part(rows), steps=np.append(np.inf, self._apart(rows)) / step)
+        if self.drift is not None:
+            few.drift = self.drift._replace(waves=self.drift.waves[rows])
+        few.keep(tuple(replace(group, functions=group.functions[rows]) for group in self.groups))
+        return few
+
     def keep(self, groups: tuple[Group, ...]) -> None:
         """Go on with these groups of unknowns: those that add to the reference come first, then offsets."""
         self.groups = groups
-        steady = [group.functions for group in groups if not isinstance(group, Offset)]
-        self.steady = np.concatenate(steady, axis=1) * self.unmapped[:, None]
         self.offsets = [group for group in groups if isinstance(group, Offset)]
-        self.bent = self.steady.shape[1] + sum(len(group.shape) for group in self.offsets)
+        self.steady = Columns([group for group in groups if not isinstance(group, Offset)])
+        self.bent = len(self.steady) + sum(len(group.shape) for group in self.offsets)
         """Where the unknowns of the positions begin."""
         many = 0 if self.drift is None else len(self.drift.shape)
         self.slopes = np.zeros((len(self.kept), 2 * many))
+
+    def slow(self, latent: FloatArray) -> FloatArray:
+        """Return what the reference lacks beside the rock (n,), nT: its level and slow changes."""
+        return (self.steady @ latent[: len(self.steady)]) * self.unmapped
 
     def offset(self, latent: FloatArray, of: Sequence[Offset] | None = None) -> FloatArray:
         """Return the sensor's offset (n, 3), nT, beside what depends on the positions.
 
         `latent` (p,) are the unknowns of all groups; `of` are the offsets that count, by default all.
         """
-        out, start = np.zeros((len(self.kept), 3)), self.steady.shape[1]
+        out, start = np.zeros((len(self.kept), 3)), len(self.steady)
         for group in self.offsets:
             d = latent[start : start + len(group.shape)]
             start += len(d)
@@ -89,10 +101,14 @@ class SurveySamples:
                 out += group.functions @ d.reshape(3, -1).T
         return out
 
-    def basis(self, field: Matern, rows: IndexArray | slice = slice(None)) -> csr_array:
-        """Return what the field's coefficients add to the reference, at all samples or `rows`: (m, nodes)."""
+    def basis(self, field: Matern, rows: IndexArray | slice) -> csr_array:
+        """Return what the field's coefficients add to the reference at `rows`: (m, nodes)."""
         known = field.basis(self.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.unmapped[rows]) @ known)
+
+    def rock(self, field: Matern, w: FloatArray) -> FloatArray:
+        """Return what coefficients w (nodes,) or (nodes, k) add at every sample: (n,) or (n, k), nT."""
+        return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def bend(self, field: Matern, w: FloatArray, latent: FloatArray) -> None:
         """Move the track to where it is with the unknowns `latent` (p,), and take the field's slope there.
@@ -102,7 +118,7 @@ class SurveySamples:
         if self.drift is None:
             return
         north, east = latent[self.bent :].reshape(2, -1)
-        waves = self.drift.waves
+        waves = self.drift.waves[:]
         self.place = self.as_logged + np.stack([waves @ north, waves @ east], axis=1)
         slopes = [(slope @ w * self.unmapped)[:, None] * waves for slope in field.slopes(self.place)]
         self.slopes = np.hstack(slopes)
@@ -111,42 +127,33 @@ class SurveySamples:
         self,
         family: PriorFamily,
         z: FloatArray,
-        lacking: FloatArray,
+        field: Matern,
         w: FloatArray,
-        B: csr_array,
         rows: IndexArray,
         step: int = 1,
     ) -> Iterator[Linear]:
-        """Yield every `step`-th sample, `rows` (m,), linearised about z (q,), w as :class:`~.joint.Linear`.
-
-        `lacking` (m,), nT, is all that the reference lacks there at that answer, B w among it.
-        """
-        samples = self.samples.part(rows)
-        q = family.E.shape[1] - sum(len(group.shape) for group in self.groups)
-        samples = replace(
-            samples,
-            reference=samples.reference + lacking,
-            field=samples.field - self.offset(z[q:])[rows],
-        )
+        """Yield `rows` (m,), every `step`-th sample, linearised about z (q,) and w (nodes,)."""
+        latent = z[family.E.shape[1] - sum(len(group.shape) for group in self.groups) :]
+        slow, offset = self.slow(latent), self.offset(latent)
         follows = np.zeros(len(rows), bool)
-        apart = self._apart(rows)
-        follows[1:] = apart == step
+        follows[1:] = self._apart(rows) == step
         c = family.E @ z + family.offset
-        E = family.E[:, :q]
+        E = family.E[:, : len(z) - len(latent)]
         for start in range(0, len(rows), CHUNK):
-            first = max(start - 1, 0)
-            part = slice(first, start + CHUNK)
-            piece = samples.part(part)
-            e, g = residuals(piece, c)
-            s = sizes(piece, c)
-            mine, size = rows[part], s[:, None]
-            offsets = [g[:, 6 + k, None] * one.functions[mine] for one in self.offsets for k in range(3)]
-            D = np.hstack(
-                [jacobian(piece.phi, g) @ E, -self.steady[mine] / size, *offsets, -self.slopes[mine] / size]
+            part = slice(max(start - 1, 0), start + CHUNK)
+            mine = rows[part]
+            B, samples = self.basis(field, mine), self.samples.part(mine)
+            piece = replace(
+                samples, reference=samples.reference + slow[mine] + B @ w, field=samples.field - offset[mine]
             )
-            here = csr_array(diags_array(-1.0 / s) @ B[part])
-            y = e - D @ z - here @ w
-            yield Linear(np.column_stack([y, D]), here, follows[part], overlap=start > 0)
+            e, g = residuals(piece, c)
+            size = sizes(piece, c)
+            steady = self.steady[mine] * (-self.unmapped[mine] / size)[:, None]
+            offsets = [g[:, 6 + k, None] * one.functions[mine] for one in self.offsets for k in range(3)]
+            slopes = -self.slopes[mine] / size[:, None]
+            D = np.hstack([jacobian(piece.phi, g) @ E, steady, *offsets, slopes])
+            here = csr_array(diags_array(-1.0 / size) @ B)
+            yield Linear(np.column_stack([e - D @ z - here @ w, D]), here, follows[part], overlap=start > 0)
 
     def _apart(self, rows: IndexArray) -> FloatArray:
         """Return sampling intervals between successive `rows`; infinite across runs."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf
+from scipy.linalg.lapack import dpotrf, dpotrs
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu, spsolve_triangular
 
@@ -27,9 +27,12 @@ from magbridge.arrays import FloatArray, IndexArray
 
 __all__ = ["Factor", "NearInverse", "near_inverse"]
 
+SMALL, FULL = 1_500, 0.02
+"""Rows, and share of a matrix that is not zero, to which and from which on LAPACK is faster than SuperLU."""
+
 
 class Factor:
-    """A symmetric positive definite sparse matrix (n, n), factorised.
+    """A symmetric positive definite sparse matrix (n, n), factorised; one that is nearly full as if it were.
 
     Raises
     ------
@@ -38,6 +41,14 @@ class Factor:
     """
 
     def __init__(self, matrix: csr_array) -> None:
+        n = matrix.shape[0]
+        self._full: FloatArray | None = None
+        if n <= SMALL and matrix.nnz > FULL * n * n:
+            self._full, info = dpotrf(matrix.toarray(), lower=True, clean=True)
+            if info:
+                raise np.linalg.LinAlgError("not positive definite")
+            self.log_determinant = 2.0 * float(np.log(np.diag(self._full)).sum())
+            return
         try:
             self._lu = splu(
                 csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
@@ -52,6 +63,8 @@ class Factor:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the inverse times b (n,) or (n, r)."""
+        if self._full is not None:
+            return np.asarray(dpotrs(self._full, right, lower=True)[0])
         return np.asarray(self._lu.solve(np.asfortranarray(right)))
 
     def draw(self, white: FloatArray) -> FloatArray:
@@ -59,6 +72,8 @@ class Factor:
 
         With the matrix ``P^T L D L^T P`` they are ``P^T L^-T D^-1/2 white`` (Rue & Held 2005, section 2.4).
         """
+        if self._full is not None:
+            return np.asarray(solve_triangular(self._full, white, lower=True, trans="T", check_finite=False))
         scaled = white / np.sqrt(self._lu.U.diagonal())[:, None]
         upper = csr_array(self._lu.L.T)
         drawn = spsolve_triangular(upper, scaled, lower=False, unit_diagonal=True)

@@ -8,6 +8,10 @@ is the precision of a field with Matern's covariance of length :math:`\ell` and 
 :math:`\nu = \alpha - 1` (Lindgren, Rue & Lindstrom 2011); v makes the field's variance 1. Large
 :math:`\nu` comes near a Gaussian of the same length.
 
+Sources at a depth d have the spectrum :math:`e^{-2 |k| d}` (Spector & Grant 1970), and by the product
+:math:`\cosh 2 k d = \prod_i (1 + k^2 / \kappa_i^2),\ \kappa_i = (2 i - 1) \pi / 4 d`, a precision of factors
+whose kappas are 1 : 3 : 5 : 7.
+
 Above its sources every wave of the field falls off upwards as :math:`e^{-|k| z}`, |k| its wave number, which
 no sparse matrix does to w. Such a field is written in u, :math:`w = (p I + L) u`, with the precision
 :math:`(p I + L)\, Q\, (p I + L)`; d deeper it is
@@ -21,7 +25,8 @@ length (a polynomial in L alone, without the pole p: 2 to 4 %, more than a senso
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import matmul
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -32,14 +37,19 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.field.place.blocks import Factor
 from magbridge.field.place.nodes import Nodes
 
-__all__ = ["SMOOTHNESS", "Matern"]
+__all__ = ["BURIED", "SMOOTHNESS", "Matern"]
 
 SMOOTHNESS = (2, 3, 4, 6, 10, 16)
 """Powers alpha that are tried: from rough to as good as a Gaussian."""
+BURIED, FIRST = 4, 0.6705
+"""Factors of sources at a depth, and their first kappa times the length: so the correlation begins to fall as
+that of a Gaussian of that length."""
 SPLINE, FALLING = 4, 8
 """Strips of nodes that a spline reaches across, and one that falls off upwards."""
 POLE = 0.2
 """p: the approximation is best where the field's power ends, at about a node's spacing."""
+HIGHEST = 8.0
+"""The Laplacian's largest eigenvalue."""
 DEPTHS = 33
 """Depths at which b is found, between the shallowest and the deepest."""
 WAVES = 96
@@ -59,17 +69,24 @@ class Matern:
         One of :data:`SMOOTHNESS`.
     harmonic : bool
         Whether it falls off upwards as Laplace's equation demands; else it is the same at every depth.
+    buried : bool
+        Whether its spectrum is that of sources at a depth, of alpha factors; else Matern's.
     """
 
     nodes: Nodes
     length: float
     alpha: int
     harmonic: bool = False
+    buried: bool = False
 
     @property
-    def _kappa2(self) -> float:
-        """``kappa² h²``."""
-        return float(2.0 * (self.alpha - 1) * (self.nodes.spacing / self.length) ** 2)
+    def _kappa2(self) -> FloatArray:
+        """``kappa² h²`` of each of the precision's factors (alpha,)."""
+        if self.buried:
+            return np.asarray(
+                (FIRST * np.arange(1, 2 * self.alpha, 2) * self.nodes.spacing / self.length) ** 2
+            )
+        return np.full(self.alpha, 2.0 * (self.alpha - 1) * (self.nodes.spacing / self.length) ** 2)
 
     @cached_property
     def _spectrum(self) -> tuple[FloatArray, FloatArray]:
@@ -78,7 +95,8 @@ class Matern:
         one = 4.0 * np.sin(0.5 * theta) ** 2
         spline = ((2.0 + np.cos(theta)) / 3.0) ** 2
         waves = one[:, None] + one
-        return waves, spline[:, None] * spline / (self._kappa2 + waves) ** self.alpha
+        power = np.prod([kappa2 + waves for kappa2 in self._kappa2], axis=0)
+        return waves, spline[:, None] * spline / power
 
     @property
     def _wave_numbers(self) -> FloatArray:
@@ -101,8 +119,19 @@ class Matern:
         return csr_array(diags_array(np.asarray(linked.sum(axis=1)).ravel()) - linked)
 
     @cached_property
-    def _root(self) -> csr_array:
-        return csr_array(self._kappa2 * eye_array(self.nodes.size) + self._laplacian)
+    def _roots(self) -> list[tuple[csr_array, int]]:
+        """The factors of the precision that differ, and how often each is in it."""
+        kappas, times = np.unique(self._kappa2, return_counts=True)
+        same = eye_array(self.nodes.size)
+        return [
+            (csr_array(k * same + self._laplacian), m) for k, m in zip(kappas, times.tolist(), strict=True)
+        ]
+
+    @property
+    def condition(self) -> float:
+        """The precision's largest eigenvalue over its smallest."""
+        lifted = (1.0 + HIGHEST / POLE) ** 2 if self.harmonic else 1.0
+        return float(np.prod(1.0 + HIGHEST / self._kappa2)) * lifted
 
     @cached_property
     def _lift(self) -> csr_array:
@@ -112,7 +141,7 @@ class Matern:
     @cached_property
     def precision(self) -> csr_array:
         """(nodes, nodes) precision of the coefficients."""
-        power = matrix_power(self._root, self.alpha)
+        power = reduce(matmul, (matrix_power(root, times) for root, times in self._roots))
         if self.harmonic:
             power = self._lift @ power @ self._lift
         return csr_array(float(self._spectrum[1].mean()) * power)
@@ -127,7 +156,8 @@ class Matern:
         """Of the precision."""
         n, variance = self.nodes.size, float(self._spectrum[1].mean())
         lifted = 2.0 * Factor(self._lift).log_determinant if self.harmonic else 0.0
-        return float(n * np.log(variance)) + self.alpha * Factor(self._root).log_determinant + lifted
+        roots = sum(times * Factor(root).log_determinant for root, times in self._roots)
+        return float(n * np.log(variance) + roots + lifted)
 
     def basis(self, place: FloatArray, deeper: FloatArray | float = 0.0) -> csr_array:
         """Return what the coefficients add at places (n, 2), m, so many m below the nodes: (n, nodes)."""

@@ -1,0 +1,121 @@
+"""The default fit from one start: coefficients, widths and noise in turn, until the evidence settles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.evidence import Quadratic, Widths, maximise
+from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise
+from magbridge.calibration.fitting.prior import Prior, PriorFamily
+from magbridge.calibration.fitting.solve import Solution, covariance_of, gauss_newton
+from magbridge.calibration.residual import Samples, Whitening, jacobian, residuals, residuals_of
+
+__all__ = ["Climbed", "climb", "thinned"]
+
+ENOUGH, BLOCK = 6000, 50
+"""Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
+ROUNDS = 16
+"""Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class Climbed:
+    """Where a climb ended."""
+
+    solution: Solution
+    widths: Widths
+    noise: NoiseModel
+    family: PriorFamily
+    quadratic: Quadratic
+    score: float
+
+
+def thinned(samples: Samples) -> Samples:
+    """Take blocks of neighbours evenly over all samples: enough to choose a start by."""
+    blocks = len(samples.field) // BLOCK
+    if len(samples.field) <= ENOUGH:
+        return samples
+    rows = (
+        np.linspace(0, blocks - 1, ENOUGH // BLOCK).astype(int)[:, None] * BLOCK + np.arange(BLOCK)
+    ).ravel()
+    part = samples.part(rows)
+    part.steps[::BLOCK] = np.inf
+    return part
+
+
+def climb(
+    samples: Samples,
+    family: PriorFamily,
+    z: FloatArray,
+    eta: FloatArray,
+    noise: NoiseModel | None = None,
+    *,
+    shaped: bool = False,
+) -> Climbed:
+    """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that.
+
+    `shaped`: the memory of `noise` is kept.
+    """
+    score, white = -np.inf, noise is None
+    shape = noise.shape if noise is not None and shaped else None
+    if noise is None:
+        z, noise = _approach(samples, family.at(eta), z)
+    for step in range(ROUNDS):
+        if family.renew is not None and step:
+            family = family.renew(z)
+        # the first widths are a guess, and not worth settling at
+        solution = gauss_newton(samples, family.at(eta), noise, z, steps=50 if step else 3)
+        kept = len(samples.field) - noise.rejected
+        quadratic = Quadratic.about(solution.z, solution.normal, kept)
+        widths = maximise(quadratic, family, eta, noise.sigma)
+        eta, z = widths.eta, solution.z
+        last, score = score, _score(widths, noise, samples)
+        noise = replace(noise, sigma=widths.sigma)
+        still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
+        if still and not white:
+            break
+        # residuals of a wrong model look correlated for long, so the autocorrelation waits until it settles
+        white = white and not still and step < ROUNDS // 2
+        # at last the noise's autocorrelation and outliers are kept, so that the rest settles
+        if step < ROUNDS - 4:
+            prior = family.at(eta)
+            e = residuals_of(samples, prior.coefficients(z))
+            doubt = (0.0, 0.0) if white or shape else _doubt(samples, prior, solution, noise)
+            steps = np.where(white, np.inf, samples.steps)
+            found = estimate_noise(e, steps, widths.determined, doubt, shape)
+            noise = replace(found, sigma=widths.sigma)
+    return Climbed(solution, widths, noise, family, quadratic, score)
+
+
+def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel) -> tuple[float, float]:
+    """Variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
+    few = thinned(samples)
+    _, g = residuals(few, prior.coefficients(solution.z))
+    J = jacobian(few.phi, g)
+    P = covariance_of(solution.normal.hessian / noise.sigma**2 + prior.precision)
+    JP = J @ (prior.E @ P @ prior.E.T)
+    next_one = few.steps[1:] == 1
+    return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[next_one]))
+
+
+def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
+    """Come near the answer: after each Gauss-Newton step the noise is set to the bulk of the residuals."""
+    apart = np.full(len(samples.field), np.inf)
+    noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
+    for _ in range(ROUNDS):
+        z = gauss_newton(samples, prior, noise, z, steps=1, tolerance=0.1).z
+        last, noise = noise, estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
+        if noise.sigma > 0.8 * last.sigma:
+            break
+    return z, noise
+
+
+def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
+    """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
+    outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
+    variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
+    whitening = 0.5 * np.log(variance).sum()
+    return float(widths.log_evidence - noise.rejected * outlier - whitening)

@@ -1,0 +1,161 @@
+"""The result of a fit: a calibration, its residuals, and what can be said of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.known import Information
+from magbridge.calibration.fitting.left_out import LeftOut
+from magbridge.calibration.fitting.noise import NoiseModel
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.offset_terms import Creep
+from magbridge.calibration.fitting.prior import Prior
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
+from magbridge.calibration.terms import Polynomial
+from magbridge.version import __version__
+
+__all__ = ["Fit", "assemble"]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of a fit.
+
+    Attributes
+    ----------
+    calibration : Calibration
+    residual : (n,) array
+        nT in the sensor's own units: ``(F - H_e) / |A^T u|``.
+    warnings : tuple of str
+        What the data could not determine, in words for a pilot.
+    details : dict
+        Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
+        each estimable combination from the data alone (nT).
+    samples : Samples
+        The data as fitted, for :mod:`.identify`.
+    open : tuple of str
+        What the track leaves open, which is a reason for an error that is large.
+    information : Information or None
+        What the data alone say of the coefficients; None where the method's prior is none of all of them.
+    creep : Creep or None
+        How the sensor's offset crept meanwhile, where the data show that it did.
+    """
+
+    calibration: Calibration
+    residual: FloatArray
+    warnings: tuple[str, ...]
+    details: dict[str, Any]
+    samples: Samples
+    open: tuple[str, ...] = ()
+    information: Information | None = None
+    creep: Creep | None = None
+
+    def __repr__(self) -> str:
+        count = f", {len(self.calibration.warnings)} warnings" if self.calibration.warnings else ""
+        return f"<Fit: {self.rms:.2f} nT RMS of {len(self.residual)} samples{count}; {self.calibration!r}>"
+
+    def _repr_html_(self) -> str:
+        """Return the same for a notebook, with the warnings."""
+        warnings = "".join(f"<li>{escape(warning)}</li>" for warning in self.warnings)
+        return f"<p>{escape(repr(self))}</p>" + f"<ul>{warnings}</ul>" * bool(warnings)
+
+    @property
+    def supported(self) -> bool:
+        """Whether the calibration is without doubts: ``--strict`` demands it.
+
+        The error expected elsewhere is not large against the noise, and the headings have no wide gap.
+        """
+        return not self.calibration.warnings
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Smallest and largest scale of A at the samples: a fit can reduce its residual by shrinking them."""
+        step = max(len(self.samples.phi) // 1000, 1)
+        scales, _ = scales_and_offsets(
+            self.samples.part(slice(None, None, step)), self.calibration.without_effects().coefficients
+        )
+        return float(scales.min()), float(scales.max())
+
+    @property
+    def rms(self) -> float:
+        """RMS of the residual, nT."""
+        return rms(self.residual)
+
+
+def assemble(
+    data: Observations,
+    samples: Samples,
+    parameters: tuple[Parameter, ...],
+    exponents: tuple[tuple[int, ...], ...],
+    coefficients: FloatArray,
+    covariance: FloatArray,
+    noise: NoiseModel,
+    method: str,
+    left_out: LeftOut | None = None,
+    prior: Prior | None = None,
+    details: dict[str, Any] | None = None,
+) -> Fit:
+    """Return the fit: its numbers as a calibration with a table of runs, and its residuals.
+
+    Parameters
+    ----------
+    data, samples
+        The calibration runs, and what was fitted of them.
+    parameters, exponents
+        The positions that the coefficients depend on, and the m monomials in them.
+    coefficients : (9 m,) array
+        nT, monomial by monomial.
+    covariance : (9 m, 9 m) array
+        nT².
+    noise, method, details
+        As :class:`Fit` and its calibration have them.
+    left_out : LeftOut, optional
+        What the fit is worth on parts left out: the sigmas grow by its ratio.
+    prior : Prior, optional
+        Of all coefficients, as they were fitted with it.
+    """
+    e = residuals_of(samples, coefficients)
+    information = Information.left_by(prior, coefficients, covariance) if prior is not None else None
+    if left_out is not None:
+        information = information and information.divided(left_out.ratio)
+        noise, covariance = replace(noise, sigma=noise.sigma * left_out.ratio), covariance * left_out.ratio**2
+        details = {**(details or {}), "left_out_nT": left_out.rms, "left_out_ratio": left_out.ratio}
+    steps = np.diff(data.time)
+    calibration = Calibration(
+        parameters=parameters,
+        terms=(Polynomial(exponents=exponents),),
+        coefficients=coefficients,
+        covariance=covariance,
+        noise=Noise(
+            noise.sigma,
+            samples.kappa * noise.sigma,
+            noise.autocorrelation,
+            float(np.median(steps)) if steps.size else 0.0,
+            noise.white,
+        ),
+        reference=Reference(samples.F_0, data.model),
+        sensor=Sensor(data.sensor),
+        runs=_runs(data, e),
+        method=method,
+        inputs=dict(data.inputs),
+        software=f"magbridge {__version__}",
+    )
+    return Fit(calibration, e, (), details or {}, samples, information=information)
+
+
+def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:
+    """Return each run's samples, RMS residual (nT) and mean positions."""
+    labels, which = np.unique(data.runs, return_inverse=True)
+    count = np.bincount(which)
+    squares = np.bincount(which, e * e)
+    places = [np.bincount(which, column) / count for column in data.parameters.T]
+    return tuple(
+        Run(str(label), int(n), float(np.sqrt(square / n)), tuple(map(float, place)))
+        for label, n, square, *place in zip(labels, count, squares, *places, strict=True)
+    )

@@ -1,0 +1,244 @@
+"""Rounds of a joint fit to a survey: coefficients, widths and the field in turn, until no residual moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.answer import Answer, start
+from magbridge.calibration.fitting.evidence import maximise
+from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
+from magbridge.calibration.fitting.field_search import (
+    Choice,
+    Weighed,
+    choose,
+    first_guess,
+    refined,
+    same_noise,
+)
+from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
+from magbridge.calibration.fitting.latent import Group, likeliest, with_groups
+from magbridge.calibration.fitting.prior import PriorFamily
+from magbridge.calibration.fitting.survey_samples import SurveySamples
+from magbridge.calibration.residual import Samples, residuals_of, robust_scale
+from magbridge.errors import CalibrationError
+from magbridge.field.place.matern import Matern
+
+__all__ = ["SEARCHED", "WIDE", "settled"]
+
+GUESSED = 2
+"""Rounds before the field is searched: while the coefficients are far off, they look like rock and noise."""
+SEARCHES = 2
+"""Rounds after that in which the search goes on."""
+ROUNDS = 40
+"""Rounds at most; six are usual, and some twenty from a start 10,000 nT off, whose steps are shortened."""
+STILL = 0.05
+"""Of the noise: a round that moves no residual by more (RMS) is the last."""
+OUTLIER = 5.0
+"""Sigmas beyond which a sample is left out."""
+OVERSHOT = 10.0
+"""Growth of the objective by which a step goes too far; less may be the track that is bent only after it."""
+SHORTEST = 1e-3
+"""Part of a step, below which it is not shortened further."""
+SEARCHED, WIDE = 12_000, 5_000.0
+"""Samples about the middle that the field's size and length are searched with; where there are more within so
+many m north and east, every second or third of these."""
+SETTLED = 50_000
+"""Samples with which the rounds come to rest, before those with all of a longer log."""
+MOST = 40_000
+"""Nodes about all samples, at most."""
+
+
+def settled(survey: SurveySamples, own: PriorFamily) -> Answer:
+    """Return where the rounds come to rest; the offsets that the log does not need are taken out of `survey`.
+
+    Those of a long log come to rest with every second or tenth sample, and go on with all from there.
+
+    Raises
+    ------
+    CalibrationError
+        They do not come to rest.
+    """
+    step = max(len(survey.kept) // SETTLED, 1)
+    few = survey.thinned(step) if step > 1 else survey
+    few.keep(tuple(replace(group, functions=group.functions[:]) for group in few.groups))
+    rounds = _Rounds(few, own)
+    answer = rounds.settle()
+    if step == 1:
+        return answer
+    names = {group.name for group in few.groups}
+    survey.keep(tuple(group for group in survey.groups if group.name in names))
+    rounds.go_on(survey, step)
+    return rounds.settle()
+
+
+class _Rounds:
+    """Alternate coefficients, widths and the field until no residual moves."""
+
+    def __init__(self, survey: SurveySamples, own: PriorFamily) -> None:
+        self.survey, self.own, self.q = survey, own, own.E.shape[1]
+        self.until = GUESSED + SEARCHES
+        self.weigh_offers = self.until + 1 if any(one.offered for one in survey.groups) else -1
+        self.family = with_groups(own, survey.groups)
+        self.part = about_the_middle(survey.place, SEARCHED, WIDE)
+        self.step = max(int(self.part.sum()) // SEARCHED, 1)
+        self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
+        self.middle = float(np.median(ladder(survey.place[self.part])))
+        self.choice = self._everywhere(first_guess(survey.place[self.part]))
+        self.z, self.sigma = start(survey, self.family)
+        self.eta, self.w = self.family.centre, np.zeros(self.choice.field.nodes.size)
+        self.nodes = self.choice.field.nodes
+        self.last: FloatArray | None = None
+
+    def go_on(self, survey: SurveySamples, step: int) -> None:
+        """Go on with `survey`, of which the samples so far were every `step`-th one; nothing is searched."""
+        self.survey, self.until, self.weigh_offers = survey, -1, -1
+        self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / step))
+        field = self.choice.field
+        survey.bend(field, self.w, self.z[self.q :])
+        self.last = self._residuals(self.z, self._slow(self.z) + survey.rock(field, self.w))
+        survey.kept = np.abs(self.last) <= OUTLIER * robust_scale(self.last)
+        weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
+        self.choice = same_noise(self._sums(field), self.choice, weighed)
+
+    def settle(self) -> Answer:
+        """Return the answer.
+
+        Raises
+        ------
+        CalibrationError
+            The rounds do not come to rest.
+        """
+        survey, moved = self.survey, np.inf
+        for turn in range(ROUNDS):
+            if self.own.renew is not None and turn:
+                self.own = self.own.renew(self.z[: self.q])
+                self.family = with_groups(self.own, survey.groups)
+            if turn == self.weigh_offers:
+                self._weigh_offers()
+            answer = self._round(turn)
+            e = self._residuals(answer.z, answer.lacking)
+            if self.last is not None:
+                moved = float(np.sqrt(np.mean((e - self.last) ** 2)))
+            self.last = e
+            if turn > self.until and moved < STILL * self.sigma:
+                return answer
+            if GUESSED <= turn <= self.until:
+                survey.kept = np.abs(e) <= OUTLIER * robust_scale(e)
+        if moved > self.sigma:
+            raise CalibrationError("the fit to the survey did not settle: the data contradict themselves")
+        return answer
+
+    def _round(self, turn: int) -> Answer:
+        """Search the field where it is time to, and solve for all that is linear about the last answer."""
+        weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
+        if searched := self.until - SEARCHES <= turn <= self.until:
+            self._search(weighed, anew=turn == self.until - SEARCHES)
+        sums = self._sums(self.choice.field)
+        if searched and self.step > 1:
+            self.choice = same_noise(sums, self.choice, weighed)
+        choice, reduced = self.choice, eliminate(sums, self.choice.field, self.choice.ratio, self.choice.rho)
+        widths = maximise(reduced.quadratic, self.family, self.eta, self.sigma)
+        self.eta, self.sigma = widths.eta, widths.sigma
+        precision = reduced.quadratic.H / self.sigma**2 + self.family.at(self.eta).precision
+        step = np.linalg.solve(precision, reduced.quadratic.b / self.sigma**2) - self.z
+        self.z, lacking = self._damped(np.asarray(step, float), reduced, choice.field)
+        self.w, self.nodes = reduced.field(self.z), choice.field.nodes
+        if self.survey.drift is not None:
+            self.survey.bend(choice.field, self.w, self.z[self.q :])
+            lacking = self._slow(self.z) + self.survey.rock(choice.field, self.w)
+        score = widths.log_evidence + reduced.log_evidence
+        return Answer(self.z, self.w, sums, choice, widths, self.family, lacking, score, self.middle)
+
+    def _search(self, weighed: Weighed, *, anew: bool) -> None:
+        """Choose the field with a part of the samples, and put it on nodes about them all."""
+        place, before = self.survey.place[self.part], self.choice
+        if anew:
+            found = choose(self._few, place, weighed, before.ratio, harmonic=self.harmonic)
+        else:
+            begin = replace(before, rho=before.rho**self.step)
+            if not self.part.all():
+                field = before.field
+                begin = replace(
+                    begin, field=replace(field, nodes=nodes_for(place, field.length, field.alpha))
+                )
+            found = refined(self._few, place, begin, weighed)
+        self.choice = self._everywhere(replace(found, rho=found.rho ** (1.0 / self.step)))
+
+    def _everywhere(self, choice: Choice) -> Choice:
+        """Return a choice that was made with a part of the samples on nodes about them all."""
+        if self.part.all():
+            return choice
+        field = choice.field
+        nodes = nodes_for(self.survey.place, field.length, field.alpha, MOST)
+        return replace(choice, field=replace(field, nodes=nodes))
+
+    def _weigh_offers(self) -> None:
+        """Keep of what is offered what the log needs; where that is not all, the search goes on without."""
+        survey, choice = self.survey, self.choice
+        reduced = eliminate(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
+        kept = likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma)
+        if len(kept) < len(survey.groups):
+            self._regroup(kept)
+            self.until += SEARCHES
+
+    def _regroup(self, groups: tuple[Group, ...]) -> None:
+        """Go on with other groups of unknowns; those that were there stay where they are."""
+        at, width, row, column = {}, {}, self.q, len(self.own.centre)
+        for one in self.survey.groups:
+            at[one.name], width[one.name] = self.z[row : row + len(one.shape)], self.eta[column : column + 1]
+            row, column = row + len(one.shape), column + bool(one.spread)
+        z = [at.get(one.name, np.zeros(len(one.shape))) for one in groups]
+        eta = [width.get(one.name, np.log([one.width])) for one in groups if one.spread]
+        self.z = np.concatenate([self.z[: self.q], *z])
+        self.eta = np.concatenate([self.eta[: len(self.own.centre)], *eta])
+        self.survey.keep(groups)
+        self.family = with_groups(self.own, groups)
+
+    def _damped(self, step: FloatArray, reduced: Reduced, field: Matern) -> tuple[FloatArray, FloatArray]:
+        """Return z after the step (q,), shortened while it overshoots, as it may far off; what lacks there.
+
+        A track that bends from the last answer's to that of z meets the field's slopes on its way.
+        """
+        precision, survey = self.family.at(self.eta).precision, self.survey
+        here, change = survey.rock(field, np.column_stack([reduced.field(self.z), reduced.follow @ step])).T
+        here, change = here + self._slow(self.z), change + self._slow(step)
+        if survey.slopes.size:
+            change += survey.slopes @ step[self.q + survey.bent :]
+
+        def objective(part: float) -> float:
+            z = self.z + part * step
+            e = self._residuals(z, here + part * change)[survey.kept]
+            return float(e @ e) / self.sigma**2 + float(z @ precision @ z)
+
+        before, part = objective(0.0), 1.0
+        while part > SHORTEST and not objective(part) < OVERSHOT * before:
+            part *= 0.5
+        return self.z + part * step, here + part * change
+
+    def _few(self, field: Matern) -> Sums:
+        return self._sums(field, np.flatnonzero(self.survey.kept & self.part)[:: self.step], self.step)
+
+    def _sums(self, field: Matern, rows: IndexArray | None = None, step: int = 1) -> Sums:
+        """Return the sums of all samples, or of `rows`, every `step`-th one, about the last answer.
+
+        Where the nodes are new they are about a field of 0.
+        """
+        w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
+        self.survey.bend(field, w, self.z[self.q :])
+        rows = np.flatnonzero(self.survey.kept) if rows is None else rows
+        return add_up(self.survey.linear(self.family, self.z, field, w, rows, step))
+
+    def _slow(self, z: FloatArray) -> FloatArray:
+        return self.survey.slow(z[self.q :])
+
+    def _residuals(self, z: FloatArray, lacking: FloatArray) -> FloatArray:
+        samples = self.survey.samples
+        known: Samples = replace(
+            samples,
+            reference=samples.reference + lacking,
+            field=samples.field - self.survey.offset(z[self.q :]),
+        )
+        return residuals_of(known, self.family.E @ z + self.family.offset)
