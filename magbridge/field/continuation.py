@@ -36,20 +36,13 @@ LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
 class Continued(NamedTuple):
-    """A grid at another height, and the error of the continuation.
-
-    Attributes
-    ----------
-    grid : AnomalyGrid
-    sigma : float
-        nT, 1-sigma of what the continuation leaves out; 0 upward to one level.
-    length : float
-        m, correlation length of that error: at short distances its correlation falls as exp(-r²/2 length²).
-    """
+    """A grid at another height, and the error of the continuation."""
 
     grid: AnomalyGrid
     sigma: float
+    """nT, 1-sigma of what the continuation leaves out; 0 upward to one level."""
     length: float
+    """m, correlation length of that error: at short distances its correlation falls as exp(-r²/2 length²)."""
 
 
 def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:

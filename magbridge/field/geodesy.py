@@ -10,15 +10,9 @@ import numpy as np
 from magbridge.arrays import FloatArray
 
 __all__ = [
-    "ECCENTRICITY_SQUARED",
-    "EQUATORIAL_RADIUS",
-    "metres_per_degree",
-    "offset",
-    "separation",
-    "signed_longitude",
-    "worse_axis",
-    "wrap",
-]
+    "ECCENTRICITY_SQUARED", "EQUATORIAL_RADIUS", "metres_per_degree", "offset", "separation",
+    "signed_longitude", "worse_axis", "wrap",
+]  # fmt: skip
 
 EQUATORIAL_RADIUS = 6_378_137.0
 """m, of WGS84."""

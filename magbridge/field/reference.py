@@ -18,17 +18,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "EARTHS",
-    "about_mean",
-    "earth_field",
-    "main_field",
-    "other_units",
-    "placed",
-    "positions",
-    "reference_field",
-    "require_date",
-    "sphere_radius",
-]
+    "EARTHS", "about_mean", "earth_field", "main_field", "other_units", "placed", "positions",
+    "reference_field", "require_date", "sphere_radius",
+]  # fmt: skip
 
 EARTHS = 20_000.0, 70_000.0
 """nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""

@@ -32,30 +32,20 @@ def named(causes: Sequence[str]) -> str:
 
 
 class Signs(NamedTuple):
-    """What a sample's causes would do to its residual.
-
-    Attributes
-    ----------
-    time : float
-        s.
-    offset : (3,) array
-        Derivative of the residual by the offset of each axis.
-    positions : tuple of float
-        Parameters, scaled to their range.
-    watched : tuple of float
-        degC and A: temperature and currents; NaN where unknown.
-    clock : float
-        nT/s: how the residual changes with the telemetry's time.
-    level : float
-        By the reference's level.
-    """
+    """What a sample's causes would do to its residual."""
 
     time: float
+    """s."""
     offset: FloatArray
+    """(3,): Derivative of the residual by the offset of each axis."""
     positions: tuple[float, ...]
+    """Parameters, scaled to their range."""
     watched: tuple[float, ...]
+    """degC and A: temperature and currents; NaN where unknown."""
     clock: float
+    """nT/s: how the residual changes with the telemetry's time."""
     level: float
+    """By the reference's level."""
 
 
 class Cause(NamedTuple):
@@ -67,28 +57,18 @@ class Cause(NamedTuple):
 
 
 class Alarm(NamedTuple):
-    """The model no longer explains the data.
-
-    Attributes
-    ----------
-    causes : tuple of str
-        Which fit, the likeliest first.
-    channels : tuple of str
-        The telemetry that each follows; empty for none.
-    since : float
-        s, when the likeliest began.
-    size : float
-        nT, root mean square of what it adds to the total field.
-    strength : float
-        L of the likeliest.
-    mapless : bool
-        It is only the map that is doubted, and rock that it does not show explains the data: what is
-        corrected is in no doubt, and the alarm stands as long as it is raised.
-    """
+    """The model no longer explains the data."""
 
     causes: tuple[str, ...]
+    """Which fit, the likeliest first."""
     channels: tuple[str, ...]
+    """The telemetry that each follows; empty for none."""
     since: float
+    """s, when the likeliest began."""
     size: float
+    """nT, root mean square of what it adds to the total field."""
     strength: float
+    """L of the likeliest."""
     mapless: bool = False
+    """It is only the map that is doubted, and rock that it does not show explains the data: what is corrected
+    is in no doubt, and the alarm stands as long as it is raised."""

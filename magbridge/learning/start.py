@@ -71,23 +71,16 @@ def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, orde
 
 
 class Fitted(NamedTuple):
-    """What the samples say.
-
-    Attributes
-    ----------
-    coefficients : (K,) array
-    nuisances : (3,) array
-        The nuisance after the last sample.
-    covariance : (K + 3, K + 3) array
-        Of both.
-    noise : float
-        nT, 1-sigma of a channel.
-    """
+    """What the samples say."""
 
     coefficients: FloatArray
+    """(K,)."""
     nuisances: FloatArray
+    """(3,): The nuisance after the last sample."""
     covariance: FloatArray
+    """(K + 3, K + 3): Of both."""
     noise: float
+    """nT, 1-sigma of a channel."""
 
 
 class Start:

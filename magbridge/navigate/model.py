@@ -27,15 +27,8 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options
 
 __all__ = [
-    "N_STATES",
-    "Block",
-    "average",
-    "block_length",
-    "measurement_row",
-    "prior",
-    "resolution",
-    "transition",
-]
+    "N_STATES", "Block", "average", "block_length", "measurement_row", "prior", "resolution", "transition",
+]  # fmt: skip
 
 N_STATES = 6
 FINE = 0.35
@@ -43,32 +36,22 @@ FINE = 0.35
 
 
 class Block(NamedTuple):
-    """Samples close enough together to be one measurement.
-
-    Attributes
-    ----------
-    time_us : int
-        µs, their mean time.
-    latitude, longitude : float
-        deg, dead-reckoned, their mean.
-    anomaly : float
-        nT, total field minus the main field at the dead-reckoned position.
-    variance : float
-        nT², of that mean.
-    slope_north, slope_east : float
-        nT/m, of the main field.
-    depth : float
-        m, their mean; NaN stands for the map's own height.
-    """
+    """Samples close enough together to be one measurement."""
 
     time_us: int
+    """µs, their mean time."""
     latitude: float
     longitude: float
+    """`latitude`, `longitude`: deg, dead-reckoned, their mean."""
     anomaly: float
+    """nT, total field minus the main field at the dead-reckoned position."""
     variance: float
+    """nT², of that mean."""
     slope_north: float
     slope_east: float
+    """`slope_north`, `slope_east`: nT/m, of the main field."""
     depth: float = nan
+    """m, their mean; NaN stands for the map's own height."""
 
 
 def average(blocks: Sequence[Block] | FloatArray) -> Block:

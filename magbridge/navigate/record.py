@@ -26,68 +26,47 @@ class State(IntEnum):
 
 
 class Record(msgspec.Struct, frozen=True, gc=False):
-    """One update.
-
-    Attributes
-    ----------
-    time_us : int
-        µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in.
-    state : State
-    valid : bool
-        The position can be used: it may be sent as a fix.
-    latitude, longitude : float
-        deg.
-    covariance_nn, covariance_ne, covariance_ee : float
-        m², of the position.
-    innovation, innovation_variance : float
-        nT, nT²; measured minus expected anomaly; NaN off the map.
-    gate : float
-        Largest innovation squared over variance that is taken in.
-    accepted : bool
-        The measurement was taken in.
-    depth : float
-        m.
-    anomaly : float
-        nT, measured: total field minus main field at the dead-reckoned position.
-    map_anomaly : float
-        nT, of the map at the position; NaN off the map.
-    bias, bias_sigma : float
-        nT, of the calibration.
-    map_error : float
-        nT.
-    current_north, current_east : float
-        m/s.
-    north, east : float
-        m, from the dead-reckoned position.
-    hypotheses : int
-    odds : float
-        Natural logarithm of the odds of another place against this one.
-    """
+    """One update."""
 
     time_us: int
+    """µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in."""
     state: State
     valid: bool
+    """The position can be used: it may be sent as a fix."""
     latitude: float
     longitude: float
+    """`latitude`, `longitude`: deg."""
     covariance_nn: float
     covariance_ne: float
     covariance_ee: float
+    """`covariance_nn`, `covariance_ne`, `covariance_ee`: m², of the position."""
     innovation: float
     innovation_variance: float
+    """`innovation`, `innovation_variance`: nT, nT²; measured minus expected anomaly; NaN off the map."""
     gate: float
+    """Largest innovation squared over variance that is taken in."""
     accepted: bool
+    """The measurement was taken in."""
     depth: float
+    """m."""
     anomaly: float
+    """nT, measured: total field minus main field at the dead-reckoned position."""
     map_anomaly: float
+    """nT, of the map at the position; NaN off the map."""
     bias: float
     bias_sigma: float
+    """`bias`, `bias_sigma`: nT, of the calibration."""
     map_error: float
+    """nT."""
     current_north: float
     current_east: float
+    """`current_north`, `current_east`: m/s."""
     north: float
     east: float
+    """`north`, `east`: m, from the dead-reckoned position."""
     hypotheses: int
     odds: float
+    """Natural logarithm of the odds of another place against this one."""
 
 
 class Reckoned(NamedTuple):

@@ -18,25 +18,17 @@ APART = 20
 
 @dataclass(frozen=True, eq=False)
 class Crossovers:
-    """Places where two lines cross.
-
-    Attributes
-    ----------
-    place : (m, 2) array
-        m north and east.
-    first, second : (m,) arrays
-        Samples that begin the two segments.
-    share : (m, 2) array
-        How far along each segment, 0 to 1.
-    step : int
-        Samples of a segment.
-    """
+    """Places where two lines cross."""
 
     place: FloatArray
+    """(m, 2), m north and east."""
     first: IndexArray
     second: IndexArray
+    """`first`, `second`, (m,): Samples that begin the two segments."""
     share: FloatArray
+    """(m, 2): How far along each segment, 0 to 1."""
     step: int
+    """Samples of a segment."""
 
     def misties(self, value: FloatArray) -> FloatArray:
         """Return the difference (m,) of `value` (n,) between the lines, the first minus the second."""

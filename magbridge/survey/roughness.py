@@ -29,20 +29,14 @@ PRIOR = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Roughness:
-    """The size of the field over the typical one, on a grid of cells.
-
-    Attributes
-    ----------
-    low : (2,) array
-        m north and east.
-    cell : float
-        m.
-    scale : (a, b) array
-    """
+    """The size of the field over the typical one, on a grid of cells."""
 
     low: FloatArray
+    """(2,), m north and east."""
     cell: float
+    """m."""
     scale: FloatArray
+    """(a, b)."""
 
     @classmethod
     def even(cls) -> Roughness:

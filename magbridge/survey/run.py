@@ -29,27 +29,17 @@ __all__ = ["Result", "facts", "samples_of", "summary", "survey"]
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """A survey that is done.
-
-    Attributes
-    ----------
-    samples : Samples
-        Corrected.
-    gridded : Gridded
-    found : Crossovers
-    before, after : (m,) arrays
-        nT, mis-ties before levelling and after.
-    residual : (n,) array
-        nT, of every sample.
-    warnings : tuple of str
-    """
+    """A survey that is done."""
 
     samples: Samples
+    """Corrected."""
     gridded: Gridded
     found: Crossovers
     before: FloatArray
     after: FloatArray
+    """`before`, `after`, (m,), nT, mis-ties before levelling and after."""
     residual: FloatArray
+    """(n,), nT, of every sample."""
     warnings: tuple[str, ...]
 
 

@@ -13,45 +13,30 @@ __all__ = ["Samples"]
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """What a map is made of.
-
-    Attributes
-    ----------
-    place : (n, 2) array
-        m north and east of `origin`.
-    depth : (n,) array
-        m below the ellipsoid (negative: above).
-    time : (n,) array
-        s since 1970 UTC; NaN where not known.
-    value : (n,) array
-        nT, anomaly.
-    line : (n,) array
-        Label of the line, or of the log where there are no lines.
-    tie : (n,) array
-        Whether the line is a tie line.
-    origin : tuple of 2 float
-        deg, latitude and longitude.
-    weight : (n,) array
-        Noise of a sample over the typical one's.
-    rho : float
-        Autocorrelation of successive samples' noise.
-    modes : (n, r) array
-        nT, what 1-sigma of each of the calibration's uncertain combinations does to every sample.
-    level_sigma : float
-        nT, 1-sigma of what all samples are off by, the reference's level.
-    """
+    """What a map is made of."""
 
     place: FloatArray
+    """(n, 2), m north and east of `origin`."""
     depth: FloatArray
+    """(n,), m below the ellipsoid (negative: above)."""
     time: FloatArray
+    """(n,), s since 1970 UTC; NaN where not known."""
     value: FloatArray
+    """(n,), nT, anomaly."""
     line: IndexArray
+    """(n,): Label of the line, or of the log where there are no lines."""
     tie: BoolArray
+    """(n,): Whether the line is a tie line."""
     origin: tuple[float, float]
+    """deg, latitude and longitude."""
     weight: FloatArray = field(default_factory=lambda: np.empty(0))
+    """(n,): Noise of a sample over the typical one's."""
     rho: float = 0.0
+    """Autocorrelation of successive samples' noise."""
     modes: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    """(n, r), nT, what 1-sigma of each of the calibration's uncertain combinations does to every sample."""
     level_sigma: float = 0.0
+    """nT, 1-sigma of what all samples are off by, the reference's level."""
 
     def __post_init__(self) -> None:
         n = len(self.value)

@@ -13,17 +13,9 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.observations import Observations
 
 __all__ = [
-    "SHARE",
-    "courses",
-    "crossed",
-    "far_off",
-    "jumped",
-    "left_open",
-    "left_open_by",
-    "rough_rock",
-    "tells_rock",
-    "too_rough",
-]
+    "SHARE", "courses", "crossed", "far_off", "jumped", "left_open", "left_open_by", "rough_rock",
+    "tells_rock", "too_rough",
+]  # fmt: skip
 
 TURNED = 30.0
 """deg between two courses that cross."""

@@ -37,21 +37,14 @@ RANK_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Combinations:
-    """Combinations of coefficients that the data determine, best known first.
-
-    Attributes
-    ----------
-    rank : int
-        How many are determined at all, however large the noise.
-    sigma : (rank,) array
-        nT, 1-sigma of each from the data alone.
-    vectors : (rank, K) array
-        Each a unit vector over the coefficients, scaled by the norms of their Jacobian columns.
-    """
+    """Combinations of coefficients that the data determine, best known first."""
 
     rank: int
+    """How many are determined at all, however large the noise."""
     sigma: FloatArray
+    """(rank,), nT, 1-sigma of each from the data alone."""
     vectors: FloatArray
+    """(rank, K): Each a unit vector over the coefficients, scaled by the norms of their Jacobian columns."""
 
 
 def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Combinations:

@@ -74,27 +74,18 @@ class Information(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A Gaussian expectation of the coefficients.
-
-    Attributes
-    ----------
-    parameters : tuple of Parameter
-        How the positions are scaled, with the range that was seen.
-    exponents : tuple of tuple of int
-        The m monomials, all of them up to a degree.
-    field : float
-        nT, the F_0 that the coefficients refer to.
-    mean : (9 m,) array
-        nT.
-    covariance : (9 m, 9 m) array
-        nT², positive definite.
-    """
+    """A Gaussian expectation of the coefficients."""
 
     parameters: tuple[Parameter, ...]
+    """How the positions are scaled, with the range that was seen."""
     exponents: tuple[Exponents, ...]
+    """The m monomials, all of them up to a degree."""
     field: float
+    """nT, the F_0 that the coefficients refer to."""
     mean: FloatArray
+    """(9 m,), nT."""
     covariance: FloatArray
+    """(9 m, 9 m), nT², positive definite."""
 
     def ranges(self, data: Observations) -> tuple[Parameter, ...]:
         """Return the parameters, their ranges widened to what `data` have.

@@ -61,19 +61,13 @@ CHANCE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Errors of the parts left out, each predicted from the others.
-
-    Attributes
-    ----------
-    rms : float
-        nT, in the sensor's own units; single samples count as five sigmas at most.
-    ratio : float
-        Root mean square of the errors over their claimed sigmas; 1 where it is less, or not more than chance.
-        The larger one, where groups of like attitude are left out, too.
-    """
+    """Errors of the parts left out, each predicted from the others."""
 
     rms: float
+    """nT, in the sensor's own units; single samples count as five sigmas at most."""
     ratio: float
+    """Root mean square of the errors over their claimed sigmas; 1 where it is less, or not more than chance.
+    The larger one, where groups of like attitude are left out, too."""
 
 
 def leave_out(

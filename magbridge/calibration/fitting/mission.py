@@ -25,18 +25,12 @@ ROLL = 10.0
 
 @dataclass(frozen=True, eq=False)
 class Mission:
-    """The fields and positions that a mission meets.
-
-    Attributes
-    ----------
-    field_body : (n, 3) array
-        nT, the true field in body axes.
-    parameters : (n, k) array
-        Actuator positions at the same samples, in their units.
-    """
+    """The fields and positions that a mission meets."""
 
     field_body: FloatArray
+    """(n, 3), nT, the true field in body axes."""
     parameters: FloatArray
+    """(n, k): Actuator positions at the same samples, in their units."""
 
     @classmethod
     def of(cls, data: Observations) -> Mission:

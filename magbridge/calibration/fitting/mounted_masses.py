@@ -46,21 +46,14 @@ LATENT = 12
 
 
 class Mounting(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """``[mass.NAME]``: where the mass that parameter NAME moves sits, seen from the sensor.
-
-    Attributes
-    ----------
-    at : tuple of 3 float
-        m, body frame, where the parameter is 0.
-    travel : tuple of 3 float
-        m per unit of the parameter.
-    at_sigma : float
-        m, 1-sigma of `at`.
-    """
+    """``[mass.NAME]``: where the mass that parameter NAME moves sits, seen from the sensor."""
 
     at: Vector
+    """m, body frame, where the parameter is 0."""
     travel: Vector
+    """m per unit of the parameter."""
     at_sigma: Annotated[float, Meta(gt=0)] = 0.05
+    """m, 1-sigma of `at`."""
 
 
 class _VehicleFile(msgspec.Struct, forbid_unknown_fields=True):

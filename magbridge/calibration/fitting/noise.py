@@ -22,24 +22,16 @@ LIKELIER = 5.0
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Noise of the residuals.
-
-    Attributes
-    ----------
-    sigma : float
-        nT, in the sensor's own units, of a single sample.
-    autocorrelation : float
-        Of successive samples in a run: rho of the slow part, AR(1).
-    white : float
-        Share of the variance that is white noise beside it.
-    weight : (n,) array or None
-        1 for a sample that counts, 0 for an outlier; None when all count.
-    """
+    """Noise of the residuals."""
 
     sigma: float
+    """nT, in the sensor's own units, of a single sample."""
     autocorrelation: float = 0.0
+    """Of successive samples in a run: rho of the slow part, AR(1)."""
     white: float = 0.0
+    """Share of the variance that is white noise beside it."""
     weight: FloatArray | None = None
+    """(n,): 1 for a sample that counts, 0 for an outlier; None when all count."""
 
     @property
     def shape(self) -> tuple[float, float]:

@@ -37,60 +37,42 @@ def _nothing() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Calibration data as arrays, without the rows that lack a value or hold an impossible field.
-
-    Attributes
-    ----------
-    field : (n, 3) array
-        nT, raw channels, sensor axes.
-    reference : (n,) array
-        nT, the true total field.
-    parameters : (n, k) array
-        Actuator positions; k may be 0.
-    names, units : tuple of str
-        Of the parameters.
-    runs : (n,) array
-        A label for each sample: dive, spiral, file. Validation leaves out whole runs. If not given, one run.
-    time : (n,) array
-        s since 1970 UTC; if not given, one sample a second.
-    attitude : (n, 3) array, optional
-        rad, roll, pitch, heading (true).
-    reference_ned : (n, 3) array, optional
-        nT, the true field vector, north-east-down.
-    place : (n, 3) array, optional
-        m north, east, down of `origin`.
-    unmapped : (n,) array, optional
-        1 where the reference lacks the rock below or what a map lacks of it, 0 where it is the true field.
-    temperature : (n,) array, optional
-        degC, of the fluxgate; NaN where it is not known.
-    map_sigma : float or None
-        nT, 1-sigma of the map in the reference; None without a map.
-    origin : tuple of 2 float
-        deg, latitude and longitude of the origin of `place`.
-    sensor : str
-    inputs : dict
-        File -> SHA-256.
-    model : str
-        Name of the reference.
-    """
+    """Calibration data as arrays, without the rows that lack a value or hold an impossible field."""
 
     field: FloatArray
+    """(n, 3), nT, raw channels, sensor axes."""
     reference: FloatArray
+    """(n,), nT, the true total field."""
     parameters: FloatArray
+    """(n, k): Actuator positions; k may be 0."""
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
+    """`names`, `units`: Of the parameters."""
     runs: NDArray[np.generic] = attribute(default_factory=_nothing)
+    """(n,): A label for each sample: dive, spiral, file. Validation leaves out whole runs. If not given, one
+    run."""
     time: FloatArray = attribute(default_factory=_nothing)
+    """(n,), s since 1970 UTC; if not given, one sample a second."""
     attitude: FloatArray | None = None
+    """(n, 3), rad, roll, pitch, heading (true)."""
     reference_ned: FloatArray | None = None
+    """(n, 3), nT, the true field vector, north-east-down."""
     place: FloatArray | None = None
+    """(n, 3), m north, east, down of `origin`."""
     unmapped: FloatArray | None = None
+    """(n,): 1 where the reference lacks the rock below or what a map lacks of it, 0 where it is the true
+    field."""
     temperature: FloatArray | None = None
+    """(n,), degC, of the fluxgate; NaN where it is not known."""
     map_sigma: float | None = None
+    """nT, 1-sigma of the map in the reference; None without a map."""
     origin: tuple[float, float] = (0.0, 0.0)
+    """deg, latitude and longitude of the origin of `place`."""
     sensor: str = ""
     inputs: dict[str, str] = attribute(default_factory=dict)
+    """File -> SHA-256."""
     model: str = ""
+    """Name of the reference."""
 
     def __post_init__(self) -> None:
         n = len(self.field)

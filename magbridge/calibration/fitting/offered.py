@@ -40,19 +40,12 @@ HINTED = 0.98
 
 @dataclass(frozen=True)
 class Offer:
-    """A column that was tried as a parameter.
-
-    Attributes
-    ----------
-    name : str
-    without, left_out : float
-        nT, RMS on parts left out of the fit without it, and with it.
-    taken : bool
-    """
+    """A column that was tried as a parameter."""
 
     name: str
     without: float
     left_out: float
+    """`without`, `left_out`: nT, RMS on parts left out of the fit without it, and with it."""
     taken: bool
 
 

@@ -34,21 +34,14 @@ PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
 
 @dataclass(frozen=True, eq=False)
 class Creep:
-    """How the offset crept while a survey lasted.
-
-    Attributes
-    ----------
-    time : (n,) array
-        s since 1970 UTC.
-    offset : (n, 3) array
-        nT, sensor axes, about the mean.
-    calibration : Calibration
-        What holds once that is taken off the readings; beyond the survey the offset may be any of these.
-    """
+    """How the offset crept while a survey lasted."""
 
     time: FloatArray
+    """(n,), s since 1970 UTC."""
     offset: FloatArray
+    """(n, 3), nT, sensor axes, about the mean."""
     calibration: Calibration
+    """What holds once that is taken off the readings; beyond the survey the offset may be any of these."""
 
     def at(self, time: FloatArray) -> FloatArray:
         """Return the offset (m, 3), nT, at times (m,), s since 1970 UTC."""

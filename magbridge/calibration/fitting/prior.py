@@ -64,31 +64,22 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class PriorFamily:
-    """A hierarchical prior: coefficients follow from latent numbers z, whose widths follow from eta.
-
-    Attributes
-    ----------
-    E : (K, q) array
-        ``c = E z + offset``; the prior of z is centred at 0.
-    offset : (K,) array
-    constant, design : (q,) array, (q, h) array
-        Log widths of z are ``constant + design @ eta``.
-    centre, spread : (h,) arrays
-        Prior of eta.
-    names : tuple of str
-        What ``exp(eta)`` is the width of, number by number.
-    renew : callable, optional
-        ``z -> PriorFamily``: the family linearised anew at z.
-    """
+    """A hierarchical prior: coefficients follow from latent numbers z, whose widths follow from eta."""
 
     E: FloatArray
+    """(K, q): ``c = E z + offset``; the prior of z is centred at 0."""
     offset: FloatArray
+    """(K,)."""
     constant: FloatArray
     design: FloatArray
+    """`constant`, `design`, (q,): Log widths of z are ``constant + design @ eta``."""
     centre: FloatArray
     spread: FloatArray
+    """`centre`, `spread`, (h,): Prior of eta."""
     names: tuple[str, ...]
+    """What ``exp(eta)`` is the width of, number by number."""
     renew: Callable[[FloatArray], PriorFamily] | None = None
+    """``z -> PriorFamily``: the family linearised anew at z."""
 
     def widths(self, eta: FloatArray) -> FloatArray:
         """(q,) prior 1-sigma of z at `eta` (h,)."""

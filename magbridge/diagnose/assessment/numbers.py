@@ -22,21 +22,9 @@ if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
 __all__ = [
-    "Alone",
-    "Budget",
-    "Delays",
-    "Level",
-    "Motion",
-    "alone",
-    "budget",
-    "cancelling",
-    "delays",
-    "level",
-    "motion",
-    "slow_share",
-    "stays",
-    "times_usual",
-]
+    "Alone", "Budget", "Delays", "Level", "Motion", "alone", "budget", "cancelling", "delays", "level",
+    "motion", "slow_share", "stays", "times_usual",
+]  # fmt: skip
 
 CANCEL = 0.7
 """Two causes cancel each other where their sum is less than this share of the larger one."""

@@ -12,15 +12,7 @@ from scipy.sparse import csr_array
 from magbridge.arrays import BoolArray, FloatArray
 
 __all__ = [
-    "Columns",
-    "Interpolated",
-    "Mixture",
-    "Since",
-    "parts",
-    "places",
-    "side_by_side",
-    "size_of",
-    "times",
+    "Columns", "Interpolated", "Mixture", "Since", "parts", "places", "side_by_side", "size_of", "times",
     "together",
 ]  # fmt: skip
 

@@ -39,23 +39,10 @@ from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = [
-    "IDEAL",
-    "LEVEL",
-    "MOST_REMAINING",
-    "ODDS",
-    "REMNANT",
-    "SMOOTH",
-    "Score",
-    "bayes_factor_threshold",
-    "certainty",
-    "evidence_of",
-    "log_bayes",
-    "log_odds",
-    "look_elsewhere_factors",
-    "one_sided",
-    "regressor_error",
-    "score",
-]
+    "IDEAL", "LEVEL", "MOST_REMAINING", "ODDS", "REMNANT", "SMOOTH", "Score", "bayes_factor_threshold",
+    "certainty", "evidence_of", "log_bayes", "log_odds", "look_elsewhere_factors", "one_sided",
+    "regressor_error", "score",
+]  # fmt: skip
 
 LEVEL = 0.01
 """Family-wise false-alarm rate."""

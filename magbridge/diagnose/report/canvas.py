@@ -15,21 +15,9 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.pictures import literal
 
 __all__ = [
-    "AFTER",
-    "BEFORE",
-    "DOTS",
-    "FAINT",
-    "INK",
-    "SMALL",
-    "canvas",
-    "clock",
-    "curves",
-    "ends",
-    "png",
-    "rolling",
-    "sides",
-    "thin",
-]
+    "AFTER", "BEFORE", "DOTS", "FAINT", "INK", "SMALL", "canvas", "clock", "curves", "ends", "png", "rolling",
+    "sides", "thin",
+]  # fmt: skip
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 """Vermilion and blue, which any eye tells apart; in grey print the second is darker."""

@@ -17,20 +17,9 @@ from magbridge.diagnose.seen import Seen
 from magbridge.diagnose.words import label, measured, names_of, number, series_of
 
 __all__ = [
-    "MANY",
-    "bold",
-    "chance",
-    "figure",
-    "goes_with",
-    "label",
-    "listed",
-    "measured",
-    "number",
-    "physics",
-    "row",
-    "sizes",
-    "table",
-]
+    "MANY", "bold", "chance", "figure", "goes_with", "label", "listed", "measured", "number", "physics",
+    "row", "sizes", "table",
+]  # fmt: skip
 
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 MANY = 12

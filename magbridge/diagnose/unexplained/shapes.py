@@ -19,19 +19,9 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
 
 __all__ = [
-    "bends",
-    "crossing",
-    "curve",
-    "delayed",
-    "direction",
-    "hysteresis",
-    "lower_end",
-    "near_surface",
-    "repeated",
-    "response",
-    "spectra",
-    "swings",
-]
+    "bends", "crossing", "curve", "delayed", "direction", "hysteresis", "lower_end", "near_surface",
+    "repeated", "response", "spectra", "swings",
+]  # fmt: skip
 
 BEND = 32
 """Order of the polynomials of an axis' response: fine enough for a converter's coarsest steps."""

@@ -22,24 +22,16 @@ MOST = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Nodes of a square grid, where there are any; numbered strip by strip along the longer side.
-
-    Attributes
-    ----------
-    spacing : float
-        m.
-    low : (2,) array
-        m, north and east, of the box's first node.
-    number : (a, b) array
-        The number of each of the box's nodes, -1 where there is none.
-    turned : bool
-        Whether strips run north (the box is longer to the east).
-    """
+    """Nodes of a square grid, where there are any; numbered strip by strip along the longer side."""
 
     spacing: float
+    """m."""
     low: FloatArray
+    """(2,), m, north and east, of the box's first node."""
     number: IndexArray
+    """(a, b): The number of each of the box's nodes, -1 where there is none."""
     turned: bool
+    """Whether strips run north (the box is longer to the east)."""
 
     @property
     def size(self) -> int:
