@@ -170,12 +170,16 @@ class SurveyBound:
         P = np.linalg.inv(G.T @ np.linalg.solve(self._K, G) + np.eye(len(self._scale)))
         return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (floor**2).sum()))
 
+    def data_covariance(self, *, vehicle_known: bool) -> FloatArray:
+        """Return the covariance (n, n), nT², of the magnitudes: rock, level, noise, vehicle."""
+        return np.asarray(self._K if vehicle_known else self._K + self._G @ self._G.T)
+
     def of_map(self, at: FloatArray, apart_from: int, *, vehicle_known: bool) -> FloatArray:
         """Return the least error (m,), nT, of the map at places (m, 2), m.
 
         It is apart from the mean error at the first `apart_from` of them.
         """
-        K = self._K if vehicle_known else self._K + self._G @ self._G.T
+        K = self.data_covariance(vehicle_known=vehicle_known)
         C = self._alike(at, self._place)
         S = self._alike(at, at) - C @ cho_solve(cho_factor(K), C.T)
         level = S[:apart_from].mean(axis=0)

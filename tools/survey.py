@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import csv
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -167,11 +167,8 @@ def kept(path: Path | None) -> list[Row]:
     if path is None or not path.exists():
         return []
     with path.open(newline="") as file:
-        of = {name: float if kind == "float" else str for name, kind in Row.__annotations__.items()}
-        return [
-            Row(**{k: int(v) if k == "seed" else of[k](v) for k, v in one.items()})  # type: ignore[arg-type]
-            for one in csv.DictReader(file)
-        ]
+        of: dict[str, Callable[[str], Any]] = {"seed": int, "noise": str, "failed": str}
+        return [Row(**{k: of.get(k, float)(v) for k, v in one.items()}) for one in csv.DictReader(file)]
 
 
 def keep(row: Row, path: Path) -> None:
