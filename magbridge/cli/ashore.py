@@ -23,9 +23,9 @@ from magbridge.cli.common import (
     command,
     file_to_write,
     logs_to_read,
-    note_losses,
     print_result,
 )
+from magbridge.cli.remarks import note_losses
 from magbridge.errors import WrongUse
 from magbridge.progress import track, waiting
 

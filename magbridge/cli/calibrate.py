@@ -20,16 +20,13 @@ from magbridge.cli.common import (
     Picture,
     Reading,
     Whole,
-    by_base_station,
     check_inputs,
-    chosen_parameters,
     command,
     complain,
     logs_to_read,
-    note_losses,
-    note_unused_grid,
     print_result,
 )
+from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, note_unused_grid
 from magbridge.errors import CalibrationError, DataError, OutOfRange, WrongUse
 from magbridge.files import digest
 from magbridge.progress import waiting

@@ -1,35 +1,29 @@
-"""What the commands share: the application, common arguments, printing of results and warnings."""
+"""What the commands share: the application, common arguments, printing of results."""
 
 from __future__ import annotations
 
 import datetime as dt
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from cyclopts import App, Parameter, Token
 
 from magbridge import __version__
-from magbridge.errors import FormatError, WrongUse
+from magbridge.errors import WrongUse
 from magbridge.files import existing
 from magbridge.logs import Options, suffixes
 from magbridge.logs.registry import is_bag
 
-if TYPE_CHECKING:
-    import xarray as xr
-
-    from magbridge.calibration.model import Calibration
-
 __all__ = [
     "AS_THEY_SAY", "Base", "Day", "Folder", "Grid", "Heading", "Json", "Log", "Output", "Picture", "Reading",
-    "Whole", "app", "by_base_station", "check_inputs", "chosen_parameters", "command", "complain",
-    "file_to_write", "folder_to_write", "logs_to_read", "note_losses", "note_missing", "note_no_date",
-    "note_settings", "note_unused_grid", "print_result", "refuse_unsuited", "warnings_of",
+    "Whole", "app", "check_inputs", "command", "complain", "file_to_write", "folder_to_write", "logs_to_read",
+    "print_result",
 ]  # fmt: skip
 
 
@@ -147,8 +141,6 @@ class Reading:
 
 AS_THEY_SAY = Reading()
 """Logs are read as they say themselves."""
-NAMED = 5
-"""Losses that are named, a line each; the others are counted."""
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
@@ -185,137 +177,6 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
     for path in check_inputs(files, output, *others):
         if not is_bag(path):
             existing(path)
-
-
-def warnings_of(calibration: Calibration, file: Path) -> list[str]:
-    """Return a line that says why the data that a calibration was fitted to do not support it, or none."""
-    warnings = "; ".join(calibration.warnings)
-    return [f"{file}: the data it was fitted to do not support it: {warnings}"] if warnings else []
-
-
-def note_losses(*pieces: Mapping[str, Any]) -> None:
-    """Report on stderr what reading skipped, from the attributes of a deployment or of its pieces."""
-    from magbridge.logs.deployment import COUNTERS, GUESSED, named_losses, noted, passed_over
-
-    for guess in dict.fromkeys(str(attrs.get(GUESSED, "")) for attrs in pieces):
-        if guess:
-            complain(f"guessed: {guess}")
-    if counts := passed_over(*pieces):
-        losses = ", ".join(f"{count} {COUNTERS[name][count > 1]}" for name, count in counts.items())
-        complain(f"in the logs: {losses}")
-    for note in dict.fromkeys(noted(*pieces)):
-        complain(note)
-    lines = named_losses(*pieces)
-    for line in lines[:NAMED]:
-        complain(line)
-    if len(lines) > NAMED:
-        complain(f"and in {len(lines) - NAMED} places more")
-
-
-def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Dataset]:
-    """Return a vehicle's logs with what the field varied by.
-
-    That is by a file of its own, or by an observatory's log among the others.
-
-    Raises
-    ------
-    FormatError, DataError
-        The base station's log has no field, or not for the logs' time.
-    """
-    from magbridge.field.base_station import apart, with_daily_variation
-    from magbridge.logs import read
-    from magbridge.logs.deployment import join
-
-    own, stations = apart(logs)
-    if base is not None:
-        stations = [read(base)]
-    if not own or not stations:
-        return list(logs)
-    if len({station.attrs.get("observatory") for station in stations}) > 1:
-        names = " and ".join(str(station.attrs["source"]) for station in stations)
-        raise WrongUse(f"{names} are of several observatories: give one of them, the nearest")
-    station = join(stations)
-    note_losses(station.attrs)
-    return with_daily_variation(own, station)
-
-
-def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: Any) -> tuple[str, ...]:
-    """Return the parameters of a fit: those that are named, or for ``auto`` the columns that are worth it.
-
-    What each that was tried buys on parts left out is told on stderr. `options` are of
-    :func:`~magbridge.calibration.fitting.offered.best_parameters`.
-
-    Raises
-    ------
-    WrongUse
-        ``auto`` among names.
-    """
-    from magbridge.calibration.fitting.offered import AUTO, best_parameters, lines
-    from magbridge.logs.info import movers
-
-    if AUTO not in named:
-        return tuple(named)
-    if len(named) > 1:
-        raise WrongUse(f"--parameter {AUTO}: chooses them all, and goes with no other")
-    offered = movers(deployment)
-    taken, offers = best_parameters(deployment, offered, **options)
-    for line in lines(offers) or [
-        f"--parameter {AUTO}: none of {' '.join(offered) or 'its columns'} moves the field"
-    ]:
-        complain(line)
-    return taken
-
-
-def note_missing(calibration: Calibration, deployment: xr.Dataset) -> None:
-    """Warn on stderr of columns that the calibration needs and a log does not have."""
-    for name in calibration.channels:
-        if name not in deployment:
-            lacking = f"{deployment.attrs['source']}: no column {name!r}, which the calibration needs"
-            complain(f"{lacking}: every sample is flagged, with a sigma to match")
-
-
-def note_unused_grid(grid: Path | None, *logs: xr.Dataset) -> None:
-    """Warn on stderr of logs that hold a reference in every row: a grid is only added to the IGRF."""
-    for log in logs if grid else ():
-        if "reference_field" in log and log["reference_field"].notnull().all():
-            complain(f"{log.attrs['source']}: has reference_field in every row: --grid {grid} is not used")
-
-
-def note_no_date(deployment: xr.Dataset) -> None:
-    """Warn on stderr that a log has no anomaly, since the field of its day is not known."""
-    from magbridge.columns import counts_from_boot
-
-    if counts_from_boot(deployment):
-        source = deployment.attrs["source"]
-        complain(f"{source}: its times count from the boot: no anomaly without --date YYYY-MM-DD")
-
-
-def note_settings(*pieces: Mapping[str, Any]) -> None:
-    """Warn on stderr where a bridge was tuned in the course of its log, from the attributes of its pieces."""
-    from magbridge.logs.deployment import CHANGES
-
-    for attrs in pieces:
-        if times := int(attrs.get(CHANGES, 0)):
-            often = "once" if times == 1 else f"{times} times"
-            complain(
-                f"{attrs['source']}: MB_* parameters were set {often} in the course of the log; it is "
-                "corrected with those of its start (magbridge replay follows them)"
-            )
-            return
-
-
-def refuse_unsuited(calibration: Calibration, deployment: xr.Dataset) -> None:
-    """FormatError: a log to be corrected is of another sensor, or parameters or channels in another unit."""
-    from magbridge.columns import CHANNELS, require_units
-    from magbridge.field.reference import other_units
-
-    source, sensor = deployment.attrs["source"], str(deployment.attrs.get("sensor", ""))
-    if not calibration.sensor.may_be(sensor):
-        raise FormatError(source, f"sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
-    require_units(deployment, calibration.units)
-    channels = deployment[list(CHANNELS)].to_array().to_numpy().T
-    if wrong := other_units(channels, calibration.reference.field):
-        raise FormatError(source, wrong)
 
 
 def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:

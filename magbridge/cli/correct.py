@@ -1,9 +1,7 @@
-"""Correct a log, and tell what has come of it."""
+"""Correct a log."""
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,14 +18,17 @@ from magbridge.cli.common import (
     complain,
     file_to_write,
     logs_to_read,
+    print_result,
+)
+from magbridge.cli.remarks import (
     note_losses,
     note_missing,
     note_no_date,
     note_settings,
-    print_result,
     refuse_unsuited,
     warnings_of,
 )
+from magbridge.cli.tally import Tally
 from magbridge.columns import CHANNELS, CORRECTED
 from magbridge.errors import ConfigError, DataError, WrongUse
 from magbridge.progress import track
@@ -109,7 +110,7 @@ def correct(
         complain(doubt)
     if save is not None and not learn:
         raise WrongUse("--save writes what was learned: give --learn, too")
-    tally, whole = _Tally(), False
+    tally, whole = Tally(), False
     correction: Correction | None = None
     pieces: list[dict[str, Any]] = []
     drawn: list[xr.Dataset] = []
@@ -238,57 +239,3 @@ def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Pa
     attrs = {"calibration_id": f"{calibration_id(known):08x}", HISTORY: "\n".join(history)}
     meaning = {name: value for name, value in lasting(log.attrs).items() if name in MEANING}
     return corrected.assign({name: log[name] for name in names}).assign_attrs(meaning | attrs)
-
-
-@dataclass
-class _Tally:
-    """What has come of a log so far."""
-
-    samples: int = 0
-    left_out: int = 0
-    """`samples`, `left_out`: Rows corrected, and those that are no samples."""
-    flagged: int = 0
-    """Samples whose total field is in doubt."""
-    flags: Counter[str] = field(default_factory=Counter)
-    """Name of a flag -> samples that carry it."""
-    unearthly: int = 0
-    """Samples whose total field is none of the Earth's."""
-
-    def add(self, corrected: xr.Dataset, rows: int) -> None:
-        """Count a piece of the log that had so many rows, with its samples corrected."""
-        from magbridge.field.reference import EARTHS
-        from magbridge.records import Quality
-
-        self.samples += corrected.sizes["time"]
-        self.left_out += rows - corrected.sizes["time"]
-        doubtful = ~Quality.NO_BORESIGHT  # without a boresight, the total field is just as good
-        quality = corrected["quality"].to_numpy().astype(int)
-        self.flagged += int((quality & doubtful != 0).sum())
-        self.flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})
-        total = corrected["total_field"]
-        self.unearthly += int(((total < EARTHS[0]) | (total > EARTHS[1])).sum())
-
-    def doubt(self) -> str:
-        """Return why the calibration may be another vehicle's; empty where nothing says so."""
-        from magbridge.field.reference import EARTHS
-
-        if self.unearthly <= self.samples / 2:
-            return ""
-        low, high = (f"{limit:,.0f}" for limit in EARTHS)
-        return (
-            f"another vehicle's? {self.unearthly} of {self.samples} corrected total fields are none of the "
-            f"Earth's, {low} to {high} nT"
-        )
-
-    def facts(self) -> dict[str, Any]:
-        """Return the numbers to print as JSON."""
-        left_out = {"left_out": self.left_out}
-        return {"rows": self.samples, "flagged": self.flagged, "flags": +self.flags, **left_out}
-
-    def summary(self) -> str:
-        """Return the numbers in a sentence."""
-        named = ", ".join(f"{name} {count}" for name, count in (+self.flags).items())
-        text = f"{self.samples} samples, {self.flagged} of them flagged" + (f" ({named})" if named else "")
-        return text + (
-            f"; {self.left_out} rows without any of {' '.join(CHANNELS)} left out" if self.left_out else ""
-        )

@@ -16,11 +16,9 @@ from magbridge.cli.common import (
     command,
     complain,
     logs_to_read,
-    note_losses,
-    note_unused_grid,
     print_result,
-    warnings_of,
 )
+from magbridge.cli.remarks import note_losses, note_unused_grid, warnings_of
 from magbridge.files import digest
 from magbridge.progress import waiting
 

@@ -7,7 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Whole, command, complain, file_to_write, warnings_of
+from magbridge.cli.common import Folder, Whole, command, complain, file_to_write
+from magbridge.cli.remarks import warnings_of
 from magbridge.errors import DataError, WrongUse
 
 

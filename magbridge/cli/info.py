@@ -6,16 +6,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    Json,
-    Reading,
-    command,
-    complain,
-    logs_to_read,
-    note_losses,
-    print_result,
-)
+from magbridge.cli.common import AS_THEY_SAY, Json, Reading, command, complain, logs_to_read, print_result
+from magbridge.cli.remarks import note_losses
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:

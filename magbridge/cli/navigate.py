@@ -18,13 +18,9 @@ from magbridge.cli.common import (
     command,
     complain,
     logs_to_read,
-    note_losses,
-    note_missing,
-    note_settings,
     print_result,
-    refuse_unsuited,
-    warnings_of,
 )
+from magbridge.cli.remarks import note_losses, note_missing, note_settings, refuse_unsuited, warnings_of
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:

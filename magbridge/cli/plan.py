@@ -7,17 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import (
-    AS_THEY_SAY,
-    Heading,
-    Json,
-    Reading,
-    Whole,
-    command,
-    complain,
-    note_losses,
-    print_result,
-)
+from magbridge.cli.common import AS_THEY_SAY, Heading, Json, Reading, Whole, command, complain, print_result
+from magbridge.cli.remarks import note_losses
 from magbridge.errors import WrongUse
 from magbridge.progress import waiting
 

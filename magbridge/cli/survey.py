@@ -16,16 +16,13 @@ from magbridge.cli.common import (
     Picture,
     Reading,
     Whole,
-    by_base_station,
     check_inputs,
-    chosen_parameters,
     command,
     complain,
     file_to_write,
-    note_losses,
     print_result,
-    warnings_of,
 )
+from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, warnings_of
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import waiting
 
