@@ -11,11 +11,9 @@ uncertainty: Schmidt 1966).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.evidence import Widths, maximise
@@ -27,13 +25,10 @@ from magbridge.calibration.fitting.field_search import (
     choose,
     climb,
 )
-from magbridge.calibration.fitting.joint import Linear, Reduced, Sums, add_up, eliminate
+from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
 from magbridge.calibration.fitting.latent import (
-    CHUNK,
     NOTHING,
-    Columns,
     Group,
-    in_chunks,
     likeliest,
     slow_functions,
     with_groups,
@@ -42,9 +37,9 @@ from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
 from magbridge.field.place.blocks import near_inverse
-from magbridge.field.place.matern import Matern
 from magbridge.survey.gridded import Gridded, Posterior
 from magbridge.survey.roughness import Roughness
+from magbridge.survey.rows import Rows
 from magbridge.survey.samples import Samples
 
 __all__ = ["gridded"]
@@ -66,55 +61,6 @@ MOST = 40_000
 """Nodes at most; their variances take 0.5 GB."""
 
 
-class _Problem:
-    """The samples of a survey as rows of a linear model."""
-
-    def __init__(self, samples: Samples, groups: tuple[Group, ...], roughness: Roughness) -> None:
-        self.samples, self.roughness = samples, roughness
-        self.mean = float(np.median(samples.value))
-        self.middle = float(np.nanmedian(samples.depth))
-        self.deeper = np.nan_to_num(samples.depth - self.middle)
-        self.D = Columns(groups)
-        self.scale = roughness.at(samples.place)
-        self.kept = np.ones(len(samples.value), bool)
-
-    def basis(self, field: Matern, rows: IndexArray | slice) -> csr_array:
-        known = field.basis(self.samples.place[rows], self.deeper[rows])
-        return csr_array(diags_array(self.scale[rows]) @ known)
-
-    def mean_over_samples(self, field: Matern) -> FloatArray:
-        """Return what each of the field's coefficients adds to the samples' mean: (nodes,)."""
-        kept, total = np.flatnonzero(self.kept), np.zeros(field.nodes.size)
-        for start in range(0, len(kept), CHUNK):
-            total += self.basis(field, kept[start : start + CHUNK]).sum(axis=0)
-        return total / len(kept)
-
-    def rock(self, field: Matern, w: FloatArray) -> FloatArray:
-        """Return what coefficients w (nodes,) of a field are at every sample: (n,), nT."""
-        return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
-
-    def sums(self, field: Matern, rows: IndexArray, modes: bool = False) -> Sums:
-        return add_up(self._pieces(field, rows, modes))
-
-    def _pieces(self, field: Matern, rows: IndexArray, modes: bool) -> Iterator[Linear]:
-        s = self.samples
-        rows = rows[self.kept[rows]]
-        follows = np.zeros(len(rows), bool)
-        follows[1:] = (np.diff(rows) == 1) & (s.line[rows][1:] == s.line[rows][:-1])
-        for start in range(0, len(rows), CHUNK):
-            first = max(start - 1, 0)
-            mine = rows[first : start + CHUNK]
-            weight = -1.0 / s.weight[mine]
-            V = [(s.value[mine] - self.mean)[:, None], self.D[mine]]
-            if modes:
-                V.append(s.modes[mine])
-            rows_of = np.concatenate(V, axis=1)
-            rows_of[:, 1:] *= weight[:, None]
-            rows_of[:, 0] *= -weight
-            B = csr_array(diags_array(weight) @ self.basis(field, mine))
-            yield Linear(rows_of, B, follows[first : start + CHUNK], overlap=start > 0)
-
-
 def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     """Grid a survey.
 
@@ -130,11 +76,12 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MOST)
     choice = replace(choice, field=replace(choice.field, nodes=nodes))
     every = np.arange(len(samples.value))
-    groups = _needed(samples, choice, roughness, sigma)
-    problem, family = _Problem(samples, groups, roughness), with_groups(NOTHING, groups)
+    problem = Rows(samples, _groups(samples), roughness)
+    sums = problem.sums(choice.field, every)
+    groups = _needed(problem.groups, sums, choice, sigma)
+    family = with_groups(NOTHING, groups)
     weighed = Weighed(family, family.centre, sigma, choice.field.length)
     for turn in range(2):
-        sums = problem.sums(choice.field, every)
         reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
         widths = maximise(reduced.quadratic, family, weighed.eta, sigma)
         z, _ = _solved(reduced, widths, family)
@@ -144,6 +91,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         if turn or not (far := np.abs(e) > OUTLIER * max(robust_scale(e), widths.sigma)).any():
             break
         problem.kept = ~far
+        sums = problem.sums(choice.field, every)
         weighed = replace(weighed, eta=widths.eta, sigma=widths.sigma)
     shaken = np.empty((nodes.size, 0))
     if samples.modes.shape[1]:
@@ -178,7 +126,7 @@ def _posterior(
     weight: float,
     choice: Choice,
     sums: Sums,
-    problem: _Problem,
+    problem: Rows,
     family: PriorFamily,
     widths: Widths,
     shaken: FloatArray,
@@ -211,12 +159,10 @@ def _groups(samples: Samples) -> tuple[Group, ...]:
     return tuple(groups)
 
 
-def _needed(samples: Samples, choice: Choice, roughness: Roughness, sigma: float) -> tuple[Group, ...]:
+def _needed(groups: tuple[Group, ...], sums: Sums, choice: Choice, sigma: float) -> tuple[Group, ...]:
     """Return levels and slow changes; these are small unless larger ones make the samples likelier."""
-    groups = _groups(samples)
     if not any(one.offered for one in groups):
         return groups
-    sums = _Problem(samples, groups, roughness).sums(choice.field, np.arange(len(samples.value)))
     reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
     kept = likeliest(reduced.quadratic, NOTHING, groups, with_groups(NOTHING, groups).centre, sigma)
     return tuple(one if one in kept else replace(one, width=UNSEEN, spread=0.0) for one in groups)
@@ -229,7 +175,7 @@ def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, R
     family = with_groups(NOTHING, groups)
     weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))
     even = Roughness.even()
-    problem = _Problem(few, groups, even)
+    problem = Rows(few, groups, even)
     size = max(robust_scale(few.value - problem.mean), 5.0)
     best = choose(
         lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
@@ -239,7 +185,7 @@ def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, R
     if not local or area < LARGE * best.field.length**2:
         return best, even
     uneven = Roughness.of(samples, best.field.length)
-    problem = _Problem(few, groups, uneven)
+    problem = Rows(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
     return (other, uneven) if other.score > best.score + LIKELIER else (best, even)
 
@@ -252,7 +198,7 @@ def _solved(reduced: Reduced, widths: Widths, family: PriorFamily) -> tuple[Floa
 
 
 def _considered(
-    problem: _Problem,
+    problem: Rows,
     choice: Choice,
     reduced: Reduced,
     widths: Widths,
