@@ -3,8 +3,8 @@
 An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
 regressors sample by sample (`begin` returns a stepper with a fresh state) or of a whole log (`batch`).
 
-Here are what they share and the effect of one telemetry channel; the others are in :mod:`.mass_effects` and
-:mod:`.instrument_effects`.
+Here are what they share and the effect of one telemetry channel; the others are in :mod:`.mass_effects`,
+:mod:`.memory_effects` and :mod:`.instrument_effects`.
 """
 
 from __future__ import annotations

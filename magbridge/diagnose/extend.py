@@ -10,7 +10,7 @@ import numpy as np
 
 from magbridge.arrays import IndexArray
 from magbridge.calibration.instrument_effects import RateEffect
-from magbridge.calibration.mass_effects import ClockEffect
+from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals, residuals_of, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate, slices

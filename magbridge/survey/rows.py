@@ -46,7 +46,7 @@ class Rows:
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def sums(self, field: Matern, rows: IndexArray, modes: bool = False) -> Sums:
-        """Return the sums of the samples `rows`, of them the kept; with the calibration's modes."""
+        """Return the sums of the samples `rows` (m,), of them the kept; with the calibration's modes."""
         return add_up(self._pieces(field, rows, modes))
 
     def _pieces(self, field: Matern, rows: IndexArray, modes: bool) -> Iterator[Linear]:

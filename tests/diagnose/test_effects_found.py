@@ -14,13 +14,8 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
-from magbridge.calibration.mass_effects import (
-    ClockEffect,
-    LegendreEffect,
-    PlayEffect,
-    PowersEffect,
-    SourcesEffect,
-)
+from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect

@@ -10,7 +10,8 @@ from scipy.linalg import inv
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
-from magbridge.calibration.mass_effects import ClockEffect, PowersEffect
+from magbridge.calibration.mass_effects import PowersEffect
+from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.assessment.weigh import unsettled
 from magbridge.diagnose.causes import CAUSES

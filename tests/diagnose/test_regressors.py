@@ -9,7 +9,8 @@ import pytest
 from posed import calibrated, missed, regressors_of, right, surveyed, thinned, walk
 
 from magbridge.calibration.effects import ChannelEffect, lagged
-from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.memory_effects import PlayEffect
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES

@@ -57,7 +57,7 @@ class Answer:
 
 
 def start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float]:
-    """Return z near the answer, the rock taken for noise; and the size of that."""
+    """Return z (q,) near the answer, the rock taken for noise; and the size of that."""
     samples, prior = survey.samples, family.at(family.centre)
     found: list[tuple[float, FloatArray]] = []
     for one in starts(samples):

@@ -57,7 +57,7 @@ def climb(
 ) -> Climbed:
     """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that.
 
-    `shaped`: the memory of `noise` is kept.
+    `z` (q,) and `eta` (h,) are where it begins. `shaped`: the memory of `noise` is kept.
     """
     score, white = -np.inf, noise is None
     shape = noise.shape if noise is not None and shaped else None

@@ -152,7 +152,7 @@ def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[Waves, F
 
 
 def in_chunks(n: int, made: Callable[[slice], FloatArray]) -> FloatArray:
-    """Return what is `made` of n rows, some at a time: bounded memory."""
+    """Return what is `made` of n rows, (n, ...), some at a time: bounded memory."""
     return np.concatenate([made(slice(start, start + CHUNK)) for start in range(0, max(n, 1), CHUNK)])
 
 

@@ -7,7 +7,8 @@ from itertools import product
 
 import numpy as np
 
-from magbridge.calibration.mass_effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
+from magbridge.calibration.memory_effects import PlayEffect
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.compare.prior import FALL
@@ -105,7 +106,7 @@ def hysteresis(problem: Problem) -> list[Candidate]:
     """Backlash of a drive, or moving steel remagnetised: ``T += b (S(y) - S(p)) / width``, y the play of p.
 
     S is straight for the backlash of a drive; for steel it is steep where the steel is: see
-    :class:`~magbridge.calibration.mass_effects.PlayEffect`.
+    :class:`~magbridge.calibration.memory_effects.PlayEffect`.
     """
     drives = product((0.05, 0.15, 0.3), (0.0,), (STRAIGHT,))
     steel = product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,))

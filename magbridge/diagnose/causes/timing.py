@@ -6,7 +6,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
-from magbridge.calibration.mass_effects import ClockEffect
+from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
 from magbridge.diagnose.compare.interpolation import LOST, rates
 from magbridge.diagnose.compare.problem import Problem, once

@@ -10,7 +10,8 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, powers
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect
-from magbridge.calibration.mass_effects import ClockEffect, LegendreEffect, PathEffect, PlayEffect
+from magbridge.calibration.mass_effects import LegendreEffect, PathEffect
+from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.timing import field_rates, mass_rates

@@ -13,7 +13,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import lagged, powers
-from magbridge.calibration.mass_effects import play
+from magbridge.calibration.memory_effects import play
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import pieces
