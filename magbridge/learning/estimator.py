@@ -88,7 +88,7 @@ class Estimator:
         self._nuisance, self._creep = nuisance, creep
         self._sloping, self._lasting = False, LASTING
         self._near: FloatArray | None = None
-        self._mean, self._kept = np.zeros(K), np.zeros((K, K))
+        self._mean, self._kept = np.zeros(K), np.zeros(K)
         self._stay = 1.0
         self.residual, self.variance, self.telling = 0.0, 1.0, False
         self._h = np.zeros(self.states)
@@ -112,7 +112,9 @@ class Estimator:
     @property
     def covariance(self) -> FloatArray:
         """Their covariance (K, K), symmetric and positive semidefinite."""
-        P = self._P[: self.size, : self.size] + self._kept
+        P = self._P[: self.size, : self.size]
+        kept = self._kept * float(self._mean @ P @ self._mean)  # what has not been learned since
+        P = P + np.outer(kept, kept)
         values, vectors = np.linalg.eigh(0.5 * (P + P.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(root @ root.T)
@@ -137,15 +139,14 @@ class Estimator:
 
         As :meth:`at_level_of`, with rock that takes up what the coefficients give; but not where the level
         drifts, or has changed beyond chance. It may have changed by so much all the same: the covariance of
-        what is published says so, while the filter, whose level is chance, is not let loose.
+        what is published says so, as far as that is not learned since; the filter is not let loose.
         """
         K = self.size
         toward = self._P[:, :K] @ self._mean
         by, variance = float(self._mean @ (published - self.coefficients)), float(self._mean @ toward[:K])
         if not self._sloping and by * by < CHANGED * CHANGED * variance:
-            moved = toward * (by / variance)
-            self._x += moved
-            self._kept += np.outer(moved[:K], moved[:K])
+            self._x += toward * (by / variance)
+            self._kept = toward[:K] * (by / variance**2)
 
     def open(self, variance: float, which: IndexArray | None = None) -> None:
         """Let coefficients `which` (3,), by default the offsets, be unknown by a further `variance` each."""
