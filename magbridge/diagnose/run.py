@@ -38,7 +38,7 @@ from magbridge.diagnose.inference.random_walk import odds_over_random_walk
 from magbridge.diagnose.inference.search import Outcome, search
 from magbridge.diagnose.seen import memory
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
-from magbridge.diagnose.unexplained.unlisted import unlisted
+from magbridge.diagnose.unexplained.unlisted import switching, unlisted
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 
@@ -126,8 +126,10 @@ def _examine(
     named, competing, fit = (
         (outcome.chosen, outcome.competing, outcome.fit) if stand else ((), (), outcome.null)
     )
-    model = [h.candidate for h in named]
     off = _off(outcome.fit, named, len(causes))
+    if switched := switching(problem, outcome.fit, named, off):
+        rest, named, competing, fit = switched, (), (), outcome.null
+    model = [h.candidate for h in named]
     wrong = off if off is not None and off.isolated else None
     progress("extending the calibration")
     settled, columns, fit = relinearised(problem, model, fit)
@@ -230,11 +232,17 @@ def _findings(
         without = held_out(problem, columns, alone).residual
         improvement = paired(without, after, problem.survey.dive, counts)
         covariance = fit.effects_covariance[own, own]
-        one = Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, chance)
-        if memory(problem, one.field(problem)).slow >= SLOW:
-            one = replace(one, over_random_walk=odds_over_random_walk(outcome, hypothesis))
-        found.append(one)
+        odds = odds_over_random_walk(outcome, hypothesis) if _is_slow(problem, hypothesis) else np.inf
+        found.append(
+            Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, chance, odds)
+        )
     return tuple(found)
+
+
+def _is_slow(problem: Problem, one: Hypothesis) -> bool:
+    """Say whether a cause is slow: most of its power is left in means over many samples."""
+    added = one.candidate.columns(slice(0, len(problem))) @ one.fit.coefficients[-one.candidate.size :]
+    return memory(problem, added).slow >= SLOW
 
 
 def _verdict(

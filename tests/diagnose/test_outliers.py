@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.signal import lfilter
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint
@@ -21,6 +23,20 @@ N = 5000
 SPIKE = np.array([0.0, 12.0, 0.0])
 PULSE = np.array([6.0, 12.0, 6.0])
 """Of a source that passes within a few samples, in units of the innovations."""
+
+
+Demo = tuple[Calibration, xr.Dataset]
+
+
+@pytest.fixture(scope="module")
+def demo() -> Demo:
+    """The demo's calibration, and its survey."""
+    scenario = load("demo")
+    parts = segments(simulate(scenario, 2))
+    learned = unfiltered(
+        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
+    )
+    return fit(learned, "auto").calibration, parts["survey"]
 
 
 def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float = 50.0) -> Outliers | None:
@@ -86,14 +102,9 @@ def test_beside_a_gap_there_is_none_to_ask() -> None:
 
 
 @pytest.mark.parametrize(("shape", "isolated"), [(SPIKE, True), (PULSE, False)])
-def test_a_diagnosis_names_isolated_samples_only(shape: np.ndarray, isolated: bool) -> None:
+def test_a_diagnosis_names_isolated_samples_only(demo: Demo, shape: np.ndarray, isolated: bool) -> None:
     """Beside others that are off it says that something was there for a moment."""
-    scenario = load("demo")
-    parts = segments(simulate(scenario, 2))
-    learned = unfiltered(
-        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
-    )
-    calibration, survey = fit(learned, "auto").calibration, parts["survey"]
+    calibration, survey = demo[0], demo[1].copy()
     off = np.zeros(survey.sizes["time"])
     for row in (200, 900):
         off[row - 1 : row + 2] = 3.0 * shape
@@ -104,3 +115,16 @@ def test_a_diagnosis_names_isolated_samples_only(shape: np.ndarray, isolated: bo
     assert (reported.wrong is not None) is isolated
     assert (reported.unexplained is None) is isolated
     assert isolated or reported.unexplained.kind == "transient"
+
+
+def test_a_relay_gets_no_name(demo: Demo) -> None:
+    """Nor does what is left of it where noise of a long memory has absorbed the rest."""
+    calibration, survey = demo[0], demo[1].copy()
+    n, rng = survey.sizes["time"], np.random.default_rng(4)
+    relay = np.searchsorted(np.sort(rng.integers(0, n, 14)), np.arange(n)) % 2
+    for name, size in (("mag_x", 9.0), ("mag_y", -6.0), ("mag_z", 12.0)):
+        survey[name] = survey[name] + size * relay
+    reported = diagnose([survey], calibration)
+    assert (reported.findings, reported.wrong) == ((), None)
+    assert reported.unexplained is not None
+    assert reported.unexplained.kind == "switching"

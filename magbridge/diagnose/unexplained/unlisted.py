@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import REMNANT
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.joint import Joint
@@ -17,7 +18,7 @@ from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.seen import memory
 from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = ["unlisted"]
+__all__ = ["switching", "unlisted"]
 
 LOUD = 2.0
 """Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
@@ -39,10 +40,21 @@ def unlisted(
 
     `off` are wrong samples, `after` (n,) is the residual on parts left out, nT, of which `counts` (n,) count.
     """
-    slow = _slow(problem, fit, named)
-    if slow and off is not None and off.lasting:
-        return slow._replace(kind="switching")
-    return _passing(off) or slow or _loud(problem, after, counts)
+    return _passing(off) or _slow(problem, fit, named) or _loud(problem, after, counts)
+
+
+def switching(
+    problem: Problem, fit: Joint, named: Sequence[Hypothesis], off: Outliers | None
+) -> Leftover | None:
+    """Describe what switches, if that is stronger than all causes that are `named`; else None.
+
+    The noise's memory has absorbed it but for its level shifts, and the names are of what that leaves.
+    """
+    rest = _slow(problem, fit, named) if off is not None and off.lasting else None
+    if rest is None or any(one.signal_to_noise >= rest.signal_to_noise for one in named):
+        return None
+    within = tuple(CompetingHypothesis(one.candidate, 0.0) for one in named)
+    return rest._replace(kind="switching", within=within)
 
 
 def _passing(off: Outliers | None) -> Leftover | None:
