@@ -320,6 +320,21 @@ def slowly(data: Observations) -> Observations:
     return replace(data, time=1e9 + 3.0 * (data.time - data.time[0]))
 
 
+def test_a_mass_that_begins_to_move_unseen_is_no_creep_of_the_offset() -> None:
+    """Between two reports a motion may have begun: the samples beside one are neither rock nor drift."""
+    data, true = flown(legs=14)
+    leg, within = np.divmod(np.arange(len(data)), 110)
+    moved = np.where(leg % 2, 1.0, -1.0) * np.array([-1.0, -0.2, 0.6, *np.ones(107)])[within]  # ends in 12 s
+    begun = np.where(within == 0, 0.3 * np.where(leg % 2, 1.0, -1.0), 0.0)  # no report tells of it
+    iron = np.outer(moved + begun, [300.0, -200.0, 150.0])
+    seen = slowly(replace(data, field=data.field + iron, parameters=moved[:, None], names=("battpos",)))
+    found = fit(seen)
+    assert found.creep is None
+    assert found.details["outliers"] == 0
+    got = correct(found.calibration, seen.field, seen.parameters, seen.time)
+    assert np.std((got.total - true)[within > 3]) < 1.2 * NOISE
+
+
 @pytest.mark.parametrize("lag", [0.0, 600.0])
 def test_offset_that_follows_the_temperature_is_found_and_written(lag: float) -> None:
     """2 nT/degC, and 10 degC between surface and depth: it is in the calibration, and not in the rock."""

@@ -138,7 +138,7 @@ def _details(found: Answer, survey: SurveySamples) -> dict[str, Any]:
         "log_evidence": found.score,
         "determined": found.widths.determined,
         "autocorrelation": choice.rho,
-        "outliers": int((~survey.kept).sum()),
+        "outliers": int((survey.at_rest & ~survey.kept).sum()),
         "widths_nT": dict(zip(names, np.exp(found.widths.eta).tolist(), strict=True)),
         "offsets_nT": {one.name: rms(survey.offset(latent, [one])) for one in survey.offsets},
         "rock": {

@@ -34,6 +34,8 @@ SEARCHES = 2
 """Rounds after that in which the search goes on."""
 ROUNDS = 40
 """Rounds at most; six are usual, and some twenty from a start 10,000 nT off, whose steps are shortened."""
+PATIENCE = 8
+"""Rounds after the search within which they are expected to be at rest; a bent track takes more."""
 STILL = 0.05
 """Of the noise: a round that moves no residual by more (RMS) is the last."""
 OUTLIER = 5.0
@@ -80,7 +82,7 @@ class _Rounds:
     def __init__(self, survey: SurveySamples, own: PriorFamily) -> None:
         self.survey, self.own, self.q = survey, own, own.E.shape[1]
         self.until = GUESSED + SEARCHES
-        self.weigh_offers = self.until + 1 if any(one.offered for one in survey.groups) else -1
+        self.offers = any(one.offered for one in survey.groups)
         self.family = with_groups(own, survey.groups)
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
         self.step = max(int(self.part.sum()) // SEARCHED, 1)
@@ -94,12 +96,12 @@ class _Rounds:
 
     def go_on(self, survey: SurveySamples, step: int) -> None:
         """Go on with `survey`, of which the samples so far were every `step`-th one; nothing is searched."""
-        self.survey, self.until, self.weigh_offers = survey, -1, -1
+        self.survey, self.until = survey, -1
         self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / step))
         field = self.choice.field
         survey.bend(field, self.w, self.z[self.q :])
         self.last = self._residuals(self.z, self._slow(self.z) + survey.rock(field, self.w))
-        survey.kept = np.abs(self.last) <= OUTLIER * robust_scale(self.last)
+        survey.kept = survey.at_rest & (np.abs(self.last) <= OUTLIER * robust_scale(self.last))
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
         self.choice = same_noise(self._sums(field), self.choice, weighed)
 
@@ -116,17 +118,18 @@ class _Rounds:
             if self.own.renew is not None and turn:
                 self.own = self.own.renew(self.z[: self.q])
                 self.family = with_groups(self.own, survey.groups)
-            if turn == self.weigh_offers:
-                self._weigh_offers()
             answer = self._round(turn)
             e = self._residuals(answer.z, answer.lacking)
             if self.last is not None:
                 moved = float(np.sqrt(np.mean((e - self.last) ** 2)))
             self.last = e
-            if turn > self.until and moved < STILL * self.sigma:
+            if turn >= GUESSED:
+                survey.kept = survey.at_rest & (np.abs(e) <= OUTLIER * robust_scale(e))
+            still = turn > self.until and moved < STILL * self.sigma
+            if still and not self.offers:
                 return answer
-            if GUESSED <= turn <= self.until:
-                survey.kept = np.abs(e) <= OUTLIER * robust_scale(e)
+            if self.offers and (still or turn == self.until + PATIENCE):
+                self._weigh_offers(turn)
         if moved > self.sigma:
             raise CalibrationError("the fit to the survey did not settle: the data contradict themselves")
         return answer
@@ -175,14 +178,18 @@ class _Rounds:
         nodes = nodes_for(self.survey.place, field.length, field.alpha, MOST)
         return replace(choice, field=replace(field, nodes=nodes))
 
-    def _weigh_offers(self) -> None:
-        """Keep of what is offered what the log needs; where that is not all, the search goes on without."""
+    def _weigh_offers(self, turn: int) -> None:
+        """Keep of what is offered what the log needs; where that is not all, the search goes on without.
+
+        Not before the rounds are at rest with all of it: until then they fit what is an outlier.
+        """
         survey, choice = self.survey, self.choice
+        self.offers = False
         reduced = eliminate(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
         kept = likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma)
         if len(kept) < len(survey.groups):
             self._regroup(kept)
-            self.until += SEARCHES
+            self.until = turn + SEARCHES
 
     def _regroup(self, groups: tuple[Group, ...]) -> None:
         """Go on with other groups of unknowns; those that were there stay where they are."""

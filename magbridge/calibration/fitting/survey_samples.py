@@ -10,13 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, diags_array
 
-from magbridge.arrays import FloatArray, IndexArray
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.joint import Linear
 from magbridge.calibration.fitting.latent import CHUNK, Columns, Group, Offset, Waves, in_chunks
 from magbridge.calibration.fitting.level import sizes
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.residual import Samples, jacobian, residuals
+from magbridge.config import Align
 from magbridge.field.place.matern import Matern
 
 __all__ = ["Drift", "SurveySamples"]
@@ -28,6 +29,21 @@ class Drift(NamedTuple):
     waves: FloatArray | Waves
     shape: FloatArray
     sigma: float
+
+
+def _at_rest(data: Observations) -> BoolArray:
+    """Say beside which samples (n,) no mass moves, by the bridge's own criterion; all, where most do.
+
+    Where one begins to move after its last report, no telemetry tells where it was. A current or a throttle
+    that always changes is no such mass.
+    """
+    rest = np.ones(len(data), bool)
+    span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
+    fastest = Align().moving_rate * span * np.maximum(np.diff(data.time), 1.0)[:, None]
+    moving = (np.abs(np.diff(data.parameters, axis=0)) > fastest).any(axis=1)
+    rest[1:] &= ~moving
+    rest[:-1] &= ~moving
+    return rest if rest.mean() > 0.5 else np.ones(len(data), bool)
 
 
 class SurveySamples:
@@ -55,7 +71,8 @@ class SurveySamples:
         self.place = self.as_logged = data.place[:, :2]
         self.middle = float(np.nanmedian(data.place[:, 2]))
         self.deeper = np.nan_to_num(data.place[:, 2] - self.middle)
-        self.kept = np.ones(len(samples.field), bool)
+        self.at_rest = _at_rest(data)
+        self.kept = self.at_rest.copy()
         if drift is not None:
             nothing = np.zeros((len(samples.field), 0))
             groups = (
@@ -66,7 +83,7 @@ class SurveySamples:
     def thinned(self, step: int) -> SurveySamples:
         """Return every `step`-th sample."""
         few, rows = copy(self), np.arange(0, len(self.kept), step)
-        for name in ("unmapped", "place", "as_logged", "deeper", "kept"):
+        for name in ("unmapped", "place", "as_logged", "deeper", "at_rest", "kept"):
             setattr(few, name, getattr(self, name)[rows])
         few.samples = replace(self.samples.part(rows), steps=np.append(np.inf, self._apart(rows)) / step)
         if self.drift is not None:
