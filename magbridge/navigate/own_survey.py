@@ -223,6 +223,11 @@ def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> 
             "tracks further apart than the field's length agree with it alike, and not all are known: this "
             "is dead reckoning alone"
         )
+    elif np.median(alone) > length:
+        yield (
+            "dead reckoning may be off by more than the field's length: the track may be at another "
+            "repetition of the field, which its sigma does not count; check it against a fix"
+        )
     elif np.median(sigma) > GAINED * np.median(alone):
         yield (
             "the field adds little to dead reckoning: the track has to come back to places it has met, "

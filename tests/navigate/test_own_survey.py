@@ -10,6 +10,7 @@ from msgspec import structs
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
 from magbridge.field.igrf import total_field
+from magbridge.navigate import own_survey
 from magbridge.navigate.options import Options
 from magbridge.navigate.own_field import OwnField
 from magbridge.navigate.own_survey import localise
@@ -49,6 +50,7 @@ def test_a_track_that_comes_back_finds_its_drift() -> None:
     assert 0.3 < error / sigma < 2.0
     assert sigma < 0.6 * float((track["unaided_sigma"] ** 2).mean()) ** 0.5
     assert track["valid"].all()
+    assert "check it against a fix" not in track.attrs["findings"]
 
 
 def test_a_straight_track_learns_nothing_and_says_so() -> None:
@@ -80,6 +82,13 @@ def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning
     assert not lost["valid"][-1]
     assert "this is dead reckoning alone" in lost.attrs["findings"]
     assert 0.4 < max(asked) < 0.7
+
+
+def test_a_drift_that_may_be_longer_than_the_field_is_to_be_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There a track may settle at another repetition of the field, and its spread does not know."""
+    monkeypatch.setattr(own_survey, "PARTICLES", 24)
+    track = localise(flown(straight=False), structs.replace(OPTIONS, current_sigma=0.3), start=START)
+    assert "check it against a fix" in track.attrs["findings"]
 
 
 @pytest.mark.parametrize("missing", ["total_field", "dr_latitude"])
