@@ -37,9 +37,8 @@ NEAR: Final = 250.0
 rock."""
 LONG: Final = 1000
 """Samples over which the mean derivative of the total field is followed."""
-CHANGED: Final = 4.0
-"""Sigmas by which the level has changed: twice as many as chance, as dives and climbs tell of it only through
-errors that are alike."""
+CHANGED: Final = 2.0
+"""Sigmas by which the level has changed."""
 LASTING: Final = 24.0 * 3600.0
 """s over which what is known of a drift's slope gets less certain by a factor of e in variance: a drift
 changes, but what was found to be none does not begin anew by itself."""
