@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 from bonne_bay_trials import MASSES, measure
+from scipy.spatial import cKDTree
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import Fit, fit
@@ -24,6 +25,8 @@ from sitl.twin import Twin
 
 __all__ = ["REAL"]
 
+AT_A_LINE = 60.0
+"""m, half a step between a line's samples, about."""
 SEED = 29
 """Of the Bonne Bay twin, as in tools/bonne_bay.py."""
 
@@ -38,6 +41,11 @@ def rio(folder: Path) -> Iterator[str]:
     z = error / np.hypot(sigma, done.gridded.sigma)
     yield f"ties from lines: median error {np.median(np.abs(error)):.1f} nT, RMS {rms(error):.0f}"
     yield f"standardised error {rms(z):.2f} RMS, {1.4826 * np.median(np.abs(z)):.2f} in the middle"
+    near = cKDTree(samples.part(~samples.tie).place).query(ties.place)[0] < AT_A_LINE
+    yield (
+        f"at most {AT_A_LINE:.0f} m from a line's sample, where nothing is left to predict: "
+        f"{np.median(np.abs(error[near])):.1f} nT, RMS {rms(error[near]):.0f}"
+    )
     joint = survey(samples)
     before, after = rms(joint.before), rms(joint.after)
     yield f"mis-ties at {len(joint.before)} crossings: {before:.1f} nT RMS, {after:.1f} levelled"

@@ -53,6 +53,8 @@ UNSEEN = 0.25
 likely as rock: with a width of their own they took up to 6 nT of it."""
 SEARCHED, SEARCHED_NODES = 4_000, 12_000
 """Samples about the middle with which the field is searched, and nodes at most."""
+WIDE = 5_000.0
+"""m, north and east of it: where there are more samples within, every second or tenth of these."""
 OUTLIER = 6.0
 """Sigmas beyond which a sample is left out."""
 LARGE, LIKELIER = 100.0, 5.0
@@ -170,7 +172,9 @@ def _needed(groups: tuple[Group, ...], sums: Sums, choice: Choice, sigma: float)
 
 def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, Roughness]:
     """Return the field that a part of the samples, with noise of about `sigma` nT, is likeliest with."""
-    few = samples.part(about_the_middle(samples.place, SEARCHED))
+    part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, WIDE))
+    step = max(len(part) // SEARCHED, 1)
+    few = samples.part(part[::step])
     groups, rows = _groups(few), np.arange(len(few.value))
     family = with_groups(NOTHING, groups)
     weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))
@@ -179,15 +183,16 @@ def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, R
     size = max(robust_scale(few.value - problem.mean), 5.0)
     best = choose(
         lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
-        harmonic=bool(np.ptp(problem.deeper) > 5.0), rho=samples.rho, effort=0.5, most=SEARCHED_NODES,
+        harmonic=bool(np.ptp(problem.deeper) > 5.0), rho=samples.rho**step, effort=0.5, most=SEARCHED_NODES,
     )  # fmt: skip
     area = float(np.prod(np.ptp(samples.place, axis=0)))
     if not local or area < LARGE * best.field.length**2:
-        return best, even
+        return replace(best, rho=samples.rho), even
     uneven = Roughness.of(samples, best.field.length)
     problem = Rows(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
-    return (other, uneven) if other.score > best.score + LIKELIER else (best, even)
+    best, chosen = (other, uneven) if other.score > best.score + LIKELIER else (best, even)
+    return replace(best, rho=samples.rho), chosen
 
 
 def _solved(reduced: Reduced, widths: Widths, family: PriorFamily) -> tuple[FloatArray, FloatArray]:

@@ -45,8 +45,8 @@ class Samples:
         if not len(self.modes):
             object.__setattr__(self, "modes", np.empty((n, 0)))
 
-    def part(self, rows: BoolArray) -> Samples:
-        """Pick samples: an (n,) mask."""
+    def part(self, rows: BoolArray | IndexArray) -> Samples:
+        """Pick samples: an (n,) mask, or places."""
         return Samples(
             self.place[rows], self.depth[rows], self.time[rows], self.value[rows], self.line[rows],
             self.tie[rows], self.origin, self.weight[rows], self.rho, self.modes[rows], self.level_sigma,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from navigation_studies.simulated import GLIDER, PLACE, Map, sail, synthetic, tr
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.read import read_grid
+from magbridge.survey import gridding
 from magbridge.survey.crossovers import crossovers
 from magbridge.survey.maps import anomaly_map
 from magbridge.survey.run import Result, survey
@@ -168,6 +170,22 @@ def test_a_change_with_time_that_crossings_show_is_not_in_the_map() -> None:
     assert not done.warnings
     assert np.std(found.levels - change) < 0.2 * np.std(change)
     assert np.std(anomaly - rock) < 1.25 * np.median(sigma)
+
+
+def test_rock_is_searched_over_more_than_the_middle_of_a_dense_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred samples a kilometre: the few about the middle one are on one leg, which tells no length."""
+    rng, rock = np.random.default_rng(8), Rock(8)
+    corners = rng.uniform(-3000.0, 3000.0, (8, 2))
+    at = np.concatenate([np.linspace(a, b, 500) for a, b in pairwise(corners)])
+    n = len(at)
+    value = rock.at(at) + rng.normal(0, NOISE, n)
+    samples = Samples(
+        at, np.zeros(n), np.linspace(0.0, 14_000.0, n), value, np.zeros(n, int), np.zeros(n, bool), ORIGIN
+    )
+    monkeypatch.setattr(gridding, "SEARCHED", 350)
+    found = gridding.gridded(samples)
+    assert 600.0 < found.field.length < 1500.0
+    assert found.size == pytest.approx(50.0, rel=0.4)
 
 
 def test_crossing_is_where_the_lines_cross() -> None:
