@@ -100,7 +100,7 @@ class Estimator:
         self._nuisance = nuisance
         both = np.r_[: self.size, self.states - STATES : self.states]
         self._x[both] = np.concatenate([coefficients, nuisances])
-        self._P[:] = 0.0
+        self._P[:] = self._kept[:] = 0.0
         self._P[np.ix_(both, both)] = covariance
 
     @property
