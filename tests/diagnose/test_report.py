@@ -94,16 +94,17 @@ def test_the_command_names_every_cause_that_may_be_it_on_a_line_of_its_own() -> 
     rest = {"kind": "drift", "signal_to_noise": 7.04, "alternatives": [clock, current]}
     rest |= {"follows": seen | {"channel": None}, "correlation_time_s": 112.3, "rms_nT": 19.96}
     found = {"verdict": "explained", "findings": [clock | {"alternatives": [current]}], "unexplained": None}
-    assert causes_of(found) == [
-        "clock_offset, S/N 9.0, follows battpos 2 s late along z; or current_field (pitch_current)"
-    ]
+    line = "clock_offset, S/N 9.0, follows battpos 2 s late along z; or current_field (pitch_current)"
+    assert causes_of(found | {"assessment": {"warnings": [[]]}}) == [line]
+    walks = {"assessment": {"warnings": [[{"code": "random_walk"}]]}}
+    assert causes_of(found | walks) == [f"{line} or noise that wanders"]
     nameless = {"verdict": "unexplained", "findings": [], "unexplained": rest}
-    nameless |= {"assessment": {"residual": {"rms_nT": 21.71, "white_nT": 3.0}}}
+    nameless |= {"assessment": {"warnings": [], "residual": {"rms_nT": 21.71, "white_nT": 3.0}}}
     words = "resembles clock_offset, current_field (pitch_current)"
     assert causes_of(nameless) == [
         f"left without a name: drift, S/N 7.0, 20.0 of 21.7 nT RMS, lasts 112 s, along z; {words}"
     ]
-    white = {"assessment": {"residual": {"rms_nT": 21.71, "white_nT": 21.6}}}
+    white = {"assessment": {"warnings": [], "residual": {"rms_nT": 21.71, "white_nT": 21.6}}}
     assert "20.0 of 21.7 nT RMS, along z" in causes_of(nameless | white)[0]
     assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == ["no cause"]
 
@@ -119,7 +120,8 @@ def test_the_command_says_what_the_gain_was_measured_on() -> None:
     }
     facts = {"verdict": "explained", "findings": [one], "unexplained": None, "rms_before_nT": 117.42}
     facts |= {"rms_after_nT": 74.42, "improvement": {"interval": [0.486, 0.84]}}
-    facts |= {"assessment": {"fit_for_use": "once_settled", "answer": "Only once these doubts are settled."}}
+    settled = {"fit_for_use": "once_settled", "answer": "Only once these doubts are settled."}
+    facts |= {"assessment": settled | {"warnings": [[]]}}
     first, use, second = summary(facts, "dives").splitlines()
     assert first == "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %)"
     assert use == "  fit for use: once settled. Only once these doubts are settled."

@@ -124,7 +124,7 @@ def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
 
 def test_predicted_and_remaining_residual_stand_beside_each_other(clear: Diagnosis) -> None:
     output = "".join(remaining(clear, CAUSES))
-    assert output.count("<tr><td>") == 4
+    assert output.count("<tr><td>") == 5
     assert "times worse than what was fitted" not in output
     worse = replace(clear, total=clear.total.__class__(5.0, 3.0, 0.6, (0.5, 0.7)))
     assert "times worse than what was fitted" in "".join(remaining(worse, CAUSES))
@@ -134,7 +134,7 @@ def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> 
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, "amps<b>")
     page = report_html(replace(clear, findings=(), unexplained=rest, verdict="unexplained"), CAUSES)
     first, below = page.split("<h2", 1)
-    assert "<b>A tone</b> of period 33 s is left (signal-to-noise ratio 9.0; it follows" in first
+    assert "<b>A tone</b> of period 33 s is left (signal-to-noise ratio 9.0; best described by" in first
     assert "amps&lt;b&gt;" in first
     residual = clear.assessment.residual
     last = number(residual.correlation_time, 2)
