@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite, log
+from math import expm1, inf, isfinite, log, sqrt
 
 import numpy as np
 
@@ -75,6 +75,7 @@ class Estimate:
         self._nowhere = 0.0
         self._resolution = inf
         self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
+        self._level: tuple[float, int] | None = None  # nT², the bias's variance at a known place; µs, then
         self._lost = False
         self._searches = 0
         self._confirmed = False  # competing filters that began wider have come to the same place
@@ -134,6 +135,8 @@ class Estimate:
         self._read()
         on_the_map = isfinite(seen.anomaly)
         if on_the_map:
+            if widest(self._alone) < self._resolution:
+                self._level = float(self.P[4, 4]), block.time_us
             self._judge(block, seconds, metres, seen.log_likelihood)
         self._choose(on_the_map)
         proven = self._confirmed and self._described
@@ -213,9 +216,16 @@ class Estimate:
         if not self._compact(widest(self.P)):
             return
         if self._monitor is None:
-            reach, level = self._reach() * (2.0 if self._lost else 1.0), self._claimed.bias_sigma
+            reach = self._reach() * (2.0 if self._lost else 1.0)
             self._monitor = IntegrityMonitor(
-                self.grid, self.options, self.x, self.P, block.time_us, reach, self._resolution, level
+                self.grid,
+                self.options,
+                self.x,
+                self.P,
+                block.time_us,
+                reach,
+                self._resolution,
+                self._levels(),
             )
             return
         verdict = self._monitor.step(block, metres, self.x, self.P)
@@ -227,6 +237,20 @@ class Estimate:
             self._monitor, self._confirmed = None, True
             if self._described:
                 self._lost, self._searches = False, 0
+
+    def _levels(self) -> tuple[float, float]:
+        """Return the bias's 1-sigma, nT, at other places; and that of half of them, 0: it is the same there.
+
+        Where the position was known, the field told the bias, wherever the filter has gone since: from then
+        on it may have changed by what was claimed. After a search that is in doubt, too.
+        """
+        o = self._claimed
+        level = o.bias_sigma
+        if self._level is not None:
+            variance, then = self._level
+            changed = -expm1(-2.0 * (self.time_us - then) * 1e-6 / o.bias_time)
+            level = min(level, sqrt(variance + level**2 * changed))
+        return level, self.options.bias_sigma if self.options is not o else 0.0
 
     def _search_anew(self) -> None:
         """Search around dead reckoning, by the next of SPREADS, at any bias: the level may be wrong."""

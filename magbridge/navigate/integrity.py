@@ -112,9 +112,8 @@ class IntegrityMonitor:
         m, 1-sigma by which *elsewhere* is spread around the filter.
     resolution : float
         m, of the banks.
-    level : float
-        nT, 1-sigma of the bias as first claimed; where that of `options` is larger, half of *elsewhere* has
-        it.
+    levels : tuple of 2 float
+        nT, 1-sigma of the bias elsewhere, and that of half of the places there; 0: of none.
     """
 
     def __init__(
@@ -126,8 +125,9 @@ class IntegrityMonitor:
         time_us: int,
         reach: float,
         resolution: float,
-        level: float,
+        levels: tuple[float, float],
     ) -> None:
+        level, doubted = levels
         wide = P.copy()
         wide[:2, :2] += reach**2 * np.eye(2)
         for state, sigma in ((2, options.current_sigma), (3, options.current_sigma), (4, level)):
@@ -137,7 +137,7 @@ class IntegrityMonitor:
         self._waiting: list[Block] = []
         self._metres, self._step = 0.0, STRIDES * block_length(grid)
         self.here = Bank(grid, x, P, resolution, options.gate)
-        self.elsewhere = Bank(grid, x, wide, resolution, options.gate, options.bias_sigma)
+        self.elsewhere = Bank(grid, x, wide, resolution, options.gate, doubted)
         self.odds = 0.0
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 

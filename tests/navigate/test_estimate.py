@@ -13,7 +13,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.estimate import SPREADS, Estimate
 from magbridge.navigate.integrity import Verdict
 from magbridge.navigate.model import Block
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import Options, with_level
 from magbridge.navigate.record import State
 
 HOUR_US = 3_600_000_000
@@ -108,3 +108,17 @@ def test_rivals_of_a_filter_that_was_confirmed_begin_half_as_far_away(
         alone = float(estimate._alone[0, 0]) ** 0.5
         reach = max(alone, 0.5 * length) if confirmed else max(alone, length)
         assert spread == pytest.approx(hypot(reach, float(estimate.P[0, 0]) ** 0.5), rel=0.2)
+
+
+def test_other_places_have_the_level_that_was_met_where_the_position_was_known(
+    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]]
+) -> None:
+    """A level known to 145 nT fits many places; met at a known start, it is the same at all of them."""
+    levels = {}
+    for sigma in (20.0, 2_000.0):
+        estimate = begun(grid, with_level(options, 145.0), measured[0][0], sigma)
+        for block, metres in measured:
+            estimate.update(block, metres)
+        levels[sigma] = estimate._levels()[0]
+    assert levels[20.0] < 20.0
+    assert levels[2_000.0] == pytest.approx(145.0, abs=0.1)
