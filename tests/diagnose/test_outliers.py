@@ -44,10 +44,10 @@ def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float 
     residual = lfilter([1.0], [1.0, -rho], rng.standard_t(nu, N))
     for row in rows:
         residual[row - 1 : row + 2] += shape * rng.choice([-1.0, 1.0])
-    return tested(residual, 2)
+    return judged(residual, 2)
 
 
-def tested(residual: np.ndarray, order: int) -> Outliers | None:
+def judged(residual: np.ndarray, order: int) -> Outliers | None:
     steps = np.ones(N, int)
     steps[[0, N // 3]] = FAR
     noise = fit_noise(residual, Past(steps, order))
@@ -88,7 +88,7 @@ def test_what_switches_is_no_wrong_sample(rho: float, order: int) -> None:
         noise = lfilter([1.0], [1.0, -rho], rng.standard_t(50.0, N))
         relay = np.searchsorted(np.sort(rng.integers(0, N, 14)), np.arange(N)) % 2
         wrong = np.isin(np.arange(N), np.arange(400, N, 700))
-        switches, spikes = (tested(noise + x, order) for x in (8.0 * relay, 12.0 * wrong))
+        switches, spikes = (judged(noise + x, order) for x in (8.0 * relay, 12.0 * wrong))
         assert switches is not None
         assert spikes is not None
         assert (switches.lasting, switches.isolated) == (True, False)
