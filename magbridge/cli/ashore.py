@@ -6,8 +6,9 @@ from collections.abc import Callable
 from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
+import msgspec
 from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
@@ -91,6 +92,7 @@ def simulate(
     output: Log,
     seed: Annotated[Whole, Parameter(validator=validators.Number(gte=0))] = 0,
     like: tuple[Path, ...] = (),
+    reference: Literal["none", "true", "map"] | None = None,
     reading: Reading = AS_THEY_SAY,
     map_output: Annotated[Path | None, Parameter(name="--map", validator=file_to_write(".nc"))] = None,
     json: Json = False,
@@ -110,6 +112,9 @@ def simulate(
     like
         A log whose attitude, position and masses drive the simulation instead of the scenario's mission;
         may be repeated. Each call makes a world around its logs: for one world, give all logs in one call.
+    reference
+        What reference_field holds, instead of what the scenario says: none leaves it out, as where nobody
+        knows the field; true is the true total field; map is the main field and an airborne survey's anomaly.
     map_output
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
     reading
@@ -126,6 +131,9 @@ def simulate(
     check_inputs((scenario, *like), output)
     check_inputs((scenario, *like, output), map_output)
     chosen = load(scenario)
+    if reference is not None:
+        telemetry = msgspec.structs.replace(chosen.telemetry, reference=reference)
+        chosen = msgspec.structs.replace(chosen, telemetry=telemetry)
     with waiting("simulating"):
         if like:
             log = read(like, options=reading.options)

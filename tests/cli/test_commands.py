@@ -46,6 +46,15 @@ def test_the_simulated_world_has_a_map(deployment: Path, like: bool, command: Co
     assert np.std(met - mapped) < 0.5 * np.std(met)
 
 
+def test_a_simulated_log_need_not_know_the_true_field(command: Command) -> None:
+    """All else is the same."""
+    command("simulate", "demo", "-o", "known.nc", "--seed", "5")
+    command("simulate", "demo", "-o", "unknown.nc", "--seed", "5", "--reference", "none")
+    known, unknown = read("known.nc"), read("unknown.nc")
+    assert set(known) - set(unknown) == {"reference_field"}
+    np.testing.assert_array_equal(known["mag_x"], unknown["mag_x"])
+
+
 def test_convert_there_and_back_keeps_every_number(deployment: Path, command: Command) -> None:
     command("convert", deployment, "-o", "a.nc")
     command("convert", "a.nc", "-o", "b.csv")
