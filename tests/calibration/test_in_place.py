@@ -19,8 +19,9 @@ from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.field_nodes import nodes_for
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
 from magbridge.calibration.fitting.joint import Linear, Sums, add_up, eliminate
-from magbridge.calibration.fitting.level import level_of
+from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.model import Noise, identity
 from magbridge.field.place.blocks import Factor, near_inverse
 from magbridge.field.place.matern import Matern
@@ -100,6 +101,20 @@ def test_rock_is_not_taken_for_noise(survey: Survey) -> None:
     assert 20.0 < rock["size_nT"] < 100.0
     assert 300.0 < rock["length_m"] < 2000.0
     assert survey[2].calibration.noise.sensor == pytest.approx(NOISE, rel=0.1)
+
+
+def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) -> None:
+    """Its sigma spans what was found; what is apart from it stays."""
+    data, _, found = survey
+    samples = pose(data, 3, None, None).samples
+    doubted, believed = (with_level(found.calibration, samples, bias, LEVEL) for bias in (400.0, 200.0))
+    assert doubted.reference.level_sigma == 400.0
+    assert believed.reference.level_sigma == pytest.approx(found.calibration.reference.level_sigma, rel=0.01)
+    apart = apart_from_level(believed).covariance
+    tiny = 1e-6 * float(np.abs(believed.covariance).max())
+    np.testing.assert_allclose(apart_from_level(doubted).covariance, apart, atol=tiny)
+    got = correct(doubted, data.field, np.empty((len(data), 0)), data.time)
+    assert got.sigma.min() > 390.0
 
 
 def test_level_stands_in_the_file(survey: Survey) -> None:

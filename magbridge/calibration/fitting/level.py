@@ -20,12 +20,17 @@ from magbridge.calibration.terms import symmetric
 
 __all__ = ["apart_from_level", "level_of", "sizes", "with_level"]
 
+CONTRADICTS = 2.0
+"""1-sigma of the reference's level, beyond which one that was found is not believed."""
 ROWS = 5_000
 """Samples that the mean is taken over, at most."""
 
 
 def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sigma: float) -> Calibration:
     """State how much of a calibration's covariance is level.
+
+    A level that was found beyond :data:`CONTRADICTS` sigmas of what was expected is in doubt as a whole: who
+    says that he knows it took something else for it, as the rock that a long log's nodes leave out.
 
     Parameters
     ----------
@@ -43,9 +48,14 @@ def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sig
     j[: len(own)] = (jacobian(part.phi, g) * sizes(part, own)[:, None]).mean(axis=0)
     Pj = calibration.covariance @ j
     sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
+    w, covariance = Pj / max(sigma, 1e-300), calibration.covariance
+    if sigma and abs(bias) > max(CONTRADICTS * bias_sigma, sigma):
+        wider = abs(bias) / sigma
+        covariance = covariance + (wider**2 - 1.0) * np.outer(w, w)
+        w, sigma = w * wider, abs(bias)
     known = calibration.reference
     reference = Reference(known.field, known.model, bias, bias_sigma, sigma)
-    return replace(calibration, reference=reference, level=tuple((Pj / max(sigma, 1e-300)).tolist()))
+    return replace(calibration, reference=reference, covariance=covariance, level=tuple(w.tolist()))
 
 
 def apart_from_level(calibration: Calibration) -> Calibration:
