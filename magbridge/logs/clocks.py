@@ -100,7 +100,7 @@ def _counted(heading: str, unit: str, numbers: FloatArray) -> Clock:
     if unit in EPOCHS and unit != "s":
         kind, assumed = unit, ""
     else:
-        kind, assumed = _kind(heading, numbers, certain=unit == "s" or heading == "time")
+        kind, assumed = _kind(heading, numbers, declared=unit == "s")
     start, scale = EPOCHS[kind]
     since = start + scale * float(np.median(numbers)) if len(numbers) else 0.0
     boot = bool(len(numbers)) and abs(since) < YEAR_1980 and heading != "time"
@@ -109,8 +109,12 @@ def _counted(heading: str, unit: str, numbers: FloatArray) -> Clock:
     return Clock(kind, assumed, boot)
 
 
-def _kind(heading: str, numbers: FloatArray, *, certain: bool) -> tuple[str, str]:
-    """Return the kind of a count whose unit is not declared, and why it is thought to be that."""
+def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, str]:
+    """Return the kind of a count, and why it is thought to be that; seconds may be `declared`.
+
+    Under our own name, ``time``, it is in seconds, unless these would be of another age of the Earth.
+    """
+    ours = declared or heading == "time"
     for kind, words in WORDS.items():
         if re.search(words, heading.lower()):
             return kind, f"{kind}, by its heading"
@@ -120,13 +124,13 @@ def _kind(heading: str, numbers: FloatArray, *, certain: bool) -> tuple[str, str
         return "s", ""
     middle = float(np.median(numbers))
     for kind, low, high in FRACTIONS:
-        if low <= middle < high and not certain:
+        if low <= middle < high and not declared:
             return kind, f"{kind} since 1970, by its size"
     step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
     for kind, low, high in SIZES:
-        if low <= middle < high and 0.0 < step < STEP:
+        if low <= middle < high and 0.0 < step < STEP and not ours:
             return kind, f"{kind} days, by its size"
-    return "s", "" if certain else "seconds"
+    return "s", "" if ours else "seconds"
 
 
 def _written(heading: str, texts: Sequence[str], zone: str | None) -> Clock:

@@ -105,6 +105,16 @@ def test_counts_of_time(heading: str, tmp_path: Path) -> None:
     np.testing.assert_allclose(log["time"], [NOON, NOON + 1], atol=1e-4)
 
 
+def test_nanoseconds_under_our_own_name_are_known_by_their_size(tmp_path: Path) -> None:
+    """As a telephone's recorder writes them; where seconds are declared they are none."""
+    rows = f"{NOON * 1e9:.0f},1\n{NOON * 1e9 + 1e9:.0f},2\n"
+    log = read(tmp_path, f"time,mag_x\n{rows}")
+    np.testing.assert_allclose(log["time"], [NOON, NOON + 1], atol=1e-6)
+    assert "ns since 1970, by its size" in log.attrs["guessed"]
+    with pytest.raises(FormatError, match="expected seconds since 1970"):
+        read(tmp_path, f"time [s],mag_x\n{rows}")
+
+
 def test_leap_seconds_are_those_of_the_day(tmp_path: Path) -> None:
     """16 s since July 2012, 17 since July 2015: at 2015-06-30T23:59:59.5Z GPS time is 16 s ahead."""
     gps = 1_435_708_799.5 - 315_964_800 + 16
