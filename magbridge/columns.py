@@ -136,6 +136,7 @@ def factor(unit: str, column: str) -> float | None:
 
 def usual(unit: str) -> str:
     """Return a unit in the spelling of :data:`COLUMNS`: ``degC`` for ``Celsius``."""
+    unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     return _SAME.get(unit, unit)
 
 

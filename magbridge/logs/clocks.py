@@ -141,6 +141,9 @@ def _written(heading: str, texts: Sequence[str], zone: str | None) -> Clock:
         return Clock("iso", zone_note)
     fit = [f"{date} {hour}" for date in DATES for hour in HOURS if _fits(times, f"{date} {hour}")]
     if not fit:
+        hours = next((hour for hour in HOURS if _fits(times, hour)), None)
+        if hours is not None:
+            return Clock(hours, "times of day, of a day that the file does not tell", boot=True)
         return Clock("iso")  # each cell will be refused with its row
     if len(fit) > 1 and len({_order(pattern) for pattern in fit}) > 1:
         which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit[:2])
@@ -183,7 +186,7 @@ def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
             if stamps.dt.tz is not None
             else stamps.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
         )
-    return _epoch(stamps)
+    return _epoch(stamps) % DAY if clock.boot else _epoch(stamps)
 
 
 def _epoch(stamps: pd.Series) -> FloatArray:

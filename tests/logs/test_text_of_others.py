@@ -115,6 +115,21 @@ def test_nanoseconds_under_our_own_name_are_known_by_their_size(tmp_path: Path) 
         read(tmp_path, f"time [s],mag_x\n{rows}")
 
 
+def test_times_of_day_are_of_a_day_that_is_given(tmp_path: Path) -> None:
+    text = "time,mag_x\n12:00:00.5,1\n12:00:01.5,2\n"
+    log = read(tmp_path, text)
+    assert (log["time"].values.tolist(), log.attrs["time_reference"]) == ([43_200.5, 43_201.5], "boot")
+    dated = read(tmp_path, text, date=NOON - 43_200.0)
+    np.testing.assert_allclose(dated["time"], [NOON + 0.5, NOON + 1.5], atol=1e-6)
+
+
+def test_the_greek_letter_is_the_micro_sign(tmp_path: Path) -> None:
+    log = read(tmp_path, "time,MAGNETIC FIELD X (\N{GREEK SMALL LETTER MU}T)\n1600000000,30.5\n")
+    assert log["MAGNETIC FIELD X"].attrs["units"] == "\N{GREEK SMALL LETTER MU}T"
+    axes = ",".join(f"B{axis} [\N{GREEK SMALL LETTER MU}T]" for axis in "xyz")
+    assert read(tmp_path, f"time,{axes}\n1600000000,30.5,1,2\n")["mag_x"].values.tolist() == [30_500.0]
+
+
 def test_leap_seconds_are_those_of_the_day(tmp_path: Path) -> None:
     """16 s since July 2012, 17 since July 2015: at 2015-06-30T23:59:59.5Z GPS time is 16 s ahead."""
     gps = 1_435_708_799.5 - 315_964_800 + 16
