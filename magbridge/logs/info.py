@@ -9,7 +9,7 @@ import xarray as xr
 from msgspec import to_builtins
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT
+from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_boot
 from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
@@ -78,7 +78,8 @@ def info(log: xr.Dataset) -> dict[str, Any]:
         "rate_hz": 1.0 / interval if interval else None,
         "gaps": len(gaps),
         "longest_gap_s": float(gaps.max()) if len(gaps) else None,
-        "references": {name: str(log.attrs.get(name, default)) for name, default in MEANING.items()},
+        "references": {name: str(log.attrs.get(name, default)) for name, default in MEANING.items()}
+        | ({"time_reference": "boot"} if counts_from_boot(log) else {}),
         "guessed": [part for part in str(log.attrs.get("guessed", "")).split("; ") if part],
         "skipped": passed_over(log.attrs),
         "compasses": [to_builtins(one) for one in compasses_in(log)],
@@ -152,7 +153,7 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
                 for unit in fitting[:1]
             ]
             hints.append(f"the vector's length is {length:.4g} nT (median){''.join(lines)}")
-    if log.attrs.get("time_reference") == "boot":
+    if counts_from_boot(log):
         hints.append("times count from a start that the log does not tell: --date says when it was")
     if "heading" in log and "heading_reference" not in log.attrs:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")

@@ -46,6 +46,13 @@ def test_info_counts_gaps_and_rates() -> None:
     assert (pump["unit"], pump["known"], pump["lowest"], pump["highest"]) == ("A", 1.0, 1.0, 2.0)
 
 
+def test_seconds_too_few_to_be_since_1970_count_from_a_start() -> None:
+    """Under our own name, too: nobody's log is of 1970."""
+    facts = info(made("log", [0.0, 0.5], {"mag_x": [1.0, 2.0]}))
+    assert facts["references"]["time_reference"] == "boot"
+    assert any("--date says when it was" in hint for hint in facts["hints"])
+
+
 def test_info_knows_a_field_in_another_unit() -> None:
     axes = {"mag_x": [30.0, 30.0], "mag_y": [5.0, 5.0], "mag_z": [45.0, 45.0]}
     (hint,) = [line for line in info(made("log", [START, START + 1], axes))["hints"] if "length" in line]
