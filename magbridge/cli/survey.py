@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,7 +24,7 @@ from magbridge.cli.common import (
     print_result,
 )
 from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, warnings_of
-from magbridge.errors import DataError, WrongUse
+from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.progress import waiting
 
 if TYPE_CHECKING:
@@ -190,7 +191,11 @@ def _calibrated(
     together = join(logs)
     parameters = chosen_parameters(parameters, together, order=order, **options)
     require(together, parameters)
-    found = fit(observations(together, parameters), order=order, **options)
+    data = observations(together, parameters)
+    found = fit(data, order=order, **options)
+    if not found.supported and data.lacks_rock and found.calibration.method == "auto":
+        with suppress(CalibrationError):  # a map is wanted, so what is rock must not count as the vehicle's
+            found = fit(data, "survey", order=order, **options)
     for warning in found.warnings:
         complain(warning)
     if strict and not found.supported:

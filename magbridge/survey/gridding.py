@@ -183,16 +183,18 @@ def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, R
     size = max(robust_scale(few.value - problem.mean), 5.0)
     best = choose(
         lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
-        harmonic=bool(np.ptp(problem.deeper) > 5.0), rho=samples.rho**step, effort=0.5, most=SEARCHED_NODES,
+        harmonic=bool(np.ptp(problem.deeper) > 5.0), effort=0.5, most=SEARCHED_NODES,
+        rho=None if samples.rho is None else samples.rho**step,
     )  # fmt: skip
+    rho = best.rho ** (1.0 / step) if samples.rho is None else samples.rho
     area = float(np.prod(np.ptp(samples.place, axis=0)))
     if not local or area < LARGE * best.field.length**2:
-        return replace(best, rho=samples.rho), even
+        return replace(best, rho=rho), even
     uneven = Roughness.of(samples, best.field.length)
     problem = Rows(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
     best, chosen = (other, uneven) if other.score > best.score + LIKELIER else (best, even)
-    return replace(best, rho=samples.rho), chosen
+    return replace(best, rho=rho), chosen
 
 
 def _solved(reduced: Reduced, widths: Widths, family: PriorFamily) -> tuple[FloatArray, FloatArray]:

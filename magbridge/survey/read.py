@@ -150,7 +150,7 @@ def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples
     modes = _modes(apart_from_level(calibration), field, read, ds["time"].to_numpy()[known])
     return replace(
         samples,
-        rho=calibration.noise.autocorrelation,
+        rho=None if calibration.warnings else calibration.noise.autocorrelation,  # rock, taken for noise
         modes=modes,
         level_sigma=calibration.reference.level_sigma,
     )
@@ -186,8 +186,13 @@ def joined(parts: Sequence[Samples]) -> Samples:
     )
     return Samples(
         np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
-        max(one.rho for one in parts), modes, max(one.level_sigma for one in parts),
+        _together([one.rho for one in parts]), modes, max(one.level_sigma for one in parts),
     )  # fmt: skip
+
+
+def _together(rho: Sequence[float | None]) -> float | None:
+    known = [one for one in rho if one is not None]
+    return max(known) if len(known) == len(rho) else None
 
 
 def _doubtful(corrected: xr.Dataset) -> BoolArray:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.crossings import SHARE, courses, crossed, far_off, too_rough
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.crossings import SHARE, courses, crossed, far_off, jumps, too_rough
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = ["Result", "facts", "samples_of", "summary", "survey"]
+
+DRAWN = 16
+"""Fields and places that are drawn where a track jumps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,7 @@ def survey(samples: Samples) -> Result:
     samples = samples.part(~far)
     with threadpool_limits(1, "blas"):
         try:
-            found = gridded(samples)
+            found = _gridded(samples)
         except np.linalg.LinAlgError as problem:
             raise CalibrationError(f"the survey cannot be gridded: {problem}") from problem
     ties = crossovers(samples.place, samples.line)
@@ -117,6 +120,40 @@ def survey(samples: Samples) -> Result:
     if (out := int((~found.kept).sum())) > 0.02 * len(residual):
         warnings.append(f"{out} of {len(residual)} samples are outliers and were left out of the map")
     return Result(samples, found, ties, before, after, residual, tuple(warnings))
+
+
+def _gridded(samples: Samples) -> Gridded:
+    """Grid samples; where the track jumps, they are as uncertain as their places.
+
+    Where stretches that are out of place cross, they contradict each other, which is no change with time.
+    """
+    at = jumps(samples.place, samples.time)
+    at = at[samples.line[at] == samples.line[at + 1]]
+    if not len(at):
+        return gridded(samples)
+    samples = replace(samples, time=np.full(len(samples.time), np.nan))
+    modes = np.hstack([samples.modes, _misplaced(samples, at, gridded(samples))])
+    return gridded(replace(samples, modes=modes))
+
+
+def _misplaced(samples: Samples, at: IndexArray, found: Gridded) -> FloatArray:
+    """Return what the samples (n, r), nT, may be off by since the track jumps `at` (m,) places.
+
+    Of the stretches before and after a jump by d one is off by d, nobody knows which: each is by N(0, d²/2).
+    Places and fields are drawn; their mean square is the variance.
+    """
+    rng, field = np.random.default_rng(0), found.posteriors[0].field
+    first = np.diff(samples.line, prepend=samples.line[0]) != 0
+    first[at + 1] = True
+    stretch, steps = np.cumsum(first), samples.place[at + 1] - samples.place[at]
+    here, drawn = field.basis(samples.place), []
+    for w in found.posteriors[0].draw(rng, DRAWN).T:
+        off = np.zeros((stretch[-1] + 1, 2))
+        for side in (at, at + 1):
+            np.add.at(off, stretch[side], rng.normal(size=(len(at), 1)) * steps / 2.0**0.5)
+        drawn.append(field.basis(samples.place + off[stretch]) @ w - here @ w)
+    rough = found.roughness.at(samples.place)[:, None]
+    return np.asarray(rough * np.stack(drawn, axis=1) / DRAWN**0.5)
 
 
 def _has_vector(log: xr.Dataset) -> bool:

@@ -31,8 +31,8 @@ class Samples:
     """deg, latitude and longitude."""
     weight: FloatArray = field(default_factory=lambda: np.empty(0))
     """(n,): Noise of a sample over the typical one's."""
-    rho: float = 0.0
-    """Autocorrelation of successive samples' noise."""
+    rho: float | None = 0.0
+    """Autocorrelation of successive samples' noise; None: not known."""
     modes: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     """(n, r), nT, what 1-sigma of each of the calibration's uncertain combinations does to every sample."""
     level_sigma: float = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +40,21 @@ def rock(place: FloatArray) -> FloatArray:
 
 
 def lanes(axis: int, count: int = 6) -> FloatArray:
-    """Return places (n, 2), m, of parallel lines along an axis, back and forth."""
+    """Return places (n, 2), m, of parallel lines along an axis, back and forth, with the ways between."""
     along = np.linspace(-2600.0, 2600.0, 44)
     turned = [along[:: 1 if k % 2 else -1] for k in range(count)]
     across = np.linspace(-2400.0, 2400.0, count) if count > 1 else np.zeros(1)
     lines = [np.stack([one, np.full(44, y)], axis=1) for one, y in zip(turned, across, strict=True)]
-    return np.roll(np.concatenate(lines), axis, axis=1)
+    return np.roll(with_ways(lines), axis, axis=1)
+
+
+def with_ways(legs: list[FloatArray]) -> FloatArray:
+    """Return the places (n, 2), m, of legs (m, 2) and of the ways from one to the next."""
+    parts = legs[:1]
+    for last, leg in pairwise(legs):
+        steps = int(np.linalg.norm(leg[0] - last[-1]) / 120.0) + 2
+        parts += [np.linspace(last[-1], leg[0], steps)[1:-1], leg]
+    return np.concatenate(parts)
 
 
 def flown(
@@ -110,7 +120,7 @@ def test_two_vehicles_with_a_calibration_each_make_one_map(command: Command, tmp
 
 def test_a_base_station_takes_a_daily_variation_off(command: Command, tmp_path: Path) -> None:
     """Forty minutes, 25 nT: left in the log, it is in the map."""
-    place = np.concatenate([lanes(0), lanes(1)])
+    place = with_ways([lanes(0), lanes(1)])
     time = STEP * np.arange(-10.0, len(place) + 10.0)
     varied = 25.0 * np.sin(2.0 * np.pi * time / 2400.0)
     write(flown("comet", place, varied=varied[10:-10]), tmp_path / "log.nc")
@@ -129,17 +139,33 @@ def test_what_correct_has_flagged_and_what_has_no_place_stay_out_of_the_map(
 
     Nor does a hole in the positions count as a straight line from one end to the other.
     """
-    write(flown("comet", np.concatenate([lanes(0), lanes(1)])), tmp_path / "log.nc")
+    write(flown("comet", with_ways([lanes(0), lanes(1)])), tmp_path / "log.nc")
     cal = calibrated("comet", tmp_path / "cal.json")
     command("correct", tmp_path / "log.nc", "--calibration", cal, "-o", tmp_path / "corrected.nc")
     (corrected,) = read_each([tmp_path / "corrected.nc"])
     spoilt = corrected.load().copy(deep=True)
     spoilt["anomaly"][::10] += 80.0
     spoilt["quality"][::10] = float(Quality.MOVING)
-    spoilt["latitude"][100:160] = np.nan
+    spoilt["latitude"][100:170] = np.nan
     write(spoilt, tmp_path / "spoilt.nc")
     error, _, facts = judged(command, tmp_path, tmp_path / "spoilt.nc")
     flags = spoilt["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)
     used = (flags == 0) & np.isfinite(spoilt["latitude"].to_numpy())
     assert facts["samples"] == used.sum() < 0.81 * len(flags)
     assert np.std(error) < 1.5
+
+
+def test_one_straight_line_has_rock_below_it(command: Command, tmp_path: Path) -> None:
+    """Told apart or not, what changes along it is neither noise nor all the vehicle's."""
+    place = np.stack([np.linspace(-3000.0, 3000.0, 300), np.zeros(300)], axis=1)
+    write(flown("comet", place), tmp_path / "log.nc")
+    map_file = tmp_path / "map.nc"
+    said = command("survey", tmp_path / "log.nc", "-o", map_file).err
+    assert "do not support this fit" in said
+    assert "never crossed your own track" in said
+    latitude, longitude = offset(*ORIGIN, place[20:-20:5, 0], place[20:-20:5, 1])
+    there = read_grid(map_file).evaluate(longitude, latitude)
+    error = there.anomaly - rock(place[20:-20:5])
+    error -= error.mean()
+    assert np.std(error) < 1.5
+    assert np.sqrt(np.mean(error**2 / there.variance)) < 1.5

@@ -172,6 +172,20 @@ def test_a_change_with_time_that_crossings_show_is_not_in_the_map() -> None:
     assert np.std(anomaly - rock) < 1.25 * np.median(sigma)
 
 
+def test_where_a_track_jumps_the_map_is_as_uncertain_as_its_places() -> None:
+    """A fix moves the second half by 600 m: what contradicts itself then is no change with time."""
+    samples, rock, _ = zigzag(np.random.default_rng(4), back=True)
+    place = samples.place.copy()
+    place[500:, 0] += 600.0
+    found = survey(replace(samples, place=place)).gridded
+    anomaly, sigma = found.at(samples.place)
+    error = anomaly - rock
+    assert np.std(error[:500]) < 0.5
+    assert np.std(error[500:]) > 5.0
+    error -= error.mean()
+    assert 0.4 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
+
+
 def test_rock_is_searched_over_more_than_the_middle_of_a_dense_log(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hundred samples a kilometre: the few about the middle one are on one leg, which tells no length."""
     rng, rock = np.random.default_rng(8), Rock(8)

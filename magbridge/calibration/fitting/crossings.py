@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from magbridge.arrays import BoolArray, FloatArray
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.observations import Observations
 
 __all__ = [
-    "SHARE", "courses", "crossed", "far_off", "jumped", "left_open", "left_open_by", "rough_rock",
-    "tells_rock", "too_rough",
+    "SHARE", "courses", "crossed", "far_off", "jumped", "jumps", "left_open", "left_open_by",
+    "rough_rock", "tells_rock", "too_rough",
 ]  # fmt: skip
 
 TURNED = 30.0
@@ -137,15 +137,21 @@ def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
     kept = ~without & ~far
     if kept.sum() < FEW:
         return
-    step = np.linalg.norm(np.diff(place[kept], axis=0), axis=1)
-    usual = float(np.median(step / np.maximum(np.diff(time[kept]), 1e-3)))
-    beyond = step - FARTHEST * usual * np.diff(time[kept])
-    jumps = np.flatnonzero(beyond > LEAP)
-    if len(jumps) and usual > 0.0:
+    at = jumps(place[kept], time[kept])
+    if len(at):
+        step = np.linalg.norm(np.diff(place[kept], axis=0)[at], axis=1)
         yield (
-            f"the position jumps by {step[jumps].max():.0f} m ({len(jumps)} jump{'s' * (len(jumps) > 1)} of "
-            f"more than {LEAP:.0f} m): a fix after dead reckoning? --position-sigma bends the track between"
+            f"the position jumps by {step.max():.0f} m ({len(at)} jump{'s' * (len(at) > 1)} of more than "
+            f"{LEAP:.0f} m): a fix after dead reckoning? --position-sigma bends the track between"
         )
+
+
+def jumps(place: FloatArray, time: FloatArray) -> IndexArray:
+    """Return after which of the places (n, 2), m, at times (n,), s, the track jumps farther than it moves."""
+    step = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    usual = float(np.median(step / np.maximum(np.diff(time), 1e-3)))
+    beyond = step - FARTHEST * usual * np.diff(time)
+    return np.flatnonzero((beyond > LEAP) & (usual > 0.0))
 
 
 def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, int]:
