@@ -2,7 +2,8 @@
 
 Random gliders survey rock of 60 nT in a criss-cross, with the IGRF as the only reference and no calibration
 run. Printed and drawn: the RMS error about its mean of the published field over the noise floor, in each
-stretch of the survey, and its claimed sigma, with and without the error of the level, which nobody sees.
+stretch of the survey, and its claimed sigma, with and without the error of the level, which nobody sees;
+and the standardised error of its samples, level and all.
 
     python tools/live_nothing.py --seeds 4 --hours 24 -o docs/figures/learning.png
 """
@@ -20,6 +21,7 @@ from rich.console import Console
 from terminal import command_line, table
 
 from magbridge.calibration.model import Parameter
+from magbridge.calibration.residual import rms
 from magbridge.learning import Learner
 from magbridge.learning.start import class_prior
 
@@ -30,7 +32,7 @@ FLOOR = 1.0
 
 
 def run(seed: int, hours: float) -> np.ndarray:
-    """Return, of each stretch, the error about its mean, the mean error, the claimed sigma; nT."""
+    """Return, of each stretch, error about its mean, mean error and claimed sigma, nT; error over sigma."""
     log = live.sampled(live.fly("nothing", seed, hours)[1])
     parameters = []
     for name in MASSES:
@@ -40,16 +42,17 @@ def run(seed: int, hours: float) -> np.ndarray:
     seen = live.learn(Learner(prior), prior, log)
     time, error = hours_of(log), seen.total - log["truth_total_field"].to_numpy()
     rest = live.at_rest(seen.quality)
-    rows = np.full((len(EDGES) - 1, 3), np.nan)
+    rows = np.full((len(EDGES) - 1, 4), np.nan)
     for row, low, high in zip(rows, EDGES[:-1], EDGES[1:], strict=True):
         here = rest & (time >= low) & (time < high)
         if here.sum() > 10:
-            row[:] = np.std(error[here]), np.mean(error[here]), np.median(seen.sigma[here])
+            std, mean = np.std(error[here]), np.mean(error[here])
+            row[:] = std, mean, np.median(seen.sigma[here]), rms((error / seen.sigma)[here])
     return rows
 
 
 def draw(results: np.ndarray, file: Path) -> None:
-    """Draw error and sigma (seeds, stretches, 3) against hours."""
+    """Draw error and sigma (seeds, stretches, 4) against hours."""
     import matplotlib.pyplot as plt  # noqa: PLC0415 - only here
 
     flown = np.isfinite(results[:, :, 0]).any(0)
@@ -80,15 +83,15 @@ def main() -> None:
     asked = parser.parse_args()
     results = np.array([run(seed, asked.hours) for seed in range(asked.first, asked.first + asked.seeds)])
     shown = table(
-        f"{asked.seeds} gliders", "hours", "about the mean", "worst", "level", "sigma", "error/sigma"
+        f"{asked.seeds} gliders", "hours", "about the mean", "worst", "level", "sigma", "error/sigma", "worst"
     )
     for k, (low, high) in enumerate(pairwise(EDGES)):
-        std, mean, sigma = results[:, k].T
+        std, mean, sigma, whole = results[:, k].T
         if np.isfinite(std).any():
-            rms = np.sqrt(np.nanmean((std**2 + mean**2) / sigma**2))
             shown.add_row(
                 f"{low:g} to {high:g}", f"{np.nanmedian(std) / FLOOR:.2f}", f"{np.nanmax(std) / FLOOR:.2f}",
-                f"{np.nanmedian(np.abs(mean)):.0f}", f"{np.nanmedian(sigma):.0f}", f"{rms:.2f}",
+                f"{np.nanmedian(np.abs(mean)):.0f}", f"{np.nanmedian(sigma):.0f}",
+                f"{rms(whole):.2f}", f"{whole.max():.2f}",
             )  # fmt: skip
     Console(width=100).print(shown)
     if asked.output is not None:

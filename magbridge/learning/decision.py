@@ -93,6 +93,8 @@ class Decision:
             self._count(learned=learned)
         elif not frozen:
             self._begin(knowledge, sample, way)
+        if knowledge.start is not None and not knowledge.start.fitted:
+            return False  # neither published nor judged
         return self._decide(knowledge, apart * now.s, frozen=frozen)
 
     def _compare(self, knowledge: Knowledge, time: float, apart: float) -> None:

@@ -70,14 +70,17 @@ class Publication:
     def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
         """Return the calibration that an estimator has learned from so many samples, with its origin."""
         first, coefficients, method = self.first, estimator.coefficients, self.first.method
+        covariance = estimator.covariance
         if first.method == NONE:
             method = "learned"
             if self.learned:
                 coefficients = estimator.at_level_of(self.coefficients)
+                by = coefficients - estimator.coefficients
+                covariance = covariance + np.outer(by, by)
         elif "learned" not in method:
             method += ", learned"
         inputs = first.inputs | {f"calibration {calibration_id(first):08x}": f"{samples} samples later"}
-        made = self._model.calibration(coefficients, estimator.covariance)
+        made = self._model.calibration(coefficients, covariance)
         return replace(made, method=method, inputs=inputs, noise=noise)
 
     def stale(self, apart: float) -> bool:

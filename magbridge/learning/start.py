@@ -112,6 +112,11 @@ class Start:
         return True
 
     @property
+    def fitted(self) -> bool:
+        """Whether they have been: until then the filter is linearised at what is known of the class."""
+        return self._next > FIRST
+
+    @property
     def over(self) -> bool:
         """Whether a filter can go on alone."""
         return len(self._samples) >= LAST

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from worlds import FIELD, MASS, World, calibration, error_of, learn
 
 from magbridge.calibration.model import Calibration
 from magbridge.learning import Learner
-from magbridge.learning.start import class_prior
+from magbridge.learning.start import FIRST, class_prior
 
 HARD_IRON = np.array([2500.0, -1800.0, 3000.0])
 
@@ -37,6 +38,14 @@ def test_a_vehicle_without_a_calibration_gets_one() -> None:
     assert abs(np.mean(total - world.total)) < 2.0 * 145.0
 
 
+def test_nothing_is_published_before_all_samples_were_fitted() -> None:
+    """A filter that is linearised at what is known of the class may predict well, and be far off."""
+    world, learner = World(vehicle(), 60), Learner(class_prior((MASS,), FIELD))
+    published = []
+    learn(learner, world, seen=lambda _: published.append(learner.calibration.method))
+    assert "learned" not in published[:FIRST]
+
+
 def test_what_was_learned_from_nothing_can_be_forgotten() -> None:
     """It then begins with nothing again."""
     learner = Learner(class_prior((MASS,), FIELD))
@@ -54,3 +63,18 @@ def test_a_class_is_as_unknown_as_physics_lets_it_be() -> None:
     assert 3000.0 < sigma[0, 6] < 6000.0
     assert 500.0 < sigma[0, 0] < 4000.0
     assert sigma[1, 6] > sigma[2, 6] > sigma[3, 6]
+
+
+def test_the_level_that_is_kept_is_as_unsure_as_it_differs_from_what_was_learned() -> None:
+    """What is published keeps its first level; its sigma spans both."""
+    learner = Learner(class_prior((MASS,), FIELD))
+    learn(learner, World(vehicle(), 300))
+    publication, best = learner._publication, learner._knowledge.bank.best
+    publication.coefficients = best.coefficients.copy()
+    publication.coefficients[6:9] += 300.0
+    made = publication.made(best, 300, learner.calibration.noise)
+    coefficients, covariance = learner._model.coefficients(made)
+    by = float(best._mean @ (coefficients - best.coefficients))
+    assert abs(by) > 20.0
+    more = covariance - best.covariance
+    assert best._mean @ more @ best._mean == pytest.approx(by * by)
