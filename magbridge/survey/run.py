@@ -125,27 +125,28 @@ def survey(samples: Samples) -> Result:
 def _gridded(samples: Samples) -> Gridded:
     """Grid samples; where the track jumps, they are as uncertain as their places.
 
-    Where stretches that are out of place cross, they contradict each other, which is no change with time.
+    Where stretches that are out of place cross, they contradict each other: each has a level of its own,
+    and what is left is no change with time.
     """
     at = jumps(samples.place, samples.time)
     at = at[samples.line[at] == samples.line[at + 1]]
     if not len(at):
         return gridded(samples)
-    samples = replace(samples, time=np.full(len(samples.time), np.nan))
-    modes = np.hstack([samples.modes, _misplaced(samples, at, gridded(samples))])
-    return gridded(replace(samples, modes=modes))
+    first = np.diff(samples.line, prepend=samples.line[0]) != 0
+    first[at + 1] = True
+    apart = replace(samples, time=np.full(len(samples.time), np.nan), line=np.cumsum(first))
+    modes = np.hstack([samples.modes, _misplaced(apart, at, gridded(apart))])
+    return gridded(replace(apart, modes=modes))
 
 
 def _misplaced(samples: Samples, at: IndexArray, found: Gridded) -> FloatArray:
-    """Return what the samples (n, r), nT, may be off by since the track jumps `at` (m,) places.
+    """Return what the samples (n, r), nT, may be off by since the track jumps `at` (m,) ends of lines.
 
     Of the stretches before and after a jump by d one is off by d, nobody knows which: each is by N(0, d²/2).
     Places and fields are drawn; their mean square is the variance.
     """
     rng, field = np.random.default_rng(0), found.posteriors[0].field
-    first = np.diff(samples.line, prepend=samples.line[0]) != 0
-    first[at + 1] = True
-    stretch, steps = np.cumsum(first), samples.place[at + 1] - samples.place[at]
+    stretch, steps = samples.line, samples.place[at + 1] - samples.place[at]
     here, drawn = field.basis(samples.place), []
     for w in found.posteriors[0].draw(rng, DRAWN).T:
         off = np.zeros((stretch[-1] + 1, 2))
