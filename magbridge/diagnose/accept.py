@@ -15,7 +15,7 @@ from magbridge.diagnose.inference.evidence import ODDS, REMNANT, bayes_factor_th
 from magbridge.diagnose.inference.hypothesis import Hypothesis, shaped_ratio
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.left_out import held_out
-from magbridge.diagnose.inference.search import Outcome
+from magbridge.diagnose.inference.search import Outcome, beside_slow_noise, search
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.varying import varying
 
@@ -67,18 +67,20 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     return False, free._replace(within=_within(outcome, behind))
 
 
-def settle(outcome: Outcome, tone: Candidate | None) -> tuple[Outcome, bool, Leftover | None]:
-    """Return the outcome that counts, and what :func:`accept` says of it.
+def settle(
+    problem: Problem, candidates: Sequence[Candidate], causes: int, tone: Candidate | None
+) -> tuple[Outcome, bool, Leftover | None]:
+    """Search, and return the outcome that counts, and what :func:`accept` says of it.
 
     Slow noise takes part of what descriptions stand for, too, and so makes names look better beside them. So
-    names found beside it are asserted only if those found without it are.
+    where the names found without it are not asserted, none are searched for beside it.
     """
-    asserted, rest = accept(outcome.problem, outcome, tone)
-    if asserted and outcome.plain is not None:
-        plain, described = accept(outcome.plain.problem, outcome.plain, tone)
-        if not plain:
-            return outcome.plain, False, described
-    return outcome, asserted, rest
+    plain = search(problem, candidates, causes)
+    asserted, rest = accept(problem, plain, tone)
+    if not asserted:
+        return plain, False, rest
+    outcome = beside_slow_noise(plain, candidates, causes)
+    return outcome, *((True, rest) if outcome is plain else accept(outcome.problem, outcome, tone))
 
 
 def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, best: Leftover | None) -> float:

@@ -35,7 +35,7 @@ from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.random_walk import odds_over_random_walk
-from magbridge.diagnose.inference.search import Outcome, search
+from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.seen import memory
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.unlisted import switching, unlisted
@@ -118,14 +118,11 @@ def _examine(
     progress("preparing causes")
     candidates, untestable = _put_forward(problem, causes)
     progress("searching")
-    outcome = search(problem, candidates, len(causes))
-    progress("what is left")
     tone = _strongest_tone(problem, candidates)
-    outcome, stand, rest = settle(outcome, tone)
+    outcome, stand, rest = settle(problem, candidates, len(causes), tone)
     problem = outcome.problem
-    named, competing, fit = (
-        (outcome.chosen, outcome.competing, outcome.fit) if stand else ((), (), outcome.null)
-    )
+    found = outcome.chosen, outcome.competing, outcome.fit
+    named, competing, fit = found if stand else ((), (), outcome.null)
     off = _off(outcome.fit, named, len(causes))
     if switched := switching(problem, outcome.fit, named, off):
         rest, named, competing, fit = switched, (), (), outcome.null
@@ -192,8 +189,7 @@ def _whenever(candidates: Sequence[Candidate], learned: BoolArray) -> list[Candi
     """
     if not learned.any():
         return list(candidates)
-    timed = [any(isinstance(effect, TimeEffect) for effect in candidate.effects) for candidate in candidates]
-    lasting = [c for c, has_time in zip(candidates, timed, strict=True) if c.effects and not has_time]
+    lasting = [c for c in candidates if c.effects and not any(isinstance(e, TimeEffect) for e in c.effects)]
     return [*candidates, *(since(candidate, learned) for candidate in lasting)]
 
 

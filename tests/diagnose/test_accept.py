@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from posed import candidate, missed, right
 
-from magbridge.diagnose.accept import _within, accept, settle
+from magbridge.diagnose import accept as deciding
+from magbridge.diagnose.accept import _within, accept
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import GridPoint
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import ODDS, bayes_factor_threshold
-from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.inference.search import Outcome, search
 from magbridge.diagnose.unexplained.varying import varying
 
 ROWS = 300
@@ -72,18 +73,27 @@ def test_dives_left_out_overrule_a_name_that_fits() -> None:
         assert accept(problem, search(problem, [alike], 1), None)[0] == named
 
 
-def test_what_is_named_beside_slow_noise_must_stand_without_it() -> None:
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_only_what_stands_without_slow_noise_is_searched_for_beside_it(
+    share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     problem, rng = right(ROWS), np.random.default_rng(10)
+    beside: list[Outcome] = []
+
+    def spied(found: Outcome, *_: object) -> Outcome:
+        beside.append(found)
+        return found
+
     bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
     problem = replace(problem, residual=bent + rng.normal(size=ROWS))
-    exact, alike = (
-        search(problem, [candidate("a", shape, point=GridPoint(likelier=300.0))], 1)
-        for shape in (bent, bent + 0.5 * bent.std() * rng.normal(size=ROWS))
-    )
-    assert settle(replace(exact, plain=exact), None)[1]
-    outcome, asserted, rest = settle(replace(exact, plain=alike), None)
-    assert (outcome, asserted) == (alike, False)
-    assert rest is not None
+    shape = bent + share * bent.std() * rng.normal(size=ROWS)
+    monkeypatch.setattr(deciding, "beside_slow_noise", spied)
+    name = candidate("a", shape, point=GridPoint(likelier=300.0))
+    outcome, asserted, rest = deciding.settle(problem, [name], 1, None)
+    assert outcome.chosen
+    assert asserted == (share == 0.0)
+    assert beside == [outcome][: int(asserted)]
+    assert asserted or rest is not None
 
 
 @pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])

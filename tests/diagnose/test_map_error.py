@@ -15,7 +15,7 @@ from magbridge.diagnose.causes.reference import diurnal_variation, reference_bia
 from magbridge.diagnose.causes.time_dependent import offset_drift, offset_step
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.inference.search import beside_slow_noise, search
 
 N = 1500
 NORTH = 2000.0 * (1.0 - np.abs(np.linspace(-1.0, 1.0, N)))
@@ -82,6 +82,6 @@ def test_a_gradient_over_the_whole_region_is_the_maps_error_alone() -> None:
     survey = replace(whole.survey, time=whole.survey.time[0] + 16.0 * np.arange(N))
     wrong = 0.01 * (NORTH - 1000.0) + rng.normal(size=N)
     problem = drawn(replace(whole, survey=survey), wrong, DOWN)
-    slow = [c for cause in (diurnal_variation, offset_drift, offset_step) for c in cause(problem)]
-    found = search(problem, [*map_error(problem), *slow], 4)
+    every = [c for cause in (map_error, diurnal_variation, offset_drift, offset_step) for c in cause(problem)]
+    found = beside_slow_noise(search(problem, every, 4), every, 4)
     assert [h.candidate.cause for h in found.chosen] == ["map_error"]

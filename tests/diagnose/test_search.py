@@ -16,8 +16,9 @@ from magbridge.diagnose.causes.reference import reference_bias
 from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.exchange import exchanged
+from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.random_walk import odds_over_random_walk
-from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.inference.search import _surplus, beside_slow_noise, search
 from magbridge.diagnose.inference.state import State
 
 
@@ -63,7 +64,8 @@ def test_flicker_noise_gets_no_name_and_a_step_in_white_noise_its_own(
     read = np.sum(problem.jacobian[:, 6:] * (coloured if noise == "flicker" else white), axis=1)
     problem = replace(problem, residual=read + size * (t > 0.5))
     steps = [fault("offset_step", (t > at).astype(float), 10.0) for at in np.arange(0.05, 1.0, 0.05)]
-    outcome = search(problem, [fault("offset_drift", t, 10.0), *steps], 2)
+    candidates = [fault("offset_drift", t, 10.0), *steps]
+    outcome = beside_slow_noise(search(problem, candidates, 2), candidates, 2)
     assert {h.candidate.cause for h in outcome.chosen} == named
     slow = outcome.problem.slow_noise(outcome.fit.z)
     assert (np.std(slow) > 0.3 * np.std(read)) == (noise == "flicker")
@@ -79,6 +81,24 @@ def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
     state.round([], state.null)
     both = early.with_(late)
     assert exchanged(state, [both], state.fit([both]))[0] == [early]
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_of_two_alike_one_that_gains_nothing_on_new_dives_is_dropped(alike: bool) -> None:
+    """Where it is like none, its own test decides. By chance what does nothing may gain, in one of six."""
+    rng, n, dropped = np.random.default_rng(3), 600, 0
+    for _ in range(10):
+        acts, none = (np.arange(n) > 200.0).astype(float), rng.normal(size=n)
+        one = fault("offset_step", acts, 10.0)
+        like = fault("offset_drift", acts + 0.1 * none if alike else none, 10.0)
+        state = State(replace(right(n), residual=5.0 * acts + rng.normal(size=n)), [one, like], 1, 2)
+        base = state.fit([one, like])
+        both = [
+            Hypothesis(own, 0.0, 0.0, 0.0, state.fit([other, own]))
+            for own, other in ((one, like), (like, one))
+        ]
+        dropped += _surplus(state, both, base) == 1
+    assert dropped >= 6 if alike else dropped == 0
 
 
 def test_one_cause_gives_way_to_two_beside_a_third() -> None:
@@ -135,6 +155,7 @@ def test_a_slow_cause_is_told_from_a_random_walk_only_where_it_is_clear(walks: b
     noise, walk = rng.normal(size=n), np.cumsum(rng.normal(size=n)) / np.sqrt(n)
     problem = replace(problem, residual=noise + (walk if walks else 80.0 / np.sqrt(n) * (t > 0.5)))
     steps = [fault("offset_step", (t > at).astype(float), 10.0) for at in np.arange(0.05, 1.0, 0.05)]
-    outcome = search(problem, [fault("offset_drift", t, 10.0), *steps], 2)
+    candidates = [fault("offset_drift", t, 10.0), *steps]
+    outcome = beside_slow_noise(search(problem, candidates, 2), candidates, 2)
     (named,) = outcome.chosen
     assert (odds_over_random_walk(outcome, named) > ODDS) != walks

@@ -12,7 +12,7 @@ from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, bayes_factor_threshold, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.pairs import pairs_of
+from magbridge.diagnose.inference.pairs import AT_ONCE, pairs_of
 from magbridge.diagnose.inference.state import State
 
 __all__ = ["CompetingHypothesis", "competing_hypotheses", "sets_of"]
@@ -62,7 +62,7 @@ def sets_of(
         for place in range(len(model)):
             for hypothesis in competing_hypotheses(state, info, model, base, place):
                 yield place, hypothesis
-        for places in combinations(range(len(pieces)), min(2, len(pieces))):
+        for places in combinations(range(len(pieces)), 2 if 1 < len(pieces) <= AT_ONCE else 1):
             for pair in pairs_of(state, info, [piece for piece, _ in pieces], base, *places):
                 for candidate, n in ((pair.first, places[0]), (pair.second, places[-1])):
                     yield pieces[n][1], CompetingHypothesis(candidate, pair.behind)

@@ -10,7 +10,7 @@ import numpy as np
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.competing import competing_hypotheses
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.pairs import pairs_of
+from magbridge.diagnose.inference.pairs import AT_ONCE, pairs_of
 from magbridge.diagnose.inference.profile_likelihood import refined
 from magbridge.diagnose.inference.state import State
 
@@ -45,7 +45,8 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
     if len(pieces) == 1:
         found = [(r.behind, [r.candidate], [0]) for r in competing_hypotheses(state, info, pieces, base, 0)]
     everywhere = range(len(pieces))
-    for places in [*combinations(everywhere, 1), *combinations(everywhere, 2)]:
+    twos = combinations(everywhere, 2) if len(pieces) <= AT_ONCE else ()
+    for places in [*combinations(everywhere, 1), *twos]:
         for pair in pairs_of(state, info, pieces, base, *places):
             kept = [n for n in places if pieces[n] is pair.first or pieces[n] is pair.second]
             new = [c for c in (pair.first, pair.second) if not any(c is pieces[n] for n in kept)]

@@ -22,7 +22,9 @@ from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import LEVEL, score
 from magbridge.diagnose.inference.information import Information
 
-__all__ = ["CONFOUNDED", "LARGEST", "Isolability", "Visible", "isolability"]
+__all__ = [
+    "CONFOUNDED", "LARGEST", "Isolability", "Visible", "isolability", "likeness", "most_visible",
+]  # fmt: skip
 
 CONFOUNDED = 0.85
 """Correlation beyond which two causes are listed as a pair: at this one they are told apart in 95 of 100
@@ -67,11 +69,11 @@ def isolability(
 ) -> Isolability:
     """Evaluate `info`; the candidate that the log shows best stands for the whole grid of its cause."""
     at = slices(candidates)
-    picked = _most_visible(candidates, info, at)
+    picked = most_visible(candidates, info, at)
     among = [candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0) for k in picked]
     visible = [_visible(candidates[k], info, at[k], count) for k, count in zip(picked, among, strict=True)]
     pairs = [
-        (one, other, _likeness(info, candidates[a], at[a], candidates[b], at[b]))
+        (one, other, likeness(info, candidates[a], at[a], candidates[b], at[b]))
         for (one, a), (other, b) in combinations(zip(visible, picked, strict=True), 2)
         if one.cause != other.cause
     ]
@@ -79,7 +81,7 @@ def isolability(
     return Isolability(tuple(visible), tuple(alike), dict(untestable))
 
 
-def _most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
+def most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
     """Return the place of the candidate of each cause and channel that the log shows best."""
     best: dict[Group, tuple[float, int]] = {}
     for k, candidate in enumerate(candidates):
@@ -111,7 +113,7 @@ def _plausible(size: float) -> float:
     return size if size < LARGEST else float("inf")
 
 
-def _likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
+def likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
     """Correlation of two signatures: root of the mean share that one can imitate of the other, the larger."""
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))

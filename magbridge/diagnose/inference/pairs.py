@@ -35,8 +35,10 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.state import State
 from magbridge.diagnose.inference.statistic import Statistic
 
-__all__ = ["Pair", "pairs_of"]
+__all__ = ["AT_ONCE", "Pair", "pairs_of"]
 
+AT_ONCE = 4
+"""Regressors of a model, beyond which no two are replaced at once: each two take a table of all pairs."""
 TOGETHER = 128
 """Columns of candidates that are scored at once: enough to outweigh a call, few enough for a core's cache."""
 

@@ -12,8 +12,9 @@ needless are dropped.
 Noise that ends up slow may have absorbed what several causes do together: then none alone stands out from it.
 So a second start finds causes beside noise of a short correlation, and weighs them beside noise of any.
 
-What is found is then searched for beside noise that grows towards low frequencies, where that gains anything
-(:mod:`~.compare.slow_noise`), and the likelier is kept: a cause that only stands for such noise is not found.
+What is found, and asserted, is then searched for beside noise that grows towards low frequencies, where that
+gains anything (:mod:`~.compare.slow_noise`), and the likelier is kept: a cause that only stands for such
+noise is not found.
 
 The competing hypotheses are read off one matrix at the end: the information of all candidates under the noise
 that is left, the other causes projected out.
@@ -22,11 +23,10 @@ that is left, the other causes projected out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem, with_slow_noise
 from magbridge.diagnose.inference.competing import CompetingHypothesis, sets_of
@@ -42,12 +42,13 @@ from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import BRIEFEST, autoregressive_order
 from magbridge.diagnose.inference.hypothesis import Hypothesis, shaped_ratio
 from magbridge.diagnose.inference.information import Information
+from magbridge.diagnose.inference.isolability import CONFOUNDED, likeness, most_visible
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.state import State
 
-__all__ = ["Outcome", "search"]
+__all__ = ["Outcome", "beside_slow_noise", "search"]
 
 MOST = 6
 """Regressors found one by one in a log, at most."""
@@ -74,27 +75,15 @@ class Outcome:
     """Cause -> number of independent hypotheses behind it."""
     evidence: float
     """Log evidence of what was found and of its noise, against the null without slow noise."""
-    plain: Outcome | None = None
-    """What was found without slow noise, where that was less likely."""
 
 
-def search(problem: Problem, candidates: Sequence[Candidate], causes: int) -> Outcome:
-    """Find the causes that the data support, among the candidates of so many `causes`."""
-    found = _search(problem, candidates, causes)
-    if not found.chosen or problem.waves.size:
-        return found
-    noisy, null = with_slow_noise(problem), found.null
-    slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
-    if slow.log_likelihood <= null.log_likelihood:
-        return found
-    beside = _search(noisy, candidates, causes, null)
-    return replace(beside, plain=found) if beside.evidence > found.evidence else found
-
-
-def _search(
+def search(
     problem: Problem, candidates: Sequence[Candidate], causes: int, plain: Joint | None = None
 ) -> Outcome:
-    """Find the causes that the data support under one noise; `plain` is the null without its slow part."""
+    """Find the causes that the data support, among the candidates of so many `causes`, under one noise.
+
+    `plain` is the null without slow noise, where the problem has such.
+    """
     rough = fit_joint(problem, [], 1, rounds=2)
     order = autoregressive_order(rough.residual, problem.survey.slots)
     state = State(problem, candidates, order, causes)
@@ -112,6 +101,15 @@ def _search(
     return Outcome(
         problem, tuple(chosen), competing, state.null, base, p_value, info, state.look_elsewhere, evidence
     )
+
+
+def beside_slow_noise(found: Outcome, candidates: Sequence[Candidate], causes: int) -> Outcome:
+    """Search again beside slow noise what was found without it; return the likelier."""
+    noisy, null = with_slow_noise(found.problem), found.null
+    slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
+    if slow.log_likelihood <= null.log_likelihood:
+        return found
+    return max(found, search(noisy, candidates, causes, null), key=lambda outcome: outcome.evidence)
 
 
 def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
@@ -214,20 +212,31 @@ def _backward_elimination(
 
 
 def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | None:
-    """Return the place of the weakest cause if it need not be there, beside a Gaussian process.
+    """Return the place of the weakest cause if it need not be there, beside a Gaussian process or its like.
 
-    That takes part in every slow shape, and what it leaves of a map's error passes for a second one.
+    A process takes part in every slow shape, and what it leaves of a map's error passes for a second one. Two
+    that look alike share what neither is; where that gains nothing on new dives left out, one is too many.
     """
     smooth = max((_remnant(h) for h in chosen if h.candidate.nonparametric), default=0.0)
     k = min(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
-    if not smooth or chosen[k].candidate.nonparametric:
-        return None
     model = [h.candidate for h in chosen]
+    if model[k].nonparametric or not (smooth or _like_another(state, model, base, k)):
+        return None
     others = model[:k] + model[k + 1 :]
     if chosen[k].signal_to_noise < smooth:
         return k
-    residual = [
-        held_out(state.problem, [candidate.columns for candidate in some], fit).residual
+    counts = slice(None) if smooth else ~state.problem.survey.learned
+    power = [
+        np.sum(held_out(state.problem, [candidate.columns for candidate in some], fit).residual[counts] ** 2)
         for some, fit in ((others, state.fit(others)), (model, base))
     ]
-    return k if rms(residual[0]) < rms(residual[1]) else None
+    return k if power[0] < power[1] else None
+
+
+def _like_another(state: State, model: Sequence[Candidate], base: Joint, k: int) -> bool:
+    """Say whether the log shows the k-th cause much as another of the model."""
+    info = state.conditional_on(model, base)
+    every = {state.candidates[n].group: n for n in most_visible(state.candidates, info, state.at)}
+    own, *others = (every[candidate.group] for candidate in (model[k], *model[:k], *model[k + 1 :]))
+    one, at = state.candidates[own], state.at[own]
+    return any(likeness(info, one, at, state.candidates[n], state.at[n]) > CONFOUNDED for n in others)
