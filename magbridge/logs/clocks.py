@@ -52,6 +52,7 @@ DATES = (
     *(rf"%{day}{sign}%{month}{sign}%Y" for sign in "/-" for day, month in ("dm", "md")),
     *(rf"%Y{sign}%m{sign}%d" for sign in "./"),
 )
+OF_A_DAY = "times of day, of a day that the file does not tell"
 HOURS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p")
 
 
@@ -87,13 +88,24 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
         Dates that can be read in two ways; says what to declare.
     """
     unit = {"seconds": "s", "sec": "s", "hours": "h", "UTC": ""}.get(unit, unit)
-    if "%" in unit or unit == "iso":
+    if "%" in unit:
+        return Clock(unit, boot="%d" not in unit and "%j" not in unit)
+    if unit == "iso":
         return Clock(unit)
     present = [text.strip() for text in texts if text.strip()]
     numbers = pd.to_numeric(pd.Series(present, dtype=object), errors="coerce").to_numpy(float)
+    if not unit and _on_a_clock(present):
+        return Clock("%H%M%S.%f" if "." in present[0] else "%H%M%S", OF_A_DAY, boot=True)
     if not present or np.isfinite(numbers).any():
         return _counted(heading, unit, numbers[np.isfinite(numbers)])
     return _written(heading, present, zone)
+
+
+def _on_a_clock(texts: Sequence[str]) -> bool:
+    """Say whether six digits are hours, minutes and seconds, as 120059 before 120100, and no count."""
+    if not texts or not all(re.fullmatch(r"[0-2]\d[0-5]\d[0-5]\d(\.\d+)?", text) for text in texts):
+        return False
+    return texts[0].startswith("0") or len({text[2:4] for text in texts}) > 1
 
 
 def _counted(heading: str, unit: str, numbers: FloatArray) -> Clock:
@@ -143,7 +155,7 @@ def _written(heading: str, texts: Sequence[str], zone: str | None) -> Clock:
     if not fit:
         hours = next((hour for hour in HOURS if _fits(times, hour)), None)
         if hours is not None:
-            return Clock(hours, "times of day, of a day that the file does not tell", boot=True)
+            return Clock(hours, OF_A_DAY, boot=True)
         return Clock("iso")  # each cell will be refused with its row
     if len(fit) > 1 and len({_order(pattern) for pattern in fit}) > 1:
         which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit[:2])

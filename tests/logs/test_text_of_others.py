@@ -123,6 +123,18 @@ def test_times_of_day_are_of_a_day_that_is_given(tmp_path: Path) -> None:
     np.testing.assert_allclose(dated["time"], [NOON + 0.5, NOON + 1.5], atol=1e-6)
 
 
+@pytest.mark.parametrize("heading", ["time", "UTC", "time [%H%M%S.%f]"])
+def test_six_digits_that_step_over_sixty_are_times_of_day(heading: str, tmp_path: Path) -> None:
+    """As proton magnetometers and NMEA write them; the minute has 60 s, a count would go on to 99."""
+    column = ["time=time [%H%M%S.%f]"] if "%" in heading else []
+    heading = heading.partition(" ")[0]
+    log = read(tmp_path, f"{heading},nT\n120058.0,48120\n120059.0,48121\n120100.0,48122\n", column=column)
+    assert log["time"].values.tolist() == [43_258.0, 43_259.0, 43_260.0]
+    assert log.attrs["time_reference"] == "boot"
+    count = read(tmp_path, "time,nT\n120058.0,48120\n120060.0,48121\n120062.0,48122\n")
+    assert count["time"].values.tolist() == [120_058.0, 120_060.0, 120_062.0]
+
+
 def test_the_greek_letter_is_the_micro_sign(tmp_path: Path) -> None:
     log = read(tmp_path, "time,MAGNETIC FIELD X (\N{GREEK SMALL LETTER MU}T)\n1600000000,30.5\n")
     assert log["MAGNETIC FIELD X"].attrs["units"] == "\N{GREEK SMALL LETTER MU}T"
