@@ -71,7 +71,7 @@ class Correction:
         self._told = told = Told()
         self.notices = told.notices
         judged = calibration.method != "none"
-        self.plausibility = Plausibility(calibration.noise.sensor, told) if judged else None
+        self.plausibility = self._plausibility(calibration) if judged else None
         self.turns, self.attitude = Turns(told), Attitude(told)
         self.direction = None if calibration.boresight is None else Direction(told)
 
@@ -189,11 +189,14 @@ class Correction:
         if self._raised is not None:
             self._raised.replace(calibration.at_level(), values)
         if self.plausibility is None:
-            self.plausibility = Plausibility(calibration.noise.sensor, self._told)
+            self.plausibility = self._plausibility(calibration)
         elif self.learner is not None:
             self.plausibility.explain(by, jumps=not self.learner.renewed)
             self.turns.explain(by)
             self.attitude.forget()
+
+    def _plausibility(self, calibration: Calibration) -> Plausibility:
+        return Plausibility(calibration.noise.sensor, self._told, calibration.reference.level_sigma)
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
         """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""

@@ -127,6 +127,19 @@ def test_a_level_that_is_wrong_at_first_is_none_to_jump_from() -> None:
     assert not [text for text in judge.notices if "jumps" in text]
 
 
+@pytest.mark.parametrize("level", [0.0, 145.0])
+def test_a_level_that_all_samples_share_is_no_noise(level: float) -> None:
+    """A vehicle that calibrated itself knows its level to 145 nT, and the rest to one."""
+    judge, rng = Plausibility(1.0, level=level), np.random.default_rng(5)
+    more = []
+    for k in range(100):
+        x, y, z = (20_000.0 + rng.normal(0.0, 1.0, 3)).tolist()
+        more.append(judge.check(k * 4_000_000, (x, y, z), FIELD + rng.normal(), 145.01, 0, FIELD, 145.0))
+        assert not judge.flags
+    assert any("noise" in text for text in judge.notices) is (level == 0.0)
+    assert (max(more) == 0.0) is (level > 0.0)
+
+
 def test_repeats_are_counted_from_the_last_change() -> None:
     judge = Plausibility(1.0)
     for k in range(400):  # three of a kind, for ever

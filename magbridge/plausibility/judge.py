@@ -31,6 +31,8 @@ class Plausibility:
         nT, 1-sigma of a channel's noise by the calibration.
     told : Told, optional
         Takes what is found.
+    level : float
+        nT, the part of every sample's sigma that all share: it makes the field neither jump nor scatter.
 
     Attributes
     ----------
@@ -40,7 +42,8 @@ class Plausibility:
         The last sample is an outlier, of a sensor at fault, or not of the Earth: no level, old or new.
     """
 
-    def __init__(self, noise: float, told: Told | None = None) -> None:
+    def __init__(self, noise: float, told: Told | None = None, level: float = 0.0) -> None:
+        self._shared = level * level
         self.flags = 0
         self.fault = False
         told = told or Told()
@@ -89,7 +92,8 @@ class Plausibility:
         doubtful = doubtful or level.wrong
         jump.outlier = False
         if steady:
-            more += jump.check(time_us, total, sigma, learn=not doubtful)
+            apart: float = max(sigma * sigma - self._shared, 0.0) ** 0.5
+            more += jump.check(time_us, total, apart, learn=not doubtful)
         else:
             jump.moved = True
         self.fault = doubtful or jump.outlier or time_us < level.until_us
