@@ -7,64 +7,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_array
+from surveyed_rock import NOISE, error_of, flown
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting import rounds
-from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import too_rough
-from magbridge.calibration.fitting.field_nodes import nodes_for
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
-from magbridge.calibration.fitting.joint import Linear, Sums, add_up, eliminate
+from magbridge.calibration.fitting.joint import Sums
 from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.model import Noise, identity
-from magbridge.field.place.blocks import Factor, near_inverse
 from magbridge.field.place.matern import Matern
-from magbridge.field.place.nodes import nodes_near
 from magbridge.survey.gridding import gridded
 from magbridge.survey.samples import Samples
 
-MAIN = np.array([18_000.0, -5_000.0, 48_000.0])
-IRON = np.eye(3) + np.array([[0.012, 0.003, -0.004], [0.003, -0.008, 0.002], [-0.004, 0.002, 0.005]])
-OFFSET = np.array([900.0, -600.0, 1200.0])
-NOISE = 1.0
-
 Survey = tuple[Observations, FloatArray, Fit]
-
-
-def flown(
-    *, legs: int = 16, straight: bool = False, zigzag: bool = False, seed: int = 3
-) -> tuple[Observations, FloatArray]:
-    """Fly dives and climbs criss-cross over rock of 40 nT; return what was read, and the true total field."""
-    rng = np.random.default_rng(seed)
-    each, dt, speed = 110, 4.0, 0.9
-    n = legs * each
-    leg = np.arange(n) // each
-    course = np.zeros(legs) if straight else np.radians(rng.uniform(0, 360, legs))
-    if zigzag:
-        course = np.radians(np.where(np.arange(legs) // 2 % 2, 50.0, -50.0))
-    heading = course[leg] + rng.normal(0, 0.02, n)
-    pitch = np.radians(np.where(leg % 2, 25, -25) + rng.normal(0, 1, n))
-    roll = np.radians(rng.normal(0, 5, legs)[leg] + rng.normal(0, 1, n))
-    place = np.cumsum(speed * dt * np.stack([np.cos(heading), np.sin(heading), 0 * heading], axis=1), axis=0)
-    k, phase = rng.normal(0, 1 / 700.0, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
-    rock = 40.0 * np.sqrt(2 / 400) * np.cos(place[:, :2] @ k.T + phase).sum(axis=1)
-    F_0 = float(np.linalg.norm(MAIN))
-    true = F_0 + rock
-    ned = MAIN * (true / F_0)[:, None]
-    attitude = np.stack([roll, pitch, heading], axis=1)
-    field = field_body(attitude, ned) @ np.linalg.inv(IRON).T + OFFSET + rng.normal(0, NOISE, (n, 3))
-    data = Observations(
-        field=field, reference=np.full(n, F_0), parameters=np.empty((n, 0)),
-        time=1e9 + dt * np.arange(n, dtype=float), runs=leg, attitude=attitude,
-        reference_ned=np.tile(MAIN, (n, 1)), place=place, unmapped=np.ones(n),
-    )  # fmt: skip
-    return data, true
 
 
 @pytest.fixture(scope="module")
@@ -144,14 +105,6 @@ def test_true_field_is_fitted_as_before() -> None:
     found = fit(known)
     assert found.calibration.method in {"auto", "nominal"}  # which of both predicts parts left out better
     assert found.calibration.reference.level_sigma == 0.0
-
-
-def error_of(found: Fit, data: Observations, true: FloatArray) -> tuple[float, float]:
-    """Return the corrected field's error and its sigma, about the mean, nT."""
-    channels = data.channels(found.calibration)
-    got = correct(found.calibration, data.field, channels, data.time)
-    level = level_of(found.calibration, data.field, channels, data.time)
-    return float(np.std(got.total - true)), float(np.sqrt(np.median(got.sigma**2 - level**2)))
 
 
 def test_straight_line_is_not_supported() -> None:
@@ -423,112 +376,3 @@ def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:
     error, sigma = error_of(found, data, true)
     assert error > 2.0 * NOISE
     assert error < 1.25 * sigma
-
-
-@pytest.mark.parametrize(
-    ("alpha", "harmonic", "buried"),
-    [(2, False, False), (3, False, False), (4, False, False), (4, True, False), (4, False, True)],
-)
-def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: bool, buried: bool) -> None:
-    """Away from edges the splines' variance is 1; blocks of the inverse are those of the dense one.
-
-    Of sources at a depth the edge is felt farther.
-    """
-    rng = np.random.default_rng(alpha)
-    place = np.cumsum(rng.normal(0, 60, (1500, 2)), axis=0)
-    field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha, harmonic, buried)
-    Q = field.precision.toarray()
-    B = field.basis(place[::9])
-    variance = near_inverse(field.precision, field.edges).variances(B)
-    np.testing.assert_allclose(variance, np.einsum("ni,ij,nj->n", B.toarray(), np.linalg.inv(Q), B.toarray()))
-    np.testing.assert_allclose(variance, 1.0, atol=0.2 if buried else 0.05)
-    assert field.log_determinant == pytest.approx(np.linalg.slogdet(Q)[1])
-    factor = Factor(field.precision)
-    assert factor.log_determinant == pytest.approx(field.log_determinant)
-    root = factor.draw(np.eye(field.nodes.size))
-    np.testing.assert_allclose(root @ root.T, np.linalg.inv(Q), atol=1e-6 * np.abs(np.linalg.inv(Q)).max())
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.4, 0.99])
-def test_sums_are_those_of_the_whitened_samples_however_they_are_cut(rho: float) -> None:
-    """A gap in the log, one just where a piece ends, and a sample alone."""
-    rng = np.random.default_rng(4)
-    V, B = rng.normal(size=(12, 3)), rng.normal(size=(12, 5))
-    follows = np.ones(12, bool)
-    follows[[0, 3, 4, 8]] = False
-    pieces = [(0, 4), (3, 9), (8, 12)]
-    sums = add_up(Linear(V[a:b], csr_array(B[a:b]), follows[a:b], overlap=a > 0) for a, b in pieces)
-    both = np.hstack([V, B])
-    white = both.copy()
-    white[follows] = (both[follows] - rho * both[np.flatnonzero(follows) - 1]) / np.sqrt(1.0 - rho**2)
-    found, expected = sums.whitened(rho), white.T @ white
-    assert (sums.samples, sums.pairs) == (12, 8)
-    np.testing.assert_allclose(found.VV, expected[:3, :3], atol=1e-9)
-    np.testing.assert_allclose(found.VB, expected[:3, 3:], atol=1e-9)
-    np.testing.assert_allclose(found.BB.toarray(), expected[3:, 3:], atol=1e-9)
-
-
-def test_sources_at_a_depth_reach_far_and_are_smooth_nearby() -> None:
-    """Their correlation begins to fall as a Gaussian's of the length, and ends as a layer of dipoles'."""
-    length = 600.0
-    place = np.stack([np.linspace(0.0, 4.0 * length, 33), np.zeros(33)], axis=1)
-    field = Matern(nodes_near(place, 120.0, 3000.0), length, 4, buried=True)
-    B = field.basis(place)
-    covariance = B @ Factor(field.precision).solve(B.T.toarray())
-    correlation = covariance[0] / covariance[0, 0]
-    depth = length * np.sqrt(0.75)  # of a layer whose correlation (1 + r²/4d²)^-3/2 begins to fall so
-    layer = (1.0 + place[:, 0] ** 2 / (4.0 * depth**2)) ** -1.5
-    np.testing.assert_allclose(correlation, layer, atol=0.06)
-    assert correlation[24] > 10.0 * np.exp(-0.5 * 3.0**2)
-
-
-def test_nodes_too_fine_for_a_long_field_are_refused() -> None:
-    """Where the prior is singular to rounding, the evidence is noise that a search would climb."""
-    place = np.stack([np.linspace(0.0, 6000.0, 200), np.zeros(200)], axis=1)
-    values = np.sin(place[:, 0] / 900.0)
-
-    def evidence(fine: float) -> float:
-        field = Matern(nodes_near(place, 1500.0 / fine, 1500.0), 1500.0, 16)
-        sums = add_up([Linear(np.ones((200, 1)) * values[:, None], field.basis(place), np.zeros(200, bool))])
-        reduced = eliminate(sums, field, 50.0, 0.0)
-        return reduced.log_evidence - 0.5 * reduced.quadratic.c_0
-
-    assert evidence(5.0) == pytest.approx(evidence(4.0), abs=0.5)
-    with pytest.raises(np.linalg.LinAlgError, match="too fine"):
-        evidence(9.0)
-
-
-def test_nodes_are_as_fine_as_the_area_allows() -> None:
-    """A rough field over 100 km of lines: coarser nodes, and no more of them than asked for."""
-    x = np.arange(0.0, 100e3, 50.0)
-    place = np.concatenate([np.stack([x, 0.0 * x + east], axis=1) for east in np.arange(0.0, 60e3, 1e3)])
-    assert 0.7 * 4_000 < nodes_for(place, 300.0, 2, 4_000).size < 1.06 * 4_000
-    assert nodes_for(place[:100], 300.0, 2).spacing == pytest.approx(300.0 / 8.0)
-
-
-@pytest.mark.parametrize("waves", [1.0, 1.5, 2.0, 3.0])
-@pytest.mark.parametrize("deeper", [-150.0, -50.0, 80.0, 150.0])
-def test_a_wave_falls_off_upwards_as_laplace_demands(waves: float, deeper: float) -> None:
-    """A wave of wave number k is larger by exp(k d) where the track is d deeper."""
-    length = 900.0
-    x = np.linspace(-4000.0, 4000.0, 400)
-    field = Matern(nodes_near(np.stack([x, 0.0 * x], axis=1), 300.0, 2000.0), length, 6, harmonic=True)
-    k = waves / length
-    u = np.cos(k * field.nodes.places[:, 0])
-    inner = np.stack([np.linspace(-1500.0, 1500.0, 60), np.zeros(60)], axis=1)
-    here, there = (field.basis(inner, depth) @ u for depth in (0.0, deeper))
-    np.testing.assert_allclose(there, np.exp(k * deeper) * here, atol=0.012 * np.abs(here).max())
-
-
-def test_slopes_are_the_splines_derivatives() -> None:
-    nodes = nodes_near(np.array([[0.0, 0.0], [3000.0, 500.0]]), 300.0, 900.0)
-    rng = np.random.default_rng(1)
-    w, x = rng.normal(size=nodes.size), np.array([[100.0, 50.0], [2900.0, 600.0]])
-    step = np.array([[0.5, 0.0]])
-    for harmonic in (False, True):
-        field = Matern(nodes, 900.0, 4, harmonic)
-        north, east = (slope @ w for slope in field.slopes(x))
-        np.testing.assert_allclose(north, (field.basis(x + step) - field.basis(x - step)) @ w, rtol=1e-4)
-        np.testing.assert_allclose(
-            east, (field.basis(x + step[:, ::-1]) - field.basis(x - step[:, ::-1])) @ w, rtol=1e-4
-        )
