@@ -20,7 +20,7 @@ from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.config import Align
 from magbridge.field.place.matern import Matern
 
-__all__ = ["Drift", "SurveySamples"]
+__all__ = ["Drift", "SurveySamples", "beside_motion"]
 
 
 class Drift(NamedTuple):
@@ -31,18 +31,32 @@ class Drift(NamedTuple):
     sigma: float
 
 
-def _at_rest(data: Observations) -> BoolArray:
-    """Say beside which samples (n,) no mass moves, by the bridge's own criterion; all, where most do.
+def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
+    """Say beside which samples (n,) a mass moves, by the bridge's own criterion (:mod:`magbridge.track`).
 
-    Where one begins to move after its last report, no telemetry tells where it was. A current or a throttle
-    that always changes is no such mass.
+    Where one begins to move after its last report, no telemetry tells where it was.
+
+    Parameters
+    ----------
+    time : (n,) array
+        s.
+    values : (n, k) array
+        Positions of the masses.
+    spans : (k,) array
+        Of each, what it moves through.
     """
-    rest = np.ones(len(data), bool)
+    fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
+    step = (np.abs(np.diff(values, axis=0)) > fastest).any(axis=1)
+    moving = np.zeros(len(time), bool)
+    moving[1:] |= step
+    moving[:-1] |= step
+    return moving
+
+
+def _at_rest(data: Observations) -> BoolArray:
+    """Say beside which samples (n,) no mass moves; all, where most do, as a current or a throttle."""
     span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
-    fastest = Align().moving_rate * span * np.maximum(np.diff(data.time), 1.0)[:, None]
-    moving = (np.abs(np.diff(data.parameters, axis=0)) > fastest).any(axis=1)
-    rest[1:] &= ~moving
-    rest[:-1] &= ~moving
+    rest = ~beside_motion(data.time, data.parameters, span)
     return rest if rest.mean() > 0.5 else np.ones(len(data), bool)
 
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.fitting.survey_samples import beside_motion
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, require, require_units
-from magbridge.config import Align
 from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
@@ -184,11 +184,7 @@ def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray
     There the axes, sampled in turn, saw the mass at different places and form no vector. With
     simultaneous sampling such samples are kept: only they reveal an offset of the clocks.
     """
-    moving = np.zeros(table["time"].size, bool)
-    elapsed = np.maximum(np.diff(table["time"]), 1.0)
-    for parameter in calibration.parameters:
-        fastest = Align().moving_rate * (parameter.high - parameter.low)
-        step = np.abs(np.diff(table[parameter.name])) > fastest * elapsed
-        moving[1:] |= step
-        moving[:-1] |= step  # the later axes of this sample were taken when it had begun
-    return moving
+    parameters = calibration.parameters
+    time = table["time"]
+    values = np.array([table[one.name] for one in parameters]).reshape(len(parameters), time.size)
+    return beside_motion(time, values.T, np.array([one.high - one.low for one in parameters]))
