@@ -26,8 +26,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import compile_kernel
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.terms import Effect, Parameter, Polynomial, PositionTerm, symmetric
-from magbridge.deprecated import old_name
 from magbridge.errors import CalibrationError
+from magbridge.wording import counted
 
 __all__ = [
     "RAISED", "Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity",
@@ -151,7 +151,6 @@ class Calibration:
     software: str = ""
     warnings: tuple[str, ...] = ()
     level: tuple[float, ...] = ()
-    doubts = old_name("doubts", "warnings")
 
     def __post_init__(self) -> None:
         names = tuple(parameter.name for parameter in self.parameters)
@@ -173,7 +172,7 @@ class Calibration:
 
     def __repr__(self) -> str:
         ranges = (f"{one.name} {one.low:g} to {one.high:g} {one.unit}".rstrip() for one in self.parameters)
-        held = f"{len(self.coefficients)} coefficients", f"noise {self.noise.sensor:.3g} nT"
+        held = f"{counted(len(self.coefficients), 'coefficient')}", f"noise {self.noise.sensor:.3g} nT"
         return f"<Calibration {self.method or 'by hand'}: {', '.join((*ranges, *held))}>"
 
     @property

@@ -29,6 +29,7 @@ from magbridge.cli.common import (
 from magbridge.cli.remarks import note_losses
 from magbridge.errors import WrongUse
 from magbridge.progress import track, waiting
+from magbridge.wording import counted
 
 
 @command("convert FILE... -o FILE [OPTIONS]")
@@ -74,7 +75,9 @@ def convert(
             rows += part.sizes["time"]
             names = [str(name) for name in part.data_vars]
     note_losses(*pieces)
-    print_result({"file": str(output), "rows": rows, "columns": names}, f"{output}: {rows} rows", json)
+    print_result(
+        {"file": str(output), "rows": rows, "columns": names}, f"{output}: {counted(rows, 'row')}", json
+    )
 
 
 def _og(metadata: Path) -> Callable[[Path], None]:
@@ -146,7 +149,7 @@ def simulate(
     if map_output is not None:
         Twin.draw(chosen, seed).anomaly_map().save(map_output)
     rows = deployment.sizes["time"]
-    print_result({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {rows} rows", json)
+    print_result({"file": str(output), "rows": rows, "seed": seed}, f"{output}: {counted(rows, 'row')}", json)
 
 
 @command("map GRID... -o grid.nc [OPTIONS]")

@@ -24,6 +24,7 @@ from magbridge.cli.common import (
 )
 from magbridge.errors import DataError, WrongUse
 from magbridge.files import new_folder
+from magbridge.wording import counted
 
 SLOWEST = 1e-3
 """Lowest replay speed, relative to real time: a log of an hour then takes six weeks."""
@@ -119,7 +120,7 @@ def _check(config: Path) -> None:
         complain(one.text)
     fatal = sum(one.fatal for one in found)
     if fatal:
-        raise WrongUse(f"{config}: the bridge would not start: {fatal} thing{'s' * (fatal > 1)} to mend")
+        raise WrongUse(f"{config}: the bridge would not start: {counted(fatal, 'thing')} to mend")
     print(f"{config}: the bridge would start" + (", with what is said above" if found else ""))
 
 

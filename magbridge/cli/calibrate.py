@@ -30,6 +30,7 @@ from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losse
 from magbridge.errors import CalibrationError, DataError, OutOfRange, WrongUse
 from magbridge.files import digest
 from magbridge.progress import waiting
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -185,7 +186,7 @@ def calibrate(
     print_result(
         {"file": str(output), "method": method, **_facts(found, len(data)), "left_out": left_out, **worth},
         f"{output}: {method}, {_summary(found, len(data))}"
-        + (f"; {left_out} row{'s' * (left_out > 1)} without every value left out" if left_out else ""),
+        + (f"; {counted(left_out, 'row')} without every value left out" if left_out else ""),
         json,
     )
     if reading.strict and not found.supported:

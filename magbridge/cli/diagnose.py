@@ -40,7 +40,6 @@ def diagnose(
     calibration: Path,
     output: Annotated[Folder, Parameter(name=["--output", "-o"])],
     training_logs: tuple[Path, ...] = (),
-    learned_from: Annotated[tuple[Path, ...], Parameter(show=False)] = (),
     grid: Path | None = None,
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
@@ -62,8 +61,6 @@ def diagnose(
         The folder to write to.
     training_logs
         A log that the calibration was fitted to, to tell what has appeared since; may be repeated.
-    learned_from
-        The old name of --training-logs.
     grid
         An anomaly grid to add to the IGRF, where a log has no reference_field.
     reading
@@ -80,8 +77,6 @@ def diagnose(
     from magbridge.field.read import read_grid
     from magbridge.logs import read
 
-    if learned_from:
-        complain("--learned-from is now called --training-logs")
     known = load(calibration)
     with waiting("reading") as step:
         logs = [read(path, options=reading.options) for path in files]
@@ -90,7 +85,7 @@ def diagnose(
         remarks = warnings_of(known, calibration)
         own = [path for path in files if digest(path) in known.inputs.values()]
         own_logs = [log for path, log in zip(files, logs, strict=True) if path in own]
-        others = [path for path in (*training_logs, *learned_from) if path not in files]
+        others = [path for path in training_logs if path not in files]
         remarks += [f"{path}: {ITSELF}" for path in own]
         remarks += [remark for log in logs for remark in _suspect(log)]
         for remark in remarks:

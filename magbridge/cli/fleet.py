@@ -12,6 +12,7 @@ from cyclopts import App, Parameter, validators
 from magbridge.cli.common import Day, Json, Output, Whole, app, complain, print_result
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
@@ -98,7 +99,8 @@ def add(
         complain(line)
     print_result(
         {"catalogue": there.name, "vehicles": added, "logs": new, "calibrations": given, "remarks": lines},
-        f"{there.name}: {added} vehicles, {new} logs and {given} calibrations added",
+        f"{there.name}: {counted(added, 'vehicle')}, {counted(new, 'log')} and "
+        f"{counted(given, 'calibration')} added",
         json,
     )
 
@@ -182,7 +184,8 @@ def process(
     result = {"deployments": len(every), "processed": len(todo), "failures": failures}
     print_result(
         result,
-        f"{there.name}: {len(todo)} of {len(every)} deployments were new, {len(failures)} failures",
+        f"{there.name}: {counted(len(every), 'deployment')}, {len(todo)} of them new; "
+        f"{counted(len(failures), 'failure')}",
         json,
     )
     if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
@@ -208,11 +211,11 @@ def status(*, catalogue: Where = HERE, json: Json = False) -> None:
     for line in found["failures"]:
         complain(line)
     rows = "\n".join(
-        f"  {one['vehicle']}: {one['deployments']} deployments, {one['logs']} logs, {one['calibrated']} "
-        f"calibrated, {one['failed']} failed, {one['new']} new"
+        f"  {one['vehicle']}: {counted(one['deployments'], 'deployment')}, {counted(one['logs'], 'log')}, "
+        f"{one['calibrated']} calibrated, {one['failed']} failed, {one['new']} new"
         for one in found["vehicles"]
     )
-    print_result(found, f"{there.name}: {len(found['vehicles'])} vehicles\n{rows}".rstrip(), json)
+    print_result(found, f"{there.name}: {counted(len(found['vehicles']), 'vehicle')}\n{rows}".rstrip(), json)
 
 
 @fleet.command
@@ -289,7 +292,7 @@ def export(
     others = len(learnt.lessons) - count
     print_result(
         {"file": str(output), "vehicle": vehicle, "deployments": count},
-        f"{output}: what {count} deployments of {vehicle} and {others} of its fleet let expect",
+        f"{output}: what {counted(count, 'deployment')} of {vehicle} and {others} of its fleet let expect",
         json,
     )
 
@@ -298,8 +301,9 @@ def _lines(facts_of: dict[str, dict[str, Any]]) -> list[str]:
     """Return a line for each vehicle, and for each change of it."""
     lines = []
     for name, one in facts_of.items():
-        changes = [(part, change) for part in one["deployments"] for change in part["changes"]]
-        lines.append(f"{name}: {len(one['deployments'])} deployments, {len(changes)} changes")
+        parts = one["deployments"]
+        changes = [(part, change) for part in parts for change in part["changes"]]
+        lines.append(f"{name}: {counted(len(parts), 'deployment')}, {counted(len(changes), 'change')}")
         lines += [
             f"  {part['date']} {part['deployment']} (refit {part['refit']}): {change['what']} moved by "
             f"{change['by_nT']:+.0f} nT, {change['sigmas']:.1f} sigma: {change['cause']}"

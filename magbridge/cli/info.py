@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from magbridge.cli.common import AS_THEY_SAY, Json, Reading, command, complain, logs_to_read, print_result
 from magbridge.cli.remarks import note_losses
 from magbridge.progress import waiting
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -73,8 +74,10 @@ def summary(facts: dict[str, Any]) -> str:
     boot = facts["references"]["time_reference"] == "boot"
     first, last = (f"{facts[end]:.1f} s" if boot else _utc(facts[end]) for end in ("start", "end"))
     rate = f", {facts['rate_hz']:.4g} Hz" if facts["rate_hz"] else ""
-    gaps = f", {facts['gaps']} gaps, the longest of {facts['longest_gap_s']:.4g} s" if facts["gaps"] else ""
-    return f"{facts['rows']} rows, {first} to {last}{rate}{gaps}"
+    gaps = ""
+    if facts["gaps"]:
+        gaps = f", {counted(facts['gaps'], 'gap')}, the longest of {facts['longest_gap_s']:.4g} s"
+    return f"{counted(facts['rows'], 'row')}, {first} to {last}{rate}{gaps}"
 
 
 def _utc(time: float) -> str:

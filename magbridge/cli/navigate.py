@@ -22,6 +22,7 @@ from magbridge.cli.common import (
 )
 from magbridge.cli.remarks import note_losses, note_missing, note_settings, refuse_unsuited, warnings_of
 from magbridge.progress import waiting
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -185,7 +186,7 @@ def _judged(track: xr.Dataset) -> tuple[dict[str, Any], str]:
         "dead_reckoning_error_m": reckoned if judged else None,
         **track.attrs,
     }
-    return facts, f"{rows} updates, {valid:.0%} valid, 1-sigma {sigma:.0f} m at the end{off}"
+    return facts, f"{counted(rows, 'update')}, {valid:.0%} valid, 1-sigma {sigma:.0f} m at the end{off}"
 
 
 def _bound(

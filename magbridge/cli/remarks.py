@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from magbridge.cli.common import complain
 from magbridge.errors import FormatError, WrongUse
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -45,7 +46,7 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
     for line in lines[:NAMED]:
         complain(line)
     if len(lines) > NAMED:
-        complain(f"and in {len(lines) - NAMED} places more")
+        complain(f"and in {counted(len(lines) - NAMED, 'place')} more")
 
 
 def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Dataset]:

@@ -26,6 +26,7 @@ from magbridge.cli.common import (
 from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, warnings_of
 from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.progress import waiting
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -161,7 +162,7 @@ def _samples(
     known = [load(path) for path in calibration]
     for log in deployments if known else []:
         if {"latitude", "longitude"} <= set(log.variables) and (holes := int((~placed(log)).sum())):
-            complain(f"{log.attrs['source']}: {holes} samples without a position: left out")
+            complain(f"{log.attrs['source']}: {counted(holes, 'sample')} without a position: left out")
     for path, one in zip(calibration, known, strict=True):
         for doubt in warnings_of(one, path):
             complain(doubt)

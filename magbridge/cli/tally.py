@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from magbridge.columns import CHANNELS
 from magbridge.records import Quality
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -62,7 +63,8 @@ class Tally:
     def summary(self) -> str:
         """Return the numbers in a sentence."""
         named = ", ".join(f"{name} {count}" for name, count in (+self.flags).items())
-        text = f"{self.samples} samples, {self.flagged} of them flagged" + (f" ({named})" if named else "")
-        return text + (
-            f"; {self.left_out} rows without any of {' '.join(CHANNELS)} left out" if self.left_out else ""
-        )
+        text = f"{counted(self.samples, 'sample')}, {self.flagged} of them flagged"
+        text += f" ({named})" if named else ""
+        if self.left_out:
+            text += f"; {counted(self.left_out, 'row')} without any of {' '.join(CHANNELS)} left out"
+        return text

@@ -11,7 +11,6 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms
-from magbridge.deprecated import old_name
 from magbridge.diagnose.assessment.weigh import Assessment, assess
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate
@@ -57,8 +56,6 @@ class Finding:
     over_random_walk: float = np.inf
     """Log odds over a sensor whose offsets wander (:mod:`~.inference.random_walk`); infinite for a cause that
     is not slow."""
-    gain = old_name("gain", "improvement")
-    rivals = old_name("rivals", "competing")
 
     @property
     def candidate(self) -> Candidate:

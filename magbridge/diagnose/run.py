@@ -14,7 +14,6 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms
-from magbridge.deprecated import old_argument
 from magbridge.diagnose.accept import settle
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
@@ -53,7 +52,6 @@ SLOW = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
 
 
-@old_argument("learned_from", "training_logs")
 def diagnose(
     datasets: Sequence[xr.Dataset],
     calibration: Calibration,

@@ -14,6 +14,7 @@ from magbridge.errors import FormatError
 from magbridge.field.coordinates import LATITUDE, LONGITUDE, PROJECTED, Axes, stated
 from magbridge.field.grid_formats import TEXT
 from magbridge.field.grid_netcdf import ANOMALY, Parts
+from magbridge.wording import counted
 
 __all__ = ["table"]
 
@@ -68,7 +69,7 @@ def table(path: Path) -> Parts:
     elif len(words) == 3:
         places = 0, 1, 2
     else:
-        raise FormatError(path, f"{len(words)} columns without names: {HEADER}", row=1)
+        raise FormatError(path, f"{counted(len(words), 'column')} without names: {HEADER}", row=1)
     rows = _numbers(path, delimiter, int(header), places)
     if not header:
         rows = rows[:, _order(path, rows)]

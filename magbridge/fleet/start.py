@@ -10,6 +10,7 @@ from magbridge.calibration.fitting.fit import Fit
 from magbridge.calibration.fitting.known import DEPARTURE, Known
 from magbridge.fleet.catalogue import open_catalogue
 from magbridge.fleet.memory import fleet_of, owner
+from magbridge.wording import counted
 
 __all__ = ["UNLIKE", "Start", "gained", "start"]
 
@@ -79,7 +80,7 @@ def gained(found: Fit, alone: Fit | None, began: Start) -> tuple[dict[str, Any],
         "expected_nT": with_it, "expected_alone_nT": without, "departure": departure,
     }  # fmt: skip
     otherwise = f"instead of {without:.1f}" if without is not None else "where these runs alone allow no fit"
-    past = f"{began.own} deployments of {began.vehicle} and {began.others} of its fleet"
+    past = f"{counted(began.own, 'deployment')} of {began.vehicle} and {began.others} of its fleet"
     lines = [f"{past}: expect {with_it:.1f} nT of error {otherwise}"]
     if departure > UNLIKE:
         lines.append(

@@ -18,6 +18,7 @@ import xarray as xr
 
 from magbridge.columns import CHANNELS, COLUMNS
 from magbridge.errors import FormatError
+from magbridge.wording import counted
 
 __all__ = [
     "HEALTHY", "Compass", "by_columns", "choose", "compass_notes", "compasses_in", "compasses_of", "listed",
@@ -61,7 +62,7 @@ class Compass(msgspec.Struct, frozen=True, omit_defaults=True):
     def words(self) -> str:
         """What is known of it, in a few words."""
         facts = [f"id {self.id}"] if self.id else []
-        facts.append(f"{self.rate:.3g} Hz, {self.samples} samples")
+        facts.append(f"{self.rate:.3g} Hz, {counted(self.samples, 'sample')}")
         facts += ["disabled"] if self.enabled is False else []
         facts += [f"healthy in {self.healthy:.0%}"] if self.healthy is not None and self.healthy < 1 else []
         facts += [f"priority {self.priority}"] if self.priority is not None else []

@@ -23,6 +23,7 @@ from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.headings import aliases, is_unit, split
 from magbridge.logs.makers import declared_by_maker
 from magbridge.logs.mapping import Declared
+from magbridge.wording import counted
 
 __all__ = ["BLANKS", "HEADER", "Layout", "cells", "layout_of"]
 
@@ -172,7 +173,7 @@ def _preamble(lines: Sequence[str], found: Layout) -> int:
     first = next(k for k, count in enumerate(counts) if count >= usual)
     if first and all(NUMBER.fullmatch(cell) for cell in cells(lines[first], found.separator)):
         return 0
-    found.guesses.append(f"{first} line{'s' * (first > 1)} above the headings passed over")
+    found.guesses.append(f"{counted(first, 'line')} above the headings passed over")
     return first
 
 

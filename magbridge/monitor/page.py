@@ -19,6 +19,7 @@ from magbridge.monitor.state import State
 from magbridge.monitor.track import Background
 from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, RED, STYLE, Changes, slanted
 from magbridge.monitor.words import measured, silence
+from magbridge.wording import counted
 
 __all__ = ["Page"]
 
@@ -125,7 +126,7 @@ class Page:
                 text = "{}.{}".format(*bridge) + (f" ({count})" if count else "")
                 button = ui.button(text, on_click=lambda _, bridge=bridge: self._switch(bridge)).props(BUTTON)
                 button.props["aria-label"] = "Vehicle {}, component {}".format(*bridge) + (
-                    f", {count} alarms" if count else ""
+                    f", {counted(count, 'alarm')}" if count else ""
                 )
                 button.props["aria-pressed"] = "true" if bridge == self._bridge else "false"
                 if bridge == self._bridge:

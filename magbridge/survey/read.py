@@ -22,6 +22,7 @@ from magbridge.field.reference import main_field, placed, positions
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 from magbridge.survey.samples import Samples
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,7 +87,9 @@ def read_table(path: Path) -> Samples:
     tie = np.zeros(len(value), bool) if kind is None else (kind == "TIE").to_numpy()
     known = np.isfinite(value) & np.isfinite(longitude) & np.isfinite(latitude)
     if known.sum() < 10:
-        raise FormatError(path, f"only {int(known.sum())} rows have longitude, latitude and anomaly")
+        raise FormatError(
+            path, f"only {counted(int(known.sum()), 'row')} with longitude, latitude and anomaly"
+        )
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
     north, east = separation(*origin, latitude, longitude)
     return Samples(
@@ -211,7 +214,7 @@ def _placed(ds: xr.Dataset, value: FloatArray, lines: FloatArray, label: int) ->
     known = np.isfinite(value) & np.isfinite(latitude) & placed(ds)
     if known.sum() < 10:
         source = ds.attrs.get("source", "the log")
-        raise FormatError(source, f"only {int(known.sum())} samples have a field and a position")
+        raise FormatError(source, f"only {counted(int(known.sum()), 'sample')} with a field and a position")
     origin = float(np.median(latitude[known])), float(np.median(longitude[known]))
     north, east = separation(*origin, latitude, longitude)
     of = np.unique(lines, return_inverse=True)[1].ravel() + label

@@ -20,6 +20,7 @@ from magbridge.survey.gridded import Gridded
 from magbridge.survey.gridding import gridded
 from magbridge.survey.read import corrected_by_others, from_vector, joined
 from magbridge.survey.samples import Samples
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -93,8 +94,8 @@ def survey(samples: Samples) -> Result:
     """
     warnings: list[str] = []
     far = far_off(samples.place)
-    if far.any():
-        warnings.append(f"{int(far.sum())} samples far from all others (a jump in position): left out")
+    if count := int(far.sum()):
+        warnings.append(f"{counted(count, 'sample')} far from all others (a jump in position): left out")
     samples = samples.part(~far)
     with threadpool_limits(1, "blas"):
         try:
@@ -184,14 +185,14 @@ def summary(result: Result) -> str:
     """Return the numbers in a sentence."""
     known = facts(result, Path())
     ties = (
-        f"{known['crossovers']} crossovers {known['misties_before_nT']:.1f} nT RMS before levelling and "
-        f"{known['misties_after_nT']:.1f} after"
+        f"{counted(known['crossovers'], 'crossover')} {known['misties_before_nT']:.1f} nT RMS before "
+        f"levelling and {known['misties_after_nT']:.1f} after"
         if known["crossovers"]
         else "no crossovers"
     )
     rock = known["rock"]
     return (
-        f"{known['samples']} samples on {known['lines']} line{'s' * (known['lines'] > 1)}, {ties}; rock of "
+        f"{known['samples']} samples on {counted(known['lines'], 'line')}, {ties}; rock of "
         f"{rock['size_nT']:.0f} nT over {rock['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT"
     )
 

@@ -165,7 +165,7 @@ def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.
     place, page = str(catalogue.folder), tmp_path / "page.html"
     assert main(["fleet", "show", "comet", "--catalogue", place, "--html", str(page)]) == 0
     reported = capsys.readouterr().out.splitlines()
-    assert reported[0] == "comet: 5 deployments, 1 changes"
+    assert reported[0] == "comet: 5 deployments, 1 change"
     assert "d4 (refit spring): hard iron, y moved by +" in reported[1]
     assert reported[1].endswith("iron that was magnetised, fitted or taken off, and no refit is on record")
     pages = tmp_path / "pages"

@@ -260,7 +260,7 @@ def test_command_predicts_at_points(command: Command, table: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("longitude,latitude,anomaly\n1,2,3\n", "only 1 rows have longitude, latitude and anomaly"),
+        ("longitude,latitude,anomaly\n1,2,3\n", "only 1 row with longitude, latitude and anomaly"),
         ("longitude,anomaly\n1,2\n", "expected this column; there are: longitude anomaly"),
         ("longitude,latitude,anomaly\n1,2,three\n", "expected numbers"),
     ],

@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.wording import counted
 
 __all__ = [
     "SHARE", "courses", "crossed", "far_off", "jumped", "jumps", "left_open", "left_open_by",
@@ -85,10 +86,9 @@ def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
             "rock is; fly legs that cross earlier ones at other headings"
         )
     elif cells < FEW and reversed_cells < FEW:
-        places = f"{cells + reversed_cells} place{'s' * (cells + reversed_cells > 1)}"
         yield (
-            f"you crossed your own track at {places} only: rock and heading are told apart by how smooth the "
-            "rock is; fly more legs that cross earlier ones"
+            f"you crossed your own track at {counted(cells + reversed_cells, 'place')} only: rock and "
+            "heading are told apart by how smooth the rock is; fly more legs that cross earlier ones"
         )
 
 
@@ -133,7 +133,7 @@ def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
     far = far_off(place) & ~without
     for left_out, why in ((without, "without a position"), (far, "far from all others (a jump in position)")):
         if count := int(left_out.sum()):
-            yield f"{count} sample{'s' * (count > 1)} {why}: left out"
+            yield f"{counted(count, 'sample')} {why}: left out"
     kept = ~without & ~far
     if kept.sum() < FEW:
         return
@@ -141,7 +141,7 @@ def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
     if len(at):
         step = np.linalg.norm(np.diff(place[kept], axis=0)[at], axis=1)
         yield (
-            f"the position jumps by {step.max():.0f} m ({len(at)} jump{'s' * (len(at) > 1)} of more than "
+            f"the position jumps by {step.max():.0f} m ({counted(len(at), 'jump')} of more than "
             f"{LEAP:.0f} m): a fix after dead reckoning? --position-sigma bends the track between"
         )
 

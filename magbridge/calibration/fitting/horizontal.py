@@ -27,6 +27,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.residual import residuals_of
 from magbridge.errors import CalibrationError
+from magbridge.wording import counted
 
 __all__ = ["fit_horizontal"]
 
@@ -50,7 +51,9 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
         raise CalibrationError("horizontal: needs roll, pitch and a position (for the field's inclination)")
     known = np.isfinite(data.attitude[:, :2]).all(axis=1) & np.isfinite(data.reference_ned).all(axis=1)
     if known.sum() < FEWEST:
-        raise CalibrationError(f"horizontal: only {int(known.sum())} samples have roll, pitch and position")
+        raise CalibrationError(
+            f"horizontal: only {counted(int(known.sum()), 'sample')} with roll, pitch and position"
+        )
     data = data.part(np.asarray(known))
     assert data.attitude is not None
     assert data.reference_ned is not None

@@ -13,6 +13,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.calibration.terms import Polynomial
+from magbridge.wording import counted
 
 __all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "warnings_for"]
 
@@ -96,7 +97,7 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
         if len(groups) <= min(order, 3):
             places = " and ".join(f"{np.median(g):.4g}" for g in groups)
             yield (
-                f"{parameter.name} was nearly always at {len(groups)} position{'s' * (len(groups) != 1)} "
+                f"{parameter.name} was nearly always at {counted(len(groups), 'position')} "
                 f"({places} {parameter.unit}".rstrip()
                 + "): elsewhere the correction rests on the physical model, "
                 "not on measurements; fly a run with it at another position"
@@ -165,7 +166,7 @@ def _widest_gap(heading: FloatArray) -> tuple[float, float]:
 def _runs(calibration: Calibration, data: Observations) -> Iterator[str]:
     count = len(np.unique(data.runs))
     if calibration.parameters and count < 4:
-        yield f"only {count} run{'s' * (count != 1)}: too few to validate the fit on runs left out"
+        yield f"only {counted(count, 'run')}: too few to validate the fit on runs left out"
 
 
 CHECKS: tuple[Callable[[Calibration, Observations], Iterator[str]], ...] = (

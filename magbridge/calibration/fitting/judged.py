@@ -13,6 +13,7 @@ from magbridge.calibration.fitting.level import apart_from_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import in_words
 from magbridge.errors import CalibrationError
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     from magbridge.calibration.fitting.result import Fit
@@ -107,10 +108,7 @@ def _suspicions(found: Fit) -> Iterator[str]:
         yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
     yield from in_words(found.calibration, found.creep)
     if ends := found.details.get("ends", 0):
-        yield (
-            f"{ends} samples at the ends of the log do not fit the others (a crash, handling?), "
-            "and were left out"
-        )
+        yield (f"{counted(ends, 'sample')} at the ends of the log left out: unlike the others (a crash?)")
     if (ratio := found.details.get("left_out_ratio", 1.0)) > WORSE:
         yield (
             f"parts left out of the fit are off by {ratio:.1f} times what it claimed, so its sigmas were "

@@ -19,6 +19,7 @@ from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
 from magbridge.version import __version__
+from magbridge.wording import counted
 
 __all__ = ["Fit", "assemble"]
 
@@ -57,7 +58,7 @@ class Fit:
     creep: Creep | None = None
 
     def __repr__(self) -> str:
-        count = f", {len(self.calibration.warnings)} warnings" if self.calibration.warnings else ""
+        count = f", {counted(len(self.calibration.warnings), 'warning')}" if self.calibration.warnings else ""
         return f"<Fit: {self.rms:.2f} nT RMS of {len(self.residual)} samples{count}; {self.calibration!r}>"
 
     def _repr_html_(self) -> str:

@@ -16,6 +16,7 @@ from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import positions, reference_field
 from magbridge.records import BEYOND
+from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -107,7 +108,7 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
     needed = [*CHANNELS, "reference_field", *calibration.units]
     size = table["time"].size
     if size < FEWEST:
-        raise DataError(f"{source}: {size} samples, at least {FEWEST} needed")
+        raise DataError(f"{source}: {counted(size, 'sample')}, at least {FEWEST} needed")
     for name in CHANNELS:
         table[name][~(np.abs(table[name]) < BEYOND)] = np.nan
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
