@@ -31,7 +31,6 @@ ENUMS: dict[str, tuple[str, ...]] = {
     "MAG_NAVIGATION_STATE": (),
     "MAG_PORT_NAME": (),
     "MAG_PORT_STATE": (),
-    "MAG_QUALITY": (),
     "MAG_RAW_FLAGS": (),
     "MAV_AUTOPILOT": ("GENERIC", "ARDUPILOTMEGA", "INVALID", "PX4"),
     "MAV_CMD": (
@@ -55,7 +54,7 @@ ENUMS: dict[str, tuple[str, ...]] = {
     "MAV_PROTOCOL_CAPABILITY": ("PARAM_FLOAT", "COMMAND_INT", "FTP", "MAVLINK2", "PARAM_ENCODE_C_CAST"),
     "MAV_RESULT": (),
     "MAV_SEVERITY": (),
-    "MAV_STATE": (),
+    "MAV_STATE": ("ACTIVE", "CRITICAL"),
     "MAV_TYPE": ("GCS", "SUBMARINE", "ONBOARD_CONTROLLER"),
 }
 """The enumerations that the code uses, and which of their entries; an empty list means all."""
@@ -147,7 +146,7 @@ def render() -> str:
         f'"{",".join((*map(field, m.ordered_fields), *EXTENSIONS.get(m.name, ())))}"),'
         for _, m in sorted(messages.items())
     ]
-    lines.append("}")
+    lines += ["}", "", "# the enumerations that the code uses"]
     for name, wanted in ENUMS.items():
         entries = {
             entry.name.removeprefix(f"{name}_"): entry.value
@@ -157,8 +156,8 @@ def render() -> str:
             for entry in enum.entry
             if not entry.name.endswith("_ENUM_END")
         }
-        lines += ["", "", f"class {name}(IntEnum):"]
-        lines += [f"    {key} = {entries[key]}" for key in wanted or entries]
+        chosen = ", ".join(f'"{key}": {entries[key]}' for key in wanted or entries)
+        lines.append(f'{name} = IntEnum("{name}", {{{chosen}}})')
     return "\n".join(lines) + "\n"
 
 

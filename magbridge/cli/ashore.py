@@ -49,15 +49,9 @@ def convert(
         The logs to convert.
     output
         The file to write; its suffix sets the format: .csv .mcap .nc .parquet .tlog.
-    heading_reference
-        What headings refer to. If not given: what the log says, else true north.
     metadata
         A metadata.toml that says of people, platform and sensor what OceanGliders OG1.0 demands: the netCDF
         is then a file of OG1.0.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
     """
     logs_to_read(files, output, metadata)
     if metadata and output.suffix.lower() != ".nc":
@@ -120,10 +114,6 @@ def simulate(
         knows the field; true is the true total field; map is the main field and an airborne survey's anomaly.
     map_output
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
     """
     from magbridge.logs import read, write
     from sitl.like import placed_at, simulate_like
@@ -185,8 +175,6 @@ def map(  # noqa: A001 - the command's name
         Node spacing in deg; by default that of the finest grid.
     picture
         A PNG, PDF or SVG to draw, with every step.
-    json
-        Print the result as JSON.
     """
     from magbridge.field.prepare import draw_steps, prepare, surveyed_at
     from magbridge.field.read import read_grid, read_polygon

@@ -163,8 +163,6 @@ def ports(
         A baud rate to listen at; may be repeated. If not given: the usual ones, until one is understood.
     seconds
         How long to listen at each baud rate.
-    json
-        Print the result as JSON.
     """
     from magbridge.bridge.ports import BAUDRATES, Port, listen
     from magbridge.bridge.ports import ports as there
@@ -194,8 +192,6 @@ def drivers(name: str | None = None, /, *, json: Json = False) -> None:
     ----------
     name
         The driver.
-    json
-        Print the result as JSON.
     """
     from magbridge.sensors.options import driver_names, options_of
 

@@ -59,8 +59,6 @@ def demo(
         With --live, the port to serve the page at.
     show
         With --live, open the page in a browser.
-    json
-        Print the result as JSON.
     """
     if live:
         _live(out, seed, port, show=show)
@@ -153,8 +151,6 @@ def replay(
         A folder for the log that the bridge writes during the replay.
     reading
         How to read logs that are not a bridge's own.
-    json
-        Print the result as JSON.
     """
     from sitl.replay.run import replay as played
     from sitl.replay.summary import summary
@@ -176,8 +172,6 @@ def dialect(*, output: Annotated[Folder, Parameter(name=["--output", "-o"])], js
     ----------
     output
         The folder to write to; it is made if it does not exist.
-    json
-        Print the result as JSON.
     """
     from magbridge.mavlink.definitions import write_definitions
 

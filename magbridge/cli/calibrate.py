@@ -15,7 +15,6 @@ from magbridge.cli.common import (
     AS_THEY_SAY,
     Base,
     Heading,
-    Json,
     Output,
     Picture,
     Reading,
@@ -63,7 +62,7 @@ def calibrate(
     heading_reference: Heading = None,
     picture: Picture = None,
     reading: Reading = AS_THEY_SAY,
-    json: Json = False,
+    json: bool = False,
 ) -> None:
     """Fit a calibration to logs of calibration runs.
 
@@ -118,13 +117,9 @@ def calibrate(
         Which of the fleet's vehicles this is; of logs that are catalogued, it is known.
     refit
         Which refit it flies with, if its logs are not catalogued; by default a new one.
-    heading_reference
-        What headings refer to. If not given: what the log says, else true north.
     picture
         A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
         each parameter.
-    reading
-        How to read the logs.
     json
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """

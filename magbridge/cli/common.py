@@ -146,10 +146,13 @@ Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
 Grid = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write(".nc"))]
 Base = Annotated[Path | None, Parameter(name=["--base-station", "--base"])]
-Heading = Annotated[Literal["true", "magnetic"] | None, Parameter(name="--heading-reference")]
+Heading = Annotated[
+    Literal["true", "magnetic"] | None,
+    Parameter(help="What headings refer to. If not given: what the log says, else true north."),
+]
 Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Whole = Annotated[int, Parameter(converter=_whole)]
-Json = Annotated[bool, Parameter(name="--json")]
+Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
 
 
 def check_inputs(

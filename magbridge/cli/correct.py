@@ -92,10 +92,6 @@ def correct(
         With --learn: where to write the calibration that was published last.
     picture
         A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and what is flagged.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
     """
     source = _source(calibration, config, learn=learn)
     logs_to_read(files, output, source)

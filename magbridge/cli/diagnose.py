@@ -63,10 +63,6 @@ def diagnose(
         A log that the calibration was fitted to, to tell what has appeared since; may be repeated.
     grid
         An anomaly grid to add to the IGRF, where a log has no reference_field.
-    reading
-        How to read the logs.
-    json
-        Print the findings as JSON.
     """
     logs_to_read(files, output / "calibration.json", calibration)
 

@@ -24,7 +24,7 @@ fleet = App(
     help_format="markdown",
 )
 app.command(fleet)
-Where = Annotated[str, Parameter(name="--catalogue")]
+Where = Annotated[str, Parameter(help="The catalogue: a folder, or postgresql://USER@HOST/DATABASE.")]
 HERE = "fleet"
 
 
@@ -41,7 +41,7 @@ def add(
     catalogue: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Put vehicles and logs on record. What is there already is not added again.
+    """Put vehicles and logs on record, in a new catalogue if there is none; nothing is added twice.
 
     Parameters
     ----------
@@ -62,10 +62,6 @@ def add(
         Its sensor: logs of another are refused. Without --parameter, that of this deployment.
     date
         When the deployment of a calibration began (YYYY-MM-DD).
-    catalogue
-        The catalogue: a folder, or postgresql://USER@HOST/DATABASE; made where it is not there.
-    json
-        Print the result as JSON.
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.given import add_calibration
@@ -143,8 +139,6 @@ def process(
 
     Parameters
     ----------
-    catalogue
-        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
     results
         Folder for corrected logs and maps; by default results in the catalogue's folder, and fleet-results
         here for one on a server.
@@ -160,8 +154,6 @@ def process(
         What each of them may use.
     scheduler
         Address of a dask scheduler to use instead, as tcp://host:8786. Its workers see the same folders.
-    json
-        Print the result as JSON.
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.job import jobs, new_jobs
@@ -194,15 +186,7 @@ def process(
 
 @fleet.command
 def status(*, catalogue: Where = HERE, json: Json = False) -> None:
-    """Say what is catalogued, what is done, and what failed.
-
-    Parameters
-    ----------
-    catalogue
-        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
-    json
-        Print the result as JSON.
-    """
+    """Say what is catalogued, what is done, and what failed."""
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.status import status as of
 
@@ -228,13 +212,9 @@ def show(
     ----------
     vehicle
         Its name; all vehicles, if none is given.
-    catalogue
-        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
     html
         Pages to write, with pictures: a file (.html) with all vehicles, or a folder with a page of each
         and all numbers as fleet.json.
-    json
-        Print the result as JSON.
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.drift import facts, history
@@ -274,10 +254,6 @@ def export(
         The calibration to write (cal.json).
     refit
         The refit it will fly with; by default a new one.
-    catalogue
-        The catalogue: a folder, or postgresql://USER@HOST/DATABASE.
-    json
-        Print the result as JSON.
     """
     from magbridge.calibration.file import save
     from magbridge.fleet.catalogue import open_catalogue

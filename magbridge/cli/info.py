@@ -28,10 +28,6 @@ def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> No
     ----------
     files
         The logs.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
     """
     logs_to_read(files)
 

@@ -76,12 +76,6 @@ def navigate(
         else those of the calibration, else 4.
     picture
         A PNG, PDF or SVG to draw: the tracks, on the map if there is one, errors and sigma; or the bound.
-    heading_reference
-        What headings refer to. If not given: what the log says, else true north.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
     """
     logs_to_read(files, output, map, calibration, config)
 

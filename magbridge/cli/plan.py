@@ -45,12 +45,6 @@ def plan(
         With --survey and no calibration: a column that gives a moving mass's position; may be repeated.
     roll
         Largest bank angle in deg that the vehicle can fly, either way.
-    heading_reference
-        What headings refer to. If not given: what the log says, else true north.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
     """
     from magbridge.calibration.file import load
     from magbridge.calibration.planning import flight_plan, survey_patterns

@@ -101,10 +101,6 @@ def survey(
         A table of the crossovers with their mis-ties before and after levelling.
     picture
         A PNG, PDF or SVG to draw: map, sigma, track, residuals, crossovers.
-    reading
-        How to read the logs.
-    json
-        Print the result as JSON.
     """
     from magbridge.survey.run import facts, summary
     from magbridge.survey.run import survey as make
