@@ -123,8 +123,11 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     else:
         rms = f"{before} nT RMS" + ", not held out" * (not parts) + "; nothing is added to the calibration"
     use = facts["assessment"]
+    if facts["findings"] and (refitted := use["rms_nT"]["refitted"]) is not None:
+        rms += f"; {number(refitted)} nT by fitting the calibration's own numbers anew"
+    verdict = facts["verdict"] if facts["verdict"] != "negligible" else "nothing needs explaining"
     fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
-    return "\n  ".join([f"{facts['verdict']}: {rms}", fit, *causes_of(facts)])
+    return "\n  ".join([f"{verdict}: {rms}", fit, *causes_of(facts)])
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:

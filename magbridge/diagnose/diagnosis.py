@@ -110,8 +110,8 @@ class Diagnosis:
     total: Improvement
     """Of all findings together."""
     isolability: Isolability
-    refitted: float
-    """nT, RMS held out where only the calibration's own numbers are fitted anew."""
+    beyond: Improvement
+    """Of all findings together, over the calibration's own numbers fitted anew, held out."""
     verdict: str
     """As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain."""
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)

@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.accept import settle
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
@@ -50,6 +49,8 @@ ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 SLOW = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
+WORTH = 0.01
+"""Share that what was found must take off the RMS which the calibration's own numbers fitted anew leave."""
 
 
 def diagnose(
@@ -145,14 +146,14 @@ def _examine(
             rest = leftover(problem, [], outcome.null, tone)
     rest = rest or unlisted(problem, fit, named, off, after, counts)
     chances = chances_alone(candidates, outcome.info, named, outcome.look_elsewhere, len(causes))
-    total = paired(before, after, problem.survey.dive, counts)
+    total, beyond = (paired(since, after, problem.survey.dive, counts) for since in (before, alone.residual))
     return Diagnosis(
         problem=problem, outcome=outcome,
         findings=_findings(problem, named, competing, fit, after, counts, chances, outcome),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
-        refitted=rms(alone.residual[counts]), verdict=_verdict(named, wrong, rest, total), causes=causes,
+        beyond=beyond, verdict=_verdict(named, wrong, rest, total, beyond), causes=causes,
     )  # fmt: skip
 
 
@@ -240,9 +241,20 @@ def _is_slow(problem: Problem, one: Hypothesis) -> bool:
 
 
 def _verdict(
-    named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Improvement
+    named: Sequence[Hypothesis],
+    wrong: Outliers | None,
+    rest: Leftover | None,
+    total: Improvement,
+    beyond: Improvement,
 ) -> str:
-    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part."""
+    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part.
+
+    They are negligible where the calibration's own numbers fitted anew do as well (`beyond` those), and what
+    is left without a name is no larger.
+    """
+    small = rest is None or (rest.size is not None and rest.size**2 < 2.0 * WORTH * beyond.before**2)
+    if named and wrong is None and small and beyond.ratio > 1.0 - WORTH:
+        return "negligible"
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"
     return "unexplained" if rest else "nothing_found"

@@ -88,5 +88,5 @@ def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
     assert "Nothing else" not in page
     assert re.search(r"What is left, [\d.]+\xa0nT RMS, fits no .* noise", page)
     assert ("remembers" in page) == last.lasts
-    assert clear.total.after < clear.refitted <= 1.01 * clear.total.before
-    assert f"fitted anew would leave {number(clear.refitted)}\xa0nT" in page
+    assert clear.total.after < clear.beyond.before <= 1.01 * clear.total.before
+    assert f"fitted anew would leave {number(clear.beyond.before)}\xa0nT" in page

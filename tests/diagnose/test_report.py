@@ -121,9 +121,13 @@ def test_the_command_says_what_the_gain_was_measured_on() -> None:
     facts = {"verdict": "explained", "findings": [one], "unexplained": None, "rms_before_nT": 117.42}
     facts |= {"rms_after_nT": 74.42, "improvement": {"interval": [0.486, 0.84]}}
     settled = {"fit_for_use": "once_settled", "answer": "Only once these doubts are settled."}
-    facts |= {"assessment": settled | {"warnings": [[]]}}
+    facts |= {"assessment": settled | {"warnings": [[]], "rms_nT": {"refitted": 101.2}}}
     first, use, second = summary(facts, "dives").splitlines()
-    assert first == "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %)"
+    assert first == (
+        "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %); 101 nT by "
+        "fitting the calibration's own numbers anew"
+    )
+    assert summary(facts | {"verdict": "negligible"}, "dives").startswith("nothing needs explaining: 117 -> ")
     assert use == "  fit for use: once settled. Only once these doubts are settled."
     assert second == "  clock_offset, S/N 9.0"
     assert "nT RMS, not held out (0.49" in summary(facts, "")
@@ -185,11 +189,34 @@ def test_names_that_gain_nothing_explain_only_in_part() -> None:
     candidate = CAUSES["reference_bias"].candidates(right(100))[0]
     named = [Hypothesis(candidate, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)]
     improvements = [Improvement(588.1, 587.3, 0.999, (0.863, upper)) for upper in (1.021, 0.999)]
-    assert [_verdict(named, None, None, improvement) for improvement in improvements] == [
+    much = Improvement(600.0, 587.3, 0.979, (0.95, 0.99))
+    assert [_verdict(named, None, None, one, much) for one in improvements] == [
         "partly_explained",
         "explained",
     ]
-    assert _verdict([], None, None, improvements[0]) == "nothing_found"
+    assert _verdict([], None, None, improvements[0], much) == "nothing_found"
+
+
+@pytest.mark.parametrize(
+    ("ratio", "rest", "verdict"),
+    [
+        (0.995, None, "negligible"),
+        (0.995, 1.0, "negligible"),
+        (0.995, 3.0, "partly_explained"),
+        (0.98, None, "explained"),
+    ],
+)
+def test_where_the_calibrations_own_numbers_do_as_well_nothing_needs_explaining(
+    ratio: float, rest: float | None, verdict: str
+) -> None:
+    """Unless something larger is left without a name: a part of 14 % is a hundredth of the RMS."""
+    left = None if rest is None else Leftover("drift", 9.0, 1e-9, 12.0, None, None, size=rest)
+    named = [Hypothesis(CAUSES["reference_bias"].candidates(right(100))[0], 25.0, 9.0, 1e-3, fit=None)]
+    total, beyond = (
+        Improvement(20.0, 10.0, 0.5, (0.4, 0.6)),
+        Improvement(10.0, 10.0 * ratio, ratio, (0.9, 0.999)),
+    )
+    assert _verdict(named, None, left, total, beyond) == verdict
 
 
 def test_a_long_table_of_terms_is_folded_to_a_line() -> None:

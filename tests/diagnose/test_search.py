@@ -18,7 +18,14 @@ from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.random_walk import odds_over_random_walk
-from magbridge.diagnose.inference.search import _surplus, beside_slow_noise, search
+from magbridge.diagnose.inference.search import (
+    LOST,
+    _forward_selection,
+    _surplus,
+    _switches,
+    beside_slow_noise,
+    search,
+)
 from magbridge.diagnose.inference.state import State
 
 
@@ -69,6 +76,20 @@ def test_flicker_noise_gets_no_name_and_a_step_in_white_noise_its_own(
     assert {h.candidate.cause for h in outcome.chosen} == named
     slow = outcome.problem.slow_noise(outcome.fit.z)
     assert (np.std(slow) > 0.3 * np.std(read)) == (noise == "flicker")
+
+
+def test_what_switches_is_not_searched_for_without_end() -> None:
+    """Beside a few regressors its many shifts still stand; telemetry that shows it describes them all."""
+    rng, n = np.random.default_rng(6), 3000
+    relay = (np.searchsorted(np.sort(rng.integers(0, n, 30)), np.arange(n)) % 2).astype(float)
+    steps = [fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in range(100, n, 100)]
+    current = fault("current_field", relay, 10.0)
+    noisy = replace(right(n), residual=16.0 * relay + rng.normal(size=n))
+    brief = State(noisy, steps, 2, 2).with_brief_noise()
+    model, base = _forward_selection(brief, brief.round([], brief.null))
+    assert len(model[0].pieces) == LOST
+    assert _switches(brief, model, base)
+    assert not _switches(brief, [*steps[:2], current], brief.fit([*steps[:2], current]))
 
 
 def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:

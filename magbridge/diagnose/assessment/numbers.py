@@ -159,5 +159,5 @@ def budget(diagnosis: Diagnosis) -> Budget:
     """Compare the residual that the calibration predicts with those that were found."""
     counts, total = diagnosis.counts, diagnosis.total
     predicted = float(np.sqrt(np.mean(diagnosis.problem.stated[counts])))
-    refitted, after = (diagnosis.refitted, total.after) if diagnosis.findings else (None, None)
+    refitted, after = (diagnosis.beyond.before, total.after) if diagnosis.findings else (None, None)
     return Budget(predicted, total.before, refitted, after, rms(diagnosis.residual[counts]))

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["OWN", "Assessment", "Fitness", "assess", "unsettled", "useful"]
 
-Fitness = Literal["yes", "once_settled", "no", "nothing_added", "reference_only"]
+Fitness = Literal["yes", "once_settled", "no", "not_needed", "nothing_added", "reference_only"]
 OWN = (
     "The calibration was fitted to this very log and has absorbed part of what is wrong: the improvement is "
     "no test."
@@ -48,6 +48,7 @@ ANSWERS: dict[Fitness, str] = {
     "yes": "Nothing in this log speaks against it.",
     "once_settled": "Only once these doubts are settled.",
     "no": "Not on the evidence of this log.",
+    "not_needed": "There is no need for it: the calibration's own numbers fitted anew do as well.",
     "reference_only": "It has no new term: what was found belongs to the reference, not to the vehicle. Its "
     "coefficients are fitted anew with that taken out.",
 }
@@ -58,7 +59,8 @@ class Assessment:
     """All that a reader gets beside the findings themselves."""
 
     fit_for_use: Fitness
-    """``yes``, ``once_settled``, ``no``, ``nothing_added`` or ``reference_only`` (no new term)."""
+    """``yes``, ``once_settled``, ``no``, ``not_needed``, ``nothing_added`` or ``reference_only`` (no new
+    term)."""
     answer: str
     """The same as a sentence."""
     reasons_for: tuple[Note, ...]
@@ -113,6 +115,8 @@ def _fitness(diagnosis: Diagnosis, use: str, against: Sequence[Note]) -> Fitness
         return "reference_only"
     if not diagnosis.total.shown:
         return "no"
+    if diagnosis.verdict == "negligible":
+        return "not_needed"
     return "once_settled" if against else "yes"
 
 

@@ -21,7 +21,8 @@ __all__ = ["improved", "late", "report_html"]
 
 STYLE = Path(__file__).with_name("style.css")
 MARKS: dict[Fitness, str] = {
-    "yes": "good", "once_settled": "doubt", "no": "bad", "nothing_added": "none", "reference_only": "none",
+    "yes": "good", "once_settled": "doubt", "no": "bad", "not_needed": "none", "nothing_added": "none",
+    "reference_only": "none",
 }  # fmt: skip
 """How an answer is marked."""
 LONG = 7200.0
@@ -132,9 +133,15 @@ def _sentence(diagnosis: Diagnosis) -> str:
         + f" that remembers {number(residual.correlation_time, 2)} s" * residual.lasts
         + "."
     )
-    if (refitted := diagnosis.assessment.budget.refitted) is not None:
-        worth += f" The calibration's own numbers fitted anew would leave {number(refitted)} nT."
-    return f"Found: {'; '.join(names)}. {worth} {other}"
+    if diagnosis.findings:
+        refitted = number(diagnosis.beyond.before)
+        worth += f" The calibration's own numbers fitted anew would leave {refitted} nT."
+    start = (
+        "Nothing needs explaining: what was found makes next to no difference. "
+        if diagnosis.verdict == "negligible"
+        else ""
+    )
+    return f"{start}Found: {'; '.join(names)}. {worth} {other}"
 
 
 def improved(improvement: Improvement, parts: str) -> str:
