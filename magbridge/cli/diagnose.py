@@ -103,7 +103,7 @@ def diagnose(
 
 
 def summary(facts: dict[str, Any], parts: str) -> str:
-    """Return the findings in lines: the verdict with its RMS, fit for use or not, then each cause.
+    """Return the findings in lines: the verdict with its RMS, fit for use or not with the doubts, each cause.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def summary(facts: dict[str, Any], parts: str) -> str:
         rms += f"; {number(refitted)} nT by fitting the calibration's own numbers anew"
     verdict = facts["verdict"] if facts["verdict"] != "negligible" else "nothing needs explaining"
     fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
-    return "\n  ".join([f"{verdict}: {rms}", fit, *causes_of(facts)])
+    doubts = [f"  {one['text']}" for one in use["reasons_against"]] * (use["fit_for_use"] == "once_settled")
+    return "\n  ".join([f"{verdict}: {rms}", fit, *doubts, *causes_of(facts)])
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:

@@ -25,7 +25,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.returns import Returns, returns
 from magbridge.diagnose.seen import Memory, Seen, memory, seen
-from magbridge.diagnose.words import label, number
+from magbridge.diagnose.words import label, names_of, number
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
@@ -170,10 +170,10 @@ def _against(
         found.append(Note("level", f"{text[0].upper()}{text[1:]}.", shift._asdict()))
     if unsure := [one for one in made if contested(one)]:
         tests = dict.fromkeys(causes[one.candidate.cause].separated_by for one in unsure)
+        names = "; ".join(f"{_name(one)} from {names_of(one.competing, ' or ')}" for one in unsure)
         text = (
-            f"Not told from other causes: {', '.join(map(_name, unsure))} (the table below names them). A "
-            "correction under a wrong name may fit this log and fail on the next. To tell: "
-            f"{'; '.join(tests)}."
+            f"Not told apart: {names}. A correction under a wrong name may fit this log and fail on the "
+            f"next. To tell: {'; '.join(tests)}."
         )
         found.append(Note("contested", text))
     if slow := [_name(one) for one in made if one.may_be_noise]:
