@@ -20,7 +20,7 @@ from magbridge.calibration import file as calibration_file
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, load
 from magbridge.errors import ConfigError, MagbridgeError
-from magbridge.link.component import check_publish
+from magbridge.link.message_rates import check_publish
 from magbridge.link.telemetry import TelemetryMap
 from magbridge.mavlink import load_key
 from magbridge.sensors import open_driver

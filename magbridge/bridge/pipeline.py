@@ -22,7 +22,8 @@ from magbridge.calibration.model import Calibration
 from magbridge.config import Align, Config
 from magbridge.correction import Correction
 from magbridge.link.authority import Sources
-from magbridge.link.component import Component, check_publish
+from magbridge.link.component import Component
+from magbridge.link.message_rates import check_publish
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from magbridge.bridge.port import Port
-from magbridge.link.component import LIMITS
+from magbridge.link.message_rates import LIMITS
 from magbridge.mavlink import spec
 
 __all__ = ["LATE", "MOST", "Stream", "cut"]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from magbridge.link.component import Component, check_publish
+from magbridge.link.component import Component
+from magbridge.link.message_rates import check_publish
 from magbridge.link.parameters import Parameters, Tunable, alignment, telemetry_ages
 from magbridge.link.telemetry import TelemetryMap
 

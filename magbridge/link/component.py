@@ -5,63 +5,32 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from pathlib import Path
 
 from magbridge.config import Link
-from magbridge.errors import ConfigError
 from magbridge.link import metadata
 from magbridge.link.announcer import Announcer
 from magbridge.link.authority import Authority
 from magbridge.link.commands import Commands
+from magbridge.link.message_rates import DEFAULTS, LIMITS, MessageRates
 from magbridge.link.outbox import Outbox
 from magbridge.link.parameter_service import ParameterService
-from magbridge.link.parameters import Parameters, Tunable, rate_name, rates
+from magbridge.link.parameters import Parameters, Tunable, rates
 from magbridge.link.publish import PUBLISHED, Publisher
-from magbridge.link.rates import Rate, period_us
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
 
-__all__ = ["LIMITS", "TIMESYNC_US", "Component", "check_publish"]
+__all__ = ["TIMESYNC_US", "Component"]
 
 TIMESYNC = spec("TIMESYNC")
 SETUP_SIGNING = spec("SETUP_SIGNING").number
-LIMITS = {
-    "HEARTBEAT": (0.2, 10.0),
-    "MAG_STATUS": (-1.0, 10.0),
-    "MAG_NAVIGATION": (-1.0, 1000.0),
-    "MAG_LEARNING": (-1.0, 1000.0),
-    **dict.fromkeys(PUBLISHED, (-1.0, 1000.0)),
-}
-"""The messages whose rate (Hz) can be set, and within which limits."""
-DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
 TIMESYNC_US = 1_000_000
 VERSION_2 = 0xFD
 MOST_REQUESTS = 64
 """Requests for files that are kept while nobody takes them."""
 FILE_REQUESTS = ("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
-LONGEST_US = 0x7FFFFFFF
-"""µs, 36 min: the longest interval that a MESSAGE_INTERVAL holds."""
-
-
-def check_publish(publish: Mapping[str, float], path: Path) -> None:
-    """Check ``[publish]``.
-
-    Raises
-    ------
-    ConfigError
-        A message that the bridge does not publish, or a rate out of range.
-    """
-    for name, rate in publish.items():
-        if name not in LIMITS:
-            raise ConfigError(path, f"publish.{name}", f"expected one of {', '.join(sorted(LIMITS))}")
-        low, high = LIMITS[name]
-        if not low <= rate <= high:
-            raise ConfigError(
-                path, f"publish.{name}", f"expected a rate from {low:g} to {high:g} Hz, not {rate:g}"
-            )
 
 
 class Component:
@@ -94,7 +63,7 @@ class Component:
     outbox : Outbox
         What is to be sent.
     received : list of bytes
-        Everything that came, as frames for the log (see `TapeReader`); the bridge empties it.
+        Everything that came, as frames for the log; the bridge empties it.
     genuine : list of bytes
         The signed frames of the last :meth:`receive` that were accepted.
     file_requests : deque of Message
@@ -137,7 +106,8 @@ class Component:
             )
         if changed := self.parameters.changed():
             self.announcer.send_statustext(f"kept from the link, not as configured: {', '.join(changed)}")
-        self.rates = {name: Rate(self.parameters[rate_name(name)]) for name in LIMITS}
+        self._message_rates = MessageRates(self.parameters, self.timers, self.codec)
+        self.rates = self._message_rates.by_name
         self.publisher = Publisher(self.outbox, self.rates, calibration_id, start_us)
         self.metadata = metadata.files(self.parameters.table.values(), link.component)
         self.file_requests: deque[Message] = deque(maxlen=MOST_REQUESTS)
@@ -151,20 +121,15 @@ class Component:
             speaking,
             self.metadata[metadata.GENERAL],
         )
-        # sent at times of the clock, not with the samples; here a rate of 0 is off
-        self._by_clock: dict[str, Callable[[], None]] = {
-            "HEARTBEAT": self._reports.heartbeat,
-            "MAG_STATUS": self._reports.status,
-        }
+        by_clock = {"HEARTBEAT": self._reports.heartbeat, "MAG_STATUS": self._reports.status}
         self._authority = Authority(link.system, link.autopilot)
         self._service = ParameterService(
             self.parameters, self.outbox, self.timers, self.announcer, self._authority
         )
-        self.parameters.watch(self._changed)
         self._commands = Commands(
             self.outbox,
-            self._requestable(),
-            self._interval_us,
+            self._requestable(by_clock),
+            lambda number: self._message_rates.interval_us(number, self._reports.sample_interval_us),
             self._set_rate,
             self._authority,
             self.announcer,
@@ -179,8 +144,8 @@ class Component:
             **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), self._command),
             **dict.fromkeys(FILE_REQUESTS, self._file_request),
         )
-        for name in self._by_clock:
-            self._start_timer(name, start_us)
+        for name, report in by_clock.items():
+            self._message_rates.send_by_clock(name, report)
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
     @property
@@ -283,26 +248,10 @@ class Component:
         ts1 = self.vehicle.clock.ask(t_us)
         self.outbox.put(TIMESYNC, TIMESYNC.struct.pack(0, ts1, self._link.system, self._link.autopilot))
 
-    def _start_timer(self, name: str, first_us: int) -> None:
-        hertz = self.rates[name].hertz
-        if hertz > 0:
-            report = self._by_clock[name]
-            self.timers.every(name, period_us(hertz), lambda _: report(), first_us)
-        else:
-            self.timers.cancel(name)
-
-    def _changed(self, parameter: str) -> None:
-        """Apply a parameter that a station changed, if it is a message's rate."""
-        for name, rate in self.rates.items():
-            if rate_name(name) == parameter:
-                rate.set(self.parameters[parameter])
-                if name in self._by_clock:
-                    self._start_timer(name, self.codec.now_us)
-
-    def _requestable(self) -> dict[int, Callable[[], bool]]:
+    def _requestable(self, by_clock: Mapping[str, Callable[[], None]]) -> dict[int, Callable[[], bool]]:
         """Return what REQUEST_MESSAGE can ask for: id to a function that sends it, False if it cannot."""
         reports = {
-            **self._by_clock,
+            **by_clock,
             "AUTOPILOT_VERSION": self._reports.version,
             "COMPONENT_INFORMATION_BASIC": self._reports.component,
             "COMPONENT_METADATA": self._reports.metadata,
@@ -312,19 +261,11 @@ class Component:
             **{spec(name).id: partial(self.publisher.repeat, name) for name in PUBLISHED},
         }
 
-    def _interval_us(self, number: int) -> int:
-        hertz = self.rates[name_of(number)].hertz
-        if hertz < 0:
-            return -1
-        return min(period_us(hertz) if hertz else self._reports.sample_interval_us(), LONGEST_US)
-
     def _set_rate(self, number: int, hertz: float | None) -> bool:
-        parameter = rate_name(name_of(number))
-        value = self.parameters.table[parameter].default if hertz is None else hertz
-        if not self.parameters.set(parameter, value):
-            return False
-        self._service.send(parameter)
-        return True
+        parameter = self._message_rates.set(number, hertz)
+        if parameter:
+            self._service.send(parameter)
+        return bool(parameter)
 
 
 def is_signed(frame: bytes) -> bool:
@@ -336,11 +277,3 @@ def always(report: Callable[[], None]) -> bool:
     """Send a report; return True, because there is always one to send."""
     report()
     return True
-
-
-def name_of(number: int) -> str:
-    """Return the name of a message whose rate can be set; KeyError where it has none."""
-    name = spec(number).name
-    if name not in LIMITS:
-        raise KeyError(name)
-    return name

@@ -15,7 +15,7 @@ from line import Line, MakeLine
 from magbridge.config import Align, Telemetry
 from magbridge.errors import FormatError
 from magbridge.link import Parameters, alignment, telemetry_ages
-from magbridge.link.component import LIMITS
+from magbridge.link.message_rates import LIMITS
 from magbridge.link.parameters import Tunable, rates, real32
 from magbridge.link.store import Kept, load, save
 
