@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from datetime import UTC, datetime
 
 import numpy as np
 import ppigrf
 import pytest
+from pace import cost
 
 from magbridge.errors import OutOfRange
 from magbridge.field import igrf as module
@@ -115,9 +115,8 @@ def test_refuses_what_it_does_not_cover() -> None:
         igrf(361, 0, 0, end)
 
 
-def test_a_million_samples_in_ten_seconds(places: tuple[np.ndarray, ...]) -> None:
+def test_a_million_samples_take_a_few_seconds(places: tuple[np.ndarray, ...]) -> None:
     n = 100_000
     lon, lat, depth = (np.resize(part, n) for part in places)
-    started = time.process_time()
-    igrf(lon, lat, depth, np.linspace(at(2020, 1, 1), at(2020, 2, 1), n))
-    assert time.process_time() - started < 1.0
+    times = np.linspace(at(2020, 1, 1), at(2020, 2, 1), n)
+    assert cost(lambda: igrf(lon, lat, depth, times)) < 200.0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import random
-import time
 from types import ModuleType
 
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from pace import cost
 
 from magbridge.mavlink import BAD_DATA, Codec, Message, spec
 from magbridge.mavlink.codec import WINDOW
@@ -122,8 +122,6 @@ def test_garbage_is_cheap_even_byte_by_byte() -> None:
     """A parser that starts anew at every byte would need minutes."""
     for garbage in (b"\xfd" * 20_000, b"\xfe\xff" * 10_000, random.Random(1).randbytes(20_000)):
         codec = Codec(1, 191)
-        begin = time.process_time()
-        for i in range(len(garbage)):
-            codec.parse(garbage[i : i + 1])
-        assert time.process_time() - begin < 2.0
+        bytewise = (garbage[i : i + 1] for i in range(len(garbage)))
+        assert cost(lambda: [codec.parse(byte) for byte in bytewise]) < 100.0  # noqa: B023 - called at once
         assert codec.bytes_skipped > len(garbage) - WINDOW - 300

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import xarray as xr
 from msgspec.structs import replace
 from navigation_studies.others import flight
 from navigation_studies.simulated import PLACE, Map, synthetic, track_over
+from pace import cost
 
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import metres_per_degree
@@ -201,11 +201,10 @@ def test_a_start_is_needed(ds: xr.Dataset, grid: AnomalyGrid, options: Options) 
         navigate(ds.isel(time=slice(0, 50)), grid, options)
 
 
-def test_ten_thousand_samples_in_two_seconds(grid: AnomalyGrid, options: Options) -> None:
+def test_ten_thousand_samples_take_seconds(grid: AnomalyGrid, options: Options) -> None:
     long = track_over(grid, replace(options, start_sigma=50.0), 5, hours=10_000 / 3600, every=1.0)
-    started = time.process_time()
-    navigate(long, grid, replace(options, start_sigma=50.0), start=PLACE)
-    assert time.process_time() - started < 4.0  # 0.8 s when nothing else runs
+    known = replace(options, start_sigma=50.0)
+    assert cost(lambda: navigate(long, grid, known, start=PLACE)) < 1000.0  # 270 when nothing else runs
 
 
 @pytest.mark.real

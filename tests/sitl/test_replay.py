@@ -195,7 +195,7 @@ def test_a_position_of_any_turn_and_a_depth_that_is_none_are_told(tmp_path: Path
 def test_speed_is_kept(survey: Path, tmp_path: Path) -> None:
     """Ten minutes at 300 times real time take at least two seconds."""
     result = replay([survey], config(tmp_path), speed=300.0)
-    assert 1.9 < result["seconds"] < 10.0
+    assert result["seconds"] > 1.9
 
 
 def test_a_bridge_s_own_log_needs_its_configuration(
