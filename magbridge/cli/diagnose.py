@@ -67,7 +67,6 @@ def diagnose(
     logs_to_read(files, output / "calibration.json", calibration)
 
     from magbridge.calibration.file import load
-    from magbridge.diagnose.assessment.weigh import unsettled
     from magbridge.diagnose.report.findings import findings
     from magbridge.diagnose.run import diagnose as examine
     from magbridge.field.read import read_grid
@@ -95,8 +94,6 @@ def diagnose(
             progress=step,
             remarks=remarks,
         )
-    if doubt := unsettled(found.problem, found.possible, found.calibration):
-        complain(doubt)
     facts = findings(found, found.causes, remarks)
     lines = summary(facts, "" if own else found.problem.survey.parts)
     print_result(facts, f"{lines}\nreport: {output / 'report.html'}", json)
@@ -127,7 +124,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
         rms += f"; {number(refitted)} nT by fitting the calibration's own numbers anew"
     verdict = facts["verdict"] if facts["verdict"] != "negligible" else "nothing needs explaining"
     fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
-    doubts = [f"  {one['text']}" for one in use["reasons_against"]] * (use["fit_for_use"] == "once_settled")
+    doubts = [f"  {one['text']}" for one in use["reasons_against"]] * (use["fit_for_use"] != "yes")
     return "\n  ".join([f"{verdict}: {rms}", fit, *doubts, *causes_of(facts)])
 
 

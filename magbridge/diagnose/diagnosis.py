@@ -51,8 +51,6 @@ class Finding:
     """(k,) in units of their prior width."""
     covariance: FloatArray
     """(k, k)."""
-    chance_alone: float
-    """That such a cause is named alone in such a log, by theory (:mod:`~.inference.naming`)."""
     over_random_walk: float = np.inf
     """Log odds over a sensor whose offsets wander (:mod:`~.inference.random_walk`); infinite for a cause that
     is not slow."""

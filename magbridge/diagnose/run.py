@@ -29,7 +29,6 @@ from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.left_out import held_out
-from magbridge.diagnose.inference.naming import chances_alone
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.random_walk import odds_over_random_walk
@@ -145,11 +144,10 @@ def _examine(
             named, competing, model, fit, after, extended = (), (), [], outcome.null, before, calibration
             rest = leftover(problem, [], outcome.null, tone)
     rest = rest or unlisted(problem, fit, named, off, after, counts)
-    chances = chances_alone(candidates, outcome.info, named, outcome.look_elsewhere, len(causes))
     total, beyond = (paired(since, after, problem.survey.dive, counts) for since in (before, alone.residual))
     return Diagnosis(
         problem=problem, outcome=outcome,
-        findings=_findings(problem, named, competing, fit, after, counts, chances, outcome),
+        findings=_findings(problem, named, competing, fit, after, counts, outcome),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
@@ -212,15 +210,12 @@ def _findings(
     fit: Joint,
     after: FloatArray,
     counts: BoolArray,
-    chances: Sequence[float],
     outcome: Outcome,
 ) -> tuple[Finding, ...]:
     """Collect each cause's results; its gain is that over a fit of the others without it."""
     found, q = [], len(fit.z)
     places = slices([h.candidate for h in named])
-    for k, (own, hypothesis, others, chance) in enumerate(
-        zip(places, named, competing, chances, strict=True)
-    ):
+    for k, (own, hypothesis, others) in enumerate(zip(places, named, competing, strict=True)):
         columns = [h.candidate.columns for i, h in enumerate(named) if i != k]
         kept = np.delete(fit.prior, slice(q + own.start, q + own.stop))
         alone = replace(fit, coefficients=np.delete(fit.coefficients, own), prior=kept)
@@ -228,9 +223,7 @@ def _findings(
         improvement = paired(without, after, problem.survey.dive, counts)
         covariance = fit.effects_covariance[own, own]
         odds = odds_over_random_walk(outcome, hypothesis) if _is_slow(problem, hypothesis) else np.inf
-        found.append(
-            Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, chance, odds)
-        )
+        found.append(Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, odds))
     return tuple(found)
 
 

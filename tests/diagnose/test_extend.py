@@ -13,7 +13,7 @@ from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
 from magbridge.calibration.mass_effects import PowersEffect
 from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.assessment.weigh import unsettled
+from magbridge.diagnose.assessment.numbers import level
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
 from magbridge.diagnose.compare.past import FAR, Past
@@ -98,7 +98,7 @@ def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
     ]
     assert off[0] > 15.0
     assert abs(off[1]) < 1.0
-    assert not unsettled(problem, [attenuated], extended)  # the reference is right
+    assert level(problem, [attenuated], extended) is None  # the reference is right
     problem.let_go()
     delay = ClockEffect(cause="filter_lag", sign=-1.0)
     both = of_effect(problem, delay, 2.0, "s", names=("delay",), phi=np.ones((9, 1600))).with_(attenuated)

@@ -76,7 +76,7 @@ def test_each_other_doubt_is_told(clear: Diagnosis) -> None:
     own = replace(clear.problem, survey=replace(survey, fitted=np.ones(len(survey), bool)))
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
     doubtful = {
-        "No improvement of its own": with_(clear, improvement=idle),
+        "shows no improvement on what was left out": with_(clear, improvement=idle),
         "10 times the usual size": with_(clear, coefficients=large),
         OWN: replace(clear, problem=own),
         "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),

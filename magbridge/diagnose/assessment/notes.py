@@ -16,10 +16,12 @@ from magbridge.diagnose.words import names_of, number, series_of
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
-__all__ = ["IMPLAUSIBLE", "Note", "contested", "not_separated", "notes"]
+__all__ = ["DOUBTS", "IMPLAUSIBLE", "Note", "contested", "not_separated", "notes"]
 
 IMPLAUSIBLE = 5.0
 """Multiple of its plausible size above which a cause is doubted."""
+DOUBTS = ("contested", "random_walk", "implausible_size", "no_improvement")
+"""Codes of notes that speak against the use of an extended calibration."""
 
 
 class Note(NamedTuple):
@@ -37,7 +39,7 @@ def notes(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[Note]:
         *_of_size(finding),
         *_of_noise(finding),
         *_of_motion(diagnosis, finding),
-        *not_separated(finding.candidate, cause, finding.competing, finding.chance_alone),
+        *not_separated(finding.candidate, cause, finding.competing),
         *_of_use(diagnosis, finding),
     ]
 
@@ -129,28 +131,23 @@ def contested(finding: Finding) -> bool:
 
 
 def not_separated(
-    candidate: Candidate, cause: Cause, competing: Sequence[CompetingHypothesis], chance: float
+    candidate: Candidate, cause: Cause, competing: Sequence[CompetingHypothesis]
 ) -> Iterator[Note]:
-    """Say which causes could take its place, what would tell them apart, and what theory expects."""
-    theory = (
-        "By theory, an effect of this size in such a log would be told from all other known causes in "
-        f"{'more than 99' if chance > 0.995 else f'{100 * chance:.0f}'} of 100 cases"
-    )
+    """Say which causes could take its place, and what would tell them apart."""
     alone = "No other known cause explains the data nearly as well (none comes within odds of 20:1)."
     if not competing:
-        yield Note("alone", f"Alternatives: none. {alone} {theory}.", {"chance_alone": chance})
+        yield Note("alone", alone)
     elif all(hypothesis.candidate.cause == candidate.cause for hypothesis in competing):
         series = ", ".join(str(series_of(hypothesis.candidate)) for hypothesis in competing)
         yield Note(
             "series_uncertain",
-            f"Alternatives: only in the series. {alone} Which series it follows is less sure: {series} would "
-            f"do nearly as well (odds below 20:1). A log in which these differ more would tell. {theory}.",
-            {"chance_alone": chance},
+            f"{alone} Which series it follows is less sure: {series} would do nearly as well (odds below "
+            "20:1). A log in which these differ more would tell.",
         )
     else:
         yield Note(
             "contested",
-            f"Alternatives: the data cannot tell it from {names_of(competing, ' or ')} (odds below 20:1). "
-            f"{theory}; here it was not. To tell them apart: {cause.separated_by}.",
-            {"chance_alone": chance},
+            f"The data cannot tell it from {names_of(competing, ' or ')} (odds below 20:1), and a correction "
+            "under a wrong name may fit this log and fail on the next. To tell them apart: "
+            f"{cause.separated_by}.",
         )

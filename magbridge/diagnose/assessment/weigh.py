@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from magbridge.calibration.model import Calibration
-from magbridge.diagnose.assessment.notes import IMPLAUSIBLE, Note, contested, notes
+from magbridge.diagnose.assessment.notes import DOUBTS, Note, contested, notes
 from magbridge.diagnose.assessment.numbers import (
     Budget,
     Delays,
@@ -19,19 +18,16 @@ from magbridge.diagnose.assessment.numbers import (
     level,
     slow_share,
     stays,
-    times_usual,
 )
-from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.returns import Returns, returns
 from magbridge.diagnose.seen import Memory, Seen, memory, seen
-from magbridge.diagnose.words import label, names_of, number
+from magbridge.diagnose.words import label, number
 
 if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
-__all__ = ["OWN", "Assessment", "Fitness", "assess", "unsettled", "useful"]
+__all__ = ["OWN", "Assessment", "Fitness", "assess", "useful"]
 
 Fitness = Literal["yes", "once_settled", "no", "not_needed", "nothing_added", "reference_only"]
 OWN = (
@@ -88,7 +84,8 @@ def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
     problem, residual = diagnosis.problem, diagnosis.residual / diagnosis.problem.reference_jacobian
     shift = level(problem, diagnosis.possible, diagnosis.calibration)
     track = returns(problem.survey)
-    against = _against(diagnosis, causes, shift, track) if diagnosis.named else []
+    noted = tuple(tuple(notes(diagnosis, one, causes[one.candidate.cause])) for one in diagnosis.findings)
+    against = _against(diagnosis, noted, shift, track) if diagnosis.named else []
     use = useful(diagnosis)
     fitness = _fitness(diagnosis, use, against)
     good = [Note("use", use), *_alone(diagnosis)] if use else []
@@ -98,7 +95,7 @@ def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
         reasons_for=tuple(good),
         reasons_against=(*against, *([Note("same_log", REPEATS)] if use else [])),
         manoeuvres=tuple(dict.fromkeys(_manoeuvres(diagnosis, causes))),
-        notes=tuple(tuple(notes(diagnosis, one, causes[one.candidate.cause])) for one in diagnosis.findings),
+        notes=noted,
         level=shift,
         delays=delays(problem, diagnosis.fit),
         budget=budget(diagnosis),
@@ -160,25 +157,25 @@ def _alone(diagnosis: Diagnosis) -> list[Note]:
 
 
 def _against(
-    diagnosis: Diagnosis, causes: Mapping[str, Cause], shift: Level | None, track: Returns | None
+    diagnosis: Diagnosis, noted: Sequence[Sequence[Note]], shift: Level | None, track: Returns | None
 ) -> list[Note]:
-    """List what a reviewer must see settled, a sentence or two each."""
-    survey, rest, made = diagnosis.problem.survey, diagnosis.unexplained, diagnosis.findings
+    """List what a reviewer must see settled; `noted` is what to know of each finding."""
+    survey, rest = diagnosis.problem.survey, diagnosis.unexplained
     found = [Note("own_log", OWN)] if (survey.fitted & ~survey.learned).any() else []
     if shift is not None:
-        text = _shifted(shift)
-        found.append(Note("level", f"{text[0].upper()}{text[1:]}.", shift._asdict()))
-    if unsure := [one for one in made if contested(one)]:
-        tests = dict.fromkeys(causes[one.candidate.cause].separated_by for one in unsure)
-        names = "; ".join(f"{_name(one)} from {names_of(one.competing, ' or ')}" for one in unsure)
         text = (
-            f"Not told apart: {names}. A correction under a wrong name may fit this log and fail on the "
-            f"next. To tell: {'; '.join(tests)}."
+            f"The extended calibration shifts the whole corrected field by {shift.shift:+.1f} nT, to within "
+            f"{shift.sigma:.1f} nT (1 sigma, if the names are right). A log cannot tell for sure whether a "
+            "constant belongs to the vehicle or to the reference: check the extended field against another "
+            "reference before using it."
         )
-        found.append(Note("contested", text))
-    if slow := [_name(one) for one in made if one.may_be_noise]:
-        text = f"A sensor whose offsets wander would look the same in this log: {', '.join(slow)}, or noise."
-        found.append(Note("random_walk", text))
+        found.append(Note("level", text, shift._asdict()))
+    found += [
+        Note(note.code, f"{_name(one)}: {note.text}", note.numbers)
+        for one, some in zip(diagnosis.findings, noted, strict=True)
+        for note in some
+        if note.code in DOUBTS
+    ]
     found += _place_or_time(diagnosis, track)
     for one, other, a, b, both in cancelling(diagnosis):
         text = (
@@ -186,14 +183,6 @@ def _against(
             f"together {number(both)}): outside of what was flown, their sum may be far off."
         )
         found.append(Note("cancelling", text, {"one_nT": a, "other_nT": b, "together_nT": both}))
-    for one in made:
-        times = times_usual(one.candidate, one.coefficients)
-        if times >= IMPLAUSIBLE:
-            text = f"{_name(one)} is {number(times, 2)} times the usual size."
-            found.append(Note("implausible_size", text, {"times_usual": times}))
-    if idle := [one for one in made if not one.improvement.shown]:
-        text = f"No improvement of its own on what was left out: {', '.join(map(_name, idle))}."
-        found.append(Note("no_improvement", text))
     if rest:
         text = f"Something of S/N {rest.signal_to_noise:.1f} is left that has no name."
         found.append(Note("unexplained", text, {"signal_to_noise": rest.signal_to_noise}))
@@ -217,21 +206,6 @@ def _manoeuvres(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     if rest is not None and rest.within:
         found.append(causes[rest.within[0].candidate.cause].separated_by)
     return found
-
-
-def unsettled(problem: Problem, possible: Sequence[Candidate], extended: Calibration) -> str:
-    """Say how far the whole corrected field is shifted, and how surely, if the reference may be wrong."""
-    shift = level(problem, possible, extended)
-    return "" if shift is None else _shifted(shift)
-
-
-def _shifted(shift: Level) -> str:
-    return (
-        f"the extended calibration shifts the whole corrected field by {shift.shift:+.1f} nT, to within "
-        f"{shift.sigma:.1f} nT (1 sigma, if the names are right), and a log cannot tell for sure whether a "
-        "constant belongs to the vehicle or to the reference; check the extended field against another "
-        "reference before using it"
-    )
 
 
 def _name(finding: Finding) -> str:

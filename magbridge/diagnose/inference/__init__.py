@@ -11,5 +11,5 @@ columns of a hypothesis, and :mod:`.joint` fits them together with calibration a
 :mod:`.competing`, also in :mod:`.pairs`.
 
 *What it is worth.* :mod:`.nonlinear_uncertainty` widens the covariance, :mod:`.outliers` tests for isolated
-wrong samples, and :mod:`.isolability` and :mod:`.naming` say what such a log could have shown at all.
+wrong samples, and :mod:`.isolability` says what such a log could have shown at all.
 """

@@ -38,7 +38,7 @@ def findings(
         "verdict": diagnosis.verdict,
         "rms_before_nT": _round(diagnosis.total.before),
         "rms_after_nT": _round(diagnosis.total.after),
-        **_improvement(diagnosis.total, diagnosis),
+        "improvement": _improvement(diagnosis.total, diagnosis),
         "findings": listed,
         "unexplained": None
         if rest is None
@@ -76,10 +76,9 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
         "signal_to_noise": _round(finding.signal_to_noise),
         "p_value": _round(finding.hypothesis.p_value),
         "alternatives": alternatives(competing),
-        "isolability": _round(finding.chance_alone),
         "separated_by": causes[candidate.cause].separated_by if competing else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
-        **_improvement(finding.improvement, diagnosis),
+        "improvement": _improvement(finding.improvement, diagnosis),
     }
 
 
@@ -200,26 +199,22 @@ def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
         "signal_to_noise": _round(float(np.sqrt(wrong.ratio))),
         "p_value": _round(wrong.p_value),
         "alternatives": [],
-        "isolability": None,
         "separated_by": None,
         "parameters": {
             "count": {"value": int(wrong.rows.size), "sigma": None, "unit": "1"},
             "median_size": {"value": _round(float(np.median(size))), "sigma": None, "unit": "nT"},
         },
         "improvement": None,
-        "gain": None,
     }
 
 
 def _improvement(improvement: Improvement, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return it under its name, and for one release under its old one, ``gain``."""
-    found = {
+    return {
         "rms_ratio": _round(improvement.ratio),
         "interval": [_round(improvement.interval[0]), _round(improvement.interval[1])],
         "level": LEVEL,
         "held_out": diagnosis.problem.survey.parts,
     }
-    return {"improvement": found, "gain": found}
 
 
 def _round(value: float) -> float:
