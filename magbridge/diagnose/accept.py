@@ -73,12 +73,12 @@ def settle(
     """Search, and return the outcome that counts, and what :func:`accept` says of it.
 
     Slow noise takes part of what descriptions stand for, too, and so makes names look better beside them. So
-    where the names found without it are not asserted, none are searched for beside it.
+    where the names found without it are not asserted, or something switches, none are searched for beside it.
     """
     plain = search(problem, candidates, causes)
     asserted, rest = accept(problem, plain, tone)
-    if not asserted:
-        return plain, False, rest
+    if not asserted or plain.switches:
+        return plain, asserted, rest
     outcome = beside_slow_noise(plain, candidates, causes)
     return outcome, *((True, rest) if outcome is plain else accept(outcome.problem, outcome, tone))
 

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
 from magbridge.diagnose.accept import settle
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
@@ -35,7 +36,7 @@ from magbridge.diagnose.inference.random_walk import odds_over_random_walk
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.seen import memory
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
-from magbridge.diagnose.unexplained.unlisted import switching, unlisted
+from magbridge.diagnose.unexplained.unlisted import far_from_white, switching, unlisted
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 
@@ -145,13 +146,14 @@ def _examine(
             rest = leftover(problem, [], outcome.null, tone)
     rest = rest or unlisted(problem, fit, named, off, after, counts)
     total, beyond = (paired(since, after, problem.survey.dive, counts) for since in (before, alone.residual))
+    negligible = beyond.ratio > 1.0 - WORTH and _small(problem, alone.residual, rest)
     return Diagnosis(
         problem=problem, outcome=outcome,
         findings=_findings(problem, named, competing, fit, after, counts, outcome),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
-        beyond=beyond, verdict=_verdict(named, wrong, rest, total, beyond), causes=causes,
+        beyond=beyond, verdict=_verdict(named, wrong, rest, total, negligible), causes=causes,
     )  # fmt: skip
 
 
@@ -233,20 +235,25 @@ def _is_slow(problem: Problem, one: Hypothesis) -> bool:
     return memory(problem, added).slow >= SLOW
 
 
+def _small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool:
+    """Say whether what is left without a name is negligible, too, and the residual noise."""
+    if rest is not None and (rest.size is None or rest.size**2 > 2.0 * WORTH * rms(residual) ** 2):
+        return False
+    return not far_from_white(problem, memory(problem, residual / problem.reference_jacobian))
+
+
 def _verdict(
     named: Sequence[Hypothesis],
     wrong: Outliers | None,
     rest: Leftover | None,
     total: Improvement,
-    beyond: Improvement,
+    negligible: bool = False,
 ) -> str:
     """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part.
 
-    They are negligible where the calibration's own numbers fitted anew do as well (`beyond` those), and what
-    is left without a name is no larger.
+    They may be `negligible`, where the calibration's own numbers fitted anew do as well, and leave noise.
     """
-    small = rest is None or (rest.size is not None and rest.size**2 < 2.0 * WORTH * beyond.before**2)
-    if named and wrong is None and small and beyond.ratio > 1.0 - WORTH:
+    if named and wrong is None and negligible:
         return "negligible"
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"

@@ -56,7 +56,7 @@ __all__ = ["Outcome", "beside_slow_noise", "search"]
 
 MOST = 6
 """Regressors found one by one in a log, at most."""
-LOST = 3
+LOST = 2
 """Regressors beside which a level that shifts at more than :data:`MOST` places is no cause of the list."""
 
 
@@ -81,6 +81,8 @@ class Outcome:
     """Cause -> number of independent hypotheses behind it."""
     evidence: float
     """Log evidence of what was found and of its noise, against the null without slow noise."""
+    switches: bool
+    """Whether the search ended because something switches that no cause describes."""
 
 
 def search(
@@ -96,6 +98,7 @@ def search(
     first = state.round([], state.null) if candidates else []
     p_value = min((h.p_value for h in first), default=1.0)
     model, base = _likeliest(state, first) if first else ([], state.null)
+    switches = _switches(state, model, base)
     chosen, base = _backward_elimination(state, model, base)
     model = [h.candidate for h in chosen]
     info = state.conditional_on(model, base)
@@ -105,8 +108,9 @@ def search(
     needed = autoregressive_order(base.residual, problem.survey.slots)
     evidence = state.value(model, base, plain) - 0.5 * (order + needed)
     return Outcome(
-        problem, tuple(chosen), competing, state.null, base, p_value, info, state.look_elsewhere, evidence
-    )
+        problem, tuple(chosen), competing, state.null, base, p_value, info, state.look_elsewhere, evidence,
+        switches,
+    )  # fmt: skip
 
 
 def beside_slow_noise(found: Outcome, candidates: Sequence[Candidate], causes: int) -> Outcome:

@@ -15,10 +15,10 @@ from magbridge.diagnose.inference.evidence import REMNANT
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.seen import memory
+from magbridge.diagnose.seen import Memory, memory
 from magbridge.diagnose.unexplained.leftover import Leftover
 
-__all__ = ["switching", "unlisted"]
+__all__ = ["far_from_white", "switching", "unlisted"]
 
 LOUD = 2.0
 """Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
@@ -74,6 +74,12 @@ def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | 
     return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
 
 
+def far_from_white(problem: Problem, found: Memory) -> bool:
+    """Say whether a residual of this memory is more than noise of the sensor."""
+    lasts = found.slow >= SLOW or found.rms >= SMOOTH * found.white
+    return lasts and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference))
+
+
 def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
     """Describe a residual that is far from white, though no description of the list stands out of it.
 
@@ -83,14 +89,13 @@ def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover
     slow = problem.slow_noise(fit.z)
     residual = (fit.residual + slow) / problem.reference_jacobian
     found = memory(problem, residual)
-    far = found.slow >= SLOW or found.rms >= SMOOTH * found.white
     if problem.waves.size:
         known = fit.prior[problem.slow] * np.diag(fit.covariance)[problem.slow]
         power, freedom = float(np.sum(fit.noise.whiten(slow) ** 2)), float(np.sum(1.0 - known))
         if power < (REMNANT * max((h.signal_to_noise for h in named), default=0.0)) ** 2:
             return None
         ratio, size = power, rms(slow / problem.reference_jacobian)
-    elif far and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference)):
+    elif far_from_white(problem, found):
         power, freedom = found.means * found.samples * found.slow, found.means
         ratio, size = (
             power * (found.rms / max(found.white, 1e-9)) ** 2,
