@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -25,8 +23,9 @@ from magbridge.cli.common import (
     logs_to_read,
     print_result,
 )
+from magbridge.cli.fits import drifting, fitted, fleet_start, from_fleet, naming, undeclared_columns
 from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, note_unused_grid
-from magbridge.errors import CalibrationError, DataError, OutOfRange, WrongUse
+from magbridge.errors import DataError, WrongUse
 from magbridge.files import digest
 from magbridge.progress import waiting
 from magbridge.wording import counted
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from magbridge.calibration.fitting.fit import Fit
-    from magbridge.calibration.fitting.observations import Observations
-    from magbridge.fleet.start import Start
 
 ALL = "all"
 """``--compass all``: a calibration for each compass."""
@@ -143,8 +140,8 @@ def calibrate(
     from magbridge.logs.deployment import join
 
     _refuse_together(parameter, method, vehicle, fleet)
-    began = _began(fleet, member, refit, files) if fleet else None
-    parameter = parameter or (began.names if began else ())
+    start = fleet_start(fleet, member, refit, files) if fleet else None
+    parameter = parameter or (start.names if start else ())
     anomalies = read_grid(grid) if grid else None
     with waiting("reading"):
         logs = by_base_station(read_each(files, options=reading.options), base)
@@ -156,7 +153,7 @@ def calibrate(
         deployment, site_bias = _about_mean(deployment, site_bias)
     note_unused_grid(grid, deployment)
     options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
-    with _naming(deployment), waiting("fitting"):
+    with naming(deployment), waiting("fitting"):
         parameter = chosen_parameters(parameter, deployment, grid=anomalies, order=order, site_bias=site_bias)
         data = replace(
             observations(deployment, parameter, grid=anomalies),
@@ -165,17 +162,17 @@ def calibrate(
         for line in unused_logs(logs, data):
             complain(line)
         data = unfiltered(data, filter_corner) if filter_corner else data
-        options |= _drifting(position_sigma, data, method)
-        if began:
-            found, doubt, worth = _from_fleet(began, data, order, site_bias=site_bias, **options)
+        options |= drifting(position_sigma, data, method)
+        if start:
+            found, doubt, worth = from_fleet(start, data, order, site_bias=site_bias, **options)
         else:
-            found, doubt, worth = *_fitted(logs, data, method, order, site_bias=site_bias, **options), {}
+            found, doubt, worth = *fitted(logs, data, method, order, site_bias=site_bias, **options), {}
     save(found.calibration, output)
     if picture:
         from magbridge.calibration.fitting.draw import draw_fit
 
         draw_fit(found.calibration, data, picture)
-    for warning in (*found.warnings, *doubt, *_undeclared(deployment, data, found)):
+    for warning in (*found.warnings, *doubt, *undeclared_columns(deployment, data, found)):
         complain(warning)
     left_out = deployment.sizes["time"] - len(data)
     print_result(
@@ -244,78 +241,6 @@ def _each_compass(
             complain(f"compass {number}: {error}")
     if failed == max(len(found), 1):
         raise DataError(f"{files[0]}: not one of its compasses could be calibrated")
-
-
-@contextmanager
-def _naming(deployment: xr.Dataset) -> Iterator[None]:
-    """Name the logs in what is wrong with them."""
-    try:
-        yield
-    except (CalibrationError, OutOfRange) as error:
-        raise DataError(f"{deployment.attrs['source']}: {error}") from error
-
-
-def _fitted(
-    logs: list[xr.Dataset], data: Observations, method: str, order: int, **options: Any
-) -> tuple[Fit, list[str]]:
-    """Return the fit, and why several logs are not of one vehicle, if they are not."""
-    from magbridge.calibration.fitting.fit import fit
-    from magbridge.calibration.fitting.sources import heterogeneous_logs
-
-    def refitted(part: Observations) -> Fit:
-        return fit(part, method, order)
-
-    try:
-        found = fit(data, method, order, **options)
-    except CalibrationError as error:
-        if doubt := heterogeneous_logs(logs, data, None, refitted):
-            raise CalibrationError(doubt) from error
-        raise
-    doubt = heterogeneous_logs(logs, data, found, refitted)
-    return found, [doubt] if doubt else []
-
-
-def _undeclared(deployment: xr.Dataset, data: Observations, found: Fit) -> list[str]:
-    """Return a line for each column of the log that moves the field and is no parameter."""
-    import numpy as np
-
-    from magbridge.calibration.fitting.hints import undeclared
-    from magbridge.logs.info import telemetry
-
-    rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
-    others = [name for name in telemetry(deployment) if name not in data.names]
-    return undeclared(found.calibration, data, {name: deployment[name].to_numpy()[rows] for name in others})
-
-
-def _drifting(position_sigma: float, data: Observations, method: str) -> dict[str, float]:
-    """Return the option by which positions drift; WrongUse: the fit has no use for positions."""
-    if position_sigma and not (data.lacks_rock and method in ("auto", "survey")):
-        raise WrongUse("--position-sigma: positions matter where the rock is found, by method survey")
-    return {"position_sigma": position_sigma} if position_sigma else {}
-
-
-def _began(fleet: str, member: str, refit: str, files: tuple[Path, ...]) -> Start:
-    """Return what a fleet lets expect of these logs."""
-    from magbridge.fleet.start import start
-
-    with waiting("learning"):
-        return start(fleet, member, refit, {digest(file) for file in files})
-
-
-def _from_fleet(
-    began: Start, data: Observations, order: int, **options: Any
-) -> tuple[Fit, list[str], dict[str, Any]]:
-    """Return the fit that starts there, and what that is worth against one that does not: lines, facts."""
-    from magbridge.calibration.fitting.fit import fit
-    from magbridge.fleet.start import gained
-
-    found = fit(data, order=order, known=began.known, **options)
-    try:
-        alone = fit(data, order=order, **options)
-    except CalibrationError:
-        alone = None
-    facts, lines = gained(found, alone, began)
-    return found, lines, {"fleet": facts}
 
 
 def _facts(found: Fit, samples: int) -> dict[str, Any]:
