@@ -20,10 +20,7 @@ IntArray = NDArray[np.int64]
 def plain(value: object) -> object:
     """Return a numpy number as Python's, for msgspec, which encodes no other.
 
-    Raises
-    ------
-    NotImplementedError
-        It is no number of numpy's.
+    NotImplementedError: it is no number of numpy's.
     """
     if isinstance(value, np.generic):
         return value.item()

@@ -154,10 +154,7 @@ def absent(name: str, there: Iterable[str]) -> str:
 def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
     """Check that a deployment has these columns.
 
-    Raises
-    ------
-    FormatError
-        It lacks one: names the file, the column, and the columns that are there.
+    FormatError: it lacks one: names the file, the column, and the columns that are there.
     """
     for name in names:
         if name not in deployment:
@@ -170,10 +167,7 @@ def require(deployment: xr.Dataset, names: Iterable[str]) -> None:
 def require_units(deployment: xr.Dataset, units: Mapping[str, str]) -> None:
     """Check that the columns of a deployment are in these units, where a column declares one.
 
-    Raises
-    ------
-    FormatError
-        One is in another unit: names the file, the column, and both units.
+    FormatError: one is in another unit: names the file, the column, and both units.
     """
     for name, unit in units.items():
         given = str(deployment[name].attrs.get("units", "")) if name in deployment else ""

@@ -304,11 +304,8 @@ class Config(Table, frozen=True):
 def load(path: str | Path) -> Config:
     """Read and check a ``bridge.toml``.
 
-    Raises
-    ------
-    ConfigError
-        The file is missing or not TOML, a key is unknown or missing, a value has the wrong type or range, or
-        a file that it names does not exist.
+    ConfigError: the file is missing or not TOML, a key is unknown or missing, a value has the wrong type or
+    range, or a file that it names does not exist.
     """
     path = Path(path)
     table = load_toml(path)

@@ -78,10 +78,7 @@ class Correction:
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
 
-        Raises
-        ------
-        ConfigError
-            A number out of range.
+        ConfigError: a number out of range.
         """
         declared = {key: float(value) for key, value in attrs.items() if isinstance(value, (int, float))}
         names = [key for key in Align.__struct_fields__ if f"align.{key}" in declared]

@@ -26,10 +26,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     that was killed is removed at the next write. The suffix is kept, because some writers choose the format
     by it.
 
-    Raises
-    ------
-    WriteError
-        The operating system does not let the file be written: no folder, no permission, no room.
+    WriteError: the operating system does not let the file be written: no folder, no permission, no room.
     """
     target = Path(path)
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")
@@ -92,10 +89,7 @@ def systems_reason(path: Path) -> Iterator[None]:
     netCDF hides that reason: it reports a full disk as 'HDF error' or 'Permission denied'. So `ROOM` bytes
     are appended to the file, which is spoilt already, and the system raises its own error.
 
-    Raises
-    ------
-    OSError
-        The file cannot be written, and why.
+    OSError: the file cannot be written, and why.
     """
     try:
         yield

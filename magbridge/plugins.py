@@ -28,13 +28,7 @@ def plugins(group: str) -> dict[str, EntryPoint]:
 
 
 def load(point: EntryPoint) -> Any:
-    """Import what an entry point names.
-
-    Raises
-    ------
-    PluginError
-        It cannot be imported.
-    """
+    """Import what an entry point names; PluginError: it cannot be imported."""
     with blamed(point):
         return point.load()
 

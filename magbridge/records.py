@@ -55,13 +55,7 @@ class Quality(IntFlag):
 
     @classmethod
     def parse(cls, names: str) -> Quality:
-        """Return the flags that `names` lists (inverse of :meth:`names`).
-
-        Raises
-        ------
-        KeyError
-            A name is not a flag.
-        """
+        """Return the flags that `names` lists (inverse of :meth:`names`); KeyError: a name is not a flag."""
         flags = cls(0)
         for name in names.split():
             flags |= cls[name.upper()]

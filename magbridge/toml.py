@@ -38,10 +38,7 @@ def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Pat
 
     :func:`convert` of the whole table would not name it.
 
-    Raises
-    ------
-    ConfigError
-        As :func:`convert`.
+    ConfigError: as :func:`convert`.
     """
     entries = table.get(key)
     for name, value in entries.items() if isinstance(entries, dict) else ():
@@ -51,10 +48,7 @@ def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Pat
 def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
     """Convert a table or a value of a TOML file to `kind`, a struct or a plain type.
 
-    Raises
-    ------
-    ConfigError
-        Names the key (`prefix` before it) and what was expected.
+    ConfigError: names the key (`prefix` before it) and what was expected.
     """
     try:
         return msgspec.convert(table, kind)

@@ -36,10 +36,8 @@ class Edge(Protocol):
 def set_up(config: Config, start: Start) -> Pipeline:
     """Return the pipeline that a configuration describes.
 
-    Raises
-    ------
-    ConfigError, FormatError, CalibrationError
-        The content of the configuration, or of a file that it names, is wrong.
+    ConfigError, FormatError, CalibrationError: the content of the configuration, or of a file that it names,
+    is wrong.
     """
     calibration = None
     if config.calibration is not None:

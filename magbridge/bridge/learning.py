@@ -29,10 +29,7 @@ KEEP_US = 600_000_000
 def expected(config: Config) -> Calibration | None:
     """Return what ``[learning]`` expects of a vehicle without a calibration; None without that table.
 
-    Raises
-    ------
-    FormatError, CalibrationError
-        ``learning.prior`` is no calibration.
+    FormatError, CalibrationError: ``learning.prior`` is no calibration.
     """
     settings = config.learning
     if settings is None:

@@ -134,12 +134,8 @@ def open_navigation(
 
     Where the configuration sets neither ``noise`` nor ``bias_sigma``, both are taken from the calibration.
 
-    Raises
-    ------
-    ConfigError
-        A fix message or an option that does not exist, or a rate too low for the receiver.
-    FormatError, OutOfRange
-        The map cannot be read.
+    ConfigError: a fix message or an option that does not exist, or a rate too low for the receiver.
+    FormatError, OutOfRange: the map cannot be read.
     """
     if wanted.fix not in FIXES:
         raise ConfigError(config.path, "navigation.fix", f"expected one of {', '.join(FIXES)}")

@@ -14,10 +14,7 @@ __all__ = ["check", "unmet"]
 def check(calibration: Calibration, config: Config) -> None:
     """Check that the link will provide what the calibration needs.
 
-    Raises
-    ------
-    ConfigError
-        A parameter that ``[telemetry]`` lacks, or that comes in another unit.
+    ConfigError: a parameter that ``[telemetry]`` lacks, or that comes in another unit.
     """
     for error in unmet(calibration, config):
         raise error

@@ -154,10 +154,7 @@ def c_header(calibration: Calibration) -> str:
 def c_source(calibration: Calibration) -> str:
     """Return ``magbridge_calibration.c``.
 
-    Raises
-    ------
-    CalibrationError
-        It has effects, which follow telemetry in time: they have a state, and are not written.
+    CalibrationError: it has effects, which follow telemetry in time: they have a state, and are not written.
     """
     if calibration.effects:
         names = ", ".join(sorted({type(one).__name__ for one in calibration.effects}))

@@ -123,12 +123,8 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
 def load(path: str | Path) -> Calibration:
     """Read ``cal.json``.
 
-    Raises
-    ------
-    FormatError
-        It cannot be opened, or as :func:`decode_calibration`.
-    CalibrationError
-        As :func:`decode_calibration`.
+    FormatError: it cannot be opened, or as :func:`decode_calibration`. CalibrationError: as
+    :func:`decode_calibration`.
     """
     try:
         data = Path(path).read_bytes()
@@ -140,10 +136,7 @@ def load(path: str | Path) -> Calibration:
 def save(calibration: Calibration, path: str | Path) -> None:
     """Write ``cal.json``: whole, or not at all.
 
-    Raises
-    ------
-    WriteError
-        The file cannot be written; what was there before is as it was.
+    WriteError: the file cannot be written; what was there before is as it was.
     """
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode_calibration(calibration))

@@ -226,10 +226,7 @@ def symmetric(entries: FloatArray) -> FloatArray:
 def term_class(kind: str) -> type[Term]:
     """Look a term's class up by its name in :data:`TERMS` or among the entry points.
 
-    Raises
-    ------
-    CalibrationError
-        Neither has that name.
+    CalibrationError: neither has that name.
     """
     found: Any
     if kind in TERMS:

@@ -170,12 +170,7 @@ def check_inputs(
 def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> None:
     """Check, before anything heavy is imported, that logs are there and are not written over.
 
-    Raises
-    ------
-    WrongUse
-        As :func:`check_inputs`.
-    FormatError
-        One is not there.
+    WrongUse: as :func:`check_inputs`. FormatError: one is not there.
     """
     for path in check_inputs(files, output, *others):
         if not is_bag(path):

@@ -162,10 +162,7 @@ def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Pa
 def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]:
     """Return the calibration to begin with, and a bridge's settings.
 
-    Raises
-    ------
-    ConfigError
-        The configuration has no calibration, and no ``[learning]`` that could do without.
+    ConfigError: the configuration has no calibration, and no ``[learning]`` that could do without.
     """
     from magbridge.bridge.learning import expected
     from magbridge.calibration.file import load

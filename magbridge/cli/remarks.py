@@ -54,10 +54,7 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
 
     That is by a file of its own, or by an observatory's log among the others.
 
-    Raises
-    ------
-    FormatError, DataError
-        The base station's log has no field, or not for the logs' time.
+    FormatError, DataError: the base station's log has no field, or not for the logs' time.
     """
     from magbridge.field.base_station import apart, with_daily_variation
     from magbridge.logs import read
@@ -82,10 +79,7 @@ def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: A
     What each that was tried buys on parts left out is told on stderr. `options` are of
     :func:`~magbridge.calibration.fitting.offered.best_parameters`.
 
-    Raises
-    ------
-    WrongUse
-        ``auto`` among names.
+    WrongUse: ``auto`` among names.
     """
     from magbridge.calibration.fitting.offered import AUTO, best_parameters, lines
     from magbridge.logs.info import movers

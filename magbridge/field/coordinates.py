@@ -62,12 +62,8 @@ def geographic(
 ) -> tuple[RealArray, RealArray, dict[str, RealArray]]:
     """Return longitudes, latitudes (deg) and fields (ny, nx): as they are, or reprojected.
 
-    Raises
-    ------
-    FormatError
-        Lengths of no known projection; numbers that may be degrees or not; units of neither.
-    MissingExtra
-        A projection, and no pyproj.
+    FormatError: lengths of no known projection; numbers that may be degrees or not; units of neither.
+    MissingExtra: a projection, and no pyproj.
     """
     crs = _reference_system(path, axes.crs)
     if _are_degrees(path, x, y, axes.unit.lower(), crs):

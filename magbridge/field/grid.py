@@ -230,10 +230,7 @@ class AnomalyGrid:
     def at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> FloatArray:
         """Return the anomaly at n places, nT, (n,): see :meth:`evaluate`.
 
-        Raises
-        ------
-        OutOfRange
-            A place that the map does not cover.
+        OutOfRange: a place that the map does not cover.
         """
         anomaly = self.evaluate(longitude, latitude, depth).anomaly
         lon, lat = np.broadcast_arrays(np.atleast_1d(longitude), np.atleast_1d(latitude))
@@ -296,10 +293,7 @@ class AnomalyGrid:
     def save(self, path: str | Path) -> None:
         """Write the grid as CF netCDF, which :func:`~magbridge.field.read.read_grid` and GMT read.
 
-        Raises
-        ------
-        WriteError
-            The file cannot be written; it is as it was before.
+        WriteError: the file cannot be written; it is as it was before.
         """
         write(self, path)
 

@@ -119,10 +119,7 @@ def _geosoft(path: Path) -> Parts:
 def ascii_grid(path: Path) -> Parts:
     """Read ESRI ASCII: ``ncols nrows``, a corner or centre, ``cellsize``, then rows from the north.
 
-    Raises
-    ------
-    FormatError
-        A header or a number is missing.
+    FormatError: a header or a number is missing.
     """
     words = path.read_text(**TEXT).split()
     header: dict[str, float] = {}
@@ -147,10 +144,7 @@ def ascii_grid(path: Path) -> Parts:
 def folder(path: Path) -> Parts:
     """Read MagNav's example: longitudes, latitudes and altitude beside a matrix, each a CSV file.
 
-    Raises
-    ------
-    FormatError
-        One of the files is missing or is no table of numbers.
+    FormatError: one of the files is missing or is no table of numbers.
     """
     try:
         with warnings.catch_warnings():

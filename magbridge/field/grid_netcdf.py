@@ -112,13 +112,7 @@ def _two_dimensional(path: Path, grid: Any, data: Any) -> Coordinates | None:
 
 
 def write(grid: AnomalyGrid, path: str | Path) -> None:
-    """Write a grid as CF netCDF.
-
-    Raises
-    ------
-    WriteError
-        The file cannot be written; it is as it was before.
-    """
+    """Write a grid as CF netCDF; WriteError: the file cannot be written; it is as it was before."""
     import xarray as xr  # noqa: PLC0415  the live path runs without xarray
 
     over = ("latitude", "longitude")

@@ -51,10 +51,7 @@ class Column(NamedTuple):
 def table(path: Path) -> Parts:
     """Read a grid from columns, named or not; any order of rows; gaps are holes.
 
-    Raises
-    ------
-    FormatError
-        No such columns, columns that may be this or that, or nodes that form no grid.
+    FormatError: no such columns, columns that may be this or that, or nodes that form no grid.
     """
     with path.open(**TEXT) as file:
         first = file.readline()

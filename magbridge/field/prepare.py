@@ -96,10 +96,7 @@ def prepare(
 def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> list[AnomalyGrid]:
     """Return the grids, those of unknown altitude at `altitudes` (m): one for all, or one for each.
 
-    Raises
-    ------
-    WrongUse
-        There are more or fewer of them.
+    WrongUse: there are more or fewer of them.
     """
     if len(altitudes) not in (1, len(grids)):
         count = f"{len(altitudes)} altitudes for {len(grids)} grids"

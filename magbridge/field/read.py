@@ -137,10 +137,7 @@ def read_polygon(path: str | Path) -> RealArray:
 
     A header that begins with ``longitude`` is skipped.
 
-    Raises
-    ------
-    FormatError
-        It cannot be read or is not a polygon.
+    FormatError: it cannot be read or is not a polygon.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()

@@ -97,10 +97,8 @@ def about_mean(deployment: xr.Dataset) -> xr.Dataset:
     For a log that tells neither date nor place. The mean is the radius of the sphere through the raw field,
     so that hard iron does not count; a gain that all axes share does.
 
-    Raises
-    ------
-    FormatError
-        The readings are on no sphere of the size of the Earth's field: too few attitudes, or another unit.
+    FormatError: the readings are on no sphere of the size of the Earth's field: too few attitudes, or another
+    unit.
     """
     raw = np.column_stack([deployment[f"mag_{axis}"].to_numpy() for axis in "xyz"])
     radius = sphere_radius(raw[np.isfinite(raw).all(axis=1)])

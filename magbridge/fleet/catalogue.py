@@ -101,12 +101,8 @@ class Catalogue(ABC):
     def add(self, table: str, rows: Iterable[Row]) -> int:
         """Add rows, unless they are there; return how many were not.
 
-        Raises
-        ------
-        WriteError
-            The disk is full, or the folder may not be written to.
-        PortError
-            The server does not answer, or lets nobody write.
+        WriteError: the disk is full, or the folder may not be written to. PortError: the server does not
+        answer, or lets nobody write.
         """
         keyed = {_key(row): {name: row[name] for name in TABLES[table]} for row in rows}
         return self._insert(table, dict(sorted(keyed.items()))) if keyed else 0

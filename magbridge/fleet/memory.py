@@ -52,10 +52,7 @@ def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> l
     What has been learnt from logs of these SHA-256, `without`, is left out. So is a calibration made
     elsewhere from logs that were calibrated here, too.
 
-    Raises
-    ------
-    WrongUse
-        There is no such vehicle.
+    WrongUse: there is no such vehicle.
     """
     vehicle_named(catalogue, like)
     kinds = {name: _kind(row) for name, row in vehicles(catalogue).items()}
@@ -82,12 +79,8 @@ def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> l
 def fleet_of(catalogue: Catalogue, vehicle: str, without: Collection[str] = ()) -> Fleet:
     """Return what the vehicles with the masses of this one have taught; `without` as for :func:`lessons`.
 
-    Raises
-    ------
-    WrongUse
-        There is no such vehicle.
-    DataError
-        Nothing has been calibrated yet, or the columns' units differ.
+    WrongUse: there is no such vehicle. DataError: nothing has been calibrated yet, or the columns' units
+    differ.
     """
     found = lessons(catalogue, vehicle, without)
     units = {tuple(one.unit for one in lesson.parameters) for lesson in found}
@@ -140,10 +133,7 @@ def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
 def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
     """Return vehicle and refit of logs by their SHA-256.
 
-    Raises
-    ------
-    WrongUse
-        They are not catalogued, or are of several vehicles.
+    WrongUse: they are not catalogued, or are of several vehicles.
     """
     wanted = set(digests)
     rows = [row for row in current_files(catalogue.rows("files")) if row["sha256"] in wanted]

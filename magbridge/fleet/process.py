@@ -81,10 +81,7 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
 
     A task whose worker is lost is given to another; one that is killed leaves nothing but what is done.
 
-    Raises
-    ------
-    PortError
-        The scheduler was lost.
+    PortError: the scheduler was lost.
     """
     folder = catalogue.results.resolve()
     address = str(client.scheduler.address) if client.scheduler else "dask"

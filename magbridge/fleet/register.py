@@ -70,10 +70,7 @@ class _File(Table, frozen=True):
 def read_fleet(path: Path) -> dict[str, Vehicle]:
     """Read a fleet.toml; return vehicles by name.
 
-    Raises
-    ------
-    ConfigError
-        The file, a key or a type is not as expected.
+    ConfigError: the file, a key or a type is not as expected.
     """
     table = load_toml(path)
     check_entries(table, "vehicle", Vehicle, path)
@@ -81,13 +78,7 @@ def read_fleet(path: Path) -> dict[str, Vehicle]:
 
 
 def vehicles(catalogue: Catalogue) -> dict[str, Row]:
-    """Return the vehicles by name.
-
-    Raises
-    ------
-    FormatError
-        Two have one name.
-    """
+    """Return the vehicles by name; FormatError: two have one name."""
     found: dict[str, Row] = {}
     for row in sorted(catalogue.rows("vehicles"), key=lambda row: row["version"]):
         last = found.get(row["vehicle"], row)
@@ -107,13 +98,7 @@ def masses(row: Row) -> dict[str, Mounting]:
 
 
 def vehicle_named(catalogue: Catalogue, name: str) -> Row:
-    """Return a vehicle.
-
-    Raises
-    ------
-    WrongUse
-        There is none of that name.
-    """
+    """Return a vehicle; WrongUse: there is none of that name."""
     known = vehicles(catalogue)
     if name not in known:
         raise WrongUse(f"{name}: not a vehicle of {catalogue.name} ({', '.join(known) or 'none yet'})")
@@ -123,10 +108,7 @@ def vehicle_named(catalogue: Catalogue, name: str) -> Row:
 def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     """Put a vehicle, or what is new about it, on record; return how many were added or changed.
 
-    Raises
-    ------
-    WrongUse
-        Another has that name, or it can be no folder's.
+    WrongUse: another has that name, or it can be no folder's.
     """
     _check_name(name, "a vehicle")
     row = {"vehicle": name, **{key: getattr(vehicle, key) for key in ("serial", "sensor", "order")}}
@@ -150,10 +132,7 @@ def add_logs(
 
     `logs` are the files that its patterns stand for.
 
-    Raises
-    ------
-    WrongUse
-        There is no such vehicle, or the deployment's name can be no folder's.
+    WrongUse: there is no such vehicle, or the deployment's name can be no folder's.
     """
     vehicle_named(catalogue, vehicle)
     _check_name(deployment.name, "a deployment")
@@ -191,10 +170,7 @@ def current_files(rows: Iterable[Row]) -> list[Row]:
 def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
     """Return the logs that a deployment's patterns name, beside the fleet.toml.
 
-    Raises
-    ------
-    ConfigError
-        A pattern names none.
+    ConfigError: a pattern names none.
     """
     found: list[Path] = []
     for pattern in deployment.logs:

@@ -30,10 +30,7 @@ LONGEST_US = 0x7FFFFFFF
 def check_publish(publish: Mapping[str, float], path: Path) -> None:
     """Check ``[publish]``.
 
-    Raises
-    ------
-    ConfigError
-        A message that the bridge does not publish, or a rate out of range.
+    ConfigError: a message that the bridge does not publish, or a rate out of range.
     """
     for name, rate in publish.items():
         if name not in LIMITS:

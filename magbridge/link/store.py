@@ -32,10 +32,7 @@ class Kept(msgspec.Struct, frozen=True):
 def load(path: str | Path) -> Kept:
     """Read the file; one that does not exist yet keeps nothing.
 
-    Raises
-    ------
-    FormatError
-        It is not what :func:`save` wrote.
+    FormatError: it is not what :func:`save` wrote.
     """
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=Kept)

@@ -52,10 +52,7 @@ IDS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
     """Yield the log in pieces of at most `rows` rows; what is read of it is held whole.
 
-    Raises
-    ------
-    FormatError
-        No magnetometer in it.
+    FormatError: no magnetometer in it.
     """
     with path.open("rb") as file:
         text = b"FMT," in file.read(4096)

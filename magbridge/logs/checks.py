@@ -51,10 +51,7 @@ AHEAD = 64
 def increasing(file: str | Path, time: FloatArray, *, after: float = -np.inf) -> None:
     """Check that `time` (n,), s, is finite and increases, also from `after`, the last time before it.
 
-    Raises
-    ------
-    FormatError
-        Names the first row that does not fit, counted from 1.
+    FormatError: names the first row that does not fit, counted from 1.
     """
     wrong = _wrong(time, after)
     if len(wrong):
@@ -69,11 +66,8 @@ def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) 
     Attributes of a piece count what it lost, ``rows_dropped duplicate_rows values_dropped``; ``losses`` has a
     line for the first in each column of the file.
 
-    Raises
-    ------
-    FormatError
-        At least half of the rows, or of a column's values, cannot be, or, if `strict`, any: names the first.
-        Or what `pieces` raise, after what came before it.
+    FormatError: at least half of the rows, or of a column's values, cannot be, or, if `strict`, any: names
+    the first. Or what `pieces` raise, after what came before it.
     """
     checks = _Checks(file, strict)
     last: xr.Dataset | None = None

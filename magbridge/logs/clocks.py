@@ -82,10 +82,7 @@ class Clock(NamedTuple):
 def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) -> Clock:
     """Return the clock of a column of times, from its heading, its unit and its first cells.
 
-    Raises
-    ------
-    ValueError
-        Dates that can be read in two ways; says what to declare.
+    ValueError: dates that can be read in two ways; says what to declare.
     """
     unit = {"seconds": "s", "sec": "s", "hours": "h", "UTC": ""}.get(unit, unit)
     if "%" in unit:

@@ -127,10 +127,7 @@ def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
 
     For formats that know columns, but no compasses: the rows stay those of the first.
 
-    Raises
-    ------
-    FormatError
-        There are no such columns.
+    FormatError: there are no such columns.
     """
     if wanted in (None, "0"):
         return deployment

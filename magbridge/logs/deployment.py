@@ -142,11 +142,8 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
     A part that lacks a column has NaN there. Of rows with the same time the first part's is kept, its NaNs
     filled from the later ones; the attribute ``duplicate_rows`` counts the rows dropped.
 
-    Raises
-    ------
-    FormatError
-        Two parts that disagree on an attribute that changes what values mean, as ``heading_reference``,
-        or on the unit of a column.
+    FormatError: two parts that disagree on an attribute that changes what values mean, as
+    ``heading_reference``, or on the unit of a column.
     """
     if len(parts) == 1:
         return parts[0]

@@ -30,13 +30,7 @@ TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
-    """Yield the file in pieces of at most `rows` rows.
-
-    Raises
-    ------
-    FormatError
-        No header of the format, or no rows.
-    """
+    """Yield the file in pieces of at most `rows` rows; FormatError: no header of the format, or no rows."""
     lines = path.read_text(encoding="ascii", errors="replace").splitlines()
     first = next((k for k, line in enumerate(lines) if line.startswith("DATE ")), None)
     if first is None:

@@ -88,10 +88,7 @@ def cells(line: str, separator: str) -> list[str]:
 def layout_of(path: Path, lines: Sequence[str], declared: Declared) -> Layout:
     """Return the layout of the file that begins with these lines.
 
-    Raises
-    ------
-    FormatError
-        No headings, two of one name, or a declared column that is not there.
+    FormatError: no headings, two of one name, or a declared column that is not there.
     """
     found = Layout()
     comments = _comments(path, lines, found)

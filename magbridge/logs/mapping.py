@@ -94,10 +94,7 @@ def _named(text: str) -> tuple[str, Source]:
 def renamed(dataset: xr.Dataset, declaration: Declared) -> xr.Dataset:
     """Return a deployment of a format that names its columns itself with the columns as declared.
 
-    Raises
-    ------
-    FormatError
-        A column that is not there, or a unit that does not fit ours.
+    FormatError: a column that is not there, or a unit that does not fit ours.
     """
     from magbridge.columns import require  # noqa: PLC0415 - xarray is for ashore
     from magbridge.logs.deployment import deployment  # noqa: PLC0415

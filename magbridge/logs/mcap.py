@@ -74,10 +74,7 @@ def topic_of(name: str) -> str:
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the file in pieces of at most `rows` rows; it is held whole.
 
-    Raises
-    ------
-    FormatError
-        No whole MCAP file as :class:`FileWriter` writes it.
+    FormatError: no whole MCAP file as :class:`FileWriter` writes it.
     """
     try:
         with path.open("rb") as file:
@@ -124,10 +121,7 @@ class FileWriter:
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
         """Write the rows, and before the first ones what the topics hold.
 
-        Raises
-        ------
-        WriteError
-            A time before 1970, which MCAP does not have.
+        WriteError: a time before 1970, which MCAP does not have.
         """
         if first:
             attrs = json.dumps(plain_attrs(dataset.attrs))

@@ -61,10 +61,7 @@ CHUNK = 8192
 def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the file as deployments of at most `rows` rows, each with their numbers.
 
-    Raises
-    ------
-    FormatError
-        Not netCDF or cut short, or no time in it.
+    FormatError: not netCDF or cut short, or no time in it.
     """
     try:
         with netCDF4.Dataset(path) as file:

@@ -66,13 +66,7 @@ class Metadata(Table, frozen=True):
 
 
 def read_metadata(path: Path) -> Metadata:
-    """Read a ``metadata.toml``.
-
-    Raises
-    ------
-    ConfigError
-        Missing, not TOML, or without a key that OG1.0 demands.
-    """
+    """Read a ``metadata.toml``; ConfigError: missing, not TOML, or without a key that OG1.0 demands."""
     found = convert(load_toml(path), Metadata, path)
     demanded = {"attributes": ATTRIBUTES, "platform": PLATFORM, "sensor": SENSOR}
     for table, keys in demanded.items():
@@ -85,10 +79,7 @@ def read_metadata(path: Path) -> Metadata:
 def complete(path: Path, metadata: Metadata) -> None:
     """Add to a trajectory that :mod:`.netcdf` has written what makes it a file of OG1.0.
 
-    Raises
-    ------
-    FormatError
-        It has no positions and depths.
+    FormatError: it has no positions and depths.
     """
     with netCDF4.Dataset(path, "a") as file:
         for name in PLACES:

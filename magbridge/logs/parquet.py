@@ -28,10 +28,7 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
 
     ``time`` may be numbers or timestamps.
 
-    Raises
-    ------
-    FormatError
-        Not Parquet or cut short, no column ``time``, a column that does not hold numbers.
+    FormatError: not Parquet or cut short, no column ``time``, a column that does not hold numbers.
     """
     try:
         with pq.ParquetFile(path) as file:

@@ -97,10 +97,7 @@ FASTER = 1.5
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
     """Yield the log in pieces of at most `rows` rows; it is held whole.
 
-    Raises
-    ------
-    FormatError
-        Not a ULog, or no magnetometer in it.
+    FormatError: not a ULog, or no magnetometer in it.
     """
     try:
         with path.open("rb") as file, redirect_stdout(None):  # pyulog prints what it finds damaged

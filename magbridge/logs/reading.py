@@ -74,10 +74,7 @@ def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
 
     Files that were skipped are counted in the first.
 
-    Raises
-    ------
-    FormatError, MissingExtra
-        As :func:`read`.
+    FormatError, MissingExtra: as :func:`read`.
     """
     files = _Files(_paths(paths), options)
     whole = [part for k in range(len(files.paths)) for part in files.pieces(k, WHOLE)]
@@ -93,10 +90,7 @@ def read_chunks(
     formats are held in memory one at a time. Of files that overlap in time, one piece each is held. A file
     that cannot be read to its end is read up to there.
 
-    Raises
-    ------
-    FormatError, MissingExtra
-        As :func:`read`.
+    FormatError, MissingExtra: as :func:`read`.
     """
     from magbridge.logs.merge import merge  # noqa: PLC0415 - xarray is for ashore
 

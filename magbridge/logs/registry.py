@@ -55,13 +55,7 @@ class Format(NamedTuple):
     """Where another package brings it."""
 
     def load(self) -> Any:
-        """Return the module.
-
-        Raises
-        ------
-        PluginError
-            Another package's cannot be imported, or has no ``chunks``.
-        """
+        """Return the module; PluginError: another package's cannot be imported, or has no ``chunks``."""
         if self.plugin is None:
             return import_module(self.module)
         module = load(self.plugin)
@@ -143,10 +137,7 @@ def suffixes(*, write: bool = False) -> list[str]:
 def format_of(path: Path, *, write: bool = False) -> Format:
     """Return the format of a file, or in which one of this name is written.
 
-    Raises
-    ------
-    FormatError
-        Neither its first bytes nor its name are those of a known format.
+    FormatError: neither its first bytes nor its name are those of a known format.
     """
     found = None if write else _recognised(path)
     if found is None:

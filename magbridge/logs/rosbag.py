@@ -73,10 +73,7 @@ class _Stream(NamedTuple):
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
     """Yield the bag in pieces of at most `rows` rows; what is read of it is held whole.
 
-    Raises
-    ------
-    FormatError
-        Not a bag, or no ``MagneticField`` in it.
+    FormatError: not a bag, or no ``MagneticField`` in it.
     """
     try:
         with _opened(path) as bag:

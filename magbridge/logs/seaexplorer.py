@@ -77,10 +77,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     The rows of a payload's file have what only the navigation file of its dive knows, which lies beside it:
     attitude and masses, linearly between two samples of the navigation.
 
-    Raises
-    ------
-    FormatError
-        Not a SeaExplorer's file, or cut short while it was compressed.
+    FormatError: not a SeaExplorer's file, or cut short while it was compressed.
     """
     whole = _read(path)
     if navigation := _navigation_of(path):

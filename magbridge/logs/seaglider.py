@@ -92,10 +92,7 @@ class Dive:
 def dive(path: Path, known: Dive) -> xr.Dataset:
     """Return one dive as a deployment, without the field, and said, where the compass was not logged raw.
 
-    Raises
-    ------
-    FormatError
-        One of the compass' axes is there, and another is not.
+    FormatError: one of the compass' axes is there, and another is not.
     """
     raw = [name for name in CHANNELS if name in known.sampled]
     for axis in "xyz":

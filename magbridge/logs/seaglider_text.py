@@ -27,10 +27,7 @@ FIX = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the dive in pieces of at most `rows` rows.
 
-    Raises
-    ------
-    FormatError
-        No samples, or no magnetometer among them.
+    FormatError: no samples, or no magnetometer among them.
     """
     samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
     if not samples.is_file():

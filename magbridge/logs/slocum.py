@@ -84,10 +84,7 @@ dbdreader = _import()
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the flight file, with its science file where there is one, in pieces of at most `rows` rows.
 
-    Raises
-    ------
-    FormatError
-        Not a Slocum file, no ``.cac`` for it, or no rows in it.
+    FormatError: not a Slocum file, no ``.cac`` for it, or no rows in it.
     """
     flight, science = _pair(path)
     tracks = {**_read(flight), **_measured(_read(science))}

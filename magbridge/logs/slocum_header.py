@@ -25,10 +25,8 @@ CACHES = ".", "cac", "cache", "../cac", "../cache"
 def check_header(path: Path) -> list[Path]:
     """Check the header of a Slocum's file, and the list of its sensors; return where that list may be.
 
-    Raises
-    ------
-    FormatError
-        The header is cut off, or a line of the ``.cac`` is damaged. A compressed file is not looked into.
+    FormatError: the header is cut off, or a line of the ``.cac`` is damaged. A compressed file is not looked
+    into.
     """
     with path.open("rb") as file:
         lines = file.read(MOST).split(b"\n")

@@ -59,10 +59,7 @@ TIMES = ("time", *CHANNEL_TIMES)
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
     """Yield the log as deployments of at most `rows` rows; it is read twice.
 
-    Raises
-    ------
-    FormatError
-        Nothing in it makes a row.
+    FormatError: nothing in it makes a row.
     """
     status = path.stat()
     found = survey(path, status.st_mtime_ns, status.st_size)

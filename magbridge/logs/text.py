@@ -59,11 +59,8 @@ class Metadata(msgspec.Struct):
 def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the file as deployments of at most `rows` rows, each with their numbers.
 
-    Raises
-    ------
-    FormatError
-        No header, a row of another length, a field that is not a number, or a declared column that is not
-        there.
+    FormatError: no header, a row of another length, a field that is not a number, or a declared column that
+    is not there.
     """
     encoding, guess = _encoding(path)
     with path.open(encoding=encoding) as file:

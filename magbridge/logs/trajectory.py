@@ -78,10 +78,7 @@ class _Column(NamedTuple):
 def chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the rows of an open file in pieces of at most `rows`, each with their numbers.
 
-    Raises
-    ------
-    FormatError
-        Nothing in it is a time, or no rows.
+    FormatError: nothing in it is a time, or no rows.
     """
     clock = _clock(path, file)
     dimension = _along(clock)

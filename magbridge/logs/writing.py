@@ -76,10 +76,7 @@ class Writer:
     def append(self, dataset: xr.Dataset) -> None:
         """Write the rows of `dataset`, which begin after the last ones.
 
-        Raises
-        ------
-        FormatError
-            Time does not increase, or a column was not in the first deployment.
+        FormatError: time does not increase, or a column was not in the first deployment.
         """
         from magbridge.logs.checks import increasing  # noqa: PLC0415 - xarray is for ashore
         from magbridge.logs.deployment import same_columns, uncounted  # noqa: PLC0415

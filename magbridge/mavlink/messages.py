@@ -126,13 +126,7 @@ class Spec:
 
 @cache
 def spec(message: int | str) -> Spec:
-    """Return the layout of a message, by id or name.
-
-    Raises
-    ------
-    KeyError
-        No such message.
-    """
+    """Return the layout of a message, by id or name; KeyError: no such message."""
     return Spec(message) if isinstance(message, int) else spec(IDS[message])
 
 

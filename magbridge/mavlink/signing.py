@@ -53,10 +53,7 @@ def timestamp(t_us: int) -> int:
 def load_key(path: str | Path) -> bytes:
     """Read a signing key: a file of 32 bytes.
 
-    Raises
-    ------
-    ConfigError
-        The file cannot be read or has another length.
+    ConfigError: the file cannot be read or has another length.
     """
     try:
         key = Path(path).read_bytes()

@@ -48,12 +48,7 @@ class Background:
 def read_background(path: Path) -> Background:
     """Return the anomaly grid of a file as a picture.
 
-    Raises
-    ------
-    FormatError
-        It is no grid.
-    MissingExtra
-        The analysis extra is not installed.
+    FormatError: it is no grid. MissingExtra: the analysis extra is not installed.
     """
     try:
         import numpy as np  # noqa: PLC0415 - most pages show no grid

@@ -45,10 +45,7 @@ def driver_names() -> list[str]:
 def options_of(driver: str) -> list[Option]:
     """Return the options of a driver, in its own order; those without a default first.
 
-    Raises
-    ------
-    ConfigError
-        No such driver.
+    ConfigError: no such driver.
     """
     return sorted(attributes_of(driver_class(driver, "options").Options), key=lambda one: not one.required)
 

@@ -135,10 +135,7 @@ class Twinleaf:
     def _open(self, frame: bytes) -> tuple[int, bytes]:
         """Return type and payload of a packet, the type 0 where it is another device's.
 
-        Raises
-        ------
-        ValueError
-            The packet is damaged.
+        ValueError: the packet is damaged.
         """
         packet = tio.unslip(frame)
         if crc32(packet) != CRC32_RESIDUE:

@@ -68,10 +68,7 @@ def is_table(path: Path) -> bool:
 def read_table(path: Path) -> Samples:
     """Read a table: longitude, latitude, anomaly (nT), and where there are any height, line, line_type.
 
-    Raises
-    ------
-    FormatError
-        A column is missing or holds something else than numbers.
+    FormatError: a column is missing or holds something else than numbers.
     """
     table = _table(path)
     value = _numbers(path, table, _first(path, table, ANOMALY))
@@ -102,10 +99,7 @@ def read_points(
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray]:
     """Read points: longitude and latitude (n,), deg, depth (n,), m, if known, and m north and east (n, 2).
 
-    Raises
-    ------
-    FormatError
-        A column is missing or holds something else than numbers.
+    FormatError: a column is missing or holds something else than numbers.
     """
     table = _table(path)
     longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
@@ -119,10 +113,7 @@ def read_points(
 def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
     """Return the samples of a log with ``total_field`` or ``anomaly``, nT, and positions.
 
-    Raises
-    ------
-    FormatError
-        It has neither, or no position.
+    FormatError: it has neither, or no position.
     """
     source = ds.attrs.get("source", "the log")
     if not {"latitude", "longitude"} <= set(ds.variables):

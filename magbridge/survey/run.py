@@ -85,13 +85,7 @@ def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) 
 
 
 def survey(samples: Samples) -> Result:
-    """Level and grid corrected samples.
-
-    Raises
-    ------
-    CalibrationError
-        They cannot be gridded.
-    """
+    """Level and grid corrected samples; CalibrationError: they cannot be gridded."""
     warnings: list[str] = []
     far = far_off(samples.place)
     if count := int(far.sum()):

@@ -30,10 +30,7 @@ WGS84 = (1, 1, 0, 3, 1024, 0, 1, 2, 1025, 0, 1, 1, 2048, 0, 1, 4326)
 def write_geotiff(grid: AnomalyGrid, path: Path) -> None:
     """Write a map's anomaly as a GeoTIFF, float32 on WGS84, holes as NaN.
 
-    Raises
-    ------
-    WriteError
-        The file cannot be written.
+    WriteError: the file cannot be written.
     """
     from PIL import Image, TiffImagePlugin  # noqa: PLC0415 - only here
 

@@ -29,10 +29,7 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
     The abscissae are time, heading (where attitude is known) and each parameter: a trend left in the lower
     row is something that the calibration does not describe.
 
-    Raises
-    ------
-    WriteError
-        The file cannot be written.
+    WriteError: the file cannot be written.
     """
     read = np.linalg.norm(data.field, axis=1) - data.reference
     left, _ = in_sensor_units(calibration, data)

@@ -42,10 +42,7 @@ FIRST_NOISE = 1e-3
 def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
     """Fit one ellipsoid by levelled components.
 
-    Raises
-    ------
-    CalibrationError
-        Roll and pitch, or the reference's direction, are lacking.
+    CalibrationError: roll and pitch, or the reference's direction, are lacking.
     """
     if data.attitude is None or data.reference_ned is None:
         raise CalibrationError("horizontal: needs roll, pitch and a position (for the field's inclination)")

@@ -90,10 +90,7 @@ class Known:
     def ranges(self, data: Observations) -> tuple[Parameter, ...]:
         """Return the parameters, their ranges widened to what `data` have.
 
-        Raises
-        ------
-        CalibrationError
-            The data have others, or in other units.
+        CalibrationError: the data have others, or in other units.
         """
         mine = [(one.name, one.unit) for one in self.parameters]
         theirs = list(zip(data.names, data.units, strict=True))

@@ -36,10 +36,7 @@ class Mission:
     def of(cls, data: Observations) -> Mission:
         """Take the attitudes and positions of a deployment.
 
-        Raises
-        ------
-        CalibrationError
-            Attitude or place is lacking.
+        CalibrationError: attitude or place is lacking.
         """
         known, attitude, reference_ned = data.directed()
         if not known.any():

@@ -61,13 +61,7 @@ class _VehicleFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_vehicle(path: str | Path) -> dict[str, Mounting]:
-    """Read ``vehicle.toml``.
-
-    Raises
-    ------
-    ConfigError
-        The file, a key or a type is not as expected.
-    """
+    """Read ``vehicle.toml``; ConfigError: the file, a key or a type is not as expected."""
     table = load_toml(path)
     check_entries(table, "mass", Mounting, path)
     return convert(table, _VehicleFile, path).mass

@@ -155,11 +155,8 @@ def starts(samples: Samples) -> list[FloatArray]:
 def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     """Refuse a collapsed fit; `coefficients` are (9 m,), nT.
 
-    Raises
-    ------
-    CalibrationError
-        Where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field, where the
-        attitudes do not tell it from a scale. All around, any T is known as well as the noise allows.
+    CalibrationError: where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field,
+    where the attitudes do not tell it from a scale. All around, any T is known as well as the noise allows.
     """
     seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
     scales, T = scales_and_offsets(seen, coefficients)

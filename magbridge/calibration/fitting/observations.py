@@ -158,10 +158,7 @@ class Observations:
     def ranges(self) -> tuple[Parameter, ...]:
         """Return the parameters with the range seen, scaled to [-1, 1].
 
-        Raises
-        ------
-        CalibrationError
-            A parameter that never moves.
+        CalibrationError: a parameter that never moves.
         """
         found = []
         for name, unit, column in zip(self.names, self.units, self.parameters.T, strict=True):

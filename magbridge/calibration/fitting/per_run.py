@@ -37,10 +37,7 @@ WIDTHS = np.array([0.005] * 6 + [0.02] * 3)
 def fit_per_run(data: Observations, order: int = 3) -> Fit:
     """Fit every run on its own, then polynomials through the runs.
 
-    Raises
-    ------
-    CalibrationError
-        Fewer runs than the order plus one.
+    CalibrationError: fewer runs than the order plus one.
     """
     ranges = data.ranges()
     exponents = full_order(len(ranges), order)

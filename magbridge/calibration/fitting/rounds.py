@@ -58,10 +58,7 @@ def settled(survey: SurveySamples, own: PriorFamily) -> Answer:
 
     Those of a long log come to rest with every second or tenth sample, and go on with all from there.
 
-    Raises
-    ------
-    CalibrationError
-        They do not come to rest.
+    CalibrationError: they do not come to rest.
     """
     step = max(len(survey.kept) // SETTLED, 1)
     few = survey.thinned(step) if step > 1 else survey
@@ -106,13 +103,7 @@ class _Rounds:
         self.choice = same_noise(self._sums(field), self.choice, weighed)
 
     def settle(self) -> Answer:
-        """Return the answer.
-
-        Raises
-        ------
-        CalibrationError
-            The rounds do not come to rest.
-        """
+        """Return the answer; CalibrationError: the rounds do not come to rest."""
         survey, moved = self.survey, np.inf
         for turn in range(ROUNDS):
             if self.own.renew is not None and turn:

@@ -109,10 +109,7 @@ def _solve(precision: FloatArray, gradient: FloatArray) -> FloatArray:
 def covariance_of(precision: FloatArray) -> FloatArray:
     """Inverse of a positive definite precision (q, q), symmetric to the last bit.
 
-    Raises
-    ------
-    CalibrationError
-        The precision leaves a combination free.
+    CalibrationError: the precision leaves a combination free.
     """
     scale = np.sqrt(np.diag(precision))
     try:

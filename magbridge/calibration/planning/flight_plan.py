@@ -65,10 +65,7 @@ def survey_plan(
 
     Without a calibration they are for a vehicle nobody knows, whose masses' positions are `parameters`.
 
-    Raises
-    ------
-    CalibrationError, FormatError
-        As :func:`flight_plan`.
+    CalibrationError, FormatError: as :func:`flight_plan`.
     """
     if calibration is not None:
         require_units(mission, calibration.units)

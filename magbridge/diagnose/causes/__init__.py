@@ -71,10 +71,7 @@ CAUSES: dict[str, Cause] = {
 def known() -> dict[str, Cause]:
     """Return the table with what other packages add to it.
 
-    Raises
-    ------
-    PluginError
-        One cannot be imported, is no cause, or has the name of one that is there.
+    PluginError: one cannot be imported, is no cause, or has the name of one that is there.
     """
     added = {}
     for name, point in plugins(GROUP).items():

@@ -24,10 +24,7 @@ def write(
 ) -> None:
     """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none.
 
-    Raises
-    ------
-    WriteError
-        One of them cannot be written; what was there before is as it was.
+    WriteError: one of them cannot be written; what was there before is as it was.
     """
     contents = {
         "calibration.json": encode_calibration(diagnosis.calibration),

@@ -113,10 +113,7 @@ class NearInverse:
 def near_inverse(matrix: csr_array, edges: IndexArray) -> NearInverse:
     """Return the inverse's blocks on and beside the diagonal, of a block-tridiagonal matrix (n, n).
 
-    Raises
-    ------
-    LinAlgError
-        It is not positive definite.
+    LinAlgError: it is not positive definite.
     """
     diagonal: list[FloatArray] = []
     below: list[FloatArray] = []
