@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from surveyed_rock import NOISE, error_of, flown
+from surveyed_rock import NOISE, OFFSET, error_of, flown
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
@@ -76,6 +76,23 @@ def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) 
     np.testing.assert_allclose(apart_from_level(doubted).covariance, apart, atol=tiny)
     got = correct(doubted, data.field, np.empty((len(data), 0)), data.time)
     assert got.sigma.min() > 390.0
+
+
+def test_a_slope_of_the_crust_is_not_taken_for_a_level() -> None:
+    """6 nT/km with depth that no model has, dives of 200 m, and noise in which that shows as in a month."""
+    data, true = flown(noise=0.2)
+    assert data.place is not None
+    dive = np.arange(len(data)) % 220 / 110.0
+    depth = 200.0 * np.minimum(dive, 2.0 - dive)
+    main, crust = 0.025 * depth, 0.006 * depth
+    ned = (data.field - OFFSET) * (1.0 + (main + crust) / true)[:, None]
+    place = np.column_stack([data.place[:, :2], depth])
+    seen = replace(data, field=ned + OFFSET, reference=data.reference + main, place=place)
+    found = fit(seen).calibration
+    error = correct(found, seen.field, np.empty((len(seen), 0)), seen.time).total - (true + main + crust)
+    assert abs(error.mean()) < 0.5 * LEVEL
+    assert error.std() < 0.25
+    assert 0.9 * LEVEL < found.reference.level_sigma < 1.5 * LEVEL
 
 
 def test_level_stands_in_the_file(survey: Survey) -> None:

@@ -18,7 +18,7 @@ NOISE = 1.0
 
 
 def flown(
-    *, legs: int = 16, straight: bool = False, zigzag: bool = False, seed: int = 3
+    *, legs: int = 16, straight: bool = False, zigzag: bool = False, seed: int = 3, noise: float = NOISE
 ) -> tuple[Observations, FloatArray]:
     """Fly dives and climbs criss-cross over rock of 40 nT; return what was read, and the true total field."""
     rng = np.random.default_rng(seed)
@@ -38,7 +38,7 @@ def flown(
     true = F_0 + rock
     ned = MAIN * (true / F_0)[:, None]
     attitude = np.stack([roll, pitch, heading], axis=1)
-    field = field_body(attitude, ned) @ np.linalg.inv(IRON).T + OFFSET + rng.normal(0, NOISE, (n, 3))
+    field = field_body(attitude, ned) @ np.linalg.inv(IRON).T + OFFSET + rng.normal(0, noise, (n, 3))
     data = Observations(
         field=field, reference=np.full(n, F_0), parameters=np.empty((n, 0)),
         time=1e9 + dt * np.arange(n, dtype=float), runs=leg, attitude=attitude,

@@ -4,11 +4,13 @@ Where nobody knows the true field, the reference is the main field, and what it 
 
 .. math:: H_e(x, t) = |\mathrm{IGRF}| + b + f(x) + s(t),
 
-has a level b, a Gaussian field f in place (:mod:`magbridge.field.place`) and a slow part s in time. A
-criss-cross meets the same rock with another heading, roll and position of the masses, so f and the
-coefficients can be told apart. The errors stand in the readings, as in every fit here
-(:mod:`magbridge.calibration.residual`): without the weight of :math:`|A^T u|` a joint fit would shrink A to
-have less rock to explain.
+has a level b, a Gaussian field f in place (:mod:`magbridge.field.place`) and a slow part s in time. The
+level is that of the crust far around, so b has a gradient as well: once the level moves by :math:`-g F_0` a
+gain g shows in nothing but how :math:`H_e` varies, and a long log would tell it by the main field's fall with
+height, as if nothing else fell. A criss-cross meets the same rock with another heading, roll and position of
+the masses, so f and the coefficients can be told apart. The errors stand in the readings, as in every fit
+here (:mod:`magbridge.calibration.residual`): without the weight of :math:`|A^T u|` a joint fit would shrink A
+to have less rock to explain.
 
 Notes
 -----
@@ -44,6 +46,8 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["fit_in_place"]
 
+REACH = 25_000.0
+"""m over which the reference's error, of waves far longer than a site, changes by its size: 6 nT/km."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """nT over a stretch, and the 1-sigma of its logarithm: a quiet day's currents aloft, a sensor's drift."""
 DRIFTING = 2700.0
@@ -116,8 +120,12 @@ def fit_in_place(
 
 
 def _groups(data: Observations, level: float) -> tuple[Group, ...]:
-    """Return the unknowns beside coefficients and field: the level, and what changes slowly with time."""
-    groups = [Group("level", np.ones((len(data), 1)), np.ones(1), max(level, 1e-3))]
+    """Return the unknowns beside coefficients and field: the level, its slope, what changes with time."""
+    assert data.place is not None
+    away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REACH
+    level = max(level, 1e-3)
+    groups = [Group("level", np.ones((len(data), 1)), np.ones(1), level)]
+    groups.append(Group("gradient", away, np.ones(3), level))
     waves, shape = slow_functions(data.time)
     if len(shape):
         groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
