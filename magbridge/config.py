@@ -32,64 +32,43 @@ Baudrate = Annotated[int, Meta(gt=0, le=20_000_000)]
 
 
 class Sensor(Table, frozen=True):
-    """``[sensor]``: which instrument, on which port.
-
-    Attributes
-    ----------
-    driver : str
-        A name from the driver table (:data:`magbridge.sensors.DRIVERS`).
-    port : str
-        A device, a pattern (``/dev/ttyUSB*``: the first on which a reading comes within `timeout`, so that
-        a sensor that comes back under another name is found again; one that sends NMEA 0183 and no readings
-        gets no start-up commands) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``).
-    baudrate : int
-        bit/s.
-    timeout : float
-        s without a reading after which the sensor counts as silent.
-    options : dict
-        The driver's own settings.
-    """
+    """``[sensor]``: which instrument, on which port."""
 
     driver: str
+    """A name from the driver table (:data:`magbridge.sensors.DRIVERS`)."""
     port: Name
+    """A device, a pattern (``/dev/ttyUSB*``: the first on which a reading comes within `timeout`, so that a
+    sensor that comes back under another name is found again; one that sends NMEA 0183 and no readings gets no
+    start-up commands) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``)."""
     baudrate: Baudrate = 9600
+    """bit/s."""
     timeout: Positive = 10.0
+    """s without a reading after which the sensor counts as silent."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
+    """The driver's own settings."""
 
 
 class Link(Table, frozen=True):
-    """``[link]``: the MAVLink side.
-
-    Attributes
-    ----------
-    url : str
-        As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and ``HOST:PORT`` or
-        ``[IPV6]:PORT``, or a serial device.
-    system : int
-        The vehicle's system id: ours, and the only one we listen to.
-    component : int
-        Our own component id; 191 is an onboard computer.
-    autopilot : int
-        The autopilot's component id.
-    baudrate : int
-        bit/s, where the link is a serial device.
-    signing_key : str or None
-        File of 32 bytes; packets are signed and unsigned ones refused.
-    others_rate : float
-        kB/s that all peers but the autopilot's get together, on ``udpin`` and ``tcpin``.
-    parameters : str or None
-        File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a
-        configuration called ``bridge.toml``.
-    """
+    """``[link]``: the MAVLink side."""
 
     url: Name
+    """As in the MAVLink world: ``udpin:``, ``udpout:``, ``tcp:``, ``tcpin:`` and ``HOST:PORT`` or
+    ``[IPV6]:PORT``, or a serial device."""
     system: SystemId = 1
+    """The vehicle's system id: ours, and the only one we listen to."""
     component: SystemId = 191
+    """Our own component id; 191 is an onboard computer."""
     autopilot: SystemId = 1
+    """The autopilot's component id."""
     baudrate: Baudrate = 57600
+    """bit/s, where the link is a serial device."""
     signing_key: Name | None = None
+    """File of 32 bytes; packets are signed and unsigned ones refused."""
     others_rate: NotNegative = 1000.0
+    """kB/s that all peers but the autopilot's get together, on ``udpin`` and ``tcpin``."""
     parameters: Name | None = None
+    """File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a
+    configuration called ``bridge.toml``."""
 
     def __post_init__(self) -> None:
         if self.component == self.autopilot:
@@ -105,34 +84,24 @@ class Telemetry(Table, frozen=True):
     """``[telemetry.NAME]``: a field of a message that becomes the parameter NAME.
 
     ``value = scale * message.field + offset``.
-
-    Attributes
-    ----------
-    message : str
-        The MAVLink message, ``NAMED_VALUE_FLOAT``.
-    field : str
-        One of its fields, also with an index: ``actuator[2]``.
-    match : dict
-        Values that other fields of the message must have.
-    scale, offset : float
-        As above.
-    unit : str
-        Of the parameter, as in the calibration.
-    max_age : float
-        s; an older value is stale.
-    component : int or None
-        Only what this component sends counts; without it, the autopilot's, else what the first sends that is
-        heard.
     """
 
     message: str
+    """The MAVLink message, ``NAMED_VALUE_FLOAT``."""
     field: str
+    """One of its fields, also with an index: ``actuator[2]``."""
     match: dict[str, str | int | float] = msgspec.field(default_factory=dict)
+    """Values that other fields of the message must have."""
     scale: float = 1.0
     offset: float = 0.0
+    """`scale`, `offset`: As above."""
     unit: str = ""
+    """Of the parameter, as in the calibration."""
     max_age: Positive = 30.0
+    """s; an older value is stale."""
     component: SystemId | None = None
+    """Only what this component sends counts; without it, the autopilot's, else what the first sends that is
+    heard."""
 
     def __post_init__(self) -> None:
         if not 0.0 < abs(self.scale) < inf:
@@ -142,104 +111,69 @@ class Telemetry(Table, frozen=True):
 
 
 class CalibrationFile(Table, frozen=True):
-    """``[calibration]``: what to correct with.
-
-    Attributes
-    ----------
-    file : str
-        The ``cal.json``.
-    """
+    """``[calibration]``: what to correct with."""
 
     file: Name
+    """The ``cal.json``."""
 
 
 class Align(Table, frozen=True):
-    """``[align]``: one time base for channels and telemetry; each key is also a MAVLink parameter.
-
-    Attributes
-    ----------
-    filter_delay : float
-        s by which the anti-alias filter delays the channels.
-    gap_factor : float
-        A pause longer than this many sample periods is a gap.
-    moving_rate : float
-        A parameter that changes faster than this fraction of its calibrated range per second is moving.
-    settle_time : float
-        s after a movement during which samples stay flagged.
-    stale_growth : float
-        nT/s by which the sigma grows with the age of stale telemetry.
-    turn_on_sigma : float
-        nT, 1-sigma, by which the sensor's offset changes at every power-on.
-    reference_sigma : float
-        nT, 1-sigma of the Earth's total field about the main field: a corrected field beyond five of them is
-        ``implausible``.
-    """
+    """``[align]``: one time base for channels and telemetry; each key is also a MAVLink parameter."""
 
     filter_delay: NotNegative = 0.0
+    """s by which the anti-alias filter delays the channels."""
     gap_factor: Annotated[float, Meta(gt=1, le=1e9)] = 2.5
+    """A pause longer than this many sample periods is a gap."""
     moving_rate: Positive = 0.005
+    """A parameter that changes faster than this fraction of its calibrated range per second is moving."""
     settle_time: NotNegative = 0.0
+    """s after a movement during which samples stay flagged."""
     stale_growth: NotNegative = 1.0
+    """nT/s by which the sigma grows with the age of stale telemetry."""
     turn_on_sigma: NotNegative = 20.0
+    """nT, 1-sigma, by which the sensor's offset changes at every power-on."""
     reference_sigma: Positive = 145.0
+    """nT, 1-sigma of the Earth's total field about the main field: a corrected field beyond five of them is
+    ``implausible``."""
 
 
 class Navigation(Table, frozen=True):
-    """``[navigation]``: the corrected field against an anomaly map.
-
-    Attributes
-    ----------
-    map : str
-        The anomaly grid.
-    fix : str
-        In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4, the
-        default), ``ODOMETRY`` (ArduPilot) or ``GLOBAL_POSITION_SENSOR`` (PX4).
-    rate : float
-        Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for
-        ``ODOMETRY``, else 0.
-    depth : float
-        m, of the deepest dives; a map whose altitude is known is continued to half this depth.
-    options : dict
-        Prior uncertainties and settings of the position filter: :class:`magbridge.navigate.Options`.
-    """
+    """``[navigation]``: the corrected field against an anomaly map."""
 
     map: Name
+    """The anomaly grid."""
     fix: str = "EXTERNAL_POSITION_ESTIMATE"
+    """In which message a fix goes to the autopilot: ``EXTERNAL_POSITION_ESTIMATE`` (ArduPilot and PX4, the
+    default), ``ODOMETRY`` (ArduPilot) or ``GLOBAL_POSITION_SENSOR`` (PX4)."""
     rate: NotNegative | None = None
+    """Hz of the fixes, dead-reckoned between updates; 0 is with each update. Default 5 for ``ODOMETRY``, else
+    0."""
     depth: NotNegative = 0.0
+    """m, of the deepest dives; a map whose altitude is known is continued to half this depth."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
+    """Prior uncertainties and settings of the position filter: :class:`magbridge.navigate.Options`."""
 
 
 class Learning(Table, frozen=True):
-    """``[learning]``: the calibration's coefficients are learned in flight.
-
-    Attributes
-    ----------
-    enabled : bool
-        Whether it learns from the start; ``MB_LEARN`` changes that over the link.
-    reference : str
-        What the corrected field is compared with: ``igrf``, or an anomaly grid's file, above the IGRF.
-    map_sigma, position_sigma : float
-        nT and m: how well that grid is known, and the vehicle's position on it.
-    prior : str or None
-        Without ``[calibration]``: a calibration file that says what is expected of a vehicle of this class.
-    ranges : dict of str to tuple of 2 float
-        Without both: the parameters of moving masses, each with the least and the greatest value. What is
-        expected is then what any vehicle can have.
-    max_rate : float
-        Hz: samples that are learned from, at most.
-    keep : str or None
-        Folder for the calibrations that were learned; by default that of the calibration's file.
-    """
+    """``[learning]``: the calibration's coefficients are learned in flight."""
 
     enabled: bool = False
+    """Whether it learns from the start; ``MB_LEARN`` changes that over the link."""
     reference: Name = "igrf"
+    """What the corrected field is compared with: ``igrf``, or an anomaly grid's file, above the IGRF."""
     map_sigma: NotNegative = 20.0
     position_sigma: NotNegative = 100.0
+    """`map_sigma`, `position_sigma`: nT and m: how well that grid is known, and the vehicle's position on it.
+    """
     prior: Name | None = None
+    """Without ``[calibration]``: a calibration file that says what is expected of a vehicle of this class."""
     ranges: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
+    """Without both: the parameters of moving masses, each with the least and the greatest value. What is
+    expected is then what any vehicle can have."""
     max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
+    """Hz: samples that are learned from, at most."""
     keep: Name | None = None
+    """Folder for the calibrations that were learned; by default that of the calibration's file."""
 
     def __post_init__(self) -> None:
         for name, (low, high) in self.ranges.items():
@@ -248,21 +182,14 @@ class Learning(Table, frozen=True):
 
 
 class Log(Table, frozen=True):
-    """``[log]``: where the telemetry log goes, and when a new file begins.
-
-    Attributes
-    ----------
-    directory : str
-        The folder.
-    max_size : float
-        MB of a file.
-    max_age : float
-        h that a file covers.
-    """
+    """``[log]``: where the telemetry log goes, and when a new file begins."""
 
     directory: str
+    """The folder."""
     max_size: Positive = 64.0
+    """MB of a file."""
     max_age: Positive = 24.0
+    """h that a file covers."""
 
 
 class Config(Table, frozen=True):

@@ -63,13 +63,13 @@ def configuration() -> Iterator[str]:
     from magbridge.config import Config  # noqa: PLC0415 - imports the program only where pages are made
     from magbridge.navigate import Options  # noqa: PLC0415
     from magbridge.sensors import DRIVERS  # noqa: PLC0415
-    from magbridge.sensors.options import attributes_of, documented_of, options_of  # noqa: PLC0415
+    from magbridge.sensors.options import attributes_of, options_of  # noqa: PLC0415
 
     yield "# bridge.toml\n\nWhat every key means, its type and its default. Paths are relative to the file.\n"
     for name, held in get_type_hints(Config).items():
         table = next((one for one in (held, *get_args(held)) if _is_table(one)), None)
         if table is not None:
-            yield from (f"## {name}", "", documented_of(table), "")
+            yield from (f"## {name}", "", " ".join(str(table.__doc__).split()), "")
             yield from _keys(attributes_of(table))
         elif name == "publish":
             yield from (

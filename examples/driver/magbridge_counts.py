@@ -21,18 +21,12 @@ LONGEST = 64
 
 
 class CountsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of ``[sensor.options]``; ``magbridge drivers counts`` shows them.
-
-    Attributes
-    ----------
-    nt_per_count : float
-        nT per count.
-    full_scale : int
-        Counts at which a channel saturates; 0 where it does not.
-    """
+    """Keys of ``[sensor.options]``; ``magbridge drivers counts`` shows them."""
 
     nt_per_count: Annotated[float, msgspec.Meta(gt=0)] = 1.0
+    """nT per count."""
     full_scale: Annotated[int, msgspec.Meta(ge=0)] = 0
+    """Counts at which a channel saturates; 0 where it does not."""
 
 
 class Counts(Driver):

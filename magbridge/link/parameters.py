@@ -16,27 +16,19 @@ __all__ = [
 
 
 class Tunable(msgspec.Struct, frozen=True):
-    """One parameter.
-
-    Attributes
-    ----------
-    name : str
-        On the link, at most 16 characters.
-    key : str
-        In the configuration.
-    default, low, high : float
-        In `unit`; `low` and `high` are the limits, themselves allowed.
-    doc : str
-        One line.
-    """
+    """One parameter."""
 
     name: str
+    """On the link, at most 16 characters."""
     key: str
+    """In the configuration."""
     default: float
     low: float
     high: float
+    """`default`, `low`, `high`: In `unit`; `low` and `high` are the limits, themselves allowed."""
     unit: str
     doc: str
+    """One line."""
 
 
 def alignment(align: Align) -> list[Tunable]:

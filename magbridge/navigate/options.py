@@ -20,51 +20,37 @@ LEG = 1_800.0
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How well things are known beforehand; all 1-sigma.
-
-    Attributes
-    ----------
-    start_sigma : float
-        m, of the first position, each axis.
-    current_sigma, current_time : float
-        m/s and s: the current, and its correlation time.
-    drift : float
-        m/sqrt(s), random walk of the dead reckoning.
-    bias_sigma, bias_time : float
-        nT and s: the error that the calibration leaves, and its correlation time.
-    map_sigma, map_length : float
-        nT and m: the map's error, and its correlation length. Independent errors of single nodes are the
-        grid's own sigma.
-    noise : float or None
-        nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
-        average out. None: all of it is white.
-    noise_time : float
-        s, correlation time of that noise; noise that lasts longer than a few intervals belongs to the bias.
-    gate : float
-        Largest innovation squared over its variance that is taken in.
-    interval : float
-        s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
-        correlation length.
-    sigma_limit : float
-        m, the largest 1-sigma of a valid position.
-    doubt : float
-        Odds at which another explanation of the field replaces the filter's.
-    """
+    """How well things are known beforehand; all 1-sigma."""
 
     start_sigma: Positive = 50.0
+    """m, of the first position, each axis."""
     current_sigma: NotNegative = 0.1
     current_time: Positive = 21_600.0
+    """`current_sigma`, `current_time`: m/s and s: the current, and its correlation time."""
     drift: NotNegative = 0.2
+    """m/sqrt(s), random walk of the dead reckoning."""
     bias_sigma: NotNegative = 5.0
     bias_time: Positive = 21_600.0
+    """`bias_sigma`, `bias_time`: nT and s: the error that the calibration leaves, and its correlation time.
+    """
     map_sigma: NotNegative = 2.0
     map_length: Positive = 1_000.0
+    """`map_sigma`, `map_length`: nT and m: the map's error, and its correlation length. Independent errors of
+    single nodes are the grid's own sigma."""
     noise: NotNegative | None = None
+    """nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
+    average out. None: all of it is white."""
     noise_time: NotNegative = 0.0
+    """s, correlation time of that noise; noise that lasts longer than a few intervals belongs to the bias."""
     gate: Positive = 16.0
+    """Largest innovation squared over its variance that is taken in."""
     interval: NotNegative = 20.0
+    """s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
+    correlation length."""
     sigma_limit: Positive = 500.0
+    """m, the largest 1-sigma of a valid position."""
     doubt: Positive = 2_000.0
+    """Odds at which another explanation of the field replaces the filter's."""
 
 
 def informed(options: Options, calibration: Calibration, sigma: float) -> Options:

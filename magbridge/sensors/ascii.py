@@ -88,53 +88,36 @@ KINDS: dict[str, Callable[[bytes], float]] = {
 
 
 class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[sensor.options]`` of a line protocol.
-
-    Attributes
-    ----------
-    columns : list of str
-        Meaning of each column: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-``
-        for a column to ignore; ``*`` at the end for any number of further ones.
-    separator : str
-        Between columns; empty for any number of blanks or tabs.
-    prefix : str
-        The text that every line begins with.
-    terminator : str
-        The last byte of a line; a carriage return before it is dropped.
-    unit : str
-        Of the channels: nT, uT, mT, T, pT, fT, G, mG, uG, or "counts".
-    scale : float
-        Factor on the channels, with its sign; for counts: nT per count.
-    range : float or None
-        nT at which a channel saturates.
-    checksum : str or None
-        From :data:`CHECKSUMS`: in hexadecimal after a ``*`` at the end of the line.
-    time_unit : {"s", "ms", "us"}
-        Of the column ``time``.
-    time_modulo : float
-        s, at which the device's time wraps; 0: never.
-    sequence_modulo : int
-        Where the column ``sequence`` wraps; 0: never.
-    rate : float
-        Lines per second of a device without a clock, to remove the jitter of their arrival; 0: it sends when
-        it likes, and each line is dated by its arrival.
-    start : list of str
-        Commands to send once the port is open.
-    """
+    """``[sensor.options]`` of a line protocol."""
 
     columns: list[str] = msgspec.field(default_factory=lambda: ["x", "y", "z"])
+    """Meaning of each column: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-``
+    for a column to ignore; ``*`` at the end for any number of further ones."""
     separator: str = ""
+    """Between columns; empty for any number of blanks or tabs."""
     prefix: str = ""
+    """The text that every line begins with."""
     terminator: Literal["\n", "\r"] = "\n"
+    """The last byte of a line; a carriage return before it is dropped."""
     unit: Literal["nT", "uT", "mT", "T", "pT", "fT", "G", "mG", "uG", "counts"] = "nT"
+    """Of the channels."""
     scale: float = 1.0
+    """Factor on the channels, with its sign; for counts: nT per count."""
     range: Positive | None = None
+    """nT at which a channel saturates."""
     checksum: Literal["nmea", "xor", "sum", "crc32"] | None = None
+    """From :data:`CHECKSUMS`: in hexadecimal after a ``*`` at the end of the line."""
     time_unit: Literal["s", "ms", "us"] = "s"
+    """Of the column ``time``."""
     time_modulo: NotNegative = 0.0
+    """s, at which the device's time wraps; 0: never."""
     sequence_modulo: Annotated[int, Meta(ge=0)] = 0
+    """Where the column ``sequence`` wraps; 0: never."""
     rate: NotNegative = 0.0
+    """Lines per second of a device without a clock, to remove the jitter of their arrival; 0: it sends when
+    it likes, and each line is dated by its arrival."""
     start: list[str] = msgspec.field(default_factory=list)
+    """Commands to send once the port is open."""
 
     def __post_init__(self) -> None:
         named = self.columns[:-1] if self.columns[-1:] == ["*"] else self.columns

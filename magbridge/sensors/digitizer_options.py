@@ -15,24 +15,16 @@ Positive = Annotated[float, Meta(gt=0)]
 
 
 class DigitizerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[sensor.options]`` of the digitizer.
-
-    Attributes
-    ----------
-    sensitivity : float
-        V/nT of the fluxgate's outputs, from its certificate (50 mV/µT is 5e-5).
-    reference_voltage : float
-        V at which the converter is at full scale.
-    gain : float
-        Of the amplifier between fluxgate and converter; below 1 for a divider.
-    full_scale : float or None
-        nT at which the fluxgate itself saturates, where that is before the converter.
-    """
+    """``[sensor.options]`` of the digitizer."""
 
     sensitivity: Positive
+    """V/nT of the fluxgate's outputs, from its certificate (50 mV/µT is 5e-5)."""
     reference_voltage: Positive = 2.5
+    """V at which the converter is at full scale."""
     gain: Positive = 1.0
+    """Of the amplifier between fluxgate and converter; below 1 for a divider."""
     full_scale: Positive | None = None
+    """nT at which the fluxgate itself saturates, where that is before the converter."""
 
     @property
     def nt_per_count(self) -> float:

@@ -41,21 +41,14 @@ LINE_LIMIT = 64
 
 
 class Hmr2300Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[sensor.options]`` of the HMR2300.
-
-    Attributes
-    ----------
-    output : {"binary", "ascii"}
-        Set at start-up. At 9600 bit/s ASCII reaches 30 readings/s, binary 100; at 19,200 50 and 154.
-    rate : int
-        Readings per second; only the device's own rates.
-    device : int
-        Number of the device on an RS-485 line; 99 speaks to all.
-    """
+    """``[sensor.options]`` of the HMR2300."""
 
     output: Literal["binary", "ascii"] = "binary"
+    """Set at start-up. At 9600 bit/s ASCII reaches 30 readings/s, binary 100; at 19,200 50 and 154."""
     rate: Literal[10, 20, 25, 30, 40, 50, 60, 100, 123, 154] = 20
+    """Readings per second; only the device's own rates."""
     device: Annotated[int, Meta(ge=0, le=99)] = 99
+    """Number of the device on an RS-485 line; 99 speaks to all."""
 
 
 class Hmr2300:

@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
-from typing import Any, NamedTuple
+from itertools import pairwise
+from textwrap import dedent
+from types import NoneType, UnionType
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from magbridge.plugins import plugins
 from magbridge.sensors import DRIVERS, driver_class
 
-__all__ = ["Option", "attributes_of", "documented_of", "driver_names", "options_of"]
+__all__ = ["Option", "attributes_of", "driver_names", "options_of"]
 
 
 class Option(NamedTuple):
-    """A key of ``[sensor.options]``.
-
-    Attributes
-    ----------
-    name : str
-    kind : str
-        Its type, as the driver's documentation says it.
-    default : object
-        ``msgspec.NODEFAULT`` where it is required.
-    meaning : str
-    """
+    """A key of ``[sensor.options]``."""
 
     name: str
     kind: str
+    """Its type, in words."""
     default: Any
+    """``msgspec.NODEFAULT`` where it is required."""
     meaning: str
 
     @property
@@ -51,18 +48,23 @@ def options_of(driver: str) -> list[Option]:
 
 
 def attributes_of(struct: Any) -> list[Option]:
-    """Return the fields of a msgspec struct with what its docstring tells of each."""
-    documented = _attributes(struct.__doc__ or "")
+    """Return the fields of a msgspec struct with what its source says below each."""
+    kinds, meanings = get_type_hints(struct), _meanings(struct)
     return [
-        Option(name, kind, _default(field), meaning)
-        for field in msgspec.structs.fields(struct)
-        for name, (kind, meaning) in [(field.name, documented.get(field.name, ("", "")))]
+        Option(one.name, _words(kinds[one.name]), _default(one), meanings.get(one.name, ""))
+        for one in msgspec.structs.fields(struct)
     ]
 
 
-def documented_of(struct: Any) -> str:
-    """Return a struct's docstring up to its attributes, as one paragraph."""
-    return " ".join((struct.__doc__ or "").partition("Attributes\n")[0].split())
+def _words(kind: Any) -> str:
+    """Return a type as a reader of a configuration knows it."""
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(map(repr, get_args(kind)))}"
+    if get_origin(kind) in (Union, UnionType):
+        return " or ".join(map(_words, get_args(kind)))
+    if kind is NoneType:
+        return "None"
+    return str(kind).replace("typing.", "") if get_args(kind) else kind.__name__
 
 
 def _default(field: Any) -> Any:
@@ -71,16 +73,19 @@ def _default(field: Any) -> Any:
     return field.default
 
 
-def _attributes(docstring: str) -> dict[str, tuple[str, str]]:
-    """Return name -> type and meaning of the section 'Attributes' of a numpydoc docstring."""
-    section = docstring.partition("Attributes\n")[2]
-    found: dict[str, tuple[str, str]] = {}
-    names: list[str] = []  # several may share a line: ``scale, offset : float``
-    for line in section.splitlines():
-        if match := re.fullmatch(r" {4}(\w+(?:, \w+)*) : (.+)", line):
-            names = match[1].split(", ")
-            found |= dict.fromkeys(names, (match[2], ""))
-        elif names and line.startswith(" " * 8):
-            kind, meaning = found[names[0]]
-            found |= dict.fromkeys(names, (kind, f"{meaning} {line.strip()}".strip()))
+def _meanings(struct: Any) -> dict[str, str]:
+    """Return field -> the string below it; one that begins with several names is of all of them."""
+    try:
+        (defined,) = ast.parse(dedent(inspect.getsource(struct))).body
+    except OSError:  # a package without its source
+        return {}
+    assert isinstance(defined, ast.ClassDef)
+    found: dict[str, str] = {}
+    for field, below in pairwise(defined.body):
+        match field, below:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(value=str(text))):
+                names, _, meaning = text.partition(": ")
+                several = re.fullmatch(r"`\w+`(, `\w+`)+", names)
+                shared = re.findall(r"\w+", names) if several else [name]
+                found |= dict.fromkeys(shared, " ".join((meaning if several else text).split()))
     return found

@@ -28,27 +28,18 @@ REMEMBERED = 256
 
 
 class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[sensor.options]`` of a TIO device.
-
-    Attributes
-    ----------
-    columns : tuple of 3 str
-        The three channels, as the device calls them.
-    temperature : str
-        The column with the temperature in degC, if there is one.
-    unit : str or None
-        Of the channels, instead of the one that the device states.
-    route : str
-        Which device of a tree, as in ``/0/2``.
-    range : float
-        nT at which a channel saturates.
-    """
+    """``[sensor.options]`` of a TIO device."""
 
     columns: tuple[str, str, str] = ("vector.x", "vector.y", "vector.z")
+    """The three channels, as the device calls them."""
     temperature: str = ""
+    """The column with the temperature in degC, if there is one."""
     unit: str | None = None
+    """Of the channels, instead of the one that the device states."""
     route: Annotated[str, Meta(pattern=r"^/?(\d+(/\d+)*/?)?$")] = "/"
+    """Which device of a tree, as in ``/0/2``."""
     range: Annotated[float, Meta(gt=0)] = 100_000.0
+    """nT at which a channel saturates."""
 
     def __post_init__(self) -> None:
         if self.unit is not None and self.unit not in NT_PER_UNIT:

@@ -21,39 +21,27 @@ __all__ = ["Gridded", "Posterior"]
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The field given its size and length.
-
-    Attributes
-    ----------
-    weight : float
-        How plausible these are.
-    field : Matern
-    size, sigma : float
-        nT, the field's standard deviation where the roughness is 1, and the noise's.
-    w : (nodes,) array
-        The field's coefficients.
-    follow : (nodes, r) array
-        How they move with 1-sigma of what is uncertain elsewhere: levels, slow changes, the calibration.
-    precision : csr_array
-        (nodes, nodes), in units of the noise's.
-    inverse : NearInverse
-        Of it.
-    levels : (n,) array
-        nT, what was taken off each sample: its line's level and the slow part, about their mean.
-    mean : float
-        nT, of the field over the samples: a level, which no survey knows and which is not doubt of the map.
-    """
+    """The field given its size and length."""
 
     weight: float
+    """How plausible these are."""
     field: Matern
     size: float
     sigma: float
+    """`size`, `sigma`: nT, the field's standard deviation where the roughness is 1, and the noise's."""
     w: FloatArray
+    """(nodes,): The field's coefficients."""
     follow: FloatArray
+    """(nodes, r): How they move with 1-sigma of what is uncertain elsewhere: levels, slow changes, the
+    calibration."""
     precision: csr_array
+    """(nodes, nodes), in units of the noise's."""
     inverse: NearInverse
+    """Of it."""
     levels: FloatArray
+    """(n,), nT, what was taken off each sample: its line's level and the slow part, about their mean."""
     mean: float
+    """nT, of the field over the samples: a level, which no survey knows and which is not doubt of the map."""
 
     def at(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance, (n,) each, of splines B (n, nodes)."""
@@ -69,33 +57,22 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Gridded:
-    """A gridded survey: ask it for the field at any place.
-
-    Attributes
-    ----------
-    posteriors : tuple of Posterior
-        Of the likeliest size and length first, then of others that the data leave open.
-    roughness : Roughness
-        How the field's size varies from place to place.
-    rho : float
-        The noise's autocorrelation.
-    middle : float
-        m, depth at which the map holds.
-    mean : float
-        nT, of all samples, and of the map over them.
-    kept : (n,) array
-        Which samples are no outliers.
-    widths : Widths
-        As the evidence chose them.
-    """
+    """A gridded survey: ask it for the field at any place."""
 
     posteriors: tuple[Posterior, ...]
+    """Of the likeliest size and length first, then of others that the data leave open."""
     roughness: Roughness
+    """How the field's size varies from place to place."""
     rho: float
+    """The noise's autocorrelation."""
     middle: float
+    """m, depth at which the map holds."""
     mean: float
+    """nT, of all samples, and of the map over them."""
     kept: BoolArray
+    """(n,): Which samples are no outliers."""
     widths: Widths
+    """As the evidence chose them."""
 
     @property
     def field(self) -> Matern:

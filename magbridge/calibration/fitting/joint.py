@@ -129,27 +129,18 @@ def add_up(pieces: Iterable[Linear]) -> Sums:
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """What remains for z, and how w follows from it.
-
-    Attributes
-    ----------
-    quadratic : Quadratic
-        In z.
-    log_evidence : float
-        What eliminating w and whitening add to it.
-    precision : csr_array
-        N, in units of the noise's.
-    shift : (nodes,) array
-        w at z = 0.
-    follow : (nodes, q) array
-        dw/dz.
-    """
+    """What remains for z, and how w follows from it."""
 
     quadratic: Quadratic
+    """In z."""
     log_evidence: float
+    """What eliminating w and whitening add to it."""
     precision: csr_array
+    """N, in units of the noise's."""
     shift: FloatArray
+    """(nodes,), w at z = 0."""
     follow: FloatArray
+    """(nodes, q), dw/dz."""
 
     def field(self, z: FloatArray) -> FloatArray:
         """Return w (nodes,) at z (q,)."""

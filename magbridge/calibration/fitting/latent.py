@@ -49,27 +49,19 @@ NOTHING = PriorFamily(
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Unknowns of one kind that share a width.
-
-    Attributes
-    ----------
-    name : str
-    functions : (n, r) array, or Waves
-        What they add to the reference at every sample, nT a unit.
-    shape : (r,) array
-        Width of each over the group's.
-    width, spread : float
-        The group's width, in the unknowns' unit, and the 1-sigma of its logarithm; 0: it is given.
-    offered : bool
-        Whether it stays only where the log needs it.
-    """
+    """Unknowns of one kind that share a width."""
 
     name: str
     functions: FloatArray | Waves
+    """(n, r): What they add to the reference at every sample, nT a unit."""
     shape: FloatArray
+    """(r,): Width of each over the group's."""
     width: float
     spread: float = 0.0
+    """`width`, `spread`: The group's width, in the unknowns' unit, and the 1-sigma of its logarithm; 0: it is
+    given."""
     offered: bool = False
+    """Whether it stays only where the log needs it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,36 +26,24 @@ __all__ = ["Fit", "assemble"]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The result of a fit.
-
-    Attributes
-    ----------
-    calibration : Calibration
-    residual : (n,) array
-        nT in the sensor's own units: ``(F - H_e) / |A^T u|``.
-    warnings : tuple of str
-        What the data could not determine, in words for a pilot.
-    details : dict
-        Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
-        each estimable combination from the data alone (nT).
-    samples : Samples
-        The data as fitted, for :mod:`.identify`.
-    open : tuple of str
-        What the track leaves open, which is a reason for an error that is large.
-    information : Information or None
-        What the data alone say of the coefficients; None where the method's prior is none of all of them.
-    creep : Creep or None
-        How the sensor's offset crept meanwhile, where the data show that it did.
-    """
+    """The result of a fit."""
 
     calibration: Calibration
     residual: FloatArray
+    """(n,), nT in the sensor's own units: ``(F - H_e) / |A^T u|``."""
     warnings: tuple[str, ...]
+    """What the data could not determine, in words for a pilot."""
     details: dict[str, Any]
+    """Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
+    each estimable combination from the data alone (nT)."""
     samples: Samples
+    """The data as fitted, for :mod:`.identify`."""
     open: tuple[str, ...] = ()
+    """What the track leaves open, which is a reason for an error that is large."""
     information: Information | None = None
+    """What the data alone say of the coefficients; None where the method's prior is none of all of them."""
     creep: Creep | None = None
+    """How the sensor's offset crept meanwhile, where the data show that it did."""
 
     def __repr__(self) -> str:
         count = f", {counted(len(self.calibration.warnings), 'warning')}" if self.calibration.warnings else ""

@@ -58,26 +58,17 @@ WAVES = 96
 
 @dataclass(frozen=True, eq=False)
 class Matern:
-    """A field of unit variance on nodes.
-
-    Attributes
-    ----------
-    nodes : Nodes
-    length : float
-        m, over which the correlation falls (Matern's).
-    alpha : int
-        One of :data:`SMOOTHNESS`.
-    harmonic : bool
-        Whether it falls off upwards as Laplace's equation demands; else it is the same at every depth.
-    buried : bool
-        Whether its spectrum is that of sources at a depth, of alpha factors; else Matern's.
-    """
+    """A field of unit variance on nodes."""
 
     nodes: Nodes
     length: float
+    """m, over which the correlation falls (Matern's)."""
     alpha: int
+    """One of :data:`SMOOTHNESS`."""
     harmonic: bool = False
+    """Whether it falls off upwards as Laplace's equation demands; else it is the same at every depth."""
     buried: bool = False
+    """Whether its spectrum is that of sources at a depth, of alpha factors; else Matern's."""
 
     @property
     def _kappa2(self) -> FloatArray:
