@@ -102,11 +102,6 @@ def kept_path(config: Config) -> Path | None:
 class Learning:
     """Speaks for a learner.
 
-    Parameters
-    ----------
-    learner : Learner
-    component : Component
-
     Attributes
     ----------
     to_keep : deque of Calibration

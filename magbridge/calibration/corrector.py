@@ -32,10 +32,6 @@ MARGIN = 0.02
 class Corrector:
     """Corrects sample after sample, as the bridge does.
 
-    Parameters
-    ----------
-    calibration : Calibration
-
     Notes
     -----
     While positions and the regressors of effects stay the same, only :func:`.arithmetic.apply` runs anew.

@@ -111,35 +111,14 @@ class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration with its uncertainty. It is immutable: a fit returns a new one.
-
-    Attributes
-    ----------
-    parameters : tuple of Parameter
-    terms, effects : tuple of PositionTerm, tuple of Effect
-        Coefficients stand in this order.
-    coefficients : (K,) array
-        nT (a dipole's displacement: m; an effect's: as its class says).
-    covariance : (K, K) array
-    noise, reference, sensor, boresight, runs
-        See their classes.
-    method : str
-        Which fit made it; ``"none"`` marks every sample as uncalibrated.
-    inputs : dict
-        File -> SHA-256 of what it was made from.
-    software : str
-        Version that made it.
-    warnings : tuple of str
-        Why the data that it was fitted to do not support it; empty where they do.
-    level : tuple of float
-        How the first coefficients move together where the level of the reference is off by 1-sigma (nT);
-        empty where that was known.
-    """
+    """A calibration with its uncertainty. It is immutable: a fit returns a new one."""
 
     parameters: tuple[Parameter, ...]
     terms: tuple[PositionTerm, ...]
     coefficients: FloatArray
+    """(K,) of the terms, then the effects, nT (a dipole's displacement: m; an effect's: see its class)."""
     covariance: FloatArray
+    """(K, K)."""
     noise: Noise
     reference: Reference
     effects: tuple[Effect, ...] = ()
@@ -147,10 +126,16 @@ class Calibration:
     boresight: Boresight | None = None
     runs: tuple[Run, ...] = ()
     method: str = ""
+    """Which fit made it; ``"none"`` marks every sample as uncalibrated."""
     inputs: dict[str, str] = field(default_factory=dict)
+    """File -> SHA-256 of what it was made from."""
     software: str = ""
+    """Version that made it."""
     warnings: tuple[str, ...] = ()
+    """Why the data that it was fitted to do not support it; empty where they do."""
     level: tuple[float, ...] = ()
+    """How the first coefficients move together where the level of the reference is off by 1-sigma (nT); empty
+    where that was known."""
 
     def __post_init__(self) -> None:
         names = tuple(parameter.name for parameter in self.parameters)

@@ -40,10 +40,6 @@ MEMORY: Final = 500
 class Judge:
     """Follows the predictions of both.
 
-    Parameters
-    ----------
-    nuisance : Nuisance
-
     Attributes
     ----------
     better, worse : float

@@ -140,9 +140,9 @@ class Component:
             PARAM_SET=self._if_ours(self._service.write),
             TIMESYNC=self._timesync,
             HEARTBEAT=self._heartbeat,
-            LOG_ERASE=self._erase,
+            LOG_ERASE=self._if_to_us_alone(self._erase),
             **dict.fromkeys(("COMMAND_LONG", "COMMAND_INT"), self._command),
-            **dict.fromkeys(FILE_REQUESTS, self._file_request),
+            **dict.fromkeys(FILE_REQUESTS, self._if_to_us_alone(self.file_requests.append)),
         )
         for name, report in by_clock.items():
             self._message_rates.send_by_clock(name, report)
@@ -222,17 +222,16 @@ class Component:
         if self._authority.heartbeat(message):
             self._service.greet((message.system, message.component))
 
-    def _file_request(self, message: Message) -> None:
-        """Keep a request for a file, if it is to us alone: the autopilot has files, too."""
-        target = message["target_system"], message["target_component"]
-        if target == (self._link.system, self._link.component):
-            self.file_requests.append(message)
+    def _if_to_us_alone(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
+        """Return the handler of what the autopilot has as well: files, and logs."""
+        us = self._link.system, self._link.component
+        return lambda message: (
+            handler(message) if (message["target_system"], message["target_component"]) == us else None
+        )
 
-    def _erase(self, message: Message) -> None:
-        target = message["target_system"], message["target_component"]
-        if target == (self._link.system, self._link.component):
-            text = "logs are not erased over the link"
-            self.announcer.state("erase", text, MAV_SEVERITY.WARNING, recurring=True)
+    def _erase(self, _: Message) -> None:
+        text = "logs are not erased over the link"
+        self.announcer.state("erase", text, MAV_SEVERITY.WARNING, recurring=True)
 
     def _timesync(self, message: Message) -> None:
         now_us = self.codec.now_us

@@ -7,7 +7,7 @@ cannot be granted gets the protocol's own error.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from enum import IntEnum
 from struct import Struct
 from typing import BinaryIO, NamedTuple
@@ -42,27 +42,19 @@ class Opcode(IntEnum):
     LIST = 3
     OPEN_READ = 4
     READ = 5
-    CREATE = 6
-    WRITE = 7
-    REMOVE = 8
-    CREATE_FOLDER = 9
-    REMOVE_FOLDER = 10
-    OPEN_WRITE = 11
-    TRUNCATE = 12
-    RENAME = 13
     CRC32 = 14
     BURST = 15
     ACK = 128
     NAK = 129
 
 
-WRITES = range(Opcode.CREATE, Opcode.CRC32)
+WRITES = range(6, 14)
+"""Create, write, remove, make a folder, truncate, rename ..."""
 
 
 class Error(IntEnum):
     """Why it was not granted."""
 
-    FAIL = 1
     FAIL_ERRNO = 2
     INVALID_SIZE = 3
     INVALID_SESSION = 4
@@ -303,15 +295,13 @@ class FtpServer:
             self._sessions.pop(key).file.close()
 
 
-class _no_such_file:  # noqa: N801 - a context manager, used as a function
+@contextmanager
+def _no_such_file() -> Iterator[None]:
     """Turn 'no such file', or a path that leads elsewhere, into the protocol's error."""
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (FileNotFoundError, PermissionError, UnicodeError)):
-            raise Refused(Error.FILE_NOT_FOUND) from error
+    try:
+        yield
+    except (FileNotFoundError, PermissionError, UnicodeError) as error:
+        raise Refused(Error.FILE_NOT_FOUND) from error
 
 
 def _described(one: Entry) -> bytes:

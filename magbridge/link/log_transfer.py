@@ -20,10 +20,6 @@ class LogTransfer:
     """Lists logs and sends their data.
 
     Logs are numbered from 1, the oldest, as they were when they were last listed.
-
-    Parameters
-    ----------
-    tree : Tree
     """
 
     def __init__(self, tree: Tree) -> None:

@@ -43,19 +43,7 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
 
 
 class MessageRates:
-    """Each message's rate, which is also a parameter.
-
-    Parameters
-    ----------
-    parameters : Parameters
-    timers : Timers
-    codec : Codec
-        Knows the time.
-
-    Attributes
-    ----------
-    by_name : dict of str to Rate
-    """
+    """Each message's rate, which is also a parameter."""
 
     def __init__(self, parameters: Parameters, timers: Timers, codec: Codec) -> None:
         self._parameters, self._timers, self._codec = parameters, timers, codec

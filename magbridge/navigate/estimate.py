@@ -37,11 +37,6 @@ SPREADS = (2.0, 4.0, 2.0, 8.0)
 class Estimate:
     """Position around a dead-reckoned track, from blocks of samples and fixes given in order of time.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-    options : Options
-
     Attributes
     ----------
     options : Options

@@ -37,11 +37,6 @@ FRESH = 3.0
 class Navigator:
     """Position from the total field and a map, around a dead-reckoned track.
 
-    Parameters
-    ----------
-    grid : AnomalyGrid
-    options : Options, optional
-
     Attributes
     ----------
     estimate : Estimate
