@@ -37,9 +37,9 @@ from magbridge.calibration.fitting.nominal import check_scales
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep, offered, with_creep, with_temperature
 from magbridge.calibration.fitting.pose import Vehicle, pose
-from magbridge.calibration.fitting.prior import Prior
+from magbridge.calibration.fitting.prior import Prior, PriorFamily
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.fitting.rounds import SEARCHED, WIDE, settled
+from magbridge.calibration.fitting.rounds import SEARCHED, SETTLED, WIDE, Rounds
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
 from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
@@ -92,7 +92,7 @@ def fit_in_place(
     groups = (*_groups(data, level), *offered(data))
     survey = SurveySamples(data, samples, groups, _drift(data, position_sigma))
     try:
-        found = settled(survey, posed.family)
+        found, survey = _settled(survey, posed.family)
     except np.linalg.LinAlgError as problem:
         raise CalibrationError("the fit to the survey has no answer: rock cannot be told apart") from problem
     prior, z = found.family.at(found.widths.eta), found.z
@@ -130,6 +130,37 @@ def _groups(data: Observations, level: float) -> tuple[Group, ...]:
     if len(shape):
         groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
     return tuple(groups)
+
+
+def _settled(survey: SurveySamples, own: PriorFamily) -> tuple[Answer, SurveySamples]:
+    """Return where the rounds come to rest, and the samples with the offers that the log needs.
+
+    Those of a long log come to rest with every second or tenth sample, and go on with all from there. What is
+    kept of the offers has shaped the field that was searched with it: another search without may do better.
+
+    Raises
+    ------
+    CalibrationError
+        They do not come to rest.
+    """
+    step = max(len(survey.kept) // SETTLED, 1)
+    best = Rounds(survey.thinned(step), own)
+    answer = best.settle()
+    for one in [group for group in best.survey.groups if group.offered]:
+        few = survey.thinned(step)
+        few.keep(tuple(group for group in few.groups if group.name in best.names - {one.name}))
+        other = Rounds(few, own)
+        try:
+            found = other.settle()
+        except (CalibrationError, np.linalg.LinAlgError):
+            continue
+        if other.worth(found) > best.worth(answer):
+            best, answer = other, found
+    if step == 1:
+        return answer, best.survey
+    survey.keep(tuple(group for group in survey.groups if group.name in best.names))
+    best.go_on(survey, step)
+    return best.settle(), survey
 
 
 def _drift(data: Observations, sigma: float) -> Drift | None:

@@ -20,6 +20,7 @@ from magbridge.calibration.fitting.prior import PriorFamily
 
 __all__ = [
     "CHUNK",
+    "LIKELIER",
     "NOTHING",
     "Columns",
     "Group",

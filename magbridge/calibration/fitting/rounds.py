@@ -19,14 +19,14 @@ from magbridge.calibration.fitting.field_search import (
     same_noise,
 )
 from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
-from magbridge.calibration.fitting.latent import Group, likeliest, with_groups
+from magbridge.calibration.fitting.latent import LIKELIER, Group, likeliest, with_groups
 from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.survey_samples import SurveySamples
 from magbridge.calibration.residual import Samples, residuals_of, robust_scale
 from magbridge.errors import CalibrationError
 from magbridge.field.place.matern import Matern
 
-__all__ = ["SEARCHED", "WIDE", "settled"]
+__all__ = ["SEARCHED", "SETTLED", "WIDE", "Rounds"]
 
 GUESSED = 2
 """Rounds before the field is searched: while the coefficients are far off, they look like rock and noise."""
@@ -53,27 +53,7 @@ MOST = 40_000
 """Nodes about all samples, at most."""
 
 
-def settled(survey: SurveySamples, own: PriorFamily) -> Answer:
-    """Return where the rounds come to rest; the offsets that the log does not need are taken out of `survey`.
-
-    Those of a long log come to rest with every second or tenth sample, and go on with all from there.
-
-    CalibrationError: they do not come to rest.
-    """
-    step = max(len(survey.kept) // SETTLED, 1)
-    few = survey.thinned(step) if step > 1 else survey
-    few.keep(tuple(replace(group, functions=group.functions[:]) for group in few.groups))
-    rounds = _Rounds(few, own)
-    answer = rounds.settle()
-    if step == 1:
-        return answer
-    names = {group.name for group in few.groups}
-    survey.keep(tuple(group for group in survey.groups if group.name in names))
-    rounds.go_on(survey, step)
-    return rounds.settle()
-
-
-class _Rounds:
+class Rounds:
     """Alternate coefficients, widths and the field until no residual moves."""
 
     def __init__(self, survey: SurveySamples, own: PriorFamily) -> None:
@@ -90,6 +70,17 @@ class _Rounds:
         self.eta, self.w = self.family.centre, np.zeros(self.choice.field.nodes.size)
         self.nodes = self.choice.field.nodes
         self.last: FloatArray | None = None
+
+    @property
+    def names(self) -> set[str]:
+        """Of the groups that are in the fit."""
+        return {group.name for group in self.survey.groups}
+
+    def worth(self, answer: Answer) -> float:
+        """Return its log evidence: a sample left out counts as one at the limit, an offer has its price."""
+        survey, each = self.survey, 0.5 * OUTLIER**2 + float(np.log(answer.widths.sigma))
+        left_out = int((survey.at_rest & ~survey.kept).sum())
+        return answer.score - left_out * each - LIKELIER * sum(one.offered for one in survey.groups)
 
     def go_on(self, survey: SurveySamples, step: int) -> None:
         """Go on with `survey`, of which the samples so far were every `step`-th one; nothing is searched."""
