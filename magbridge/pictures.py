@@ -1,11 +1,22 @@
-"""What pictures share: a name from a file is drawn as it is, not as mathematics."""
+"""Pictures: written whole, and a name from a file is drawn as it is, not as mathematics."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-__all__ = ["literal"]
+from magbridge.files import atomic_path
+
+__all__ = ["literal", "save"]
+
+
+def save(figure: Figure, path: str | Path, dpi: int = 110) -> None:
+    """Write a figure as PNG, PDF or SVG, by its suffix; WriteError: the file cannot be written."""
+    literal(figure)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
 
 
 def literal(figure: Figure) -> None:

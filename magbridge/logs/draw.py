@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from magbridge.files import atomic_path
+from magbridge.pictures import save
 from magbridge.records import Quality
 
 __all__ = ["corrected_panel", "draw_corrected"]
@@ -47,8 +47,7 @@ def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
         axis.set_xlabel("")
     axes[0].legend(loc="upper right", ncols=3, frameon=False, fontsize="small")
     figure.suptitle(str(log.attrs.get("source", "")), fontsize="medium")
-    with atomic_path(path) as file:
-        figure.savefig(file, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def corrected_panel(axis: Axes, log: xr.Dataset, name: str) -> None:

@@ -16,10 +16,10 @@ from magbridge.arrays import RealArray
 from magbridge.field.geodesy import metres_per_degree, signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.files import atomic_path
 from magbridge.navigate.bound import Bound
 from magbridge.navigate.record import State
 from magbridge.navigate.reference_track import errors
+from magbridge.pictures import save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,7 +44,7 @@ def draw_navigation(result: xr.Dataset, grid: AnomalyGrid | None, path: str | Pa
     for name, draw in draws.items():
         draw(panels[name], hours, result)
         _legend_above(panels[name])
-    _save(figure, path)
+    save(figure, path)
 
 
 def _field(axis: Axes, hours: RealArray, result: xr.Dataset) -> None:
@@ -125,7 +125,7 @@ def draw_bound(bound: Bound, grid: AnomalyGrid, path: str | Path) -> None:
     _plain(axis)
     axis.grid(alpha=0.3)
     axis.legend(loc="best", fontsize=8)
-    _save(figure, path)
+    save(figure, path)
 
 
 def _map(axis: Axes, grid: AnomalyGrid, longitude: Any) -> None:
@@ -237,8 +237,3 @@ def _plain(axis: Axes) -> None:
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axis.yaxis.set_major_formatter(plain)
     axis.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
-
-
-def _save(figure: Figure, path: str | Path) -> None:
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)

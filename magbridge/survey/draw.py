@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
-from magbridge.files import atomic_path
+from magbridge.pictures import save
 from magbridge.survey.crossovers import Crossovers
 from magbridge.survey.samples import Samples
 
@@ -58,8 +58,7 @@ def draw_survey(
     _map(figure, axes[0, 1], grid, grid.sigma, "1-sigma of the map (nT)", "viridis", (0.0, top))
     _residuals(axes[1, 0], residual)
     _crossings(figure, axes[1, 1], samples, found, misties, (longitude[step], latitude[step]))
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=150)
+    save(figure, path, dpi=150)
 
 
 def _map(

@@ -12,8 +12,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms, robust_scale
-from magbridge.files import atomic_path
-from magbridge.pictures import literal
+from magbridge.pictures import save
 
 __all__ = ["draw_fit"]
 
@@ -68,9 +67,7 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
         legend.values(), legend, loc="outside upper right", ncols=len(legend), fontsize=8, frameon=False,
         markerscale=2,
     )  # fmt: skip
-    with atomic_path(path) as partial:
-        literal(figure)
-        figure.savefig(partial, dpi=110)
+    save(figure, path)
 
 
 def _abscissae(data: Observations) -> dict[str, FloatArray]:
