@@ -8,6 +8,6 @@
 3. :mod:`.inference` searches for the candidates that the data support, and for their competing hypotheses.
 4. :mod:`.unexplained` describes what is left, or the whole, without a name; :mod:`.accept` weighs names
    against descriptions.
-5. :mod:`.extend` makes a calibration of the names; :mod:`.gain` measures on dives left out what that gains.
+5. :mod:`.extend` makes a calibration of the names; dives left out of the fit measure what that gains.
 6. :mod:`.diagnosis` is the result; :mod:`.report` writes it for people and for programs.
 """

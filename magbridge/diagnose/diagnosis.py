@@ -15,12 +15,12 @@ from magbridge.diagnose.assessment.weigh import Assessment, assess
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import Isolability
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.seen import Seen, seen

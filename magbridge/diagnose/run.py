@@ -23,13 +23,12 @@ from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.diagnosis import Diagnosis, Finding, counted
 from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
-from magbridge.diagnose.improvement import Improvement, paired
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.left_out import held_out
+from magbridge.diagnose.inference.left_out import Improvement, held_out, paired
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.random_walk import odds_over_random_walk
@@ -97,7 +96,7 @@ def diagnose(
         diagnosis = _examine(datasets, calibration, training_logs, grid, causes, progress)
     if out_dir is not None:
         # matplotlib only where a report is wanted
-        from magbridge.diagnose.report.files import write  # noqa: PLC0415
+        from magbridge.diagnose.report.page import write  # noqa: PLC0415
 
         progress("writing the report")
         write(diagnosis, out_dir, causes, remarks)

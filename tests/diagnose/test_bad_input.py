@@ -21,7 +21,7 @@ from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Sensor
 from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.report import files
+from magbridge.diagnose.report import page
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import DataError, WriteError
 from magbridge.field.geodesy import offset, wrap
@@ -62,13 +62,13 @@ def test_where_one_file_cannot_be_written_none_is(found: tuple[Diagnosis, Path],
     (tmp_path / "report.html").mkdir()
     (tmp_path / "findings.json").write_text("of an earlier diagnosis")
     with pytest.raises(WriteError, match=r"report\.html: cannot be written: Is a directory"):
-        files.write(found[0], tmp_path)
+        page.write(found[0], tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"report.html", "findings.json"}
     assert (tmp_path / "findings.json").read_text() == "of an earlier diagnosis"
 
 
 def test_a_full_disk_names_the_file_that_has_no_room(found: tuple[Diagnosis, Path], tmp_path: Path) -> None:
-    files.write(found[0], tmp_path / "whole")
+    page.write(found[0], tmp_path / "whole")
     sizes = {path.name: path.stat().st_size for path in (tmp_path / "whole").iterdir()}
     assert sizes["report.html"] == max(sizes.values())
     shutil.rmtree(tmp_path / "whole")
@@ -77,7 +77,7 @@ def test_a_full_disk_names_the_file_that_has_no_room(found: tuple[Diagnosis, Pat
             full_disk(room),
             pytest.raises(WriteError, match=rf"doubt/{name}: cannot be written: File too large"),
         ):
-            files.write(found[0], tmp_path / "doubt")
+            page.write(found[0], tmp_path / "doubt")
         assert not list(tmp_path.iterdir())
 
 

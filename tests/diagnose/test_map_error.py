@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from posed import right
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.causes.map_error import map_error
-from magbridge.diagnose.causes.reference import diurnal_variation, reference_bias
+from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
 from magbridge.diagnose.causes.time_dependent import offset_drift, offset_step
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint, fit_joint

@@ -11,9 +11,8 @@ import pytest
 from posed import candidate, right
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.competing import sets_of
+from magbridge.diagnose.inference.competing import _separate, exchanged, sets_of
 from magbridge.diagnose.inference.evidence import LEVEL, score
-from magbridge.diagnose.inference.exchange import _separate, exchanged
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.search import _backward_elimination
 from magbridge.diagnose.inference.state import State

@@ -9,7 +9,7 @@ from posed import missed
 
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.unexplained.passage import passage
+from magbridge.diagnose.unexplained.packets import passage
 
 
 def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None:

@@ -19,9 +19,9 @@ from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.survey import Channel, _channels
 from magbridge.diagnose.diagnosis import Finding
-from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.hypothesis import Hypothesis
+from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import _folded, _outliers, nameless
 from magbridge.diagnose.report.page import improved

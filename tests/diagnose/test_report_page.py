@@ -13,8 +13,8 @@ from posed import candidate
 from magbridge.diagnose.assessment.weigh import OWN, Assessment
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.improvement import Improvement
 from magbridge.diagnose.inference.competing import CompetingHypothesis
+from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.report.canvas import ends, rolling
 from magbridge.diagnose.report.details import remaining, visible

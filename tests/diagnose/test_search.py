@@ -14,8 +14,8 @@ from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.reference import reference_bias
 from magbridge.diagnose.compare.problem import pose
+from magbridge.diagnose.inference.competing import exchanged
 from magbridge.diagnose.inference.evidence import ODDS
-from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.random_walk import odds_over_random_walk
 from magbridge.diagnose.inference.search import (

@@ -10,9 +10,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.causes.map_error import map_error
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis, unmodelled_actuator
-from magbridge.diagnose.causes.reference import diurnal_variation, reference_bias
+from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
 from magbridge.diagnose.causes.response import nonlinearity, saturation
 from magbridge.diagnose.causes.telemetry import (
     current_field,

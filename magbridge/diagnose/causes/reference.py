@@ -1,14 +1,144 @@
-"""The reference is wrong: with time, by a constant. Where it is a map: :mod:`.map_error`."""
+"""The reference is wrong: an anomaly map from place to place; or with time, or by a constant."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable, Sequence
+from functools import partial
 
-from magbridge.arrays import FloatArray
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+from scipy.spatial.distance import cdist
+
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.causes.candidates import Candidate, of_reference
+from magbridge.diagnose.compare.design_columns import Interpolated
 from magbridge.diagnose.compare.problem import Problem
 
-__all__ = ["diurnal_variation", "reference_bias"]
+__all__ = ["diurnal_variation", "map_error", "reference_bias"]
+
+CELLS = 300
+"""Most cells at which a map's error is described."""
+FINEST = 125.0
+"""m, the smallest cell."""
+SCALES = np.array([1.0, 2.0, 4.0, 8.0, 32.0])
+"""Depths of the rock below the deepest place of the track, and half the correlation lengths of what is the
+same at every depth, in cells."""
+ALTITUDE = 100.0
+"""m above the sea at which a map holds: aircraft survey at 60 to 150 m. Of a map from 300 m a third of the
+mean error is still found."""
+FAINT = 1e-6
+"""Share of a map's mean square error below which one of the functions that describe it is left out."""
+ERROR = 20.0
+"""nT, a plausible error of a map (1-sigma)."""
+
+
+def map_error(problem: Problem) -> list[Candidate]:
+    r"""The anomaly map is wrong: it holds at another height than the vehicle's, or is drawn wrong.
+
+    *Another height* (least-squares collocation). Rock below has the field T. The map gives it at an altitude
+    a, the vehicle meets it at a depth z:
+
+    .. math:: e(x, z) = T(x, z) - T(x, -a)
+
+    The error is the same on every pass at one depth, and changes with depth as Laplace's equation demands. So
+    dives tell it from an offset: even its mean is known. Rock at a depth d gives T the covariance (Moritz
+    1980, the reciprocal distance)
+
+    .. math:: C(z, z') = (s^2 + r^2)^{-1/2}, \quad s = 2 d - z - z'
+
+    between places r apart, and e the covariance ``C(z, z') - C(z, -a) - C(-a, z') + C(-a, -a)``.
+
+    *Drawn wrong*: a smooth function of the position that is the same at every depth (Matern 3/2). A constant
+    is another cause.
+    """
+    place = problem.survey.place
+    if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
+        return []
+    Z, cell = _cells(place)
+    weights, corners = _between(place, cell)
+    seen = diags_array(problem.reference_jacobian) @ weights
+    depths, lengths = place[:, 2].max() + cell * SCALES, 2.0 * cell * SCALES
+    lacking = _expanded([partial(_lacking, d=d) for d in depths], Z, corners)
+    drawn = _expanded([partial(_matern, length=length) for length in lengths], Z, corners)
+    drawn[0][:] -= weights.mean(axis=0) @ drawn[0]
+    made = []
+    for functions, variances, spectra in (lacking, drawn):
+        width = ERROR * np.sqrt(variances)
+        columns = Interpolated(seen, functions * width)
+        names, units = tuple(f"function {k + 1}" for k in range(len(width))), ("nT",) * len(width)
+        made.append(
+            Candidate("map_error", None, columns, width, names, units, spectra=spectra, about="place")
+        )
+    return made
+
+
+def _expanded(
+    covariances: Sequence[Callable[[FloatArray, FloatArray], FloatArray]], Z: FloatArray, x: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Expand Gaussian processes in Karhunen-Loeve functions, at places x (m, 3), by visited cells Z (c, 3).
+
+    With K the mean of all covariances these are ``K(x, Z) V / lambda`` where ``K(Z, Z) = V lambda V^T``: no
+    more of them than cells, however large the box. One covariance K_l enters by the functions' prior
+    variances alone, ``diag(V^T K_l V)``.
+
+    Returns
+    -------
+    (m, k), (k,), (l, k) array
+        The functions, of unit variance; their prior variances; those by each covariance, relative to these.
+    """
+    each = np.array([K(Z, Z) for K in covariances])
+    equal = len(Z) / len(each) / each.trace(axis1=1, axis2=2)
+    values, V = np.linalg.eigh(np.tensordot(equal, each, 1))
+    values, V = values[kept := values > FAINT * len(Z)], V[:, kept]
+    mean = sum(share * K(x, Z) for share, K in zip(equal, covariances, strict=True))
+    own = equal[:, None] * np.einsum("ik,lij,jk->lk", V, each, V, optimize=True)
+    return mean @ (V / values), values, np.maximum(own / values, FAINT)
+
+
+def _cells(place: FloatArray) -> tuple[FloatArray, float]:
+    """(m, 3) mean places of the track in the cells that hold it, at most :data:`CELLS`, and their side, m."""
+    side = FINEST
+    while (found := _each(np.floor(place / side)))[1].max() >= CELLS:
+        side *= 1.1
+    of = found[1]
+    return np.stack([np.bincount(of, x) for x in place.T], axis=1) / np.bincount(of)[:, None], side
+
+
+def _each(corners: FloatArray) -> tuple[FloatArray, IndexArray]:
+    """Return the distinct rows (c, d) of whole numbers (n, d), and the place of each row among them (n,)."""
+    low = corners.min(axis=0)
+    box = np.ptp(corners, axis=0).astype(int) + 1
+    keys, of = np.unique(np.ravel_multi_index((corners - low).astype(int).T, box), return_inverse=True)
+    return np.stack(np.unravel_index(keys, box), axis=1) + low, of
+
+
+def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
+    """(n, c) weights of linear interpolation between the corners (c, d), m, of the visited cells."""
+    low = np.floor(place / side)
+    high = place / side - low
+    steps = list(np.ndindex((2,) * place.shape[1]))
+    share = np.concatenate([np.prod(np.where(step, high, 1.0 - high), axis=1) for step in steps])
+    corners, of = _each(np.concatenate([low + step for step in steps]))
+    rows = np.tile(np.arange(len(place), dtype=np.int32), len(steps))
+    return csr_array((share, (rows, of.astype(np.int32))), (len(place), len(corners))), corners * side
+
+
+def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
+    """(n, m) covariance between places (n, 3) and (m, 3) of what a map lacks of rock at a depth d."""
+    r2 = cdist(a[:, :2], b[:, :2], "sqeuclidean")
+
+    def between(above: FloatArray | float, below: FloatArray | float) -> FloatArray:
+        return np.asarray(((above + below) ** 2 + r2) ** -0.5)
+
+    here, there, high = d - a[:, 2:], d - b[:, 2], d + ALTITUDE
+    return between(here, there) - between(here, high) - between(high, there) + between(high, high)
+
+
+def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
+    """(n, m) correlation between positions, whatever their depths, Matern's of order 3/2."""
+    r = np.sqrt(3.0) / length * cdist(a[:, :2], b[:, :2])
+    found: FloatArray = (1.0 + r) * np.exp(-r)
+    return found
 
 
 def diurnal_variation(problem: Problem) -> list[Candidate]:

@@ -7,7 +7,7 @@ columns of a hypothesis, and :mod:`.joint` fits them together with calibration a
 :mod:`.statistic` is their likelihood ratio, :mod:`.evidence` what it is worth as evidence and as a test.
 
 *The search.* :mod:`.search` adds cause after cause, each in a round of the :mod:`.state`.
-:mod:`.profile_likelihood` refines nonlinear parameters, :mod:`.exchange` replaces causes by their
+:mod:`.profile_likelihood` refines nonlinear parameters, :mod:`.competing` replaces causes by their
 :mod:`.competing`, also in :mod:`.pairs`.
 
 *What it is worth.* :mod:`.nonlinear_uncertainty` widens the covariance, :mod:`.outliers` tests for isolated

@@ -6,7 +6,7 @@ Candidates are scored (:mod:`.evidence`) under two noises: that of the model so 
 when the best candidate of every cause is fitted, because the former may have absorbed an effect. The best of
 each cause are then fitted jointly with noise and calibration. The best that passes the test is added, and so
 on while one does. A cause that is found again needs more than one regressor: these become one candidate. Then
-causes are exchanged for competing hypotheses (:mod:`.exchange`). Last, causes that later findings have made
+causes are exchanged for competing hypotheses (:mod:`.competing`). Last, causes that later findings have made
 needless are dropped.
 
 Noise that ends up slow may have absorbed what several causes do together: then none alone stands out from it.
@@ -32,7 +32,7 @@ import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem, with_slow_noise
-from magbridge.diagnose.inference.competing import CompetingHypothesis, sets_of
+from magbridge.diagnose.inference.competing import CompetingHypothesis, exchanged, sets_of
 from magbridge.diagnose.inference.evidence import (
     LEVEL,
     MOST_REMAINING,
@@ -41,7 +41,6 @@ from magbridge.diagnose.inference.evidence import (
     evidence_of,
     regressor_error,
 )
-from magbridge.diagnose.inference.exchange import exchanged
 from magbridge.diagnose.inference.fit_noise import BRIEFEST, autoregressive_order
 from magbridge.diagnose.inference.hypothesis import Hypothesis, shaped_ratio
 from magbridge.diagnose.inference.information import Information

@@ -14,9 +14,9 @@ from magbridge.diagnose.assessment.weigh import Assessment
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.improvement import LEVEL, Improvement
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.design import normal
+from magbridge.diagnose.inference.left_out import LEVEL, Improvement
 from magbridge.diagnose.seen import Seen
 
 __all__ = ["FORMAT", "findings", "findings_json", "parameters"]

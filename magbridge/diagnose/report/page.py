@@ -1,23 +1,28 @@
-"""``report.html``: the answer on the first screen, and below it, folded, what it rests on."""
+"""``report.html``: the answer on the first screen, below it, folded, what it rests on. The files."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 
+from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.assessment.numbers import Delays
 from magbridge.diagnose.assessment.weigh import Assessment, Fitness
-from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.improvement import Improvement
+from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import described, found, remaining, visible
+from magbridge.diagnose.report.findings import findings_json
 from magbridge.diagnose.report.words import bold, figure, goes_with, listed, measured, number, table
+from magbridge.files import atomic_path, new_folder
 
-__all__ = ["improved", "late", "report_html"]
+__all__ = ["improved", "late", "report_html", "write"]
 
 STYLE = Path(__file__).with_name("style.css")
 MARKS: dict[Fitness, str] = {
@@ -213,3 +218,23 @@ def _compared(diagnosis: Diagnosis) -> list[str]:
         ),
         figure(figures.track(diagnosis), "A map's error looks the same on every pass at one depth."),
     ]
+
+
+def write(
+    diagnosis: Diagnosis,
+    out_dir: str | os.PathLike[str],
+    causes: Mapping[str, Cause] = CAUSES,
+    remarks: Sequence[str] = (),
+) -> None:
+    """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none.
+
+    WriteError: one of them cannot be written; what was there before is as it was.
+    """
+    contents = {
+        "calibration.json": encode_calibration(diagnosis.calibration),
+        "findings.json": findings_json(diagnosis, causes, remarks),
+        "report.html": report_html(diagnosis, causes, remarks).encode(),
+    }
+    with new_folder(out_dir) as folder, ExitStack() as written:
+        for name, content in contents.items():
+            written.enter_context(atomic_path(folder / name)).write_bytes(content)

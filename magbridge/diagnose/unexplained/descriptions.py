@@ -21,8 +21,7 @@ from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.unexplained import shapes
-from magbridge.diagnose.unexplained.packets import packets
-from magbridge.diagnose.unexplained.passage import passage
+from magbridge.diagnose.unexplained.packets import packets, passage
 
 __all__ = ["Description", "descriptions"]
 
