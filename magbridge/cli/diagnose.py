@@ -124,7 +124,9 @@ def summary(facts: dict[str, Any], parts: str) -> str:
         rms += f"; {number(refitted)} nT by fitting the calibration's own numbers anew"
     verdict = facts["verdict"] if facts["verdict"] != "negligible" else "nothing needs explaining"
     fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
-    doubts = [f"  {one['text']}" for one in use["reasons_against"]] * (use["fit_for_use"] != "yes")
+    # that a cause shows no gain stands in its own line
+    against = [one["text"] for one in use["reasons_against"] if one["code"] != "no_improvement"]
+    doubts = [f"  {text}" for text in against] * (use["fit_for_use"] != "yes")
     return "\n  ".join([f"{verdict}: {rms}", fit, *doubts, *causes_of(facts)])
 
 
@@ -136,9 +138,11 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
     causes = []
     warnings = [*facts["assessment"]["warnings"], []]  # none of outliers, which stand last
     for one, notes in zip(facts["findings"], warnings, strict=False):
-        walks = ["noise that wanders"] * any(note["code"] == "random_walk" for note in notes)
+        codes = {note["code"] for note in notes}
+        walks = ["noise that wanders"] * ("random_walk" in codes)
         others = " or ".join([*map(_plain, one["alternatives"]), *walks])
         lines = f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}{_followed(one['follows'])}"
+        lines += "; no gain is shown" * ("no_improvement" in codes)
         causes.append(lines + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:
         lines = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"

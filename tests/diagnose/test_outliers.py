@@ -11,10 +11,12 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers, outliers
+from magbridge.diagnose.report.details import remaining
 from magbridge.diagnose.run import diagnose
 from sitl import load, simulate
 from sitl.dataset import segments
@@ -121,10 +123,15 @@ def test_a_relay_gets_no_name(demo: Demo) -> None:
     """Nor does what is left of it where noise of a long memory has absorbed the rest."""
     calibration, survey = demo[0], demo[1].copy()
     n, rng = survey.sizes["time"], np.random.default_rng(4)
-    relay = np.searchsorted(np.sort(rng.integers(0, n, 14)), np.arange(n)) % 2
+    at = np.sort(rng.integers(0, n, 14))
+    relay = np.searchsorted(at, np.arange(n)) % 2
     for name, size in (("mag_x", 9.0), ("mag_y", -6.0), ("mag_z", 12.0)):
         survey[name] = survey[name] + size * relay
     reported = diagnose([survey], calibration)
     assert (reported.findings, reported.wrong) == ((), None)
     assert reported.unexplained is not None
     assert reported.unexplained.kind == "switching"
+    found = reported.problem.survey.time[list(reported.unexplained.shifts)]
+    true = survey["time"].to_numpy().astype(float)[at]
+    assert sum(np.abs(found - one).min() < 40.0 for one in true) >= 10
+    assert f"The level shifts at {found.size} places, " in "".join(remaining(reported, CAUSES))

@@ -120,8 +120,11 @@ def test_the_command_says_what_the_gain_was_measured_on() -> None:
     facts = {"verdict": "explained", "findings": [one], "unexplained": None, "rms_before_nT": 117.42}
     facts |= {"rms_after_nT": 74.42, "improvement": {"interval": [0.486, 0.84]}}
     settled: dict[str, Any] = {"fit_for_use": "once_settled", "answer": "Only once these doubts are settled."}
-    settled["reasons_against"] = [{"text": "Not told apart: this from that."}]
-    facts |= {"assessment": settled | {"warnings": [[]], "rms_nT": {"refitted": 101.2}}}
+    settled["reasons_against"] = [{"code": "contested", "text": "Not told apart: this from that."}]
+    settled["reasons_against"] += [{"code": "no_improvement", "text": "No gain."}]
+    facts |= {
+        "assessment": settled | {"warnings": [[{"code": "no_improvement"}]], "rms_nT": {"refitted": 101.2}}
+    }
     first, use, doubt, second = summary(facts, "dives").splitlines()
     assert first == (
         "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %); 101 nT by "
@@ -130,7 +133,7 @@ def test_the_command_says_what_the_gain_was_measured_on() -> None:
     assert summary(facts | {"verdict": "negligible"}, "dives").startswith("nothing needs explaining: 117 -> ")
     assert use == "  fit for use: once settled. Only once these doubts are settled."
     assert doubt == "    Not told apart: this from that."
-    assert second == "  clock_offset, S/N 9.0"
+    assert second == "  clock_offset, S/N 9.0; no gain is shown"
     assert "nT RMS, not held out (0.49" in summary(facts, "")
     assert "95 %): no gain is shown" in summary(facts | {"improvement": {"interval": [0.9, 1.02]}}, "dives")
     plain = facts | {"verdict": "nothing_found", "findings": []}

@@ -119,7 +119,7 @@ def _fitness(diagnosis: Diagnosis, use: str, against: Sequence[Note]) -> Fitness
 
 def _as_given(diagnosis: Diagnosis) -> str:
     """Say what to think of the calibration where nothing is added to it."""
-    given = "Nothing was added: calibration.json is the calibration as it was given."
+    given = "calibration.json is the calibration as it was given."
     if diagnosis.unexplained is None:
         return f"{given} As far as this log can show (last section), it holds."
     return (
@@ -162,6 +162,8 @@ def _against(
     """List what a reviewer must see settled; `noted` is what to know of each finding."""
     survey, rest = diagnosis.problem.survey, diagnosis.unexplained
     found = [Note("own_log", OWN)] if (survey.fitted & ~survey.learned).any() else []
+    if warnings := "; ".join(diagnosis.problem.calibration.warnings):
+        found.append(Note("unsupported", f"The calibration's own data do not support it: {warnings}."))
     if shift is not None:
         text = (
             f"The extended calibration shifts the whole corrected field by {shift.shift:+.1f} nT, to within "

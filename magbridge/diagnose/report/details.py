@@ -78,14 +78,18 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     return parts
 
 
-def _outliers(time: FloatArray) -> str:
-    """Say how many samples are wrong, and when: `time` (k,) in s since 1970."""
-    when = ", ".join(datetime.fromtimestamp(float(t), UTC).strftime("%H:%M:%S") for t in time[:MANY])
-    wrong = "1 isolated sample is wrong" if time.size == 1 else f"{time.size} isolated samples are wrong"
+def _when(time: FloatArray) -> str:
+    """Return the first of times (k,), s since 1970, as a clock shows them."""
     first = f"the first {MANY} " if time.size > MANY else ""
     return (
-        f"<h3><b>outliers</b></h3><p>{wrong}, {first}at {when} UTC. No RMS before or after counts them.</p>"
+        f"{first}at {', '.join(f'{datetime.fromtimestamp(float(t), UTC):%H:%M:%S}' for t in time[:MANY])} UTC"
     )
+
+
+def _outliers(time: FloatArray) -> str:
+    """Say how many samples are wrong, and when: `time` (k,) in s since 1970."""
+    wrong = "1 isolated sample is wrong" if time.size == 1 else f"{time.size} isolated samples are wrong"
+    return f"<h3><b>outliers</b></h3><p>{wrong}, {_when(time)}. No RMS before or after counts them.</p>"
 
 
 def _folded(terms: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
@@ -101,6 +105,7 @@ def _folded(terms: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
 def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     """Return what is left: how large, how slow, what it goes with, and beside what was predicted."""
     rest, residual = diagnosis.unexplained, diagnosis.assessment.residual
+    shifts = diagnosis.problem.survey.time[list(rest.shifts if rest else ())]
     budget, parts = diagnosis.assessment.budget, diagnosis.problem.survey.parts
     rows = {
         "predicted by the calibration as given: noise and its own uncertainty": budget.predicted,
@@ -127,6 +132,7 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     )
     return [
         f"<p>{described(rest, residual)}. {nameless(rest, causes)}</p>" if rest else "",
+        f"<p>The level shifts at {len(shifts)} places, {_when(shifts)}.</p>" * bool(len(shifts)),
         how,
         table(("difference between measured and reference", "RMS"), lines),
         worse * ((budget.after or 0.0) > WORSE * budget.fitted),

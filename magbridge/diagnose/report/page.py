@@ -15,6 +15,7 @@ from magbridge.diagnose.assessment.numbers import Delays
 from magbridge.diagnose.assessment.weigh import Assessment, Fitness
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import described, found, remaining, visible
@@ -102,51 +103,41 @@ def _log(diagnosis: Diagnosis) -> str:
 def _sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict: what was found, what it improves, and what is left."""
     total, rest, residual = diagnosis.total, diagnosis.unexplained, diagnosis.assessment.residual
+    before, stated = number(total.before), diagnosis.assessment.budget.predicted
+    allowed = f" {before} nT are within the {number(stated)} nT that the calibration states for itself."
+    allowed *= stated > total.before
     if diagnosis.verdict == "nothing_found":
         return (
-            f"Nothing was found: {number(total.before)} nT RMS is consistent with noise "
-            f"({number(rms(diagnosis.residual))} nT) and the calibration's stated uncertainty."
+            f"Nothing was found: {before} nT RMS is consistent with noise ({number(rms(diagnosis.residual))} "
+            "nT) and the calibration's stated uncertainty."
         )
     if diagnosis.verdict == "unexplained" and rest:
         within = f"no name is asserted; it resembles {listed(rest.within)}"
         name = within if rest.within else "none of the known causes explains it"
-        more = f"The difference of {number(total.before)} nT RMS is more than noise"
-        stated = diagnosis.assessment.budget.predicted
-        allowed = f" It is within the {number(stated)} nT that the calibration states." * (
-            stated > total.before
-        )
+        more = f"The difference of {before} nT RMS is more than noise"
         return f"{more}, but {name}. {described(rest, residual)}.{allowed}"
-    names = [
-        bold(one.candidate)
-        + (f" <span class=faint>or {listed(one.competing[:2], ' or ')}</span>" * bool(one.competing))
-        for one in diagnosis.findings
-    ]
+    names = [bold(one.candidate) + _or(one.competing[:2]) for one in diagnosis.findings]
     if diagnosis.wrong is not None:
         names.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
-    survey = diagnosis.problem.survey
-    own = (survey.fitted & ~survey.learned).any()  # the calibration was fitted to what is diagnosed
-    worth = (
-        improved(total, "" if own else survey.parts)
-        if diagnosis.findings
-        else f"Without them, {number(total.before)} nT RMS; nothing is added to the calibration."
-    )
-    louder = rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings)
-    other = (
-        f"Something {'stronger' if louder else 'else'} is left that no known cause explains."
-        if rest
-        else f"What is left, {number(residual.rms)} nT RMS, fits no description of the list better than noise"
-        + f" that remembers {number(residual.correlation_time, 2)} s" * residual.lasts
-        + "."
-    )
+    worth = f"Without them, {before} nT RMS; nothing is added to the calibration."
     if diagnosis.findings:
-        refitted = number(diagnosis.beyond.before)
-        worth += f" The calibration's own numbers fitted anew would leave {refitted} nT."
-    start = (
-        "Nothing needs explaining: what was found makes next to no difference. "
-        if diagnosis.verdict == "negligible"
-        else ""
-    )
-    return f"{start}Found: {'; '.join(names)}. {worth} {other}"
+        survey, refitted = diagnosis.problem.survey, number(diagnosis.beyond.before)
+        own = (survey.fitted & ~survey.learned).any()  # the calibration was fitted to what is diagnosed
+        worth = (
+            f"{improved(total, '' if own else survey.parts)} The calibration's own numbers fitted anew would "
+            f"leave {refitted} nT.{allowed}"
+        )
+    louder = rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings)
+    other = f"Something {'stronger' if louder else 'else'} is left that no known cause explains."
+    if not rest:
+        remembers = f" that remembers {number(residual.correlation_time, 2)} s" * residual.lasts
+        other = f"What is left, {number(residual.rms)} nT RMS, looks like noise{remembers}."
+    start = "Nothing needs explaining: what was found makes next to no difference. "
+    return f"{start * (diagnosis.verdict == 'negligible')}Found: {'; '.join(names)}. {worth} {other}"
+
+
+def _or(competing: Sequence[CompetingHypothesis]) -> str:
+    return f" <span class=faint>or {listed(competing, ' or ')}</span>" * bool(competing)
 
 
 def improved(improvement: Improvement, parts: str) -> str:

@@ -87,6 +87,8 @@ class Leftover(NamedTuple):
     """The likeliest descriptions."""
     size: float | None = None
     """RMS, nT, of the description."""
+    shifts: tuple[int, ...] = ()
+    """Samples from which on the level is shifted, of what switches."""
 
     @property
     def among(self) -> float:

@@ -50,11 +50,13 @@ def switching(
 
     The noise's memory has absorbed it but for its level shifts, and the names are of what that leaves.
     """
-    rest = _slow(problem, fit, named) if off is not None and off.lasting else None
+    if off is None or not off.lasting:
+        return None
+    rest = _slow(problem, fit, named)
     if rest is None or any(one.signal_to_noise >= rest.signal_to_noise for one in named):
         return None
     within = tuple(CompetingHypothesis(one.candidate, 0.0) for one in named)
-    return rest._replace(kind="switching", within=within)
+    return rest._replace(kind="switching", within=within, shifts=tuple(off.rows.tolist()))
 
 
 def _passing(off: Outliers | None) -> Leftover | None:
@@ -62,7 +64,8 @@ def _passing(off: Outliers | None) -> Leftover | None:
     if off is None or off.isolated:
         return None
     kind = "switching" if off.lasting else "transient"
-    return Leftover(kind, float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None)
+    shifts = tuple(off.rows.tolist()) if off.lasting else ()
+    return Leftover(kind, float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None, shifts=shifts)
 
 
 def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | None:
