@@ -131,14 +131,10 @@ class Pipeline:
         own = config.link
         self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
         self.sensor = SensorLine(
-            config.sensor.driver,
-            self._driver.start,
-            round(config.sensor.timeout * 1e6),
-            self.component.announcer,
-            self.component.timers,
-            start.time_us,
+            config.sensor.driver, self._driver.start, round(config.sensor.timeout * 1e6),
+            self.component.announcer, self.component.timers, start.time_us,
             searching=has_magic(config.sensor.port),
-        )
+        )  # fmt: skip
         self._changes = Changes(self.component.codec, self.component.announcer, self.sensor)
         self.recorder = Recorder(config.link.system, config.link.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None

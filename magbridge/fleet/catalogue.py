@@ -26,13 +26,8 @@ FORMAT = 1
 """Of the catalogues that are written; newer ones are refused."""
 SERVERS = ("postgresql://", "postgres://")
 TEXT, NUMBER, COUNT, TEXTS, NUMBERS, PACKED = (
-    pl.String(),
-    pl.Float64(),
-    pl.Int64(),
-    pl.List(pl.String()),
-    pl.List(pl.Float64()),
-    pl.Binary(),
-)
+    pl.String(), pl.Float64(), pl.Int64(), pl.List(pl.String()), pl.List(pl.Float64()), pl.Binary(),
+)  # fmt: skip
 TABLES: dict[str, dict[str, pl.DataType]] = {
     "vehicles": {
         "vehicle": TEXT, "serial": TEXT, "sensor": TEXT, "parameters": TEXTS, "order": COUNT, "mass": TEXT,

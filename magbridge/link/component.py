@@ -112,15 +112,9 @@ class Component:
         self.metadata = metadata.files(self.parameters.table.values(), link.component)
         self.file_requests: deque[Message] = deque(maxlen=MOST_REQUESTS)
         self._reports = Reports(
-            self.outbox,
-            self.vehicle,
-            start_us,
-            version,
-            calibration_id,
-            status,
-            speaking,
+            self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking,
             self.metadata[metadata.GENERAL],
-        )
+        )  # fmt: skip
         by_clock = {"HEARTBEAT": self._reports.heartbeat, "MAG_STATUS": self._reports.status}
         self._authority = Authority(link.system, link.autopilot)
         self._service = ParameterService(

@@ -100,14 +100,9 @@ class Request(NamedTuple):
     ) -> bytes:  # fmt: skip
         """Return the payload of a reply, the `ahead`-th to this request."""
         header = HEADER.pack(
-            (self.sequence + ahead) & 0xFFFF,
-            self.session if session is None else session,
-            opcode,
-            len(data),
-            self.opcode,
-            complete,
-            self.offset if offset is None else offset,
-        )
+            (self.sequence + ahead) & 0xFFFF, self.session if session is None else session, opcode, len(data),
+            self.opcode, complete, self.offset if offset is None else offset,
+        )  # fmt: skip
         return (header + data).ljust(HEADER.size + DATA, b"\0")
 
 

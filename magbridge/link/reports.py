@@ -101,30 +101,15 @@ class Reports:
         codec, vehicle, clock = self._outbox.codec, self._vehicle, self._vehicle.clock
         condition = self._status()
         payload = STATUS.struct.pack(
-            codec.utc_us,
-            round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0,
-            (codec.now_us - self._start_us) // 1_000_000 & MASK,
-            self.calibration_id,
-            condition.samples & MASK,
-            condition.samples_lost & MASK,
-            condition.sensor_bytes_skipped & MASK,
-            condition.sensor_frames_bad & MASK,
-            codec.frames & MASK,
-            vehicle.frames_lost & MASK,
-            codec.bytes_skipped & MASK,
-            codec.signing.refused & MASK if codec.signing else 0,
-            condition.log_records & MASK,
-            condition.log_lost & MASK,
-            condition.telemetry_stale,
-            condition.sample_rate,
-            condition.sensor_clock_drift,
-            clock.sigma,
-            clock.drift_ppm,
-            vehicle.reboots & 0xFFFF,
-            condition.sensor_state,
-            vehicle.state,
-            condition.log_state,
-        )
+            codec.utc_us, round(clock.offset_us(codec.now_us)) - codec.utc_offset_us if clock.known else 0,
+            (codec.now_us - self._start_us) // 1_000_000 & MASK, self.calibration_id,
+            condition.samples & MASK, condition.samples_lost & MASK, condition.sensor_bytes_skipped & MASK,
+            condition.sensor_frames_bad & MASK, codec.frames & MASK, vehicle.frames_lost & MASK,
+            codec.bytes_skipped & MASK, codec.signing.refused & MASK if codec.signing else 0,
+            condition.log_records & MASK, condition.log_lost & MASK, condition.telemetry_stale,
+            condition.sample_rate, condition.sensor_clock_drift, clock.sigma, clock.drift_ppm,
+            vehicle.reboots & 0xFFFF, condition.sensor_state, vehicle.state, condition.log_state,
+        )  # fmt: skip
         self._outbox.put(STATUS, payload)
 
     def version(self) -> None:

@@ -142,13 +142,7 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     follows = np.isin(raw[np.minimum(after, len(raw) - 1)], (V1, V2)) & (after < len(raw))
     good[unknown] = follows | (after >= len(raw))
     found = {
-        "time_us": stamp & ~3,
-        "channel": stamp & 3,
-        "number": number,
-        "system": system,
-        "component": component,
-        "frame": frame,
-        "payload": payload,
-        "end": checksum,
-    }
+        "time_us": stamp & ~3, "channel": stamp & 3, "number": number, "system": system,
+        "component": component, "frame": frame, "payload": payload, "end": checksum,
+    }  # fmt: skip
     return start[good], {name: values[good] for name, values in {**found, "stop": end}.items()}

@@ -31,14 +31,8 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.offset_terms import Creep
 
 __all__ = [
-    "corrected_by_others",
-    "from_vector",
-    "is_table",
-    "joined",
-    "read_points",
-    "read_table",
-    "without_creep",
-]
+    "corrected_by_others", "from_vector", "is_table", "joined", "read_points", "read_table", "without_creep",
+]  # fmt: skip
 
 ANOMALY = (
     "anomaly",

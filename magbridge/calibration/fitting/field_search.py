@@ -16,14 +16,8 @@ from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.field.place.matern import BURIED, SMOOTHNESS, Matern
 
 __all__ = [
-    "Choice",
-    "Weighed",
-    "choose",
-    "climb",
-    "first_guess",
-    "refined",
-    "same_noise",
-]
+    "Choice", "Weighed", "choose", "climb", "first_guess", "refined", "same_noise",
+]  # fmt: skip
 
 RESOLVED = 2.0
 """Nodes a length at least: a shorter one is not tried on so large an area."""

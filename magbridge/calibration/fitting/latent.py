@@ -19,18 +19,9 @@ from magbridge.calibration.fitting.evidence import Quadratic, maximise
 from magbridge.calibration.fitting.prior import PriorFamily
 
 __all__ = [
-    "CHUNK",
-    "LIKELIER",
-    "NOTHING",
-    "Columns",
-    "Group",
-    "Offset",
-    "Waves",
-    "in_chunks",
-    "likeliest",
-    "slow_functions",
-    "with_groups",
-]
+    "CHUNK", "LIKELIER", "NOTHING", "Columns", "Group", "Offset", "Waves", "in_chunks", "likeliest",
+    "slow_functions", "with_groups",
+]  # fmt: skip
 
 APART = 3.0 * 3600.0
 """s without a sample, after which what changes slowly starts anew."""

@@ -25,15 +25,9 @@ from magbridge.calibration.residual import Samples, independent, residuals_of, s
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "GAIN_SIGMA",
-    "HARD_IRON_SIGMA",
-    "SCALE_SIGMA",
-    "check_scales",
-    "fit_nominal",
-    "nominal",
-    "nominal_samples",
-    "starts",
-]
+    "GAIN_SIGMA", "HARD_IRON_SIGMA", "SCALE_SIGMA", "check_scales", "fit_nominal", "nominal",
+    "nominal_samples", "starts",
+]  # fmt: skip
 
 SCALE_SIGMA = 0.015
 """Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""
