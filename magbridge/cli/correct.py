@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -97,43 +98,27 @@ def correct(
     logs_to_read(files, output, source)
     check_inputs((*files, output), picture)
 
-    from magbridge.correction import Correction
     from magbridge.logs import Writer, read_chunks
-    from magbridge.rows import correct_rows
 
     known, settings = _known(calibration, config)
     for doubt in warnings_of(known, source):
         complain(doubt)
     if save is not None and not learn:
         raise WrongUse("--save writes what was learned: give --learn, too")
-    tally, whole = Tally(), False
+    tally = Tally()
     correction: Correction | None = None
     pieces: list[dict[str, Any]] = []
     drawn: list[xr.Dataset] = []
     with Writer(output) as writer:
-        for part in track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting"):
-            if correction is None:
-                note_missing(known, part)
-                note_no_date(part)
-                learner = _learner(known, part, settings) if learn else None
-                correction = Correction(known, learner=learner)
-            if not whole:
-                refuse_unsuited(known, part)
-            pieces.append(part.attrs)
-            sampled = part[list(CHANNELS)].to_array().notnull()
-            corrected = _beside(part, correct_rows(correction, part), known, source)
-            corrected = corrected.isel(time=sampled.any("variable").to_numpy())
+        parts = track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting")
+        given = files, known, source, settings if learn else None
+        for part, corrected, correction in _corrected(parts, *given):
             writer.append(corrected)
             _notify(correction)
+            pieces.append(part.attrs)
+            tally.add(corrected, part.sizes["time"])
             if picture:
                 drawn.append(corrected[list(CORRECTED)])
-            tally.add(corrected, part.sizes["time"])
-            if not whole:
-                whole = bool(sampled.all("variable").any())
-        if not whole:
-            raise DataError(
-                f"{', '.join(str(file) for file in files)}: no row has all of {' '.join(CHANNELS)}"
-            )
     if picture:
         from magbridge.logs.deployment import join
         from magbridge.logs.draw import draw_corrected
@@ -182,6 +167,29 @@ def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]
     known = load(file) if file is not None else expected(settings)
     assert known is not None
     return known, settings
+
+
+def _corrected(
+    parts: Iterable[xr.Dataset], files: tuple[Path, ...], known: Calibration, file: Path, learn: Config | None
+) -> Iterator[tuple[xr.Dataset, xr.Dataset, Correction]]:
+    """Yield each piece of a log, what is made of it, and by what; DataError: it has no field."""
+    from magbridge.correction import Correction
+    from magbridge.rows import correct_rows
+
+    correction, whole = None, False
+    for part in parts:
+        if correction is None:
+            note_missing(known, part)
+            note_no_date(part)
+            correction = Correction(known, learner=_learner(known, part, learn) if learn else None)
+        if not whole:
+            refuse_unsuited(known, part)
+        sampled = part[list(CHANNELS)].to_array().notnull()
+        corrected = _beside(part, correct_rows(correction, part), known, file)
+        yield part, corrected.isel(time=sampled.any("variable").to_numpy()), correction
+        whole = whole or bool(sampled.all("variable").any())
+    if not whole:
+        raise DataError(f"{', '.join(map(str, files))}: no row has all of {' '.join(CHANNELS)}")
 
 
 def _learner(known: Calibration, log: xr.Dataset, settings: Config) -> Learner:
