@@ -84,8 +84,9 @@ def _are_degrees(path: Path, x: RealArray, y: RealArray, unit: str, crs: Any) ->
         return True
     if unit in METRES:
         return False
-    if unit.startswith("rad"):
-        raise FormatError(path, "expected axes in degrees or metres, found radians")
+    if unit.startswith("rad") or unit == "unknown":
+        found = "radians" if unit.startswith("rad") else "a unit that is not known"
+        raise FormatError(path, f"expected axes in degrees or metres, found {found}")
     if crs is not None:
         return bool(crs.is_geographic)
     if np.abs(y).max() > 90.0 or np.abs(x).max() > 360.0:

@@ -26,6 +26,8 @@ BAD_TIFF = (OSError, KeyError, AttributeError, TypeError, ValueError)
 """What Pillow, or a tag that is not as it should be, raises."""
 TEXT: Any = {"encoding": "utf-8-sig", "errors": "replace"}
 """How a text is opened: with a byte order mark or without, and whatever its comments are written in."""
+LENGTHS = {9001: "m", 9002: "ft", 9003: "us-ft", 9036: "km"}
+"""Units of a GeoTIFF's coordinates, by EPSG's numbers."""
 NETCDF = (b"CDF\x01", b"CDF\x02", b"\x89HDF")
 
 
@@ -39,6 +41,8 @@ def grd(path: Path) -> Parts:
         return _geosoft(path)
     try:
         nx, ny, x, y, values = _SURFER[start](path)
+    except FormatError:
+        raise
     except (ValueError, IndexError) as error:
         raise FormatError(
             path, "expected a Surfer grid: it ends too early or is not what its header says"
@@ -85,10 +89,12 @@ def _surfer_7(path: Path) -> Surfer:
     raw = path.read_bytes()
     at = raw.index(b"GRID") + 8
     ny, nx = (int(n) for n in np.frombuffer(raw, "<i4", 2, at))
-    x0, y0, dx, dy, _, _, _, blank = np.frombuffer(raw, "<f8", 8, at + 8).tolist()
+    x0, y0, dx, dy, _, _, rotation, blank = np.frombuffer(raw, "<f8", 8, at + 8).tolist()
+    if 0.0 < abs(rotation) < 360.0:  # or damaged, which is seen below
+        raise FormatError(path, f"rotated by {rotation:g} degrees: expected rows along x")
     start = raw.index(b"DATA", at) + 8
     values = np.frombuffer(raw, "<f8", _held(raw, start, 8, nx * ny), start).copy()
-    values[values >= blank] = np.nan
+    values[values >= blank if blank > 0.0 else values == blank] = np.nan
     return nx, ny, (x0, x0 + dx * (nx - 1)), (y0, y0 + dy * (ny - 1)), values
 
 
@@ -184,7 +190,8 @@ def geotiff(path: Path) -> Parts:
     x = x0 + (np.arange(values.shape[1]) + half - column) * dx
     y = y0 - (np.arange(values.shape[0]) + half - row) * dy
     kind, code = settings.get(1024), settings.get(3072, 0)
-    projected = Axes("", f"EPSG:{code}") if 1024 <= code < 32767 else Axes("m")
+    unit_of_length = LENGTHS.get(settings.get(3076, 0), "unknown" if 3076 in settings else "")
+    projected = Axes(unit_of_length, f"EPSG:{code}") if 1024 <= code < 32767 else Axes("m")
     axes = projected if kind == 1 else Axes("deg" if kind == 2 else "")
     return x, y, values * scale + offset, {"axes": axes, "unit": unit}
 

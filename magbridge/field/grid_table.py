@@ -18,6 +18,8 @@ from magbridge.wording import counted
 
 __all__ = ["table"]
 
+REMARK = re.compile(r"\s*([#%/]|(line|tie)[\s:]*[\w.:]+\s*$|$)", re.IGNORECASE)
+"""A comment, or what Geosoft writes above the rows of a line."""
 NUMBERS = re.compile(r"[-+.\deinfa]+")
 UNITS = ("nt", "ut", "µt", "deg", "m", "km")
 """What a column's name may end in, after an underscore, to tell its unit."""
@@ -53,10 +55,7 @@ def table(path: Path) -> Parts:
 
     FormatError: no such columns, columns that may be this or that, or nodes that form no grid.
     """
-    with path.open(**TEXT) as file:
-        first = file.readline()
-    delimiter = next((mark for mark in ",;\t" if mark in first), None)
-    words = [word.strip() for word in first.strip().lstrip("#").lower().split(delimiter)]
+    words, delimiter, skip = _beginning(path)
     header = not all(NUMBERS.fullmatch(word) for word in words)
     unit, axes = "", Axes()
     if header:
@@ -67,7 +66,7 @@ def table(path: Path) -> Parts:
         places = 0, 1, 2
     else:
         raise FormatError(path, f"{counted(len(words), 'column')} without names: {HEADER}", row=1)
-    rows = _numbers(path, delimiter, int(header), places)
+    rows = _numbers(path, delimiter, skip, places)
     if not header:
         rows = rows[:, _order(path, rows)]
     x_levels, column = _levels(rows[:, 0])
@@ -79,6 +78,29 @@ def table(path: Path) -> Parts:
         raise FormatError(path, "expected one row for each node, some are there twice")
     values[row, column] = rows[:, 2]
     return x_levels, y_levels, values, {"unit": unit, "axes": axes}
+
+
+def _beginning(path: Path) -> tuple[list[str], str | None, int]:
+    """Return the words of the headings, or of the first row; the separator; how many lines are no rows."""
+    remarks: list[str] = []
+    with path.open(**TEXT) as file:
+        first = next((line for line in file if not _is_remark(line, remarks)), "")
+    delimiter = next((mark for mark in ",;\t" if mark in first), None)
+    candidates = [first, *(line.strip().lstrip("#%/") for line in reversed(remarks))]
+    rows = [[word.strip() for word in line.strip().lower().split(delimiter)] for line in candidates]
+    named = (row for row in rows[1:] if len(row) == len(rows[0]) and {*row} & {*LONGITUDE, *PROJECTED[0]})
+    words = rows[0]
+    if all(NUMBERS.fullmatch(word) for word in words):
+        return next(named, words), delimiter, len(remarks)
+    return words, delimiter, len(remarks) + 1
+
+
+def _is_remark(line: str, remarks: list[str]) -> bool:
+    """Whether a line is no row, nor headings: it is then kept."""
+    found = REMARK.match(line) is not None
+    if found:
+        remarks.append(line)
+    return found
 
 
 def _named(path: Path, words: list[str]) -> tuple[Column, Column, Column]:
@@ -103,6 +125,7 @@ def _named(path: Path, words: list[str]) -> tuple[Column, Column, Column]:
 def _column(place: int, word: str) -> Column:
     """Return the column of a word in the header: ``mag``, ``mag [uT]``, ``mag (uT)`` or ``mag_uT``."""
     name, *inside = re.split(r"\s*[\[(]\s*", word.strip("\"' "), maxsplit=1)
+    name = re.sub(r"_(dd|wgs84|decimal_degrees)$", "", name.strip().replace(" ", "_"))
     unit = inside[0].rstrip("]) ") if inside else ""
     stem, _, ending = name.rpartition("_")
     if not unit and stem and ending in UNITS:

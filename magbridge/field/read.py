@@ -31,6 +31,8 @@ FILLS = tuple(sign * number for number in (99999.0, 9999.0, 32768.0, 32767.0, 99
 """Numbers that files without NaN write for "not known"."""
 CERTAIN = 9_000.0
 """nT: a fill value as large as this is no anomaly; -999 may be one."""
+TINY = 1.0
+"""A map that does not say its unit, with nothing beyond this, is hardly in nT."""
 NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
 """nT in one unit, by the unit's name in lower case."""
 
@@ -88,7 +90,11 @@ def read_grid(path: str | Path) -> AnomalyGrid:
         found = parts()
     x, y, values, options = found
     scale = _scale(path, options.get("unit", ""))
-    fields = {"anomaly": without_fill(path, values) * scale}
+    anomaly = without_fill(path, values) * scale
+    # before they are reprojected: a spline would carry a hole of 1e32 over the whole map
+    fields = {"anomaly": np.where(np.abs(anomaly) < HOLE, anomaly, nan)}
+    if not options.get("unit") and 0.0 < np.nanmax(np.abs(fields["anomaly"]), initial=0.0) < TINY:
+        raise FormatError(path, f"no value is beyond {TINY:g}: state the unit, nT, uT or T")
     if "sigma" in options:
         fields["sigma"] = options["sigma"] * scale
     longitude, latitude, fields = geographic(path, x, y, fields, options.get("axes", Axes()))

@@ -41,8 +41,8 @@ def surfer_6(path: Path) -> None:
     path.write_bytes(struct.pack("<4s2h6d", b"DSBB", *MAP.shape[::-1], *limits) + MAP.astype("<f4").tobytes())
 
 
-def surfer_7(path: Path) -> None:
-    numbers = LON[0], LAT[0], LON[1] - LON[0], LAT[1] - LAT[0], MAP.min(), MAP.max(), 0.0, 1.70141e38
+def surfer_7(path: Path, rotation: float = 0.0, blank: float = 1.70141e38) -> None:
+    numbers = LON[0], LAT[0], LON[1] - LON[0], LAT[1] - LAT[0], MAP.min(), MAP.max(), rotation, blank
     grid, data = struct.pack("<2i8d", *MAP.shape, *numbers), MAP.astype("<f8").tobytes()
     sections = (b"DSRB", struct.pack("<i", 2)), (b"GRID", grid), (b"DATA", data)
     path.write_bytes(b"".join(tag + struct.pack("<i", len(body)) + body for tag, body in sections))
@@ -86,6 +86,11 @@ def geotiff(path: Path, **others: object) -> None:
     for (tag, kind), value in zip(GEOTIFF_TAGS, wanted.values(), strict=True):
         tags[tag], tags.tagtype[tag] = value, kind
     Image.fromarray(MAP[::-1].astype(np.float32)).save(path, tiffinfo=tags)
+
+
+def metres(unit: int) -> tuple[int, ...]:
+    """Return the keys of a grid in UTM's zone 32, its coordinates in a unit by EPSG's number."""
+    return (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32632, 3076, 0, 1, unit)
 
 
 def vast(path: Path) -> None:
@@ -148,6 +153,7 @@ def marked(path: Path, write: Callable[[Path], None]) -> None:
         ("a.grd", surfer_text),
         ("b.grd", surfer_6),
         ("c.grd", surfer_7),
+        ("blank.grd", lambda path: surfer_7(path, blank=-9999.0)),
         ("d.grd", old_gmt),
         ("e.grd", gmt),
         ("a.nc", cf),
@@ -159,6 +165,9 @@ def marked(path: Path, write: Callable[[Path], None]) -> None:
         ("c.csv", lambda path: table(path, "lon,lat,mag (uT)\n", scale=1e-3)),
         ("d.csv", lambda path: table(path, "\ufefflongitude,latitude,anomaly\n")),  # as Excel writes it
         ("e.csv", lambda path: table(path, "\ufeffx,y,z,mag\n", height=True)),
+        ("f.csv", lambda path: table(path, "Lon_DD,Lat_DD,Mag Anomaly (nT)\n")),
+        ("b.xyz", lambda path: table(path, "/ XYZ EXPORT\n/ x y mag\nLine L100:0\n", " ")),
+        ("c.xyz", lambda path: table(path, "# a grid\n\n# made by hand\nlon lat nT\n", " ")),
         ("c.asc", lambda path: marked(path, esri)),
         ("b.nc", lambda path: cf(path, "T", 1e-9)),
         ("a.tif", geotiff),
@@ -222,6 +231,13 @@ def scattered(path: Path) -> None:
         ),
         ("a.nc", lambda p: cf(p, names=("y", "x"), units="m"), "projected coordinates of an unknown"),
         ("a.nc", lambda p: cf(p, altitude="300 m"), "expected the altitude as a number of m, found '300 m'"),
+        ("a.nc", lambda p: cf(p, "", 1e-3), "no value is beyond 1: state the unit, nT, uT or T"),
+        ("a.grd", lambda p: surfer_7(p, rotation=30.0), "rotated by 30 degrees: expected rows along x"),
+        (
+            "a.tif",
+            lambda p: geotiff(p, keys=metres(9999)),
+            "expected axes in degrees or metres, found a unit",
+        ),
         ("a.grd", lambda p: p.write_bytes(b"DSBB" + bytes(20)), "expected a Surfer grid"),
         ("a.grd", lambda p: p.write_text("DSAA 4 4 0 1 0 1 0 1 7 7 7"), "expected a Surfer grid"),
         ("a.grd", lambda p: p.write_bytes(bytes(600)), "Geosoft"),
