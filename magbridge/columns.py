@@ -95,11 +95,13 @@ _SPELLINGS = {
     "cm/s": ("cm s-1",),
     "s": ("seconds", "sec"),
     "degC": ("Celsius", "celsius", "degrees_Celsius", "degree_Celsius", "degree_C", "°C"),
-    "nT": ("nanotesla", "nanoteslas", "gamma", "gammas"),
-    "T": ("tesla",),
+    "nT": ("nanotesla", "gamma", "gammas"),
     "uT": ("microtesla",),
-    "G": ("gauss", "Gauss", "Oe", "oersted"),  # an oersted is of the same size in air
+    "mT": ("millitesla",),
+    "T": ("tesla",),
+    "uG": ("microgauss",),
     "mG": ("milligauss", "mgauss"),
+    "G": ("gauss", "Oe", "oersted"),  # an oersted is of the same size in air
     "rad": ("radian", "radians"),
     "in": ("inch", "inches"),
     "cm3": ("cc", "cm^3", "cm³"),
@@ -137,7 +139,8 @@ def factor(unit: str, column: str) -> float | None:
 def usual(unit: str) -> str:
     """Return a unit in the spelling of :data:`COLUMNS`: ``degC`` for ``Celsius``."""
     unit = unit.replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
-    return _SAME.get(unit, unit)
+    written_out = unit.lower().replace("-", "").replace(" ", "").replace("teslas", "tesla")
+    return _SAME.get(unit) or (_SAME.get(written_out, unit) if len(written_out) > 4 else unit)
 
 
 def may_be(unit: str, other: str) -> bool:

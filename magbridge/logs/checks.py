@@ -137,7 +137,8 @@ class _Checks:
             k = int(wrong[0])
             place = int(np.searchsorted(index, k))
             before = float(time[index[place - 1]]) if place else self._last
-            self._faults.note("time", len(wrong), rows[k], _expected(float(time[k]), before, then[place]))
+            expected = _disorder(time) or _expected(float(time[k]), before, then[place])
+            self._faults.note("time", len(wrong), rows[k], expected)
         return index, len(repeated)
 
     def _plausible(self, dataset: xr.Dataset, rows: Sequence[int]) -> tuple[xr.Dataset, int]:
@@ -177,6 +178,20 @@ def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> t
 def _wrong(time: FloatArray, after: float) -> IndexArray:
     """Return the indices at which `time` (n,) is no time, or does not increase."""
     return np.flatnonzero(~((np.diff(time, prepend=after) > 0) & (np.abs(time) < YEAR_10000)))
+
+
+def _disorder(time: FloatArray) -> str:
+    """Return what was expected of times (n,) most of which run backwards, or are repeated; "" for others."""
+    steps = np.diff(time)
+    if len(steps) > 1 and np.mean(steps < 0.0) > 0.5:
+        return "expected times that increase, they run backwards: sort the rows by time"
+    if len(steps) > 1 and np.mean(steps == 0.0) > 0.5:
+        each = round(len(time) / len(np.unique(time)))
+        rate = '--column time="row [RATE Hz]"'
+        return (
+            f"expected a time for each row, {each} have the same: if in whole seconds, give the rate, {rate}"
+        )
+    return ""
 
 
 def _expected(time: float, before: float, then: float = np.inf) -> str:

@@ -1,8 +1,9 @@
 """Times as text files write them, in seconds since 1970-01-01 UTC.
 
-A number counts from an epoch (Unix, Excel, Julian, GPS ...), a text is a calendar's date. What the heading
-does not say is told by size: an Excel serial of today is 46,000, a Julian date 2.46 million, a Unix time
-1.8e9. GPS time cannot be told from Unix time by its size: it must be named.
+A number counts from an epoch (Unix, Excel, Julian, GPS ...), a text is a calendar's date (:mod:`.stamps`).
+What the heading does not say is told by size: an Excel serial of today is 46,000, a Julian date 2.46
+million, a Unix time 1.8e9. GPS time cannot be told from Unix time by its size: it must be named. Where
+several columns are the time (date and time of day, GPS week and second), they come joined by blanks.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import FloatArray
-from magbridge.logs.gps_time import GPS_EPOCH, leap_seconds
+from magbridge.logs.gps_time import GPS_EPOCH, WEEK, leap_seconds
+from magbridge.logs.stamps import DAY, HOURS, OF_THE_DAY, epoch, patterns
 
-__all__ = ["Clock", "clock_of", "seconds"]
+__all__ = ["SECONDS_OF_DAY", "Clock", "clock_of", "seconds"]
 
-DAY = 86_400.0
 EPOCHS = {
     "s": (0.0, 1.0),
     "ms": (0.0, 1e-3),
@@ -34,26 +35,27 @@ EPOCHS = {
     "gps": (GPS_EPOCH, 1.0),
 }
 """Kind of a number -> s since 1970 of its zero, and s in its unit."""
+SUMS = {"seconds and nanoseconds": (0.0, 1.0, 1e-9), "GPS week and seconds": (GPS_EPOCH, WEEK, 1.0)}
+"""Kind of two numbers, joined -> s since 1970 of their zero, and s in the unit of each."""
+SECONDS_OF_DAY = "date and seconds of the day"
 WORDS = {
-    "ms": "millisec", "us": "microsec", "ns": "nanosec", "excel": "excel", "mjd": "mjd|modified",
-    "julian": "julian|^jd$",
+    "ms": r"milli|[_ .]ms$", "us": r"micro|[_ .]us$|time_?us$", "ns": r"nano|[_ .]ns$", "excel": "excel",
+    "mjd": "mjd|modified", "julian": "julian|^jd$",
 }  # fmt: skip
 """Kind -> what in a heading says so."""
 SIZES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e6))
 """Kinds that count days, and between which numbers their times lie (1982 to 2064, 1943 to 2080, 1968 to
 2077)."""
-STEP = 5e-4
-"""Largest median step, in days (43 s), by which a count of days is known: the seconds since a boot have
-larger ones."""
-FRACTIONS = (("ns", 1e17, 1e19), ("us", 1e14, 1e17), ("ms", 1e11, 1e14))
+STEP, CERTAIN = 5e-4, 1e-4
+"""Largest median step, in days (43 s, 9 s), by which a count of days is known: the seconds since a boot have
+larger ones; and by which it is under our own name, where they would be 10,000 a second."""
+SINCE_1980 = 3e8, 4.2e9
+"""s since 1970 of 1979 and 2103, between which a count is known by its size."""
 YEAR_1980 = 315_532_800.0
-DATES = (
-    "%d.%m.%Y",  # nobody writes the month first with dots
-    *(rf"%{day}{sign}%{month}{sign}%Y" for sign in "/-" for day, month in ("dm", "md")),
-    *(rf"%Y{sign}%m{sign}%d" for sign in "./"),
-)
+SLOW = 10.0
+"""Median step of whole numbers from which on they hardly are seconds since a boot: of milliseconds it is a
+hundred a second."""
 OF_A_DAY = "times of day, of a day that the file does not tell"
-HOURS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p")
 
 
 class Clock(NamedTuple):
@@ -84,18 +86,23 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
 
     ValueError: dates that can be read in two ways; says what to declare.
     """
-    unit = {"seconds": "s", "sec": "s", "hours": "h", "UTC": ""}.get(unit, unit)
+    unit = {"seconds": "s", "sec": "s", "hours": "h"}.get(unit, unit)
     if "%" in unit:
         return Clock(unit, boot="%d" not in unit and "%j" not in unit)
-    if unit == "iso":
-        return Clock(unit)
+    if unit == "iso" or unit in SUMS:
+        return Clock(unit, unit if unit in SUMS else "")
+    of_day, unit = unit == SECONDS_OF_DAY, unit if unit in EPOCHS else ""
     present = [text.strip() for text in texts if text.strip()]
-    numbers = pd.to_numeric(pd.Series(present, dtype=object), errors="coerce").to_numpy(float)
+    numbers = _numbers(pd.Series(present, dtype="str"))
     if not unit and _on_a_clock(present):
-        return Clock("%H%M%S.%f" if "." in present[0] else "%H%M%S", OF_A_DAY, boot=True)
-    if not present or np.isfinite(numbers).any():
-        return _counted(heading, unit, numbers[np.isfinite(numbers)])
-    return _written(heading, present, zone)
+        return Clock("%H%M%S", OF_A_DAY, boot=True)
+    digits = (
+        not unit and bool(present) and all(re.fullmatch(r"(19|20)\d{12}(\.\d+)?", one) for one in present)
+    )
+    if not digits and (not present or np.isfinite(numbers).any()):
+        whole = all(re.fullmatch(r"\d+", one) for one in present)
+        return _counted(heading, unit, numbers[np.isfinite(numbers)], whole=whole)
+    return _written(heading, present, zone, of_day=of_day)
 
 
 def _on_a_clock(texts: Sequence[str]) -> bool:
@@ -105,13 +112,18 @@ def _on_a_clock(texts: Sequence[str]) -> bool:
     return texts[0].startswith("0") or len({text[2:4] for text in texts}) > 1
 
 
-def _counted(heading: str, unit: str, numbers: FloatArray) -> Clock:
-    if unit in EPOCHS and unit != "s":
+def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> Clock:
+    if unit and unit != "s":
         kind, assumed = unit, ""
     else:
         kind, assumed = _kind(heading, numbers, declared=unit == "s")
     start, scale = EPOCHS[kind]
     since = start + scale * float(np.median(numbers)) if len(numbers) else 0.0
+    dated = since >= YEAR_1980
+    step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
+    if kind == "s" and not unit and whole and step >= SLOW and not (dated and since < SINCE_1980[1]):
+        ways = " or ".join(f'--column time="{heading} [{one}]"' for one in ("ms", "us", "ns", "s"))
+        raise ValueError(f"a count with steps of {step:g}, in a unit that the file does not tell: {ways}")
     boot = bool(len(numbers)) and abs(since) < YEAR_1980 and heading != "time"
     if boot:
         assumed = f"{assumed or f'in {kind}'}, from a start that the file does not tell"
@@ -125,47 +137,40 @@ def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, st
     """
     ours = declared or heading == "time"
     for kind, words in WORDS.items():
-        if re.search(words, heading.lower()):
+        if re.search(words, heading.lower()) and not declared:
             return kind, f"{kind}, by its heading"
     if re.search("gps|gnss", heading.lower()) and len(numbers) and 1e8 < numbers.max() < 2e9:
         return "gps", "GPS time, by its heading"
     if not len(numbers):
         return "s", ""
     middle = float(np.median(numbers))
-    for kind, low, high in FRACTIONS:
-        if low <= middle < high and not declared:
+    for kind in ("ms", "us", "ns"):
+        if SINCE_1980[0] <= middle * EPOCHS[kind][1] < SINCE_1980[1] and not declared:
             return kind, f"{kind} since 1970, by its size"
     step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
     for kind, low, high in SIZES:
-        if low <= middle < high and 0.0 < step < STEP and not ours:
+        if low <= middle < high and 0.0 < step < (CERTAIN if ours else STEP) and not declared:
             return kind, f"{kind} days, by its size"
     return "s", "" if ours else "seconds"
 
 
-def _written(heading: str, texts: Sequence[str], zone: str | None) -> Clock:
+def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bool) -> Clock:
     times = pd.Series(list(texts), dtype=object)
     zoned = all(re.search(r"(Z|UTC|GMT|[+-]\d\d:?\d\d)$", text) for text in texts)
     zone_note = "" if zoned else f"times in {zone}" if zone else "times in UTC"
-    if pd.to_datetime(times, format="ISO8601", utc=True, errors="coerce").notna().all():
+    dated = all(re.match(r"\d{4}\D|\d{8}\D", text) for text in texts)
+    if dated and pd.to_datetime(times, format="ISO8601", utc=True, errors="coerce").notna().all():
         return Clock("iso", zone_note)
-    fit = [f"{date} {hour}" for date in DATES for hour in HOURS if _fits(times, f"{date} {hour}")]
+    fit = [pattern for pattern in patterns(texts) if pattern.endswith(OF_THE_DAY) == of_day]
     if not fit:
-        hours = next((hour for hour in HOURS if _fits(times, hour)), None)
-        if hours is not None:
-            return Clock(hours, OF_A_DAY, boot=True)
         return Clock("iso")  # each cell will be refused with its row
-    if len(fit) > 1 and len({_order(pattern) for pattern in fit}) > 1:
-        which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit[:2])
-        raise ValueError(f"day or month first? {texts[0]!r} can be both: {which}")
+    if len(fit) > 1:
+        which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit)
+        first = "day or month" if len({pattern.lower().find("%y") for pattern in fit}) == 1 else "day or year"
+        raise ValueError(f"{first} first? {texts[0]!r} can be both: {which}")
+    if fit[0] in HOURS:
+        return Clock(fit[0], OF_A_DAY, boot=True)
     return Clock(fit[0], f"{fit[0]}, {zone_note}" if zone_note else fit[0])
-
-
-def _order(pattern: str) -> bool:
-    return pattern.find("%d") < pattern.find("%m")
-
-
-def _fits(times: pd.Series, pattern: str) -> bool:
-    return bool(pd.to_datetime(times, format=pattern, errors="coerce").notna().all())
 
 
 def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
@@ -182,26 +187,22 @@ def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
     """
     if clock.kind in EPOCHS:
         start, scale = EPOCHS[clock.kind]
-        times: FloatArray = pd.to_numeric(cells, errors="coerce").to_numpy(np.float64) * scale + start
-        return times - leap_seconds(times) if clock.kind == "gps" else times
-    texts = cells.astype("string").str.strip()
-    if clock.kind == "iso":
-        stamps = pd.to_datetime(texts, format="ISO8601", errors="coerce", utc=zone is None)
+        times = _numbers(cells) * scale + start
+    elif clock.kind in SUMS:
+        start, *scales = SUMS[clock.kind]
+        parts = cells.astype("string").str.split(expand=True).apply(pd.to_numeric, errors="coerce")
+        large, small = parts.to_numpy(np.float64).T
+        if scales[0] == WEEK and np.nanmax(small) > WEEK:
+            small = small * 1e-3  # of the week are then milliseconds
+        times = start + large * scales[0] + small * scales[1]
     else:
-        stamps = pd.to_datetime(texts, format=clock.kind, errors="coerce", utc=zone is None)
-    if zone is not None:
-        stamps = (
-            stamps.dt.tz_convert("UTC")
-            if stamps.dt.tz is not None
-            else stamps.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
-        )
-    return _epoch(stamps) % DAY if clock.boot else _epoch(stamps)
+        times = epoch(cells, clock.kind, None if clock.boot else zone)
+        return times % DAY if clock.boot else times
+    return times - leap_seconds(times) if clock.kind.lower().startswith("gps") else times
 
 
-def _epoch(stamps: pd.Series) -> FloatArray:
-    """Return s since 1970 of time stamps, NaN for none: whole seconds apart, so that no digit is lost."""
-    plain = stamps.dt.tz_convert("UTC").dt.tz_localize(None) if stamps.dt.tz is not None else stamps
-    counts = plain.astype("datetime64[ns]").to_numpy()
-    whole = counts.astype("datetime64[s]")
-    times = whole.astype(np.int64) + (counts - whole).astype(np.int64) * 1e-9
-    return np.asarray(np.where(np.isnat(counts), np.nan, times), np.float64)
+def _numbers(cells: pd.Series) -> FloatArray:
+    """Return the cells (n,) as numbers, also Fortran's 1.6D+09; NaN for others."""
+    if not pd.api.types.is_numeric_dtype(cells):
+        cells = cells.astype("str").str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
+    return np.asarray(pd.to_numeric(cells, errors="coerce"), np.float64)

@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 
 from magbridge.columns import COLUMNS, NT_PER_UNIT, usual
 
-__all__ = ["aliases", "is_unit", "split"]
+__all__ = ["NUMBER", "aliases", "bare", "is_unit", "split"]
 
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
+"""A cell that is a number, or empty; Fortran writes 1.5D+03."""
 UNITS = {
     *NT_PER_UNIT,
     *(column.units for column in COLUMNS.values() if column.units != "1"),
@@ -20,16 +22,18 @@ UNITS = {
 """Units by which a row of units under the headings is known."""
 AXES = "x", "y", "z"
 VECTORS = (
-    "mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "b{}", "m{}",
-    "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}", "imumagmagneticfield{}", "magmagneticfield{}",
+    "mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "flux{}", "b{}",
+    "m{}", "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}",
 )  # fmt: skip
 """What the three axes are called elsewhere, with neither capitals nor punctuation."""
+ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
+"""What they end in, behind the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
 ALIASES = {
     "time": (
         *("timestamp", "datetime", "timeutc", "utctime", "datetimeutc", "dateandtime", "isotime", "unixtime"),
         *("unixtimestamp", "posixtime", "epoch", "epochtime", "utc", "gpstime", "gpsseconds", "jd", "mjd"),
         *("juliandate", "julianday", "julian", "exceltime", "exceldate", "datenum", "timeiso", "isoformat"),
-        *("zeit", "zeitstempel", "uhrzeit", "heure", "hora", "timeofday", "seconds", "t"),
+        *("zeit", "zeitstempel", "uhrzeit", "heure", "hora", "timeofday", "seconds", "t", "tempo"),
     ),
     "roll": ("rollangle", "rolldeg"),
     "pitch": ("pitchangle", "pitchdeg"),
@@ -59,6 +63,11 @@ def split(heading: str) -> tuple[str, str]:
     return name, unit.strip()
 
 
+def bare(name: str) -> str:
+    """Return a name in small letters, without punctuation."""
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
 def is_unit(text: str) -> bool:
     """Whether a cell under the headings is a unit: of a row of them at least one must be."""
     return usual(text.strip().strip("[]()")) in UNITS
@@ -70,11 +79,11 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
     The three axes are recognised together or not at all: one `b_x` alone may be anything. Three columns in
     units of a magnetic field, alike but for their x, y and z, are the axes whatever they are called.
     """
-    bare = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
+    words = list(map(bare, names))
     found: dict[int, str] = {}
 
     def only(word: str) -> int | None:
-        return bare.index(word) if bare.count(word) == 1 else None
+        return words.index(word) if words.count(word) == 1 else None
 
     if not all(f"mag_{axis}" in names for axis in AXES):
         for pattern in VECTORS:
@@ -87,7 +96,8 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
                 }
                 break
         else:
-            found |= _axes(bare, units)
+            others = ["" if name in COLUMNS else word for name, word in zip(names, words, strict=True)]
+            found |= _axes(words, units) or _ending_alike(others)
     for name in COLUMNS:
         if name in names or name == "quality":  # a foreign one is not our set of flags
             continue
@@ -99,9 +109,17 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
     return found
 
 
-def _axes(bare: Sequence[str], units: Sequence[str]) -> dict[int, str]:
+def _ending_alike(words: Sequence[str]) -> dict[int, str]:
+    """Return the positions of the three axes among bare names that end in them, if no others do."""
+    ends = [(k, match) for k, word in enumerate(words) if (match := ENDING.fullmatch(word))]
+    axes = {k: match[2] or match[4] for k, match in ends}
+    alike = len({match[1] or match[3] for _, match in ends}) == 1 and sorted(axes.values()) == list(AXES)
+    return {k: f"mag_{axis}" for k, axis in axes.items()} if alike else {}
+
+
+def _axes(words: Sequence[str], units: Sequence[str]) -> dict[int, str]:
     """Return the positions of the three axes among bare names, if their units say that they are."""
-    fields = [k for k, unit in enumerate(units) if usual(unit) in NT_PER_UNIT and bare[k]]
-    letters = {bare[k][-1]: k for k in fields} if len(fields) == len(AXES) else {}
-    alike = len({bare[k][:-1] for k in fields}) == 1
+    fields = [k for k, unit in enumerate(units) if usual(unit) in NT_PER_UNIT and words[k]]
+    letters = {words[k][-1]: k for k in fields} if len(fields) == len(AXES) else {}
+    alike = len({words[k][:-1] for k in fields}) == 1
     return {letters[axis]: f"mag_{axis}" for axis in AXES} if alike and set(letters) == set(AXES) else {}

@@ -20,6 +20,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import deployment, sliced, with_losses
+from magbridge.logs.packed import opened
 
 __all__ = ["chunks"]
 
@@ -31,7 +32,8 @@ TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the file in pieces of at most `rows` rows; FormatError: no header of the format, or no rows."""
-    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    with opened(path) as file:
+        lines = file.read().decode("ascii", "replace").splitlines()
     first = next((k for k, line in enumerate(lines) if line.startswith("DATE ")), None)
     if first is None:
         raise FormatError(path, "expected the line DATE TIME DOY ... of IAGA-2002")

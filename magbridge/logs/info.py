@@ -13,6 +13,7 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_b
 from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
+from magbridge.logs.naming import EARTHS
 
 __all__ = ["GAP", "USES", "info", "lacking", "movers", "telemetry"]
 
@@ -44,8 +45,6 @@ STATES = {
     *("degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar", "inHg", "V", "s", "m", "m/s", "nT", "arcmin")
 }
 """Units of what a vehicle is in, or drifts by: temperatures, pressures, voltages, speeds."""
-EARTHS = 15_000.0, 90_000.0
-"""nT, within which the Earth's field lies, with a vehicle's own."""
 
 
 def info(log: xr.Dataset) -> dict[str, Any]:

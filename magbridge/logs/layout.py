@@ -17,32 +17,29 @@ from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
 
-from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import SETTINGS
-from magbridge.logs.headings import aliases, is_unit, split
+from magbridge.logs.headings import NUMBER, is_unit
 from magbridge.logs.makers import declared_by_maker
 from magbridge.logs.mapping import Declared
+from magbridge.logs.naming import name_columns
 from magbridge.wording import counted
 
-__all__ = ["BLANKS", "HEADER", "Layout", "cells", "layout_of"]
+__all__ = ["BLANKS", "HEADER", "Layout", "cells", "is_remark", "layout_of"]
 
 HEADER = 200
 """Lines at the start of a file by which its layout is found."""
 ATTRIBUTE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
-COMMENTS = "#", "%", "//"
+COMMENTS = "#", "%", "/"
+LINE = re.compile(r"\s*(line|tie)[\s:]*[\w.:]+\s*", re.IGNORECASE)
+"""What Geosoft and others write between the lines of a survey."""
 SEPARATORS = ";", "\t", ",", "|"
 BLANKS = " "
 """Stands for any number of blanks between fields."""
-NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
-HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?( ?[AP]M)?", re.IGNORECASE)
-COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
-"""What is declared to be the time where a file has none: the rows, so many a second."""
-DATED = re.compile("date|datum|fecha|jour", re.IGNORECASE)
-"""What in a heading says that the column holds dates."""
 NMEA = "GgaSentence"
 """Heading of the first field that may hold separators of its own."""
-DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+DECIMAL_COMMA = re.compile(r"[-+]?(\d{1,3}(\.\d{3})+|\d+),\d+([eE][-+]?\d+)?")
+THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+\.\d*")
 
 
 @dataclass
@@ -60,8 +57,10 @@ class Layout:
     """As the file has them."""
     declared: Declared = field(default_factory=Declared)
     """What the user says of the columns, or their maker."""
-    date: int | None = None
-    """Which field has the date, where ``time`` is a time of day."""
+    stamp: list[int] = field(default_factory=list)
+    """Which fields are the time, joined by blanks: one, or date and time of day ..."""
+    hemispheres: dict[str, int] = field(default_factory=dict)
+    """``latitude``, ``longitude`` -> which field has N or S, E or W."""
     open_ended: bool = False
     """Rows may have more fields, which are not read."""
     row: int = 1
@@ -74,6 +73,8 @@ class Layout:
     """What the comments declare."""
     fill: float = nan
     """The number that stands for a missing value."""
+    foreign: bool = True
+    """Not written by us: no metadata stand beside it."""
     guesses: list[str] = field(default_factory=list)
     """What the file does not say and was taken for granted."""
 
@@ -85,25 +86,26 @@ def cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
-def layout_of(path: Path, lines: Sequence[str], declared: Declared) -> Layout:
-    """Return the layout of the file that begins with these lines.
+def layout_of(path: Path, lines: Sequence[str], declared: Declared, *, foreign: bool = True) -> Layout:
+    """Return the layout of the file that begins with these lines; `foreign`: nothing stands beside it.
 
     FormatError: no headings, two of one name, or a declared column that is not there.
     """
-    found = Layout()
+    found = Layout(foreign=foreign)
     comments = _comments(path, lines, found)
-    body = [line for line in lines[comments:] if line.strip()]
+    body = [line for line in lines[comments:] if line.strip() and not is_remark(line)]
     if not body or not lines[comments].strip():
         raise FormatError(path, "expected a header row, the file is empty", row=comments + 1)
     found.separator = declared.separator or _separator(body)
     start = comments + _preamble(lines[comments:], found)
     headings = cells(lines[start], found.separator)
     found.first = start + 1
-    if all(NUMBER.fullmatch(cell) for cell in headings):
+    if _are_values(headings):
         start, headings = _headings_elsewhere(path, lines, comments, start, declared, found)
-    found.row = row = start + 1
+    found.row = start + 1
     units = _units_row(lines, found)
-    rows = [cells(line, found.separator) for line in lines[found.first :] if line.strip()]
+    remaining = (line for line in lines[found.first :] if line.strip() and not is_remark(line))
+    rows = [cells(line, found.separator) for line in remaining]
     if rows and all(len(cell) == len(headings) + 1 and not cell[-1] for cell in rows):
         headings = [*headings, "(nothing)"]  # each row ends in a separator
         units = [*units, ""] if units else units
@@ -113,16 +115,26 @@ def layout_of(path: Path, lines: Sequence[str], declared: Declared) -> Layout:
     maker, found.declared = declared_by_maker(headings, declared)
     if maker:
         found.guesses.append(f"columns as {maker} writes them")
-    _name(path, found, headings, units, found.declared, row)
-    _find_date(found, rows)
-    _leave_texts(found, rows)
+    name_columns(path, found, headings, units, rows)
     return found
+
+
+def is_remark(line: str) -> bool:
+    """Whether a line is no row: a comment, or the name of a survey's line."""
+    return line.startswith(COMMENTS) or bool(LINE.fullmatch(line))
+
+
+def _are_values(row: Sequence[str]) -> bool:
+    """Whether a row is no headings: all are numbers, or it and most of its cells begin with a digit."""
+    there = [cell for cell in row if cell]
+    digits = [cell.lstrip("+-.")[:1].isdigit() for cell in there]
+    return all(map(NUMBER.fullmatch, there)) or (digits[0] and sum(digits) > len(there) / 2)
 
 
 def _comments(path: Path, lines: Sequence[str], found: Layout) -> int:
     """Read the comments above the headings; return how many lines they take."""
     for k, line in enumerate(lines):
-        if not line.startswith(COMMENTS):
+        if not is_remark(line):
             return k
         if match := ATTRIBUTE.fullmatch(line.strip()):
             name, text = match.groups()
@@ -168,7 +180,7 @@ def _preamble(lines: Sequence[str], found: Layout) -> int:
     if counts[0] >= usual or often < max(2, len(counts) // 2) or usual < 2:
         return 0
     first = next(k for k, count in enumerate(counts) if count >= usual)
-    if first and all(NUMBER.fullmatch(cell) for cell in cells(lines[first], found.separator)):
+    if first and _are_values(cells(lines[first], found.separator)):
         return 0
     found.guesses.append(f"{counted(first, 'line')} above the headings passed over")
     return first
@@ -181,7 +193,8 @@ def _headings_elsewhere(
     width = _count(lines[start], found.separator)
     for k in reversed(range(comments)):
         headings = cells(lines[k].lstrip("#%/ "), found.separator)
-        if len(headings) == width and not ATTRIBUTE.fullmatch(lines[k].strip()):
+        named = all(any(map(str.isalpha, cell)) for cell in headings)
+        if len(headings) == width and named and not ATTRIBUTE.fullmatch(lines[k].strip()):
             found.first = start
             found.guesses.append(f"headings from the comment in line {k + 1}")
             return k, headings
@@ -206,105 +219,8 @@ def _units_row(lines: Sequence[str], found: Layout) -> list[str]:
 
 
 def _decimal(rows: Sequence[Sequence[str]], found: Layout) -> str:
-    commas = sum(bool(DECIMAL_COMMA.fullmatch(cell)) for row in rows for cell in row)
-    if not commas:
+    written = [cell for row in rows for cell in row if "," in cell]
+    if not any(map(DECIMAL_COMMA.fullmatch, written)) or any(map(THOUSANDS.fullmatch, written)):
         return "."
     found.guesses.append("decimal commas")
     return ","
-
-
-def _name(
-    path: Path, found: Layout, headings: list[str], units: list[str], declared: Declared, row: int
-) -> None:
-    """Give each column its name and unit: as declared, as its heading says, as others call it."""
-    found.headings = headings
-    if found.separator != ",":
-        signs = {"\t": "tabs", BLANKS: "blanks"}
-        found.guesses.append(f"fields separated by {signs.get(found.separator, repr(found.separator))}")
-    parts = [split(heading) for heading in headings]
-    names = [name for name, _ in parts]
-    # a name that stands twice, with different units: the second keeps them in its name
-    names = [name if name not in names[:k] else headings[k] for k, name in enumerate(names)]
-    # a foreign 'Quality' is not our set of flags
-    lower = [name if name in COLUMNS or name.lower() == "quality" else name.lower() for name in names]
-    names = [
-        low if low in COLUMNS and lower.count(low) == 1 else name
-        for name, low in zip(names, lower, strict=True)
-    ]
-    taken = _declared(path, found, names, declared, row)
-    bare = ["" if k in taken else name for k, name in enumerate(names)]
-    declares = [parts[k][1] or (units[k] if k < len(units) else "") for k in range(len(names))]
-    known = {k: name for k, name in aliases(bare, declares).items() if name not in taken.values()}
-    for k, name in known.items():
-        found.guesses.append(f"{name} is {headings[k]!r}")
-    chosen = taken | known
-    unnamed = [name for k, name in enumerate(names) if k not in chosen and name in chosen.values()]
-    final = [
-        "" if names[k] in unnamed and k not in chosen else chosen.get(k, names[k]) for k in range(len(names))
-    ]
-    if headings[-1] == "(nothing)":
-        final[-1] = ""
-    for k, name in enumerate(final):
-        if (not headings[k] and not name) or (name and name in final[:k]):
-            raise FormatError(path, f"expected a name of its own for column {k + 1}, not {name!r}", row=row)
-        unit = declares[k]
-        if name in declared.columns and (declared_unit := declared.columns[name].unit) is not None:
-            unit = declared_unit
-        elif name in declared.columns and not unit and declared.columns[name].heading:
-            unit = split(declared.columns[name].heading or "")[1]
-        if name == "heading" and "magnetic" in f"{headings[k]} {unit}".lower():
-            found.attrs.setdefault("heading_reference", "magnetic")
-            unit = unit.replace("magnetic", "").strip(" ,")
-        if name and unit:
-            found.units[name] = unit
-    found.names = final
-
-
-def _declared(
-    path: Path, found: Layout, names: Sequence[str], declared: Declared, row: int
-) -> dict[int, str]:
-    """Return position -> our name of the columns that the caller declares."""
-    taken: dict[int, str] = {}
-    for name, source in declared.columns.items():
-        theirs = source.heading or name
-        if name == "time" and (match := COUNTED.fullmatch(theirs)):
-            found.rate = float(match[1])
-            if not found.rate:
-                raise FormatError(path, "expected a rate other than 0 Hz", column="time")
-            continue
-        for candidates in (found.headings, list(names)):
-            for wanted in (theirs, split(theirs)[0]):
-                if wanted in candidates:
-                    taken.setdefault(candidates.index(wanted), name)
-                    break
-            if name in taken.values():
-                break
-        else:
-            there = " ".join(repr(heading) if " " in heading else heading for heading in found.headings)
-            raise FormatError(path, f"expected this column; there are: {there}", row=row, column=theirs)
-    return taken
-
-
-def _find_date(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find the column with the date, where ``time`` holds times of day."""
-    dates = [k for k, heading in enumerate(found.headings) if DATED.search(split(heading)[0])]
-    if "time" not in found.names or len(dates) != 1 or found.names[dates[0]] == "time":
-        return
-    place = found.names.index("time")
-    if any(len(row) > place and HOUR.fullmatch(row[place]) for row in rows):
-        found.date, found.names[dates[0]] = dates[0], ""
-
-
-def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Leave out the columns of others that hold texts: nothing here can be done with them."""
-    left = []
-    for k, name in enumerate(found.names):
-        values = [row[k] for row in rows if k < len(row) and row[k]]
-        if not name or name in COLUMNS or not values:
-            continue
-        text = [cell.replace(",", ".") if found.decimal == "," else cell for cell in values]
-        if not any(NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
-            found.names[k] = ""
-            left.append(name)
-    if left:
-        found.guesses.append(f"left out, no numbers: {', '.join(left)}")

@@ -1,5 +1,7 @@
-"""Files of instruments whose makers say what their columns mean: what a user would have to declare.
+"""Files of instruments and autopilots whose makers say what the columns mean: what else a user declares.
 
+PX4's topics as ``ulog2csv`` writes them are in microseconds since the boot and in gauss (PX4,
+msg/SensorMag.msg, msg/VehicleMagnetometer.msg). Geometrics' MagMap writes the month first.
 MagArrow's compass has its x to the right, its y aft and its z down (Geometrics, MagArrow user manual, 'Data
 Format'); ``Mag`` is its caesium magnetometer.
 """
@@ -24,7 +26,29 @@ MAKERS: dict[str, tuple[set[str], dict[str, Source]]] = {
             "mag_z": Source(heading="CompassZ", unit="nT"),
             "sensor_temperature": Source(heading="CompassTemperature", unit="degC"),
         },
-    )
+    ),
+    "MagMap": (
+        {"READING_1", "DATE", "TIME", "LINE", "MARK"},
+        {
+            "total_field": Source(heading="READING_1", unit="nT"),
+            "time": Source(heading="TIME", unit="%m/%d/%y %H:%M:%S"),
+        },
+    ),
+    "SeaSPY's BOB": (
+        {"Reading_Date", "Reading_Time", "Field"},
+        {"total_field": Source(heading="Field", unit="nT")},
+    ),
+    "GEM": ({"nT", "sq"}, {"total_field": Source(heading="nT", unit="nT")}),
+    "PX4's vehicle_magnetometer": (
+        {"timestamp", "device_id", "magnetometer_ga[0]"},
+        {"time": Source(heading="timestamp", unit="us")}
+        | {f"mag_{axis}": Source(heading=f"magnetometer_ga[{k}]", unit="G") for k, axis in enumerate("xyz")},
+    ),
+    "PX4's sensor_mag": (
+        {"timestamp", "device_id", "x", "error_count"},
+        {"time": Source(heading="timestamp", unit="us")}
+        | {f"mag_{axis}": Source(heading=axis, unit="G") for axis in "xyz"},
+    ),
 }
 """Instrument -> headings by which its files are known, and what its columns are."""
 

@@ -1,4 +1,7 @@
-"""Parquet: one float64 column per variable, its unit and meaning in the field's metadata."""
+"""Parquet: one float64 column per variable, its unit and meaning in the field's metadata.
+
+Columns of others are found as those of a text file (:mod:`.naming`).
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from magbridge.arrays import FloatArray
+from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.deployment import deployment, plain_attrs
+from magbridge.logs.clocks import Clock, clock_of, seconds
+from magbridge.logs.deployment import GUESSED, HISTORY, deployment, plain_attrs
+from magbridge.logs.layout import HEADER, Layout
+from magbridge.logs.naming import name_columns
 
 try:
     import pyarrow as pa
@@ -40,19 +48,61 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
 def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the rows, each piece with their numbers."""
     schema = file.schema_arrow
-    units = {field.name: _text(field.metadata, b"units") for field in schema}
     meanings = {field.name: _text(field.metadata, b"long_name") for field in schema}
     attrs = json.loads(_text(schema.metadata, b"magbridge") or "{}")
-    if "time" not in schema.names:
-        raise FormatError(path, f"expected this column; there are: {' '.join(schema.names)}", column="time")
     if not file.metadata.num_rows:
         raise FormatError(path, "expected rows, there are none")
+    layout, clock = _layout(path, file, foreign=b"magbridge" not in (schema.metadata or {}))
     row = 1
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):
-        columns = {field.name: _floats(path, field, batch.column(k)) for k, field in enumerate(schema)}
+        time = _times(batch, layout, clock)
+        columns = {
+            name: _floats(path, schema.field(k), batch.column(k))
+            for k, name in enumerate(layout.names)
+            if name and name != "time"
+        }
         numbers = range(row, row + batch.num_rows)
-        yield deployment(path, columns.pop("time"), columns, units, attrs, meanings), numbers
+        yield deployment(path, time, columns, layout.units, attrs | layout.attrs, meanings), numbers
         row = numbers.stop
+
+
+def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, Clock | None]:
+    """Return what the columns are, by names and first rows; and how times are read that are no stamps."""
+    schema = file.schema_arrow
+    first = next(file.iter_batches(batch_size=HEADER))
+    cells = [["" if one is None else str(one) for one in column.to_pylist()] for column in first.columns]
+    units = [_text(field.metadata, b"units") for field in schema]
+    layout = Layout(foreign=foreign)
+    name_columns(path, layout, schema.names, units, list(zip(*cells, strict=True)))
+    if not layout.stamp:
+        raise FormatError(path, absent("time", schema.names), column="time")
+    time, unit = schema.field(layout.stamp[-1]), layout.units.pop("time", "")
+    clock = None
+    if not pa.types.is_timestamp(time.type):
+        texts = [" ".join(parts) for parts in zip(*(cells[k] for k in layout.stamp), strict=True)]
+        try:
+            clock = clock_of(time.name, unit, texts, None)
+        except ValueError as error:
+            raise FormatError(path, str(error), column=time.name) from None
+        layout.guesses += [f"time: {clock.assumed}"] if clock.assumed else []
+        layout.attrs |= {"time_reference": "boot"} if clock.boot else {}
+    if foreign and layout.guesses:
+        note = "; ".join(layout.guesses)
+        layout.attrs |= {GUESSED: note, HISTORY: f"{path.name} was read with: {note}"}
+    return layout, clock
+
+
+def _times(batch: Any, layout: Layout, clock: Clock | None) -> FloatArray:
+    """Return the times (n,) of a batch, s since 1970."""
+    columns = [batch.column(k) for k in layout.stamp]
+    if clock is None:
+        return _floats(Path(), batch.schema.field(layout.stamp[-1]), columns[-1])
+    if len(columns) == 1:
+        return seconds(clock, columns[0].to_pandas(), None)
+    joined = pd.concat([column.to_pandas().astype("string") for column in columns], axis=1).agg(
+        " ".join, axis=1
+    )
+    return seconds(clock, joined, None)
 
 
 def _text(metadata: dict[bytes, bytes] | None, key: bytes) -> str:

@@ -19,6 +19,7 @@ from magbridge.errors import FormatError
 from magbridge.files import existing
 from magbridge.guard import Guarded, Job, guarded
 from magbridge.logs.options import Options
+from magbridge.logs.packed import DAMAGE
 from magbridge.logs.registry import LEADS, Format, format_of, is_bag
 
 if TYPE_CHECKING:
@@ -203,6 +204,8 @@ def _chunks(
             yield _dated(part.assign_attrs(source=source), options.date)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    except DAMAGE as error:
+        raise FormatError(path, f"expected a whole compressed file: {error}") from None
     if part is None:
         raise FormatError(path, "expected rows, there are none")
 

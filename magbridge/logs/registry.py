@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from magbridge.errors import FormatError, PluginError
+from magbridge.logs.packed import DAMAGE, is_packed, opened
 from magbridge.plugins import blamed, load, plugins
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd"
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
 LEADS = {**FLIGHT, ".log": ".eng"}
 """Suffix of a file that is read with another of its name, to that of the other."""
+PACKED = ".gz", ".bz2", ".xz"
+"""Suffixes before which another tells what the file is."""
 HEADER = 4096
 """Bytes at the beginning of a file by which it is recognised."""
 
@@ -51,6 +54,8 @@ class Format(NamedTuple):
     """Whether it heeds itself which compass the options ask for; else its columns are looked through."""
     maps_columns: bool = False
     """Whether it heeds itself what the options declare of columns; else they are renamed when it is read."""
+    packed: bool = False
+    """Whether it may be compressed as a whole."""
     plugin: EntryPoint | None = None
     """Where another package brings it."""
 
@@ -97,15 +102,26 @@ FORMATS: dict[str, Format] = {
     "telemetry": Format(
         "magbridge.logs.telemetry", (".tlog",), rb"\x00[\x00-\x0c].{6}[\xfd\xfe]", writes=True, compasses=True
     ),
-    "csv": Format("magbridge.logs.text", (".csv",), writes=True, maps_columns=True),
+    "csv": Format("magbridge.logs.text", (".csv",), writes=True, maps_columns=True, packed=True),
     "seaexplorer": Format(
-        "magbridge.logs.seaexplorer", (".gz",), rb"Timestamp;NavState;|PLD_REALTIMECLOCK;|\x1f\x8b"
+        "magbridge.logs.seaexplorer", (), rb"Timestamp;NavState;|PLD_REALTIMECLOCK;", packed=True
     ),
-    "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002"),
+    "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002", packed=True),
     "seaglider": Format("magbridge.logs.seaglider_text", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
-    "text": Format("magbridge.logs.text", (".txt", ".tsv", ".dat", ".asc"), maps_columns=True),
+    "text": Format(
+        "magbridge.logs.text", (".txt", ".tsv", ".dat", ".asc", ".xyz"), maps_columns=True, packed=True
+    ),
 }
 """Name to format; the first whose signature matches reads the file."""
+OTHERS = {
+    rb"PK\x03\x04|\xd0\xcf\x11\xe0": "a spreadsheet, or an archive: save it as CSV, or unpack it",
+    rb"\x28\xb5\x2f\xfd|7z\xbc\xaf|\x1f\x9d|\x1f\x8b|BZh|\xfd7zXZ": "it is compressed: unpack it first",
+    rb"MATLAB 5\.0": "a .mat of MATLAB: save it as CSV (writetable)",
+    rb"%PDF|\s*<(!DOCTYPE|html|\?xml)": "a document, no table",
+    rb"\s*[{\[]\s*[\"{\[]": "JSON: save it as CSV",
+    rb"[A-Z]{3} [A-Z]{3}\d{4} \d{3} \d\d [A-Z]{4} ": "INTERMAGNET's IMF: ask for IAGA-2002",
+}
+"""First bytes of what is no log, or none that is read -> what it is, and what to do."""
 
 
 @cache
@@ -139,14 +155,22 @@ def format_of(path: Path, *, write: bool = False) -> Format:
 
     FormatError: neither its first bytes nor its name are those of a known format.
     """
-    found = None if write else _recognised(path)
+    start = b"" if write or is_bag(path) else _start(path)
+    found = FORMATS["ros"] if is_bag(path) else _recognised(start)
+    packed = not write and path.is_file() and is_packed(path)
+    if found is None and (
+        other := next((text for mark, text in OTHERS.items() if re.match(mark, start)), None)
+    ):
+        raise FormatError(path, f"expected a log, found {other}")
     if found is None:
         known = suffixes(write=write)
-        suffix = path.suffix.lower()
+        suffix = Path(path.stem if packed and path.suffix.lower() in PACKED else path).suffix.lower()
         if suffix not in known:
             raise FormatError(path, f"expected a file name that ends in one of {' '.join(known)}")
         formats = [*FORMATS.values(), *_plugins().values()]
         found = next(one for one in formats if suffix in one.suffixes and (one.writes or not write))
+    if packed and not found.packed:
+        raise FormatError(path, "expected a log, it is compressed: unpack it first")
     return found
 
 
@@ -155,17 +179,21 @@ def is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file()
 
 
-def _recognised(path: Path) -> Format | None:
-    """Return the format whose signature the file bears; None where it bears none."""
-    if is_bag(path):
-        return FORMATS["ros"]
+def _start(path: Path) -> bytes:
+    """Return the first bytes of a file, unpacked."""
     try:
-        with path.open("rb") as file:
-            header = file.read(HEADER)
+        with opened(path) as file:
+            return file.read(HEADER)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+    except DAMAGE as error:
+        raise FormatError(path, f"expected a whole compressed file: {error}") from None
+
+
+def _recognised(start: bytes) -> Format | None:
+    """Return the format whose signature a file bears that begins so; None where it bears none."""
     signed = (one for one in FORMATS.values() if one.signature is not None)
-    return next((one for one in signed if re.match(one.signature or b"", header, re.DOTALL)), None)
+    return next((one for one in signed if re.match(one.signature or b"", start, re.DOTALL)), None)
 
 
 def metadata_path(path: Path) -> Path:

@@ -1,12 +1,13 @@
-"""Telemetry on its own time base, brought to the rows of a deployment."""
+"""Telemetry on its own time base, brought to the rows of a deployment; and what gliders write for degrees."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["CIRCLES", "MAX_AGE", "latest", "linear"]
+__all__ = ["CIRCLES", "MAX_AGE", "degrees", "latest", "linear"]
 
 MAX_AGE = 30.0
 """s; a value that was received longer ago is not carried to a row."""
@@ -77,3 +78,10 @@ def linear(
     before, after = time[np.maximum(right - 1, 0)], time[np.minimum(right, len(time) - 1)]
     result[(after - before > max_gap) | (at - time[-1] > max_gap) | (time[0] - at > max_gap)] = np.nan
     return result if period is None else result - period * np.floor((result - start) / period)
+
+
+def degrees(written: ArrayLike) -> FloatArray:
+    """Return degrees (n,) from ``-13036.442``, degrees and minutes written together (n,)."""
+    values = np.asarray(written, np.float64)
+    whole = np.trunc(values / 100.0)
+    return np.asarray(whole + (values - 100.0 * whole) / 60.0)

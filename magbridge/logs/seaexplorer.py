@@ -16,9 +16,7 @@ Names and units as pyglider reads them, https://pyglider.readthedocs.io
 
 from __future__ import annotations
 
-import gzip
 import re
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,7 +28,8 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import HISTORY, deployment, named_losses, sliced, with_losses
 from magbridge.logs.headings import aliases
-from magbridge.logs.resample import CIRCLES, linear
+from magbridge.logs.packed import opened
+from magbridge.logs.resample import CIRCLES, degrees, linear
 
 __all__ = ["chunks"]
 
@@ -125,7 +124,7 @@ def _read(path: Path) -> xr.Dataset:
         name, unit, scale = NAMES.get(str(theirs), (known.get(k, str(theirs).lower()), "", 1.0))
         values = numbers[theirs].to_numpy(float)
         values = np.where(np.abs(values) == UNKNOWN, np.nan, values)
-        columns.setdefault(name, _degrees(values) if theirs in PLACES else values * scale)
+        columns.setdefault(name, degrees(values) if theirs in PLACES else values * scale)
         units[name] = unit
     whole = deployment(path, time, columns, units)
     remarks = (
@@ -136,11 +135,8 @@ def _read(path: Path) -> xr.Dataset:
 
 def _table(path: Path) -> tuple[pd.DataFrame, int]:
     """Return the file as text, and how many lines have more fields than its header."""
-    try:
-        data = path.read_bytes()
-        text = (gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data).decode("utf-8", "replace")
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise FormatError(path, f"expected a whole gzip file: {error}") from None
+    with opened(path) as file:
+        text = file.read().decode("utf-8", "replace")
     header, *lines = text.splitlines()
     names = [name.strip() for name in header.rstrip(";\r").split(";")]
     fields = [line.rstrip(";\r").split(";", len(names)) for line in lines if line.strip()]
@@ -157,9 +153,3 @@ def _seconds(stamps: pd.Series[str]) -> FloatArray:
     whole = np.where(np.isnat(days), np.nan, days.astype("int64").astype(float))
     fraction = pd.to_numeric("0." + parts[2].replace("", "0"), errors="coerce").to_numpy(float)
     return np.asarray(whole + np.nan_to_num(fraction))
-
-
-def _degrees(values: FloatArray) -> FloatArray:
-    """Return degrees (n,) from ``-13036.442``, degrees and minutes written together (n,)."""
-    whole = np.trunc(values / 100.0)
-    return np.asarray(whole + (values - 100.0 * whole) / 60.0)

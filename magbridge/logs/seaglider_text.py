@@ -16,6 +16,7 @@ import xarray as xr
 
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import sliced
+from magbridge.logs.resample import degrees
 from magbridge.logs.seaglider import Dive, dive
 
 __all__ = ["chunks"]
@@ -72,7 +73,7 @@ def _add_log(known: Dive, path: Path) -> None:
             manoeuvres.append([_number(value) for value in values])
         elif found := FIX.match(line):
             when = datetime.strptime(found[1] + found[2], "%d%m%y%H%M%S").replace(tzinfo=UTC).timestamp()
-            fixes.append((when, _degrees(found[3]), _degrees(found[4])))
+            fixes.append((when, *degrees([found[3], found[4]])))
         elif len(values) in (1, 2):  # a canonical log also has the default
             known.settings[name] = _number(values[0])
     known.manoeuvres = dict(zip(names, np.array(manoeuvres, float).reshape(-1, len(names)).T, strict=True))
@@ -105,10 +106,3 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return float("nan")
-
-
-def _degrees(text: str) -> float:
-    """Return degrees from ``-12454.180``, degrees and minutes written together."""
-    value = float(text)
-    whole = np.trunc(value / 100.0)
-    return float(whole + (value - 100.0 * whole) / 60.0)

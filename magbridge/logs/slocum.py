@@ -1,4 +1,4 @@
-"""Slocum gliders: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, compressed ``.dcd`` ... ``.tcd``.
+"""Slocum: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, compressed ``.dcd`` ..., as text ``.dba``.
 
 A row is a cycle of the flight computer; values that were not updated in a cycle are interpolated linearly.
 The science file of the same name beside a flight file is joined to it, and the other way round: either name,
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from functools import reduce
@@ -28,7 +29,7 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.registry import FLIGHT
-from magbridge.logs.resample import CIRCLES, linear
+from magbridge.logs.resample import CIRCLES, degrees, linear
 from magbridge.logs.slocum_header import check_header
 
 __all__ = ["chunks"]
@@ -38,6 +39,11 @@ MAX_GAP = 300.0
 Tracks = dict[str, tuple[FloatArray, FloatArray]]
 """By sensor: times (m,), s, and values (m,)."""
 CTD = "sci_water_temp", "sci_water_pressure"
+ASCII_HEADER = re.compile(rb"\w+:.*")
+"""A line of the header of what ``dbd2asc`` wrote; below it are names, units, sizes, and a cycle a line."""
+CLOCKS = b"m_present_time", b"sci_m_present_time"
+FILL = 69_696_969.0
+"""deg and min, of a position that was never known."""
 SCIENCE = {flight: science for science, flight in FLIGHT.items()}
 SENSORS = {
     # theirs: (ours, unit, factor)
@@ -135,6 +141,9 @@ def _read(path: Path | None) -> Tracks:
     """Return time and values of each of :data:`SENSORS` in the file, at its updates."""
     if path is None:
         return {}
+    with path.open("rb") as file:
+        if b"DBD_ASC" in file.readline():
+            return _read_ascii(path)
     lists = check_header(path)
     # dbdreader writes the list of sensors where it looks for it
     with tempfile.TemporaryDirectory() as scratch:
@@ -157,3 +166,26 @@ def _read(path: Path | None) -> Tracks:
             raise FormatError(path, f"expected a whole Slocum file: {error}") from None
     tracks = tracks if len(wanted) > 1 else [tracks]
     return {name: (np.asarray(t), np.asarray(v)) for name, (t, v) in zip(wanted, tracks, strict=True)}
+
+
+def _read_ascii(path: Path) -> Tracks:
+    """Return the same of what ``dbd2asc`` wrote (``.dba``): NaN stands for no update."""
+    lines = path.read_bytes().splitlines()
+    start = next((k for k, line in enumerate(lines) if not ASCII_HEADER.fullmatch(line)), len(lines))
+    try:
+        names, units, _ = (line.split() for line in lines[start : start + 3])
+        rows = [line.split() for line in lines[start + 3 :] if line.strip()]
+        values = np.array([row for row in rows if len(row) == len(names)], float).reshape(-1, len(names)).T
+        clock = next(values[names.index(name)] for name in CLOCKS if name in names)
+    except (ValueError, StopIteration):
+        raise FormatError(
+            path, "expected names, units, sizes and rows of numbers, as dbd2asc writes them"
+        ) from None
+    tracks = {}
+    for name, unit, written in zip(names, units, values, strict=True):
+        if (ours := name.decode("ascii", "replace")) in {*SENSORS, "m_present_time", "sci_m_present_time"}:
+            place = np.where(np.abs(written) < FILL, degrees(written), np.nan)
+            track = place if unit in {b"lat", b"lon"} else written
+            there = np.isfinite(clock) & np.isfinite(track)
+            tracks[ours] = (clock[there], track[there])
+    return tracks

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ from magbridge.errors import FormatError
 from magbridge.logs.clocks import Clock, clock_of, seconds
 from magbridge.logs.faults import Faults
 from magbridge.logs.layout import BLANKS, Layout, cells
+from magbridge.logs.naming import HEMISPHERES
+from magbridge.logs.stamps import DAY
+from magbridge.logs.unknown import unknown
 from magbridge.records import Quality
 
 __all__ = ["Table"]
@@ -42,10 +46,10 @@ class Table:
         self.faults = Faults(path, strict=strict)
         self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
         self.guesses: list[str] = []
-        self._time = layout.names.index("time") if "time" in layout.names else -1
+        self._midnights, self._last = 0.0, 0.0
         if layout.rate:
             self._clock = Clock("s", f"{layout.rate:g} rows a second", boot=True)
-        elif self._time >= 0:
+        elif layout.stamp:
             self._clock = self._clock_by(first_lines)
         else:
             missing = f'{absent("time", layout.headings)}; if none is: --column time="row [20 Hz]", its rate'
@@ -59,19 +63,13 @@ class Table:
     def _clock_by(self, first_lines: Sequence[str]) -> Clock:
         """Return how the column of times is read, by its heading, its unit and its first cells."""
         layout = self._layout
-        heading, unit = layout.headings[self._time].strip(), layout.units.pop("time", "")
+        heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.pop("time", "")
         first = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
-        texts = [self._stamp(row) for row in first if max(self._time, layout.date or 0) < len(row)]
-        if layout.date is not None:
-            self.guesses.append(f"date and time from {layout.headings[layout.date]!r} and {heading!r}")
+        texts = [" ".join(row[k] for k in layout.stamp) for row in first if max(layout.stamp) < len(row)]
         try:
             return clock_of(heading, unit, texts, self._declared.zone)
         except ValueError as error:
             raise FormatError(self._path, str(error), column="time") from None
-
-    def _stamp(self, row: Sequence[str]) -> str:
-        date = self._layout.date
-        return row[self._time] if date is None else f"{row[date]} {row[self._time]}"
 
     def read(
         self, lines: list[str], numbers: Sequence[int]
@@ -89,6 +87,15 @@ class Table:
             for k, name in enumerate(self._layout.names)
             if name and name != "time"
         }
+        for name, k in self._layout.hemispheres.items():
+            opposite = frame[k].str.strip().str.upper().isin(["S", "W"]).to_numpy(bool)
+            columns[name] = np.where(opposite, -np.abs(columns[name]), columns[name])
+        for name, codes in (unknown(columns) if self._layout.foreign else {}).items():
+            value = float(columns[name][int(codes.argmax())])
+            self._note(
+                name, codes, kept, f"expected a value, or nothing where it is not known, not {value!r}"
+            )
+            columns[name][codes] = np.nan
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:
                 columns[name][columns[source.valid] == 0.0] = np.nan
@@ -129,9 +136,11 @@ class Table:
 
     def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
         layout = self._layout
-        kept = [k for k, name in enumerate(layout.names) if name or k == layout.date]
-        texts = {k for k, name in enumerate(layout.names) if name == "quality" or k == layout.date}
-        texts |= {self._time} if self._clock.is_text else set()
+        texts = {k for k, name in enumerate(layout.names) if name == "quality"} | {
+            *layout.hemispheres.values()
+        }
+        texts |= {*layout.stamp} if self._clock.is_text or len(layout.stamp) > 1 else set()
+        kept = [k for k, name in enumerate(layout.names) if name or k in texts]
         if not lines:
             return pd.DataFrame({k: pd.Series(dtype="str" if k in texts else float) for k in kept})
         frame = pd.read_csv(
@@ -157,10 +166,13 @@ class Table:
         if self._layout.rate:  # a row that was left out keeps its time
             lines = np.asarray(numbers, np.float64) - 1.0 - self._layout.first
             return lines / self._layout.rate, np.zeros(len(lines), bool)
-        column = frame[self._time]
-        if self._layout.date is not None:
-            column = frame[self._layout.date].str.strip() + " " + column.str.strip()
+        first, *others = self._layout.stamp
+        column = frame[first]
+        for k in others:
+            column = column.str.strip() + " " + frame[k].str.strip()
         times = seconds(self._clock, column, self._declared.zone)
+        if self._clock.is_text and self._clock.boot:
+            times = self._unwound(times)
         wrong = np.isnan(times) & column.notna().to_numpy()
         times[times == self._fill] = np.nan
         self.faults.count("time", len(times))
@@ -169,6 +181,16 @@ class Table:
             self._note("time", wrong, numbers, f"expected {self._clock.expected}, not {text!r}")
         return times, wrong
 
+    def _unwound(self, times: FloatArray) -> FloatArray:
+        """Return times of day (n,) that go on after midnight."""
+        known = np.isfinite(times)
+        steps = np.diff(times[known], prepend=self._last)
+        days = self._midnights + DAY * np.cumsum(steps < -DAY / 2)
+        if known.any():
+            self._midnights, self._last = float(days[-1]), float(times[known][-1])
+            times[known] += days
+        return times
+
     def _floats(self, name: str, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
         if name == "quality":
             return self._flags(column, numbers)
@@ -176,8 +198,7 @@ class Table:
             values = column.to_numpy(np.float64, copy=True)
         else:
             texts = column.astype("str").str.strip()
-            texts = texts.str.replace(",", ".") if self._layout.decimal == "," else texts
-            values = pd.to_numeric(texts, errors="coerce").to_numpy(np.float64, copy=True)
+            values = _numbers(name, texts, self._layout.decimal)
             wrong = np.isnan(values) & column.notna().to_numpy() & (texts.str.lower() != "nan").to_numpy()
             if wrong.any():
                 text = str(column.iloc[int(wrong.argmax())]).strip()
@@ -199,3 +220,17 @@ class Table:
                 expected = f"expected the names of flags, not {text!r}"
                 raise FormatError(self._path, expected, row=row, column="quality") from None
         return np.array([known[text] for text in texts])
+
+
+def _numbers(name: str, texts: pd.Series, decimal: str) -> FloatArray:
+    """Return what texts (n,) mean, also 1.5D+03, 18.300,25 and 52.7 W; NaN for what is no number."""
+    group = re.escape("." if decimal == "," else ",")
+    grouped = rf"^([-+]?\d{{1,3}}(?:{group}\d{{3}})+)(?=\D|$)"
+    texts = texts.str.replace(grouped, lambda match: re.sub(r"[.,]", "", match[1]), regex=True)
+    texts = texts.str.replace(",", ".") if decimal == "," else texts
+    texts = texts.str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
+    if name in HEMISPHERES:
+        signs = np.where(texts.str.contains("[SWsw]", regex=True), -1.0, 1.0)
+        texts = texts.str.replace("[NSEW\u00b0]", "", regex=True, flags=re.IGNORECASE)
+        return np.asarray(signs * pd.to_numeric(texts, errors="coerce").to_numpy(np.float64))
+    return np.array(pd.to_numeric(texts, errors="coerce"), np.float64)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import io
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from math import isnan
@@ -33,8 +34,9 @@ from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
 from magbridge.logs.deployment import GUESSED, HISTORY, deployment, lasting, with_losses
-from magbridge.logs.layout import HEADER, layout_of
+from magbridge.logs.layout import HEADER, is_remark, layout_of
 from magbridge.logs.options import Options
+from magbridge.logs.packed import opened
 from magbridge.logs.registry import metadata_path
 from magbridge.logs.table import Table
 from magbridge.records import Quality
@@ -46,8 +48,8 @@ LONGEST = 1 << 20
 """Characters of the longest line that is read whole."""
 KEPT = 1000
 """Characters that are kept of a longer one: a row that is dropped, and counted."""
-LOOKED_AT = 1 << 16
-"""Bytes by which the encoding is found."""
+LOOKED_AT, LINE = 1 << 16, 256
+"""Bytes by which the encoding is found, and of the first line, which holds no zero in a text."""
 
 
 class Metadata(msgspec.Struct):
@@ -63,19 +65,25 @@ def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple
     is not there.
     """
     encoding, guess = _encoding(path)
-    with path.open(encoding=encoding) as file:
+    with io.TextIOWrapper(opened(path), encoding) as file:
         try:
             yield from _chunks(path, file, rows, options, guess)
         except UnicodeDecodeError:
-            raise FormatError(path, "expected text in UTF-8") from None
+            raise FormatError(path, f"expected text in {encoding.upper().removesuffix('-SIG')}") from None
 
 
 def _encoding(path: Path) -> tuple[str, list[str]]:
     """Return the encoding of a text file, and what had to be guessed."""
-    with path.open("rb") as file:
+    with opened(path) as file:
         start = file.read(LOOKED_AT)
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", []
+    line = start.partition(b"\n")[0][:LINE]
+    zeros = [not any(line[k::2]) for k in (1, 0)]
+    if len(line) > 1 and any(zeros) and not all(zeros):
+        return f"utf-16-{'le' if zeros[0] else 'be'}", []
+    if b"\0" in line:
+        raise FormatError(path, "expected text, the file is binary")
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError:
@@ -93,15 +101,16 @@ def _chunks(
     if reader := captures.reader(header):
         yield from reader(path, chain(header, lines), rows)
         return
-    layout = layout_of(path, header, options.declared)
+    beside = _attributes(path)
+    layout = layout_of(path, header, options.declared, foreign=not metadata_path(path).is_file())
     table = Table(path, layout, header, strict=options.strict)
-    attrs = {**_attributes(path), **layout.attrs, **table.attrs}
+    attrs = {**beside, **layout.attrs, **table.attrs}
     if guesses := [*guess, *layout.guesses, *table.guesses]:
         note = "; ".join(guesses)
         before = [str(attrs[HISTORY])] if HISTORY in attrs else []
         attrs |= {GUESSED: note, HISTORY: "\n".join([*before, f"{path.name} was read with: {note}"])}
     numbered = enumerate(chain(header[layout.first :], lines), layout.first + 1)
-    wanted = ((row, line) for row, line in numbered if line.strip() and not line.startswith("#"))
+    wanted = ((row, line) for row, line in numbered if line.strip() and not is_remark(line))
     while block := list(islice(wanted, rows)):
         time, columns, numbers = table.read([line for _, line in block], [row for row, _ in block])
         piece = deployment(path, time, columns, layout.units, attrs)

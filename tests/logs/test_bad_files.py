@@ -31,7 +31,6 @@ BAD_CSV = {
     "1,2\n3,4\n": "row 1: expected a header row with the columns' names, not '1,2'; without one, say what "
     'each column is, as --column time="column_1 [s]"',
     "time,water_speed [kn]\n1,2\n": "column 'water_speed': expected m/s, not kn",
-    "time,,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 2, not ''",
     "time,mag_x,mag_x\n1,2,3\n": "row 1: expected a name of its own for column 3, not 'mag_x'",
     "time,mag_x\n1,2\n2\n": "row 3: expected 2 fields, not 1",
     "time,mag_x\n1,2\n2,3,4\n": "row 3: expected 2 fields, not 3",
@@ -49,7 +48,9 @@ BAD_CSV = {
     ),
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
     "time,heading\n1,-9999\n": "row 2, column 'heading': expected deg, at most 540, not -9999.0",
-    "time,depth\n1,4\n2,1e300\n": "row 3, column 'depth': expected m, at most 100000, not 1e+300",
+    "time,depth\n1,4\n2,1e300\n": (
+        "row 3, column 'depth': expected a value, or nothing where it is not known, not 1e+300"
+    ),
     "time,water [Celsius]\n1,4\n2,-999\n": (
         "row 3, column 'water': expected at least -273.15 degC, or nothing where it is not known, not -999.0"
     ),
@@ -89,7 +90,7 @@ def test_csv(text: str, rows: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("header", "words"),
-    [("", "expected this column"), ("time,mag_x\n1,2\n", "row 3: expected 2 fields, not 1")],
+    [("", "expected text, the file is binary"), ("time,mag_x\n1,2\n", "row 3: expected 2 fields, not 1")],
 )
 def test_csv_of_endless_zeros_is_not_held(header: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
@@ -238,7 +239,7 @@ def test_parquet_of_text(tmp_path: Path) -> None:
     parquet.write_table(pa.table({"time": [1.0], "mag_x": ["north"]}), path)
     assert refused(path) == "column 'mag_x': expected numbers, not string"
     parquet.write_table(pa.table({"mag_x": [1.0]}), path)
-    assert refused(path) == "column 'time': expected this column; there are: mag_x"
+    assert refused(path).startswith("column 'time': expected this column; there are: mag_x; if one")
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".tlog", ".bin", ".ulg"])

@@ -71,7 +71,7 @@ def test_payload_of_a_seaexplorer(tmp_path: Path) -> None:
 def test_a_gzip_file_that_is_cut_short(tmp_path: Path) -> None:
     path = tmp_path / "sea035.12.gli.sub.36.gz"
     path.write_bytes(gzip.compress(GLI.encode())[:-30])
-    with pytest.raises(FormatError, match="expected a whole gzip file"):
+    with pytest.raises(FormatError, match="expected a whole compressed file"):
         logs.read(path)
 
 

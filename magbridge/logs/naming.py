@@ -1,0 +1,241 @@
+"""Which column of a text file is which of ours, in what unit, and which of them together are the time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT
+from magbridge.errors import FormatError
+from magbridge.logs.clocks import SECONDS_OF_DAY
+from magbridge.logs.headings import NUMBER, aliases, bare, split
+from magbridge.logs.stamps import DAY
+
+if TYPE_CHECKING:
+    from magbridge.logs.layout import Layout
+
+__all__ = ["EARTHS", "HEMISPHERES", "name_columns"]
+
+COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
+"""What is declared to be the time where a file has none: the rows, so many a second."""
+HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d(\.\d*)?", re.IGNORECASE)
+DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyymmdd|ddmmyy)", re.IGNORECASE)
+"""What in a heading says that the column holds dates."""
+TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
+"""What in a heading says that the column holds times, if it is the only one."""
+OF_THE_DAY = re.compile("day|sod|utc|midnight", re.IGNORECASE)
+"""What in a heading says that seconds count from midnight, beside a date."""
+JOINED = {
+    "seconds and nanoseconds": ("(.*stamp)?(secs?|seconds)", "(.*stamp)?(nanosecs?|nsecs?|nanoseconds)"),
+    "GPS week and seconds": (
+        "gps(week|wk)|gwk", "(gps|gnss)?(i?tow|sow|seconds?|timeofweek|secondsofweek)(s|sec|ms)?|gms|gpsms",
+    ),
+    "year to second": (
+        "years?|yyyy|yr", "months?|mon", "days?|dd", "hours?|hh|hr", "mi|min(ute)?s?", "ss|sec(ond)?s?",
+    ),
+    "year, day and time": (
+        "years?|yyyy|yr", "doy|dayofyear|yday", "hours?|hh|hr", "mi|min(ute)?s?", "ss|sec(ond)?s?",
+    ),
+}  # fmt: skip
+"""What several columns are together -> what they are called, with neither capitals nor punctuation."""
+EARTHS = 15_000.0, 90_000.0
+"""nT, within which the Earth's field lies, with a vehicle's own."""
+HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
+
+
+def name_columns(
+    path: Path, found: Layout, headings: list[str], units: Sequence[str], rows: Sequence[Sequence[str]]
+) -> None:
+    """Give each column its name and unit: as declared, as its heading says, as others call it.
+
+    `units` are those of a row of units, or empty; `rows` the cells of the first rows.
+
+    Raises
+    ------
+    FormatError
+        A declared column that is not there, or two of one name of ours.
+    """
+    found.headings = headings
+    if found.separator != ",":
+        signs = {"\t": "tabs", " ": "blanks"}
+        found.guesses.append(f"fields separated by {signs.get(found.separator, repr(found.separator))}")
+    parts = [split(heading) for heading in headings]
+    declares = [parts[k][1] or (units[k] if k < len(units) else "") for k in range(len(parts))]
+    found.names = _named(path, found, [name for name, _ in parts], declares)
+    for k, name in enumerate(found.names):
+        _take_unit(found, name, headings[k], declares[k])
+    _find_time(found, rows)
+    _units_of_axes(found, rows)
+    _leave_texts(found, rows)
+
+
+def _named(path: Path, found: Layout, names: list[str], units: Sequence[str]) -> list[str]:
+    """Return the columns' names, '' for those that are not read."""
+    headings, row = found.headings, found.row
+    # a name that stands twice, with different units: the second keeps them in its name
+    names = [name if name not in names[:k] else headings[k] for k, name in enumerate(names)]
+    # a foreign 'Quality' is not our set of flags
+    lower = [name if name in COLUMNS or name.lower() == "quality" else name.lower() for name in names]
+    names = [
+        low if low in COLUMNS and lower.count(low) == 1 else name
+        for name, low in zip(names, lower, strict=True)
+    ]
+    taken = _declared(path, found, names)
+    open_to_all = ["" if k in taken else name for k, name in enumerate(names)]
+    known = {k: name for k, name in aliases(open_to_all, units).items() if name not in taken.values()}
+    if "time" not in {*taken.values(), *known.values(), *names}:
+        timed = [k for k, name in enumerate(names) if TIMED.search(name) and k not in taken]
+        known |= dict.fromkeys(timed[:1], "time") if len(timed) == 1 else {}
+    for k, name in known.items():
+        found.guesses.append(f"{name} is {headings[k]!r}")
+    if nameless := [str(k + 1) for k, heading in enumerate(headings) if not heading and k not in taken]:
+        found.guesses.append(f"left out, no heading: column {', '.join(nameless)}")
+    chosen = taken | known
+    unnamed = [name for k, name in enumerate(names) if k not in chosen and name in chosen.values()]
+    final: list[str] = []
+    for k, name in enumerate(names):
+        ours = chosen.get(k, "" if name in unnamed or headings[k] == "(nothing)" else name)
+        if ours in final and ours:
+            if ours in COLUMNS:
+                raise FormatError(
+                    path, f"expected a name of its own for column {k + 1}, not {ours!r}", row=row
+                )
+            ours = f"{ours}_{k + 1}"
+        final.append(ours)
+    return final
+
+
+def _take_unit(found: Layout, name: str, heading: str, unit: str) -> None:
+    source = found.declared.columns.get(name)
+    if source is not None and source.unit is not None:
+        unit = source.unit
+    elif source is not None and not unit and source.heading:
+        unit = split(source.heading)[1]
+    if name == "heading" and "magnetic" in f"{heading} {unit}".lower():
+        found.attrs.setdefault("heading_reference", "magnetic")
+        unit = unit.replace("magnetic", "").strip(" ,")
+    if name and unit:
+        found.units[name] = unit
+
+
+def _declared(path: Path, found: Layout, names: Sequence[str]) -> dict[int, str]:
+    """Return position -> our name of the columns that the caller declares."""
+    taken: dict[int, str] = {}
+    for name, source in found.declared.columns.items():
+        theirs = source.heading or name
+        if name == "time" and (match := COUNTED.fullmatch(theirs)):
+            found.rate = float(match[1])
+            if not found.rate:
+                raise FormatError(path, "expected a rate other than 0 Hz", column="time")
+            continue
+        for candidates in (found.headings, list(names)):
+            for wanted in (theirs, split(theirs)[0]):
+                if wanted in candidates:
+                    taken.setdefault(candidates.index(wanted), name)
+                    break
+            if name in taken.values():
+                break
+        else:
+            there = " ".join(repr(heading) if " " in heading else heading for heading in found.headings)
+            expected = f"expected this column; there are: {there}"
+            raise FormatError(path, expected, row=found.row, column=theirs)
+    return taken
+
+
+def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
+    """Find the column that is the time, or those that are it together: date and time of day ..."""
+    place = found.names.index("time") if "time" in found.names else None
+    called = [bare(split(heading)[0]) for heading in found.headings]
+    dates = [k for k, name in enumerate(called) if DATED.search(name) and k != place]
+    for kind, patterns in JOINED.items():
+        places = [[k for k, name in enumerate(called) if re.fullmatch(one, name)] for one in patterns]
+        if all(len(one) == 1 for one in places) and (place is None or [place] in places):
+            found.stamp = [one[0] for one in places]
+            found.units["time"] = kind if len(patterns) == 2 else ""
+            break
+    else:
+        place = dates[0] if place is None and len(dates) == 1 else place
+        found.stamp = [] if place is None else [place]
+        if place is not None and len(dates) == 1 and dates != [place]:
+            cells = [row[place] for row in rows if len(row) > place]
+            counted = OF_THE_DAY.search(found.headings[place]) and all(map(_in_a_day, cells))
+            undated = "%" in (unit := found.units.get("time", "")) and not {"%d", "%j"} & {
+                *re.findall("%.", unit)
+            }
+            if (any(map(HOUR.fullmatch, cells)) or counted) and not undated:
+                found.stamp = [*dates, place]
+            if counted and not all(map(HOUR.fullmatch, cells)):
+                found.units["time"] = SECONDS_OF_DAY
+    if found.rate or not found.stamp:
+        return
+    if len(found.stamp) > 1 or found.names[found.stamp[0]] != "time":
+        found.guesses.append(f"time from {' and '.join(repr(found.headings[k]) for k in found.stamp)}")
+    for k in found.stamp:
+        found.names[k] = "time" if k == found.stamp[-1] else ""
+
+
+def _in_a_day(cell: str) -> bool:
+    try:
+        return 0.0 <= float(cell or 0) < DAY
+    except ValueError:
+        return False
+
+
+def _units_of_axes(found: Layout, rows: Sequence[Sequence[str]]) -> None:
+    """Find the unit of the axes where the file does not state it: one that has it, or the field's length."""
+    undeclared = found.foreign and not set(CHANNELS) & set(found.declared.columns)
+    if not undeclared or not set(CHANNELS) <= set(found.names):
+        return
+    stated = {found.units.get(name, "") for name in CHANNELS}
+    if stated == {""}:
+        unit = _unit_by_length(found, rows)
+        if unit:
+            found.guesses.append(f"mag_x, mag_y, mag_z in {unit}, by the field's length")
+    elif len(stated) == 2 and "" in stated:
+        unit = max(stated)
+        found.guesses.append(f"mag_x, mag_y, mag_z all in {unit}")
+    else:
+        return
+    if unit:
+        found.units |= dict.fromkeys(CHANNELS, unit)
+
+
+def _unit_by_length(found: Layout, rows: Sequence[Sequence[str]]) -> str:
+    """Return the unit in which the field has the length of the Earth's; "" for nT, or where there is none."""
+    places = [found.names.index(name) for name in CHANNELS]
+    lengths = []
+    for row in rows:
+        try:
+            texts = (row[k].replace(",", ".") if found.decimal == "," else row[k] for k in places)
+            lengths.append(float(np.linalg.norm([float(text) for text in texts])))
+        except (ValueError, IndexError):
+            continue
+    length = float(np.median(lengths)) if lengths else 0.0
+    if EARTHS[0] < length < EARTHS[1]:
+        return ""
+    factors = ((unit, factor) for unit, factor in NT_PER_UNIT.items() if unit != "nT")
+    return next((unit for unit, factor in factors if EARTHS[0] < length * factor < EARTHS[1]), "")
+
+
+def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
+    """Leave out the columns of others that hold texts; N and S, E and W are signs of a position."""
+    left = []
+    for k, name in enumerate(found.names):
+        values = {row[k] for row in rows if k < len(row) and row[k]}
+        if not name or name in COLUMNS or not values:
+            continue
+        text = [cell.replace(",", ".") if found.decimal == "," else cell for cell in values]
+        if any(NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
+            continue
+        found.names[k] = ""
+        side = [one for one, letters in HEMISPHERES.items() if {v.upper() for v in values} <= {*letters}]
+        if side and side[0] in found.names:
+            found.hemispheres[side[0]] = k
+        else:
+            left.append(name)
+    if left:
+        found.guesses.append(f"left out, no numbers: {', '.join(left)}")

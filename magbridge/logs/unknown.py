@@ -1,0 +1,42 @@
+"""Numbers that programs without NaN write for "not known"."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.columns import CHANNELS
+
+__all__ = ["unknown"]
+
+CODES = np.outer([-1.0, 1.0], [
+    9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
+    2_147_483_647.0, 69_696_969.0,
+])  # fmt: skip
+"""As they are met, with either sign."""
+HUGE = 1e30
+"""A larger number is one, too, whatever it measures: 1e31, 1e34, 9.97e36."""
+
+
+def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
+    """Return which values of some columns, (n,) each, stand for "not known", without being declared.
+
+    They are huge, or one of :data:`CODES` that lies beyond all others by half their range. A field whose
+    three axes are 0, or the same code, is none.
+    """
+    found = {name: _beyond(values) for name, values in columns.items() if name not in {"time", "quality"}}
+    if set(CHANNELS) <= set(columns):
+        x, y, z = (columns[name] for name in CHANNELS)
+        alike = (x == y) & (y == z) & ((x == 0.0) | np.isin(x, CODES))
+        found |= {name: found[name] | alike for name in CHANNELS}
+    return {name: wrong for name, wrong in found.items() if wrong.any()}
+
+
+def _beyond(values: FloatArray) -> BoolArray:
+    wrong: BoolArray = np.abs(values) > HUGE
+    codes = np.isin(values, CODES)
+    others = values[np.isfinite(values) & ~codes & ~wrong]
+    if codes.any() and len(others):
+        low, high = others.min(), others.max()
+        wrong |= codes & (np.maximum(low - values, values - high) > max(0.5 * (high - low), 1.0))
+    return wrong
