@@ -69,7 +69,9 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
 def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, Clock | None]:
     """Return what the columns are, by names and first rows; and how times are read that are no stamps."""
     schema = file.schema_arrow
-    first = next(file.iter_batches(batch_size=HEADER))
+    first = next(file.iter_batches(batch_size=HEADER), None)
+    if first is None:
+        raise FormatError(path, "expected rows, there are none")
     cells = [["" if one is None else str(one) for one in column.to_pylist()] for column in first.columns]
     units = [_text(field.metadata, b"units") for field in schema]
     layout = Layout(foreign=foreign)
