@@ -45,7 +45,7 @@ def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
         "field": FIELD * directions / np.linalg.norm(directions, axis=1)[:, None],
         "steps": np.where(np.arange(n) > 0, 1, FAR), "dive": np.arange(n) // 50, "place": None,
         "attitude": None, "fitted": np.zeros(n, bool), "learned": np.zeros(n, bool), "cycles": np.empty(0),
-        "source": "made", "dives": -(-n // 50),
+        "source": "made",
         "channels": {"p": Channel(p, "in", ("position",))},
     }  # fmt: skip
     return Survey(**plain | more)

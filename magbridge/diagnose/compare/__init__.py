@@ -1,6 +1,6 @@
 """The comparison: what was measured against what the forward model predicts, as a linear problem.
 
-:mod:`.take` gathers deployments into a :mod:`.survey`, of many :mod:`.dives`. :mod:`.problem` linearises it
-about the calibration, whose coefficients stay free (:mod:`.prior`). Every hypothesis adds
+:mod:`.load_survey` gathers deployments into a :mod:`.survey`, of many :mod:`.dives`. :mod:`.problem`
+linearises it about the calibration, whose coefficients stay free (:mod:`.prior`). Every hypothesis adds
 :mod:`.design_columns` to that problem.
 """

@@ -6,7 +6,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["dives_of", "eighths", "held", "new_dives"]
+__all__ = ["dives_of", "eighths", "held"]
 
 Table = dict[str, FloatArray]
 """Columns (n,) in order of time, each with a value somewhere; ``learned`` is 1 where it was learned from."""
@@ -31,12 +31,6 @@ def dives_of(table: Table) -> IntArray:
         if 4 <= start.sum() <= 0.05 * len(depth):
             return np.cumsum(start)
     return eighths(len(table["time"]))
-
-
-def new_dives(table: Table) -> int:
-    """Count the dives of the logs that are diagnosed; 0 where they have too few."""
-    dive = dives_of(_part(table, table["learned"] < 0.5))
-    return 0 if np.array_equal(dive, eighths(len(dive))) else np.unique(dive).size
 
 
 def held(values: FloatArray) -> FloatArray:

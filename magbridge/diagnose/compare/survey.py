@@ -11,7 +11,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.columns import AGE
-from magbridge.diagnose.compare.dives import dives_of, eighths, held, new_dives
+from magbridge.diagnose.compare.dives import dives_of, eighths, held
 from magbridge.diagnose.compare.kinds import kinds_of
 from magbridge.diagnose.compare.past import FAR, Past
 from magbridge.errors import DataError
@@ -66,8 +66,6 @@ class Survey:
     one's noise."""
     dive: IntArray
     """(n,) number of the dive, the unit of cross-validation."""
-    dives: int
-    """Dives of the logs that are diagnosed, by themselves; 0 where they have too few."""
     place: FloatArray | None
     """(n, 3) m north and east of the middle, and below the surface: 0 in a log without a depth."""
     attitude: FloatArray | None
@@ -166,7 +164,6 @@ def assemble(
         still=still,
         steps=steps,
         dive=dives_of(table),
-        dives=new_dives(table),
         place=_place(table),
         attitude=attitude,
         fitted=table["fitted"] > 0.5,

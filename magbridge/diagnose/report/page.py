@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 
+import numpy as np
+
 from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.residual import rms
 from magbridge.diagnose.assessment.numbers import Delays
@@ -91,7 +93,7 @@ def _log(diagnosis: Diagnosis) -> str:
     first, last = (datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in new[[0, -1]])
     span = float(new[-1] - new[0])
     length = f"{span / 3600.0:.1f} h" if span > LONG else f"{span / 60.0:.0f} min"
-    dives = f" in {survey.dives} dives" if survey.dives else ""
+    dives = f" in {np.unique(survey.dive[~survey.learned]).size} dives" * (survey.parts == "dives")
     training = f", beside {int(survey.learned.sum())} that the calibration was fitted to"
     return (
         f'<p class="faint">{first} to {last} UTC ({length}) · {new.size} samples{dives}'
