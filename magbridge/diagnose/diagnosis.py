@@ -83,7 +83,8 @@ class Finding:
     def follows(self, problem: Problem, fit: Joint) -> Seen:
         """Say what is seen of it in what all other causes leave: nothing where noise hides it."""
         field = self.field(problem)
-        return seen(problem, field + fit.residual / problem.reference_jacobian)._replace(size=rms(field))
+        found = seen(problem, field + fit.residual / problem.reference_jacobian, field)
+        return found._replace(size=rms(field))
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,8 +86,11 @@ class Memory(NamedTuple):
         return self.white < WHITE * self.rms
 
 
-def seen(problem: Problem, signal: FloatArray) -> Seen:
-    """Say which series a signal (n,), nT of the total field, follows."""
+def seen(problem: Problem, signal: FloatArray, of: FloatArray | None = None) -> Seen:
+    """Say which series a signal (n,), nT of the total field, follows.
+
+    Where it is only `of` (n,) it that matters, beside something else, that must follow the series, too.
+    """
     part = slice(None, None, -(-len(signal) // ROWS))
     u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
     axes = np.column_stack([np.ones(len(u)), u])
@@ -97,9 +100,9 @@ def seen(problem: Problem, signal: FloatArray) -> Seen:
     if not total:
         return Seen(None, 0.0, None, size, 0.0)
     base = np.linalg.qr(axes)[0]
-    y = y - base @ (base.T @ y)
+    y, own = (x - base @ (base.T @ x) for x in (y, signal[part] if of is None else of[part]))
 
-    def fitted(q: FloatArray, some: slice) -> FloatArray:
+    def fitted(q: FloatArray, some: slice, y: FloatArray = y) -> FloatArray:
         X = (q[:, :, None] * axes[:, None, some]).reshape(len(q), -1)
         X -= base @ (base.T @ X)
         G = X.T @ X
@@ -117,8 +120,9 @@ def seen(problem: Problem, signal: FloatArray) -> Seen:
 
     found = [(explained(q), name, lag, q) for name, lag, q in _series(problem, part)]
     share, name, lag, q = max(found, key=lambda one: one[0] - WORTH * (one[2] > 0.0))
+    apart = float(own @ fitted(q, EVERY, own)) / (float(own @ own) + 1e-300)
     chance = _by_chance(share, q.shape[1] * len(AXES), (y - fitted(q, EVERY))[:, None] * axes)
-    if share >= LEAST and len(found) * chance < LEVEL:
+    if min(share, apart) >= LEAST and len(found) * chance < LEVEL:
         return Seen(name, lag, axis(q, share), size, share)
     waves = _waves(problem.survey.time[part])
     slow = explained(waves)

@@ -98,6 +98,14 @@ def test_a_slow_series_that_explains_all_is_followed(flown: Problem) -> None:
     assert seen(replace(flown, survey=survey), signal)[:2] == ("warmth", 0.0)
 
 
+def test_a_cause_does_not_follow_what_only_the_rest_beside_it_does(flown: Problem) -> None:
+    warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
+    survey = replace(flown.survey, channels={"warmth": Channel(warmth, "degC", ("temperature",))})
+    problem, own = replace(flown, survey=survey), 4.0 * np.random.default_rng(6).normal(size=N)
+    assert seen(problem, own + 20.0 * warmth).channel == "warmth"
+    assert seen(problem, own + 20.0 * warmth, own).channel is None
+
+
 def _slow_log() -> tuple[xr.Dataset, Calibration, FloatArray]:
     """A survey beside whose reference something wanders, a calibration that states it, and what does, nT."""
     scenario = load("demo")
