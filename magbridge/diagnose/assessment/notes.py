@@ -35,16 +35,14 @@ class Note(NamedTuple):
 def notes(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[Note]:
     """List what to know of one finding; `cause` is its row in the table of causes."""
     return [
-        *_of_shape(finding),
-        *_of_size(finding),
-        *_of_noise(finding),
-        *_of_motion(diagnosis, finding),
+        *_of_numbers(finding),
         *not_separated(finding.candidate, cause, finding.competing),
         *_of_use(diagnosis, finding),
     ]
 
 
-def _of_shape(finding: Finding) -> Iterator[Note]:
+def _of_numbers(finding: Finding) -> Iterator[Note]:
+    """Say what its numbers mean, whether they are implausibly large, and whether it may be noise."""
     candidate = finding.candidate
     if any(name.endswith(")") for name in candidate.names):
         yield Note(
@@ -61,11 +59,7 @@ def _of_shape(finding: Finding) -> Iterator[Note]:
             "field stays too short.",
             {"corner_Hz": corner},
         )
-
-
-def _of_size(finding: Finding) -> Iterator[Note]:
-    """Say so when a cause is implausibly large, as if two cancelled."""
-    times = times_usual(finding.candidate, finding.coefficients)
+    times = times_usual(candidate, finding.coefficients)
     if times >= IMPLAUSIBLE:
         yield Note(
             "implausible_size",
@@ -74,10 +68,6 @@ def _of_size(finding: Finding) -> Iterator[Note]:
             "is used.",
             {"times_usual": times},
         )
-
-
-def _of_noise(finding: Finding) -> Iterator[Note]:
-    """Say so when a sensor whose offsets wander would explain a slow cause as well."""
     if finding.may_be_noise:
         yield Note(
             "random_walk",
@@ -87,7 +77,9 @@ def _of_noise(finding: Finding) -> Iterator[Note]:
         )
 
 
-def _of_motion(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
+def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
+    """Say when and where it acts, whether it is corrected, and what that improves."""
+    candidate, rest = finding.candidate, diagnosis.unexplained
     found = motion(diagnosis.problem, finding)
     if found is not None:
         yield Note(
@@ -97,10 +89,6 @@ def _of_motion(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
             "row says would look the same.",
             found._asdict(),
         )
-
-
-def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
-    candidate, rest = finding.candidate, diagnosis.unexplained
     if any(piece.since for piece in candidate.pieces):
         yield Note(
             "recent",
