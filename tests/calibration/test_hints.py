@@ -17,6 +17,7 @@ def test_a_mass_that_was_left_out_is_named(declared: tuple[str, ...], seed: int)
     """Also one that nearly always moves with the declared one, as a glider's ballast with its battery."""
     log = simulate(load("demo"), seed)
     data = observations(log, declared)
+    data = data.part(np.arange(len(data)) % 3 == 0)  # as much to see in a third of the time
     rows = np.searchsorted(log["time"].to_numpy(), data.time)
     noise = np.random.default_rng(2).normal(size=len(data))
     others = {name: log[name].to_numpy()[rows] for name in ("ballast", "sensor_temperature")}
