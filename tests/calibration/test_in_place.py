@@ -161,8 +161,7 @@ def test_a_long_log_comes_to_rest_with_few_samples_and_ends_with_all(
     survey: Survey, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What every sixth sample tells is a start; calibration and sigma are those of all samples."""
-    data, true, _ = survey
-    whole = fit(data)
+    data, true, whole = survey
     used, sums = [], rounds.Rounds._sums
 
     def counted(own: rounds.Rounds, *args: Any) -> Sums:
