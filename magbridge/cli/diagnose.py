@@ -109,7 +109,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     parts : str
         What was left out of the fit in turn, to measure the RMS after; empty where nothing was.
     """
-    from magbridge.diagnose.report.words import number
+    from magbridge.diagnose.words import number
 
     before, after = (number(facts[f"rms_{when}_nT"]) for when in ("before", "after"))
     low, high = facts["improvement"]["interval"]
@@ -132,8 +132,8 @@ def summary(facts: dict[str, Any], parts: str) -> str:
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
     """Return a line for each cause found, with the alternatives to it, and for what is left unexplained."""
-    from magbridge.diagnose.report.words import number
     from magbridge.diagnose.seen import WHITE
+    from magbridge.diagnose.words import number
 
     causes = []
     warnings = [*facts["assessment"]["warnings"], []]  # none of outliers, which stand last

@@ -1,4 +1,4 @@
-"""Decide whether names are asserted, against descriptions of the same signal without a name."""
+"""Decide whether names are asserted: against descriptions of the same signal without one, or noise."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate, Group
 from magbridge.diagnose.compare.design_columns import Columns
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.compare.problem import Problem, with_slow_noise
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT, bayes_factor_threshold, log_odds
+from magbridge.diagnose.inference.fit_noise import autoregressive_order
 from magbridge.diagnose.inference.hypothesis import Hypothesis, shaped_ratio
-from magbridge.diagnose.inference.joint import Joint
+from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.left_out import held_out
 from magbridge.diagnose.inference.search import Outcome, beside_slow_noise, search
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover
 from magbridge.diagnose.unexplained.varying import varying
 
-__all__ = ["accept", "settle"]
+__all__ = ["accept", "odds_over_random_walk", "settle"]
 
 AGAINST = 2.0
 """Log odds by which dives left out must speak against names. They say it with noise: of 14 right names of S/N
@@ -117,3 +118,27 @@ def _within(outcome: Outcome, behind: float) -> tuple[CompetingHypothesis, ...]:
             if one.behind + behind < limit and (known is None or one.behind + behind < known.behind):
                 found[one.candidate.group] = replace(one, behind=one.behind + behind)
     return tuple(sorted(found.values(), key=lambda one: one.behind))
+
+
+def odds_over_random_walk(outcome: Outcome, own: Hypothesis) -> float:
+    """Return the log odds of one cause that was chosen over offsets that wander in its place.
+
+    Notes
+    -----
+    A random walk has a power of 1/f^2: half waves of variance ``g / k^2`` in place of the ``g / k`` of
+    :mod:`~magbridge.diagnose.compare.slow_noise`. Most of that is of the lowest frequencies, of which a step
+    or a drift of a low signal-to-noise is, too, so a log may not tell them apart. Both are weighed by their
+    evidence, each autoregression at Akaike's price: beside a walk it is shorter.
+    """
+    slots, noise = outcome.problem.survey.slots, outcome.null.noise
+    others = [one.candidate for one in outcome.chosen if one is not own]
+    columns, spectra = [one.columns for one in others], [one.spectra for one in others]
+    walking = with_slow_noise(outcome.problem, 2)
+    rough = fit_joint(walking, columns, 1, spectra=spectra, rounds=2)
+    order = autoregressive_order(rough.residual, slots)
+    walk = fit_joint(walking, columns, order, spectra=spectra, blocks=noise.uneven)
+    without = fit_joint(outcome.problem, columns, noise.past.order, spectra=spectra, blocks=noise.uneven)
+    # coefficients that what is left no longer needs have each gained half a nat by chance
+    price = 0.5 * (noise.past.order + autoregressive_order(outcome.fit.residual, slots))
+    price += float(np.log(outcome.look_elsewhere[own.candidate.cause]))
+    return own.evidence - price + without.log_likelihood - (walk.log_likelihood - order)

@@ -52,7 +52,7 @@ class Finding:
     covariance: FloatArray
     """(k, k)."""
     over_random_walk: float = np.inf
-    """Log odds over a sensor whose offsets wander (:mod:`~.inference.random_walk`); infinite for a cause that
+    """Log odds over a sensor whose offsets wander (:mod:`.accept`); infinite for a cause that
     is not slow."""
 
     @property

@@ -14,7 +14,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms
-from magbridge.diagnose.accept import settle
+from magbridge.diagnose.accept import odds_over_random_walk, settle
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.causes.time_dependent import interference_tone
@@ -31,7 +31,6 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.left_out import Improvement, held_out, paired
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
-from magbridge.diagnose.inference.random_walk import odds_over_random_walk
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.seen import memory
 from magbridge.diagnose.unexplained.leftover import Leftover, leftover

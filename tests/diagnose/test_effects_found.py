@@ -19,7 +19,7 @@ from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.effect_columns import effect_columns
+from magbridge.diagnose.compare.design_columns import effect_columns
 from magbridge.diagnose.compare.problem import pose, samples_of
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.errors import FormatError

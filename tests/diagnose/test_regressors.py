@@ -18,7 +18,7 @@ from magbridge.diagnose.causes.masses import actuator_order
 from magbridge.diagnose.causes.response import BENT
 from magbridge.diagnose.causes.time_dependent import offset_step
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.effect_columns import effect_columns
+from magbridge.diagnose.compare.design_columns import effect_columns
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.past import FAR
 from magbridge.diagnose.compare.problem import Problem, pose

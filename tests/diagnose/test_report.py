@@ -25,9 +25,9 @@ from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import _folded, _outliers, nameless
 from magbridge.diagnose.report.page import improved
-from magbridge.diagnose.report.words import chance, measured, number, physics, row, sizes
 from magbridge.diagnose.run import _small, _verdict
 from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.words import chance, measured, number, physics, row, sizes
 
 
 @pytest.mark.parametrize("cause", CAUSES)

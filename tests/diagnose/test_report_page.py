@@ -19,8 +19,8 @@ from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.report.canvas import ends, rolling
 from magbridge.diagnose.report.details import remaining, visible
 from magbridge.diagnose.report.page import report_html
-from magbridge.diagnose.report.words import number
 from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.words import number
 
 
 def answer(diagnosis: Diagnosis) -> Assessment:

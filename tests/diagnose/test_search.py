@@ -11,13 +11,13 @@ from posed import calibrated, candidate, right, surveyed
 from scipy.signal import lfilter
 
 from magbridge.calibration.instrument_effects import TimeEffect
+from magbridge.diagnose.accept import odds_over_random_walk
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.reference import reference_bias
 from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.inference.competing import exchanged
 from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.hypothesis import Hypothesis
-from magbridge.diagnose.inference.random_walk import odds_over_random_walk
 from magbridge.diagnose.inference.search import (
     LOST,
     _forward_selection,

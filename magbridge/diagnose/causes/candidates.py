@@ -10,8 +10,15 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.design_columns import Columns, Mixture, Since, parts, places, together
-from magbridge.diagnose.compare.effect_columns import effect_columns
+from magbridge.diagnose.compare.design_columns import (
+    Columns,
+    Mixture,
+    Since,
+    effect_columns,
+    parts,
+    places,
+    together,
+)
 from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["AXES", "Candidate", "GridPoint", "Group", "of_effect", "of_reference", "per", "since", "slices"]

@@ -9,7 +9,7 @@ cause. So the noise of axis i may also have a slow part (Keshner 1982, Proc. IEE
 .. math:: o_i(t) = \sum_k c_{ki} \cos(\pi k t / T), \qquad \operatorname{var} c_{ki} = g / k
 
 of one common size g (:mod:`~magbridge.diagnose.inference.statistic`). It is that of many frequencies, of
-which no slow cause has all. A random walk has 1/k^2 (:mod:`~magbridge.diagnose.inference.random_walk`).
+which no slow cause has all. A random walk has 1/k^2 (:mod:`~magbridge.diagnose.accept`).
 """
 
 from __future__ import annotations

@@ -17,7 +17,9 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.isolability import CONFOUNDED, Visible
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.findings import parameters
-from magbridge.diagnose.report.words import (
+from magbridge.diagnose.seen import Memory, Seen
+from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.words import (
     MANY,
     bold,
     chance,
@@ -31,8 +33,6 @@ from magbridge.diagnose.report.words import (
     sizes,
     table,
 )
-from magbridge.diagnose.seen import Memory, Seen
-from magbridge.diagnose.unexplained.leftover import Leftover
 
 __all__ = ["described", "found", "nameless", "remaining", "visible"]
 

@@ -26,7 +26,7 @@ from magbridge.diagnose.report.canvas import (
     sides,
     thin,
 )
-from magbridge.diagnose.report.words import label
+from magbridge.diagnose.words import label
 
 __all__ = ["channels", "measured", "spectrum", "terms", "track"]
 

@@ -22,7 +22,7 @@ from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import described, found, remaining, visible
 from magbridge.diagnose.report.findings import findings_json
-from magbridge.diagnose.report.words import bold, figure, goes_with, listed, measured, number, table
+from magbridge.diagnose.words import bold, figure, goes_with, listed, measured, number, table
 from magbridge.files import atomic_path, new_folder
 
 __all__ = ["improved", "late", "report_html", "write"]

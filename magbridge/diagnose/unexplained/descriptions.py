@@ -15,8 +15,7 @@ from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.design_columns import Columns, size_of
-from magbridge.diagnose.compare.effect_columns import effect_columns
+from magbridge.diagnose.compare.design_columns import Columns, effect_columns, size_of
 from magbridge.diagnose.compare.interpolation import rates
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import Joint
