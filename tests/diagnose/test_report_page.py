@@ -51,6 +51,17 @@ def test_without_a_gain_it_does_not_fly(clear: Diagnosis) -> None:
     assert "do not use it" in reasons(found)[0]
 
 
+def test_what_makes_no_difference_needs_no_extension(clear: Diagnosis) -> None:
+    """And a calibration whose own data do not support it is a doubt of every extension."""
+    small = replace(clear, verdict="negligible")
+    assert answer(small).fit_for_use == "not_needed"
+    assert "Nothing needs explaining: what was found makes" in report_html(small, CAUSES).partition("<h2")[0]
+    given = replace(clear.problem.calibration, warnings=("all headings lie within 20 degrees",))
+    found = answer(replace(clear, problem=replace(clear.problem, calibration=given)))
+    assert found.fit_for_use == "once_settled"
+    assert "own data do not support it: all headings lie within 20 degrees." in "".join(reasons(found))
+
+
 def test_another_possible_cause_is_a_doubt_that_a_manoeuvre_settles(clear: Diagnosis) -> None:
     """Another channel of the same cause is none: the name holds."""
     other = CompetingHypothesis(candidate("offset_drift", np.ones(1)), 1.0)
