@@ -20,7 +20,7 @@ from magbridge.learning import Learner
 from magbridge.learning.model import TEMPERATURE
 from magbridge.plausibility import Attitude, Plausibility
 from magbridge.plausibility.direction import Direction
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 from magbridge.plausibility.turns import Turns
 from magbridge.records import BEYOND, Corrected, Reading
 from magbridge.toml import convert
@@ -68,12 +68,12 @@ class Correction:
         self._corrector = Corrector(calibration)
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
         # what has no calibration is not expected to be the Earth's field
-        self._told = told = Told()
-        self.notices = told.notices
+        self._found = found = Notices()
+        self.notices = found.lines
         judged = calibration.method != "none"
         self.plausibility = self._plausibility(calibration) if judged else None
-        self.turns, self.attitude = Turns(told), Attitude(told)
-        self.direction = None if calibration.boresight is None else Direction(told)
+        self.turns, self.attitude = Turns(found), Attitude(found)
+        self.direction = None if calibration.boresight is None else Direction(found)
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
@@ -193,7 +193,7 @@ class Correction:
             self.attitude.forget()
 
     def _plausibility(self, calibration: Calibration) -> Plausibility:
-        return Plausibility(calibration.noise.sensor, self._told, calibration.reference.level_sigma)
+        return Plausibility(calibration.noise.sensor, self._found, calibration.reference.level_sigma)
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
         """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""

@@ -8,8 +8,8 @@ import pytest
 from magbridge.plausibility import Plausibility
 from magbridge.plausibility.jump import GATE, SLOPE_US
 from magbridge.plausibility.level import FAR, LEVEL, NEAR
+from magbridge.plausibility.notices import Notices
 from magbridge.plausibility.scatter import QUIETEST, Scatter
-from magbridge.plausibility.told import Told
 from magbridge.records import Quality
 
 FIELD, IMPLAUSIBLE, MOVING = 50_000.0, int(Quality.IMPLAUSIBLE), int(Quality.MOVING)
@@ -321,7 +321,7 @@ def test_the_slope_is_measured_over_twenty_seconds() -> None:
 
 def scattered(speed: float, size: float, period: float, places: int = 2, every: float = 0.1) -> float:
     """Return what a hum adds to sigma, nT, of samples so many s apart with 1 nT of noise."""
-    scatter, noise = Scatter(1.0, Told()), np.random.default_rng(1).normal(0.0, 1.0, 3000)
+    scatter, noise = Scatter(1.0, Notices()), np.random.default_rng(1).normal(0.0, 1.0, 3000)
     scatter.begin(9.0 * scatter.floor)
     for k in range(places):
         scatter.place((1 + k) * 60_000_000, 48.0 + k * speed * 60.0 / 111_200.0, -57.0)

@@ -132,13 +132,13 @@ class SensorLine:
     def _look(self, time_us: int) -> None:
         if time_us - self._received_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
             return
-        mumbles = time_us - self._unparsed_us < self._timeout_us // 2
-        what = self._mumble() if mumbles else "is silent"
+        sends = time_us - self._unparsed_us < self._timeout_us // 2
+        what = self._unparsed() if sends else "is silent"
         self._announcer.state("sensor", f"{self._name} {what}", MAV_SEVERITY.ERROR)
         self.wrong_device = not self._known
         self._wake(time_us)
 
-    def _mumble(self) -> str:
+    def _unparsed(self) -> str:
         """Say what comes instead of readings: at a wrong baud rate, bytes that are no text."""
         if not TEXT.fullmatch(self._tail):
             return "sends, but no readings: baud rate?"

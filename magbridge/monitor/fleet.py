@@ -45,7 +45,7 @@ class Fleet:
             return
         for state in self.states.values():
             if state.bridge is not None and state.bridge[0] == message.system:
-                state.overhear(message, now)
+                state.receive_other(message, now)
 
     def _room(self, now: float) -> bool:
         """Make room for one more bridge; False where all that are known still speak."""

@@ -119,7 +119,7 @@ class State:
             STATUSTEXT=self._text, PARAM_VALUE=self._value,
         )  # fmt: skip
         place = dict.fromkeys(("GLOBAL_POSITION_INT", "GPS_RAW_INT"), self._position)
-        self._overheard = by_id(NAMED_VALUE_FLOAT=self._named_value, **place)
+        self._others = by_id(NAMED_VALUE_FLOAT=self._named_value, **place)
 
     def receive(self, message: Message, now: float) -> None:
         """Take a message of the bridge that came at `now`."""
@@ -131,9 +131,9 @@ class State:
         if handle := self._handlers.get(message.id):
             handle(message, now)
 
-    def overhear(self, message: Message, now: float) -> None:
+    def receive_other(self, message: Message, now: float) -> None:
         """Take a message of another component of the same vehicle, such as its autopilot."""
-        if handle := self._overheard.get(message.id):
+        if handle := self._others.get(message.id):
             handle(message, now)
 
     def due(self, now: float) -> list[tuple[str, dict[str, Any]]]:

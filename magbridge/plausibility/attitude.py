@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from magbridge.plausibility.judge import DOUBTFUL
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 
 __all__ = ["Attitude"]
 
@@ -49,13 +49,13 @@ class Attitude:
 
     Parameters
     ----------
-    told : Told, optional
+    notices : Notices, optional
         Takes what is found.
     """
 
-    def __init__(self, told: Told | None = None) -> None:
-        self._told = told or Told()
-        self.notices = self._told.notices
+    def __init__(self, notices: Notices | None = None) -> None:
+        self._notices = notices or Notices()
+        self.notices = self._notices.lines
         self._variance, self._looks = START, LEARNED
         self._next_us = 0
         self._wrong = False
@@ -118,4 +118,4 @@ class Attitude:
         self._theta = self._covariance @ self._toward
         self._wrong = float(self._theta @ self._toward) > (CALM if self._wrong else ALARM)
         if self._wrong:
-            self._told.tell("attitude", "field follows the attitude: gain, offset or a mass wrong")
+            self._notices.report("attitude", "field follows the attitude: gain, offset or a mass wrong")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import log, nan
 from typing import Final
 
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 from magbridge.records import Vector
 
 __all__ = ["Axes"]
@@ -35,8 +35,8 @@ class Axis:
 class Axes:
     """The three channels."""
 
-    def __init__(self, told: Told) -> None:
-        self._told = told
+    def __init__(self, notices: Notices) -> None:
+        self._notices = notices
         self._axes = (Axis(), Axis(), Axis())
         self._stood = False  # whether an axis has a rail
 
@@ -68,5 +68,5 @@ class Axes:
             axis.share += (1.0 - axis.share) / REPEATS
             return False
         axis.rail, self._stood = abs(value), True
-        self._told.tell("axis", f"axis {NAMES[number]} stuck at {value:.0f} nT, or clipped there")
+        self._notices.report("axis", f"axis {NAMES[number]} stuck at {value:.0f} nT, or clipped there")
         return True

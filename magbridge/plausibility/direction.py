@@ -16,7 +16,7 @@ from __future__ import annotations
 from math import asin, atan2, cos, degrees, inf, isfinite, nan, pi, radians, remainder, sin, sqrt
 from typing import Final
 
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 from magbridge.records import Quality
 
 __all__ = ["Direction"]
@@ -43,7 +43,7 @@ class Direction:
 
     Parameters
     ----------
-    told : Told, optional
+    notices : Notices, optional
         Takes what is found.
 
     Attributes
@@ -52,10 +52,10 @@ class Direction:
         Of the last sample: :class:`~magbridge.records.Quality` bits.
     """
 
-    def __init__(self, told: Told | None = None) -> None:
+    def __init__(self, notices: Notices | None = None) -> None:
         self.flags = 0
-        self._told = told or Told()
-        self.notices = self._told.notices
+        self._notices = notices or Notices()
+        self.notices = self._notices.lines
         self._roll = self._pitch = self._yaw = nan
         self._attitude_us = -FRESH_US
         self._inclination = self._declination = nan
@@ -114,8 +114,8 @@ class Direction:
         if self._tilted >= LASTING:
             self._tilted_until_us = time_us + LONG_US
             text = f"inclination off by {degrees(tilt):+.0f} deg: axes or mounting wrong"
-            self._told.tell("inclination", text)
+            self._notices.report("inclination", text)
         if self._turned >= LASTING:
             text = f"vector {degrees(turn):+.0f} deg off the heading: axes or compass wrong"
-            self._told.tell("heading", text)
+            self._notices.report("heading", text)
         self.flags = IMPLAUSIBLE if time_us < self._tilted_until_us else 0

@@ -9,8 +9,8 @@ from magbridge.plausibility.axes import Axes
 from magbridge.plausibility.jump import GATE, Jump
 from magbridge.plausibility.level import Level
 from magbridge.plausibility.moves import Moves
+from magbridge.plausibility.notices import Notices
 from magbridge.plausibility.scatter import Scatter
-from magbridge.plausibility.told import Told
 from magbridge.records import Quality, Vector
 
 __all__ = ["DOUBTFUL", "Plausibility"]
@@ -29,7 +29,7 @@ class Plausibility:
     ----------
     noise : float
         nT, 1-sigma of a channel's noise by the calibration.
-    told : Told, optional
+    notices : Notices, optional
         Takes what is found.
     level : float
         nT, the part of every sample's sigma that all share: it makes the field neither jump nor scatter.
@@ -42,14 +42,14 @@ class Plausibility:
         The last sample is an outlier, of a sensor at fault, or not of the Earth: no level, old or new.
     """
 
-    def __init__(self, noise: float, told: Told | None = None, level: float = 0.0) -> None:
+    def __init__(self, noise: float, notices: Notices | None = None, level: float = 0.0) -> None:
         self._shared = level * level
         self.flags = 0
         self.fault = False
-        told = told or Told()
-        self.notices = told.notices
-        self._axes, self._level, self._moves = Axes(told), Level(told), Moves(told)
-        self._scatter = Scatter(noise, told)
+        notices = notices or Notices()
+        self.notices = notices.lines
+        self._axes, self._level, self._moves = Axes(notices), Level(notices), Moves(notices)
+        self._scatter = Scatter(noise, notices)
         self._jump = Jump(self._scatter, self._moves)
 
     def place(self, time_us: int, latitude: float, longitude: float) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from math import isnan
 from typing import Final
 
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 
 __all__ = ["FAR", "LEVEL", "NEAR", "Level"]
 
@@ -42,8 +42,8 @@ class Level:
         µs until which it is doubtful that it was wrong.
     """
 
-    def __init__(self, told: Told) -> None:
-        self._told = told
+    def __init__(self, notices: Notices) -> None:
+        self._notices = notices
         self.wrong = False
         self.until_us = 0
         self._near = self._far = False  # the main field, once
@@ -65,7 +65,7 @@ class Level:
         self._far = not self._near and (self._far or sigmas2 > FAR * FAR)
         if not self._far:
             return 0.0
-        self._told.tell("far", f"field of {total:.0f} nT, expected {reference:.0f}: sigma is widened")
+        self._notices.report("far", f"field of {total:.0f} nT, expected {reference:.0f}: sigma is widened")
         return off * off
 
     def _take(self, time_us: int, total: float, reference: float, wrong: bool) -> None:
@@ -79,4 +79,6 @@ class Level:
         if self._wrongs >= WRONGS and time_us - self._since_us >= WRONG_US:
             self.until_us = time_us + HOLD_US
             expected = f"{LEAST:.0f} to {MOST:.0f}" if isnan(reference) else f"{reference:.0f}"
-            self._told.tell("level", f"field of {total:.0f} nT, expected {expected}: sensor or calibration")
+            self._notices.report(
+                "level", f"field of {total:.0f} nT, expected {expected}: sensor or calibration"
+            )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 
 __all__ = ["Moves"]
 
@@ -30,8 +30,8 @@ class Moves:
         The level is another than before the first.
     """
 
-    def __init__(self, told: Told) -> None:
-        self._told = told
+    def __init__(self, notices: Notices) -> None:
+        self._notices = notices
         self.away = False
         self._sum = self._largest = 0.0
         self._count = 0
@@ -51,9 +51,9 @@ class Moves:
         self._count += 1
         if by_mass:
             text = f"field jumps by {by:+.0f} nT as a mass moves: calibration or telemetry wrong"
-            self._told.tell("move", text)
+            self._notices.report("move", text)
         else:
-            self._told.tell("jump", f"field jumps by {by:+.0f} nT, which no telemetry explains")
+            self._notices.report("jump", f"field jumps by {by:+.0f} nT, which no telemetry explains")
 
     def doubt(self, time_us: int, nothing: float) -> float:
         """Set :attr:`away`; return the variance (nT²) that the jumps add."""

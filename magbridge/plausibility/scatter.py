@@ -14,7 +14,7 @@ from math import nan
 from typing import Final
 
 from magbridge.field.geodesy import separation
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 
 __all__ = ["QUIETEST", "Scatter"]
 
@@ -90,8 +90,8 @@ class Scatter:
         nT², of an innovation from one sample to the next; never less than the calibration's noise gives.
     """
 
-    def __init__(self, noise: float, told: Told) -> None:
-        self._told = told
+    def __init__(self, noise: float, notices: Notices) -> None:
+        self._notices = notices
         self._known = noise > 0.0
         self.floor = 1.5 * max(noise, QUIETEST) ** 2
         self.variance = self.floor
@@ -166,5 +166,5 @@ class Scatter:
         sure = 1.0 + UNSURE / self._next.count
         self._noisy = ratio > NOISY * (0.5 if self._noisy else sure)
         if ratio > LOUD * sure:
-            self._told.tell("noise", f"noise of {variance**0.5:.0f} nT: sigma is widened")
+            self._notices.report("noise", f"noise of {variance**0.5:.0f} nT: sigma is widened")
         return variance if self._noisy else 0.0

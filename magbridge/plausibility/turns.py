@@ -18,7 +18,7 @@ from __future__ import annotations
 from typing import Final
 
 from magbridge.plausibility.judge import DOUBTFUL
-from magbridge.plausibility.told import Told
+from magbridge.plausibility.notices import Notices
 
 __all__ = ["Turns"]
 
@@ -47,13 +47,13 @@ class Turns:
 
     Parameters
     ----------
-    told : Told, optional
+    notices : Notices, optional
         Takes what is found.
     """
 
-    def __init__(self, told: Told | None = None) -> None:
-        self._told = told or Told()
-        self.notices = self._told.notices
+    def __init__(self, notices: Notices | None = None) -> None:
+        self._notices = notices or Notices()
+        self.notices = self._notices.lines
         self._next_us = 0
         self._anchor_us = -LONGEST_US
         self._field, self._variance = 0.0, 0.0
@@ -116,4 +116,6 @@ class Turns:
         self._wrong = self._sum > (0.0 if self._wrong else ALARM)
         if self._wrong:
             size = self._largest**0.5
-            self._told.tell("turns", f"field changes by {size:.0f} nT in turns: offset, gain or a mass wrong")
+            self._notices.report(
+                "turns", f"field changes by {size:.0f} nT in turns: offset, gain or a mass wrong"
+            )

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-__all__ = ["Told"]
+__all__ = ["Notices"]
 
 
-class Told:
+class Notices:
     """Lines for the user.
 
     Attributes
     ----------
-    notices : list of str
+    lines : list of str
         What was found since the caller has last emptied it.
     """
 
     def __init__(self) -> None:
-        self.notices: list[str] = []
+        self.lines: list[str] = []
         self._keys: set[str] = set()
 
-    def tell(self, key: str, text: str) -> None:
+    def report(self, key: str, text: str) -> None:
         """Take a line, unless there was one of this key."""
         if key not in self._keys:
             self._keys.add(key)
-            self.notices.append(text)
+            self.lines.append(text)
