@@ -22,13 +22,15 @@ def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
     """Return which values of some columns, (n,) each, stand for "not known", without being declared.
 
     They are huge, or one of :data:`CODES` that lies beyond all others by half their range. A field whose
-    three axes are 0, or the same code, is none.
+    three axes are 0, or the same code, is none, nor is a place at 0, 0: a receiver without a fix writes it.
     """
     found = {name: _beyond(values) for name, values in columns.items() if name not in {"time", "quality"}}
-    if set(CHANNELS) <= set(columns):
-        x, y, z = (columns[name] for name in CHANNELS)
-        alike = (x == y) & (y == z) & ((x == 0.0) | np.isin(x, CODES))
-        found |= {name: found[name] | alike for name in CHANNELS}
+    for together in (CHANNELS, ("latitude", "longitude")):
+        if set(together) <= set(columns):
+            first, *others = (columns[name] for name in together)
+            alike = np.all([first == other for other in others], axis=0)
+            alike &= (first == 0.0) | np.isin(first, CODES)
+            found |= {name: found[name] | alike for name in together}
     return {name: wrong for name, wrong in found.items() if wrong.any()}
 
 

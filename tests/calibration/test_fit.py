@@ -269,8 +269,16 @@ def test_a_collapsed_fit_is_refused() -> None:
     data = Observations(
         field * [3.0, 3.0, 3.0] + rng.normal(0, 1, (400, 3)), np.full(400, 5e4), np.empty((400, 0))
     )
-    with pytest.raises(CalibrationError, match="collapsed"):
+    with pytest.raises(CalibrationError, match=r"collapsed: .* there are too few attitudes"):
         fit(data, "nominal", gain_sigma=1.0)
+
+
+def test_a_stuck_channel_and_counts_are_named(glider: Gliders) -> None:
+    runs = glider(0).runs
+    with pytest.raises(CalibrationError, match=r"a reading counts 6\.\d+ nT, or there are too few attitudes"):
+        fit(replace(runs, field=runs.field / 6.67), "nominal", gain_sigma=1.0)
+    with pytest.raises(CalibrationError, match="mag_y is 43000 in every sample: the channel is stuck"):
+        fit(replace(runs, field=runs.field * [1.0, 0.0, 1.0] + [0.0, 43_000.0, 0.0]))
 
 
 def test_without_parameters_auto_is_one_ellipsoid(glider: Gliders) -> None:

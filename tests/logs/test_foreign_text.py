@@ -182,6 +182,12 @@ def test_a_field_of_nothing_is_none_and_one_axis_at_0_is(tmp_path: Path) -> None
     assert float(log["mag_x"][6]) == -9999.0
 
 
+def test_a_place_at_0_0_is_a_receiver_without_a_fix(tmp_path: Path) -> None:
+    log = read(tmp_path, "time,lat,lon\n1600000000,0,0\n1600000001,0,9.5\n1600000002,47.5,0\n")
+    assert np.isnan(log["latitude"]).values.tolist() == [True, False, False]
+    assert np.isnan(log["longitude"]).values.tolist() == [True, False, False]
+
+
 PLACES = {
     "columns of letters": ("lat,NS,lon,EW", "47.5,N,52.75,W", "47.5,N,52.75,W"),
     "letters behind": ("lat,lon", "47.5N,52.75W", "47.5 N,52.75 W"),

@@ -16,6 +16,7 @@ from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.calibration.residual import robust_scale
+from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError
 from magbridge.field.reference import other_units
 
@@ -156,7 +157,12 @@ def _biased(found: Fit, sigma: float) -> Fit:
 
 
 def _refuse_one_attitude(data: Observations) -> None:
-    """Refuse samples of one attitude: they cannot separate the sensor's errors from the field."""
+    """Refuse samples of one attitude, or axis: they cannot separate the sensor's errors from the field."""
+    if (stuck := np.flatnonzero(np.ptp(data.field, axis=0) == 0.0)).size:
+        which = CHANNELS[int(stuck[0])]
+        raise CalibrationError(
+            f"{which} is {data.field[0, stuck[0]]:g} in every sample: the channel is stuck"
+        )
     unit = data.field / np.linalg.norm(data.field, axis=1)[:, None]
     middle = unit.mean(axis=0)
     off = np.degrees(np.arccos(np.clip(unit @ middle / np.linalg.norm(middle), -1.0, 1.0)))

@@ -160,7 +160,9 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     narrow = float(np.linalg.eigvalsh(np.cov(seen.field.T))[0]) < ALL_AROUND * samples.F_0**2
     if scales[worst, 0] < 0.5 or scales[worst, 2] > 2.0 or (narrow and T[worst] / samples.F_0 > 2.0):
         listed = ", ".join(f"{value:.3g}" for value in scales[worst])
+        alike = scales[worst, 2] < 1.2 * scales[worst, 0]
+        counts = f"a reading counts {scales[worst].mean():.3g} nT, or " if alike else ""
         raise CalibrationError(
             f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
-            f"{samples.F_0:.0f} nT; there are too few attitudes to tell scale from offset"
+            f"{samples.F_0:.0f} nT; {counts}there are too few attitudes to tell scale from offset"
         )
