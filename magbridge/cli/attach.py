@@ -198,7 +198,7 @@ def drivers(name: str | None = None, /, *, json: Json = False) -> None:
     facts = {}
     for one in [name] if name else driver_names():
         facts[one] = [
-            {"name": o.name, "type": o.kind, "required": o.required, "meaning": o.meaning}
+            {"name": o.name, "type": o.kind, "required": o.required, "meaning": o.meaning.replace("``", "")}
             | ({} if o.required else {"default": o.default})
             for o in options_of(one)
         ]

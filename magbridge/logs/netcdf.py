@@ -27,6 +27,7 @@ from magbridge.files import systems_reason
 from magbridge.logs import seaglider, trajectory
 from magbridge.logs.cf import EPOCH
 from magbridge.logs.deployment import sliced
+from magbridge.logs.unknown import known
 from magbridge.records import Quality
 from magbridge.version import __version__
 
@@ -70,7 +71,9 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
                 for k, part in enumerate(sliced(whole, rows)):
                     yield part, range(k * rows + 1, k * rows + 1 + part.sizes["time"])
             else:
-                yield from trajectory.chunks(path, file, rows)
+                ours = any("column" in variable.ncattrs() for variable in file.variables.values())
+                for part, numbers in trajectory.chunks(path, file, rows):
+                    yield part if ours else known(path, part), numbers
     except (OSError, RuntimeError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise FormatError(path, f"expected a whole netCDF file: {reason}") from None

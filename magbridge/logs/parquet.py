@@ -21,6 +21,7 @@ from magbridge.logs.clocks import Clock, clock_of, seconds
 from magbridge.logs.deployment import GUESSED, HISTORY, deployment, plain_attrs
 from magbridge.logs.layout import HEADER, Layout
 from magbridge.logs.naming import name_columns
+from magbridge.logs.unknown import known
 
 try:
     import pyarrow as pa
@@ -62,7 +63,8 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
             if name and name != "time"
         }
         numbers = range(row, row + batch.num_rows)
-        yield deployment(path, time, columns, layout.units, attrs | layout.attrs, meanings), numbers
+        piece = deployment(path, time, columns, layout.units, attrs | layout.attrs, meanings)
+        yield known(path, piece) if layout.foreign else piece, numbers
         row = numbers.stop
 
 

@@ -19,7 +19,7 @@ from magbridge.logs.faults import Faults
 from magbridge.logs.layout import BLANKS, Layout, cells
 from magbridge.logs.naming import HEMISPHERES
 from magbridge.logs.stamps import DAY
-from magbridge.logs.unknown import unknown
+from magbridge.logs.unknown import EXPECTED, unknown
 from magbridge.records import Quality
 
 __all__ = ["Table"]
@@ -92,9 +92,7 @@ class Table:
             columns[name] = np.where(opposite, -np.abs(columns[name]), columns[name])
         for name, codes in (unknown(columns) if self._layout.foreign else {}).items():
             value = float(columns[name][int(codes.argmax())])
-            self._note(
-                name, codes, kept, f"expected a value, or nothing where it is not known, not {value!r}"
-            )
+            self._note(name, codes, kept, f"{EXPECTED}{value!r}")
             columns[name][codes] = np.nan
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:

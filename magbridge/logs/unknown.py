@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+import xarray as xr
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import CHANNELS
+from magbridge.errors import FormatError
+from magbridge.logs.deployment import with_losses
 
-__all__ = ["unknown"]
+__all__ = ["EXPECTED", "known", "unknown"]
+
+EXPECTED = "expected a value, or nothing where it is not known, not "
 
 CODES = np.outer([-1.0, 1.0], [
     9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
@@ -42,3 +49,14 @@ def _beyond(values: FloatArray) -> BoolArray:
         low, high = others.min(), others.max()
         wrong |= codes & (np.maximum(low - values, values - high) > max(0.5 * (high - low), 1.0))
     return wrong
+
+
+def known(path: Path, dataset: xr.Dataset) -> xr.Dataset:
+    """Return a deployment of another program without what stands for "not known": counted, and named."""
+    codes = unknown({str(name): column.to_numpy() for name, column in dataset.data_vars.items()})
+    lines = []
+    for name, wrong in codes.items():
+        values = dataset[name].to_numpy()
+        lines.append(str(FormatError(path, f"{EXPECTED}{float(values[wrong][0])!r}", column=name)))
+        dataset = dataset.assign({name: dataset[name].copy(data=np.where(wrong, np.nan, values))})
+    return with_losses(dataset, {"values_dropped": sum(int(wrong.sum()) for wrong in codes.values())}, lines)

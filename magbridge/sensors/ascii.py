@@ -106,7 +106,7 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     range: Positive | None = None
     """nT at which a channel saturates."""
     checksum: Literal["nmea", "xor", "sum", "crc32"] | None = None
-    """From :data:`CHECKSUMS`: in hexadecimal after a ``*`` at the end of the line."""
+    """In hexadecimal after a ``*`` at the end of the line; ``nmea`` leaves out the first byte, the ``$``."""
     time_unit: Literal["s", "ms", "us"] = "s"
     """Of the column ``time``."""
     time_modulo: NotNegative = 0.0

@@ -173,6 +173,18 @@ def test_a_code_for_not_known_is_no_value(code: str, tmp_path: Path) -> None:
     assert "row 7, column 'mag_x': expected a value, or nothing where it is not known" in log.attrs["losses"]
 
 
+def test_codes_in_the_netcdf_and_parquet_of_others(tmp_path: Path) -> None:
+    axes = {f"mag_{axis}": ("time", [20_000.0, -9999.0, -15_000.0]) for axis in "xyz"}
+    time = xr.DataArray([NOON, NOON + 1, NOON + 2], dims="time", attrs={"units": "seconds since 1970-01-01"})
+    theirs = xr.Dataset(axes, {"time": time})
+    theirs.to_netcdf(tmp_path / "a.nc", encoding={name: {"_FillValue": None} for name in axes})
+    theirs.to_dataframe().reset_index().to_parquet(tmp_path / "a.parquet")
+    for name in ("a.nc", "a.parquet"):
+        log = logs.read(tmp_path / name)
+        assert np.isnan(log["mag_z"].values).tolist() == [False, True, False]
+        assert "column 'mag_z': expected a value, or nothing where it is not known" in log.attrs["losses"]
+
+
 def test_a_field_of_nothing_is_none_and_one_axis_at_0_is(tmp_path: Path) -> None:
     rows = [f"{NOON + k},{20_000 * (k % 3 - 1)},0,45000" for k in range(20)]
     rows[5] = f"{NOON + 5},0,0,0"
@@ -184,8 +196,8 @@ def test_a_field_of_nothing_is_none_and_one_axis_at_0_is(tmp_path: Path) -> None
 
 def test_a_place_at_0_0_is_a_receiver_without_a_fix(tmp_path: Path) -> None:
     log = read(tmp_path, "time,lat,lon\n1600000000,0,0\n1600000001,0,9.5\n1600000002,47.5,0\n")
-    assert np.isnan(log["latitude"]).values.tolist() == [True, False, False]
-    assert np.isnan(log["longitude"]).values.tolist() == [True, False, False]
+    assert np.isnan(log["latitude"].values).tolist() == [True, False, False]
+    assert np.isnan(log["longitude"].values).tolist() == [True, False, False]
 
 
 PLACES = {
