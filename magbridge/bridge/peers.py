@@ -14,6 +14,7 @@ from collections.abc import Hashable, Iterable
 from math import inf
 
 from magbridge.mavlink import BAD_DATA, Codec
+from magbridge.mavlink.framing import V2
 
 __all__ = ["ANSWERED", "TIMEOUT", "Peer", "Peers"]
 
@@ -29,7 +30,6 @@ STRANGERS = 8192
 """Bytes, likewise, of all peers together that have not yet sent anything valid."""
 LOOK = 1.0
 """s between two looks at who has fallen silent."""
-V2 = 0xFD
 
 
 class Peer:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from magbridge.bridge.port import Port
 from magbridge.link.message_rates import LIMITS
 from magbridge.mavlink import spec
+from magbridge.mavlink.framing import SIGNATURE, V2, is_signed
 
 __all__ = ["LATE", "MOST", "Stream", "cut"]
 
@@ -22,7 +23,8 @@ RENEWED = {spec(name).id for name in LIMITS}
 """Messages that are sent again and again: a newer one makes an older one worthless."""
 NAMED, NAME = spec("NAMED_VALUE_FLOAT").id, 8
 """The one of them of which each name is a kind of its own, and where in its payload the name begins."""
-VERSION_2, HEADER, CHECKSUM, SIGNED, SIGNATURE = 0xFD, 10, 2, 1, 13
+HEADER, CHECKSUM = 10, 2
+"""Bytes of a frame before its payload, and after it."""
 
 
 class Stream(Port):
@@ -121,8 +123,8 @@ def cut(data: bytes) -> Iterator[bytes]:
     """Cut `data` into MAVLink frames; a command to a sensor stays in one piece."""
     while data:
         size = len(data)
-        if data[0] == VERSION_2 and size > HEADER:
-            size = HEADER + data[1] + CHECKSUM + (SIGNATURE if data[2] & SIGNED else 0)
+        if data[0] == V2 and size > HEADER:
+            size = HEADER + data[1] + CHECKSUM + (SIGNATURE if is_signed(data) else 0)
         yield data[:size]
         data = data[size:]
 
@@ -130,6 +132,6 @@ def cut(data: bytes) -> Iterator[bytes]:
 def _kind(frame: bytes) -> bytes | None:
     """Return what the messages share that supersede each other; None where each of them counts."""
     number = int.from_bytes(frame[7:10], "little")
-    if frame[0] != VERSION_2 or number not in RENEWED:
+    if frame[0] != V2 or number not in RENEWED:
         return None
     return frame[7:10] + (frame[HEADER + NAME : HEADER + frame[1]] if number == NAMED else b"")

@@ -21,13 +21,13 @@ from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.framing import is_signed
 
 __all__ = ["TIMESYNC_US", "Component"]
 
 TIMESYNC = spec("TIMESYNC")
 SETUP_SIGNING = spec("SETUP_SIGNING").number
 TIMESYNC_US = 1_000_000
-VERSION_2 = 0xFD
 MOST_REQUESTS = 64
 """Requests for files that are kept while nobody takes them."""
 FILE_REQUESTS = ("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
@@ -259,11 +259,6 @@ class Component:
         if parameter:
             self._service.send(parameter)
         return bool(parameter)
-
-
-def is_signed(frame: bytes) -> bool:
-    """Say whether a frame carries a signature."""
-    return frame[0] == VERSION_2 and bool(frame[2] & 1)
 
 
 def always(report: Callable[[], None]) -> bool:

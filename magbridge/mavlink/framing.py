@@ -16,7 +16,7 @@ from magbridge.mavlink.messages import Message, spec
 
 __all__ = [
     "AFTER", "BEFORE_V2", "EXTRA", "HEADER", "LAST", "MAGIC", "MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED",
-    "V1", "V2", "find_magic", "frame_end", "message",
+    "V1", "V2", "find_magic", "frame_end", "is_signed", "message",
 ]  # fmt: skip
 
 V1: Final = 0xFE
@@ -107,6 +107,11 @@ def message(frame: bytes) -> Message:
     # the sequence, the sender's system and its component stand before the message's id
     sender = 4 if header == 10 else 2
     return Message(number, frame[sender + 1], frame[sender + 2], frame[sender], payload, frame, known)
+
+
+def is_signed(frame: bytes) -> bool:
+    """Say whether a frame carries a signature."""
+    return frame[0] == V2 and bool(frame[2] & SIGNED)
 
 
 def _number(data: bytes, start: int) -> int:

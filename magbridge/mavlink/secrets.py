@@ -9,6 +9,7 @@ import re
 
 from fastcrc.crc16 import mcrf4xx
 
+from magbridge.mavlink.framing import V2
 from magbridge.mavlink.messages import spec
 
 __all__ = ["SECRET", "without_secret", "without_secrets"]
@@ -21,7 +22,6 @@ HEADER = re.compile(
     rb"\xfd.{6}(?:" + b"|".join(re.escape(number.to_bytes(3, "little")) for number in SECRET) + rb")",
     re.DOTALL,
 )
-V2 = 0xFD
 
 
 def without_secret(frame: bytes) -> bytes:

@@ -23,6 +23,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from magbridge.errors import ConfigError
+from magbridge.mavlink.framing import is_signed
 
 __all__ = ["Signing", "Stream", "load_key", "readable_by_all", "timestamp"]
 
@@ -130,7 +131,7 @@ class Signing:
     def accept(self, frame: bytes, stream: tuple[int, int], number: int, t_us: int) -> bool:
         """Say whether a frame of the `stream` (system, component) is genuine and new."""
         why = "" if number in NEED_NO_SIGNATURE else "not signed"
-        if frame[0] == 0xFD and frame[2] & 1:
+        if is_signed(frame):
             why = self._doubt(frame, stream, t_us)
         if why:
             self.refused += 1
