@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from magbridge.bridge.needs import check
 from magbridge.calibration.model import Calibration, Parameter, identity
-from magbridge.config import load
+from magbridge.config import (
+    Align,
+    CalibrationFile,
+    Learning,
+    Link,
+    Log,
+    Navigation,
+    Sensor,
+    Telemetry,
+    load,
+)
 from magbridge.errors import ConfigError
+from magbridge.navigate import Options
+from magbridge.sensors.options import attributes_of
 
 GOOD = """
 [sensor]
@@ -120,3 +133,11 @@ def test_telemetry_in_another_unit_than_the_calibration_s(tmp_path: Path) -> Non
         check(calibrated_in("mm"), load(path))
     line = f"{path}: telemetry.battpos.unit: expected 'mm', the calibration's unit, not 'in'"
     assert str(caught.value) == line
+
+
+@pytest.mark.parametrize(
+    "table", [Sensor, Link, Telemetry, CalibrationFile, Align, Navigation, Learning, Log, Options]
+)
+def test_every_key_says_what_it_means(table: type[msgspec.Struct]) -> None:
+    """Also where several share a string: the documentation's tables are made of these."""
+    assert [one.name for one in attributes_of(table) if not one.meaning] == []
