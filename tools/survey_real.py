@@ -38,7 +38,8 @@ def rio(folder: Path) -> Iterator[str]:
     ties = samples.part(samples.tie)
     anomaly, sigma = done.gridded.at(ties.place, ties.depth)
     error = anomaly - ties.value
-    z = error / np.hypot(sigma, done.gridded.sigma)
+    near_by = done.gridded.kriged
+    z = error / np.hypot(sigma, done.gridded.sigma if near_by is None else near_by.of_a_line(ties.place))
     yield f"ties from lines: median error {np.median(np.abs(error)):.1f} nT, RMS {rms(error):.0f}"
     yield f"standardised error {rms(z):.2f} RMS, {1.4826 * np.median(np.abs(z)):.2f} in the middle"
     near = cKDTree(samples.part(~samples.tie).place).query(ties.place)[0] < AT_A_LINE

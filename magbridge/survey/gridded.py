@@ -13,6 +13,7 @@ from magbridge.calibration.fitting.evidence import Widths
 from magbridge.calibration.fitting.latent import in_chunks
 from magbridge.field.place.blocks import Factor, NearInverse
 from magbridge.field.place.matern import Matern
+from magbridge.survey.kriged import Kriged
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.samples import Samples
 
@@ -73,6 +74,8 @@ class Gridded:
     """(n,): Which samples are no outliers."""
     widths: Widths
     """As the evidence chose them."""
+    kriged: Kriged | None = None
+    """What predicts instead of the nodes where these are coarser than the rock."""
 
     @property
     def field(self) -> Matern:
@@ -87,7 +90,7 @@ class Gridded:
     @property
     def sigma(self) -> float:
         """The noise's, nT."""
-        return self.posteriors[0].sigma
+        return self.posteriors[0].sigma if self.kriged is None else self.kriged.noise
 
     @property
     def levels(self) -> FloatArray:
@@ -100,6 +103,8 @@ class Gridded:
         The depth is the map's own if not given.
         """
         deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
+        if self.kriged is not None:
+            return self._beside_samples(place, deeper)
         scale = self.roughness.at(place)
         outside = ~self.field.nodes.inside(place)
         mean, square = np.zeros(len(place)), np.zeros(len(place))
@@ -110,6 +115,15 @@ class Gridded:
             mean += one.weight * here
             square += one.weight * (variance + here**2)
         return self.mean + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+
+    def _beside_samples(self, place: FloatArray, deeper: FloatArray | float) -> tuple[FloatArray, FloatArray]:
+        """Return the same from the nearest samples; what depth and levels do to it is the nodes'."""
+        assert self.kriged is not None
+        mean, variance, depth = self.kriged.at(place)
+        one, scale = self.posteriors[0], diags_array(self.roughness.at(place))
+        here, there = (scale @ one.field.basis(place, at) for at in (deeper, depth - self.middle))
+        variance += ((here @ one.follow) ** 2).sum(axis=1)
+        return mean + (here - there) @ one.w, np.sqrt(variance)
 
     def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
         """Yield about so many anomalies (n,), nT, at places (n, 2), m, that the data leave open alike."""

@@ -18,7 +18,7 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_doubt import plausible
-from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
+from magbridge.calibration.fitting.field_nodes import about_the_middle, fine_enough, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
     Choice,
     Weighed,
@@ -38,6 +38,7 @@ from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.residual import robust_scale
 from magbridge.field.place.blocks import near_inverse
 from magbridge.survey.gridded import Gridded, Posterior
+from magbridge.survey.kriged import kriged
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.rows import Rows
 from magbridge.survey.samples import Samples
@@ -103,15 +104,14 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         _posterior(weight, one, sums, problem, family, widths, shaken)
         for weight, one in _left_open(choice, sums, replace(weighed, eta=widths.eta))
     ]
-    return Gridded(
-        tuple(posteriors),
-        roughness,
-        choice.rho,
-        problem.middle,
-        float(samples.value[problem.kept].mean()),
-        problem.kept,
-        widths,
-    )
+    found = Gridded(
+        tuple(posteriors), roughness, choice.rho, problem.middle,
+        float(samples.value[problem.kept].mean()), problem.kept, widths,
+    )  # fmt: skip
+    if fine_enough(nodes, choice.field.length, choice.field.alpha):
+        return found
+    levelled, kept = samples.value - found.levels, problem.kept
+    return replace(found, kriged=kriged(samples.part(kept), levelled[kept], choice.field.length))
 
 
 def _left_open(choice: Choice, sums: Sums, weighed: Weighed) -> list[tuple[float, Choice]]:

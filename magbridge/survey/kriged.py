@@ -1,0 +1,189 @@
+r"""Kriging from the nearest samples, where an area allows no nodes as fine as its rock.
+
+Sources that lie anyhow at a depth d have the spectrum :math:`e^{-2 k d}` (Spector & Grant 1970), and so, as
+:math:`\int e^{-k h} J_0(k r)\, k\, dk = h / (r^2 + h^2)^{3/2}`, the covariance
+
+.. math:: C(r) = s^2 h^3 / (r^2 + h^2)^{3/2}, \quad h = 2 d.
+
+Depth, size s and noise are those with which some samples are likeliest, each given the nearest of those
+before it in a random order (Vecchia 1988). A line that was flown elsewhere than it says reads rock of the
+same kind that no other line meets: its samples have :math:`(1 + g^2) C` in common, g by what the others
+predict.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.calibration.residual import rms
+from magbridge.survey.roughness import Roughness
+from magbridge.survey.samples import Samples
+
+__all__ = ["Kriged", "kriged"]
+
+NEAREST, GIVEN = 100, 40
+"""Samples that a place is predicted from, and one of those that choose the depth."""
+AMONG = 400
+"""Nearest samples among which are the GIVEN."""
+CHOOSING = 600
+"""Samples that do."""
+STEPS = 50
+"""Of the climb to the likeliest depth, size and noise."""
+SHARE, SPREAD = 0.1, np.log(5.0)
+"""g as expected, and the 1-sigma of its logarithm."""
+SHARES = np.geomspace(0.02, 5.0, 60)
+"""Those that are tried."""
+APART = 2.0
+"""Depths of the sources between a line's samples that tell its own."""
+CLEAR = 5.0
+"""Nats from which on the field's size may vary from place to place."""
+CHUNK = 256
+"""Places at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Kriged:
+    """Samples and what their field is like; it holds at the depth of the samples around."""
+
+    place: FloatArray
+    depth: FloatArray
+    value: FloatArray
+    line: IndexArray
+    """`place`, `depth`, `value`, `line`: (n, 2), (n,) m, (n,) nT and the number of each's line."""
+    roughness: Roughness
+    tree: cKDTree
+    below: float
+    """m, of the sources below the samples."""
+    size: float
+    noise: float
+    """`size`, `noise`: nT, standard deviation of the field where the roughness is 1, and of the noise."""
+    share: FloatArray
+    """(lines,): g, what each alone reads, over the field."""
+
+    def at(self, place: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the field, its variance, and the depth where it holds (n,) each, at places (n, 2), m."""
+        out = np.empty((len(place), 3))
+        for start in range(0, len(place), CHUNK):
+            some = place[start : start + CHUNK]
+            near = self.tree.query(some, NEAREST)[1]
+            out[start : start + CHUNK, :2] = self.given(some, near)
+            out[start : start + CHUNK, 2] = self.depth[near[:, 0]]
+        return out[:, 0], out[:, 1], out[:, 2]
+
+    def of_a_line(self, place: FloatArray) -> FloatArray:
+        """Return by how many nT (n,), 1-sigma, a line reads what is not the field at places (n, 2), m."""
+        return np.asarray(np.hypot(rms(self.share) * self.size * self.roughness.at(place), self.noise))
+
+    def given(self, place: FloatArray, near: IndexArray, line: IndexArray | None = None) -> FloatArray:
+        """Return the field and its variance (n, 2) at places (n, 2) given the samples `near` them (n, k).
+
+        About a place its mean is not known but for the spread of all samples. With `line` (n,) it is the
+        field as that line reads it.
+        """
+        x, lines, here = self.place[near], self.line[near], self.roughness.at(place)
+        there = self.roughness.at(x.reshape(-1, 2)).reshape(near.shape)
+        wide, own, k = float(self.value.var()), self.share[lines] ** 2, np.arange(near.shape[1])
+        among = self._covariance(x[:, :, None] - x[:, None]) * there[:, :, None] * there[:, None]
+        among = among * (1.0 + own[:, :, None] * (lines[:, :, None] == lines[:, None])) + wide
+        among[:, k, k] += self.noise**2
+        to = self._covariance(place[:, None] - x) * here[:, None] * there
+        variance = (self.size * here) ** 2
+        if line is not None:
+            to = to * (1.0 + own * (line[:, None] == lines))
+            variance = variance * (1.0 + self.share[line] ** 2)
+        mean = self.value[near].mean(axis=1)
+        off = self.value[near] - mean[:, None]
+        solved = np.linalg.solve(among, np.stack([off, to + wide], axis=2))
+        value, known = np.einsum("nk,nkc->cn", to + wide, solved)
+        return np.stack([mean + value, np.maximum(variance + wide - known, 0.0)], axis=1)
+
+    def _covariance(self, apart: FloatArray) -> FloatArray:
+        """Return that of places `apart` (..., 2), m, where the roughness is 1: nT²."""
+        h = 2.0 * self.below
+        return np.asarray(self.size**2 * h**3 / ((apart**2).sum(axis=-1) + h * h) ** 1.5)
+
+
+def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
+    """Return what predicts from the nearest samples; its size varies with the place where that is likelier.
+
+    Parameters
+    ----------
+    samples : Samples
+        At least :data:`AMONG`.
+    value : (n,) array
+        nT, without the lines' levels.
+    length : float
+        m, of the field, about.
+    """
+    tree, size = cKDTree(samples.place), float(np.std(value))
+    share = np.zeros(int(samples.line.max()) + 1)
+    even, score = _likeliest(Kriged(
+        samples.place, samples.depth, value, samples.line, Roughness.even(), tree, length / 2.0, size,
+        0.02 * size, share,
+    ))  # fmt: skip
+    rough = Roughness.of(samples, 2.0 * even.below)
+    uneven, other = _likeliest(replace(even, roughness=rough))
+    best = uneven if other > score + CLEAR else even
+    share = np.array([_share(best, line) for line in range(len(share))])
+    return replace(best, share=share)
+
+
+def _likeliest(start: Kriged) -> tuple[Kriged, float]:
+    """Return the likeliest depth, size and noise, and the log likelihood."""
+    rng = np.random.default_rng(0)
+    rank, some = rng.permutation(len(start.value)), rng.choice(len(start.value), CHOOSING)
+    near = start.tree.query(start.place[some], AMONG)[1]
+    near, whole = _first(near, rank[near] < rank[some, None])
+    some = some[whole]
+    first = np.log([start.below, start.size, start.noise])
+
+    def at(x: FloatArray) -> Kriged:
+        below, size, noise = np.exp(x).tolist()
+        return replace(start, below=below, size=size, noise=noise)
+
+    def downhill(x: FloatArray) -> float:
+        one = at(x)
+        mean, variance = one.given(one.place[some], near, one.line[some]).T
+        return -_likelihood(one.value[some] - mean, variance + one.noise**2)
+
+    simplex = first + 0.5 * np.vstack([np.zeros(3), np.eye(3)])
+    found = minimize(
+        downhill, first, method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": STEPS}
+    )
+    return at(found.x), -float(found.fun)
+
+
+def _share(of: Kriged, line: int) -> float:
+    """Return the likeliest g of a line, by what the others around predict; as expected where none are."""
+    rows = np.flatnonzero(of.line == line)
+    step = float(np.median(np.linalg.norm(np.diff(of.place[rows], axis=0), axis=1))) if len(rows) > 1 else 1.0
+    rows = rows[:: max(round(APART * of.below / max(step, 1e-3)), 1)]
+    near = of.tree.query(of.place[rows], AMONG)[1]
+    near, whole = _first(near, of.line[near] != line)
+    if not whole.any():
+        return SHARE
+    rows = rows[whole]
+    mean, variance = of.given(of.place[rows], near).T
+    size2 = (of.size * of.roughness.at(of.place[rows])) ** 2
+    scores = [
+        _likelihood(of.value[rows] - mean, variance + g**2 * size2 + of.noise**2)
+        - 0.5 * (np.log(g / SHARE) / SPREAD) ** 2
+        for g in SHARES
+    ]
+    return float(SHARES[int(np.argmax(scores))])
+
+
+def _first(near: IndexArray, before: BoolArray) -> tuple[IndexArray, BoolArray]:
+    """Return the first :data:`GIVEN` of `near` (n, k) that come `before`, and whether as many do (n,)."""
+    whole = np.asarray(before.sum(axis=1) >= GIVEN)
+    order = np.argsort(~before[whole], axis=1, kind="stable")[:, :GIVEN]
+    return np.take_along_axis(near[whole], order, axis=1), whole
+
+
+def _likelihood(error: FloatArray, variance: FloatArray) -> float:
+    return -0.5 * float((error**2 / variance + np.log(variance)).sum())
