@@ -101,10 +101,10 @@ def health(state: State, now: float) -> dict[str, tuple[str, bool]]:
         "Sensor": (_word(MAG_PORT_STATE, sensor), sensor == MAG_PORT_STATE.OK),
         "Autopilot": (_word(MAG_PORT_STATE, autopilot), autopilot == MAG_PORT_STATE.OK),
         "Log": (_word(MAG_LOG_STATE, log), log in (MAG_LOG_STATE.OFF, MAG_LOG_STATE.OK)),
-        "Sample rate": (_number(get("sample_rate", nan), ".2f", unit="Hz")[0], True),
-        "Latency": (_number(1e3 * field("latency", nan), ".1f", unit="ms")[0], True),
+        "Sample rate": (_figure(get("sample_rate", nan), ".2f", "Hz"), True),
+        "Latency": (_figure(1e3 * field("latency", nan), ".1f", "ms"), True),
         "Telemetry age": (
-            _number(field("telemetry_age", nan), ".1f", unit="s")[0],
+            _figure(field("telemetry_age", nan), ".1f", "s"),
             "stale_telemetry" not in state.flags,
         ),
         "Calibration": (
@@ -113,11 +113,11 @@ def health(state: State, now: float) -> dict[str, tuple[str, bool]]:
         ),
         "Uptime": (ago(get("uptime", 0)), True),
         "Messages lost on the link": (
-            f"{_count(state.lost)} of {_count(state.lost + state.received)}",
+            f"{_figure(state.lost)} of {_figure(state.lost + state.received)}",
             not state.lost,
         ),
         # of a stream that is joined in the middle of a frame, some bytes are always skipped
-        **{name: (_count(count), not count or name.startswith("Bytes")) for name, count in losses.items()},
+        **{name: (_figure(count), not count or name.startswith("Bytes")) for name, count in losses.items()},
     }
 
 
@@ -131,16 +131,13 @@ def whereabouts(state: State, now: float) -> dict[str, tuple[str, bool]]:
     return {
         "State": (_word(MAG_NAVIGATION_STATE, mode), mode != MAG_NAVIGATION_STATE.LOST),
         "Position": (f"{get('lat', 0) * 1e-7:.5f}, {get('lon', 0) * 1e-7:.5f}", True),
-        "1σ of the longer axis": (_number(sigma, ".0f", unit="m")[0], True),
+        "1σ of the longer axis": (_figure(sigma, ".0f", "m"), True),
         "Innovation ± 2σ": (
             " ".join(_number(innovation, "+.1f", 2.0 * sqrt(max(variance, 0.0)))),
             bool(get("accepted", 1)),
         ),
         "Bias ± 2σ": (" ".join(_number(get("bias", nan), "+.1f", 2.0 * get("bias_sigma", nan))), True),
-        "Current": (
-            _number(hypot(get("current_north", nan), get("current_east", nan)), ".2f", unit="m/s")[0],
-            True,
-        ),
+        "Current": (_figure(hypot(get("current_north", nan), get("current_east", nan)), ".2f", "m/s"), True),
         "Last update": (f"{ago(now - state.navigated)} ago" if state.navigation else "–", True),
     }
 
@@ -150,10 +147,10 @@ def learnt(state: State) -> dict[str, tuple[str, bool]]:
     get = state.learning.get
     causes = [cause for cause in MAG_CAUSE if get("causes", 0) & cause]
     since = time.gmtime(min(get("doubt_since", 0) * 1e-6, LAST))
-    size = _number(get("doubt_size", nan), ".0f", unit="nT")[0]
+    size = _figure(get("doubt_size", nan), ".0f", "nT")
     doubted = f"{size} since {time.strftime('%d %b %H:%M', since)} UTC"
     names = ", ".join(str(cause.name).lower().replace("_", " ") for cause in causes)
-    errors = (_number(get(f"rms_{which}", nan), ".2f", unit="nT")[0] for which in ("first", "published"))
+    errors = (_figure(get(f"rms_{which}", nan), ".2f", "nT") for which in ("first", "published"))
     return {
         "State": (_word(MAG_LEARNING_STATE, get("state", 0)), True),
         "Published": (_calibration(get("calibration_id", 0), get("first_calibration_id", 0)), True),
@@ -162,7 +159,7 @@ def learnt(state: State) -> dict[str, tuple[str, bool]]:
         "Not explained": (doubted if causes else "nothing", not causes),
         "Causes that fit": (names or "–", not causes),
         "Samples learned from": (f"{get('samples', 0):,}", True),
-        "Error of prediction, learned so far": (_number(get("rms_learned", nan), ".2f", unit="nT")[0], True),
+        "Error of prediction, learned so far": (_figure(get("rms_learned", nan), ".2f", "nT"), True),
     }
 
 
@@ -191,8 +188,9 @@ def _word(states: type[IntEnum], value: int) -> str:
     return known.get(value, f"state {value}")
 
 
-def _count(count: int) -> str:
-    return _number(count, ".0f")[0]
+def _figure(value: float, form: str = ".0f", unit: str = "") -> str:
+    """Return a value with its unit, thousands separated; a dash if it is not known."""
+    return _number(value, form, unit=unit)[0]
 
 
 def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> tuple[str, str]:
