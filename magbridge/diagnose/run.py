@@ -120,8 +120,8 @@ def _examine(
     problem = outcome.problem
     found = outcome.chosen, outcome.competing, outcome.fit
     named, competing, fit = found if stand else ((), (), outcome.null)
-    off = _off(outcome.fit, named, len(causes))
-    if switched := switching(problem, outcome.fit, named, off):
+    off = _off(outcome, named, len(causes))
+    if switched := switching(problem, outcome.fit, named, off, ended=outcome.switches):
         rest, named, competing, fit = switched, (), (), outcome.null
     model = [h.candidate for h in named]
     wrong = off if off is not None and off.isolated else None
@@ -196,11 +196,12 @@ def _strongest_tone(problem: Problem, candidates: Sequence[Candidate]) -> Candid
     return None if known else next(iter(interference_tone(problem)), None)
 
 
-def _off(fit: Joint, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
-    """Return the wrong samples, unless they may be a remnant of the strongest cause."""
-    off = outliers(fit, causes)
+def _off(outcome: Outcome, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
+    """Return the wrong samples, unless they may be a remnant of the strongest cause and nothing switches."""
+    off = outliers(outcome.fit, causes)
     strongest = max((h.signal_to_noise for h in named), default=0.0)
-    return off if off is not None and off.ratio >= (REMNANT * strongest) ** 2 else None
+    own = outcome.switches or (off is not None and off.ratio >= (REMNANT * strongest) ** 2)
+    return off if own else None
 
 
 def _findings(

@@ -27,18 +27,18 @@ PULSE = np.array([6.0, 12.0, 6.0])
 """Of a source that passes within a few samples, in units of the innovations."""
 
 
-Demo = tuple[Calibration, xr.Dataset]
+Demo = tuple[Calibration, xr.Dataset, xr.Dataset]
 
 
 @pytest.fixture(scope="module")
 def demo() -> Demo:
-    """The demo's calibration, and its survey."""
+    """The demo's calibration, its survey, and its runs."""
     scenario = load("demo")
     parts = segments(simulate(scenario, 2))
     learned = unfiltered(
         observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
     )
-    return fit(learned, "auto").calibration, parts["survey"]
+    return fit(learned, "auto").calibration, parts["survey"], parts["calibration"]
 
 
 def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float = 50.0) -> Outliers | None:
@@ -119,15 +119,16 @@ def test_a_diagnosis_names_isolated_samples_only(demo: Demo, shape: np.ndarray, 
     assert isolated or reported.unexplained.kind == "transient"
 
 
-def test_a_relay_gets_no_name(demo: Demo) -> None:
+@pytest.mark.parametrize("beside_runs", [False, True])
+def test_a_relay_gets_no_name(demo: Demo, beside_runs: bool) -> None:
     """Nor does what is left of it where noise of a long memory has absorbed the rest."""
     calibration, survey = demo[0], demo[1].copy()
-    n, rng = survey.sizes["time"], np.random.default_rng(4)
+    n, rng = survey.sizes["time"], np.random.default_rng(5 if beside_runs else 4)
     at = np.sort(rng.integers(0, n, 14))
     relay = np.searchsorted(at, np.arange(n)) % 2
     for name, size in (("mag_x", 9.0), ("mag_y", -6.0), ("mag_z", 12.0)):
         survey[name] = survey[name] + size * relay
-    reported = diagnose([survey], calibration)
+    reported = diagnose([survey], calibration, training_logs=demo[2:] if beside_runs else ())
     assert (reported.findings, reported.wrong) == ((), None)
     assert reported.unexplained is not None
     assert reported.unexplained.kind == "switching"

@@ -44,19 +44,21 @@ def unlisted(
 
 
 def switching(
-    problem: Problem, fit: Joint, named: Sequence[Hypothesis], off: Outliers | None
+    problem: Problem, fit: Joint, named: Sequence[Hypothesis], off: Outliers | None, *, ended: bool
 ) -> Leftover | None:
-    """Describe what switches, if that is stronger than all causes that are `named`; else None.
+    """Describe what switches, if that is stronger than all causes that are `named`, or has ended the search.
 
-    The noise's memory has absorbed it but for its level shifts, and the names are of what that leaves.
+    Else None. The noise's memory has absorbed it but for its level shifts, and the names are of what that
+    leaves; of a search that ended they were exchanged for no others.
     """
     if off is None or not off.lasting:
         return None
-    rest = _slow(problem, fit, named)
-    if rest is None or any(one.signal_to_noise >= rest.signal_to_noise for one in named):
+    slow = _slow(problem, fit, named)
+    if not ended and (slow is None or any(one.signal_to_noise >= slow.signal_to_noise for one in named)):
         return None
     within = tuple(CompetingHypothesis(one.candidate, 0.0) for one in named)
-    return rest._replace(kind="switching", within=within, shifts=tuple(off.rows.tolist()))
+    rest = slow or _passing(off)
+    return rest and rest._replace(kind="switching", within=within, shifts=tuple(off.rows.tolist()))
 
 
 def _passing(off: Outliers | None) -> Leftover | None:
