@@ -1,4 +1,4 @@
-"""Run a bridge on its ports until it is stopped; keep what must outlive it."""
+"""Run a bridge on its ports until it is stopped."""
 
 from __future__ import annotations
 
@@ -8,34 +8,27 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 
 from magbridge.bridge import states
 from magbridge.bridge.drive import drive, set_up
-from magbridge.bridge.events import Clock, Start
+from magbridge.bridge.events import Clock
 from magbridge.bridge.file_server import FileServer
+from magbridge.bridge.keeper import Keeper
 from magbridge.bridge.learning import keep, kept_path
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.serial_port import serial_line
 from magbridge.config import Config, load
-from magbridge.errors import FormatError
-from magbridge.link import store
 from magbridge.logs.tlog import TlogWriter
-from magbridge.mavlink import readable_by_all
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.records import Channel
 
 __all__ = ["run"]
 
-KEEP_US = 60_000_000
-"""µs between two savings of the signing time stamps."""
-SAVE_US = 1_000_000
-"""µs between two savings of parameters: each waits for the disk, and the sensor for it."""
 SWITCH = 0.0005
 """s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
 NOTICE_PAUSE = 0.2
@@ -170,68 +163,3 @@ class LogWatch:
         if state != self._reported:
             self._reported = state
             self._edge.notify(states.log_state(*state))
-
-
-class Keeper:
-    """Saves what must outlive the process: parameters set over the link, and the signing time stamps."""
-
-    AHEAD = 2 * KEEP_US // 10
-    """Units of 10 µs for which stamps are reserved at each saving, lest the next run use them again."""
-
-    def __init__(self, config: Config) -> None:
-        self._notify: Callable[[bytes], None] = lambda _: None
-        # named after the configuration: there may be another bridge's beside it
-        self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
-        self._spoilt = False
-        try:
-            self._kept = store.load(self._path)
-        except (FormatError, OSError):  # no reason to keep a vehicle ashore
-            self._kept, self._spoilt = store.Kept(), True
-        self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
-        self._saved_us = self._retry_us = self._revision = 0
-
-    def attach(self, edge: LiveEdge) -> None:
-        """Tell `edge` when something cannot be kept, or could not be read; then the file is set aside."""
-        self._notify = edge.notify
-        if self._spoilt:
-            name = self._path.name
-            if self._path.is_file():
-                with suppress(OSError):
-                    self._path.replace(self._path.with_name(f"{name}.damaged"))
-            self._notify(states.notice(f"cannot be read, not used: {name}", MAV_SEVERITY.ERROR))
-        if self._key is not None and readable_by_all(self._key):
-            self._notify(states.notice(f"{self._key.name[-20:]}: every user can read this key"))
-
-    def start(self, time_us: int) -> Start:
-        """Return the start of a run at `time_us`."""
-        kept = self._kept
-        return Start(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
-
-    def look(self, pipeline: Pipeline, time_us: int) -> None:
-        """Save changed parameters within `SAVE_US`, the time stamps every `KEEP_US`."""
-        revision = pipeline.component.parameters.revision
-        due = self._key is not None and time_us - self._saved_us > KEEP_US
-        if time_us < self._retry_us or (revision == self._revision and not due):
-            return
-        self._revision, self._saved_us, self._retry_us = revision, time_us, time_us + SAVE_US
-        if not self.save(pipeline):
-            self._revision, self._retry_us = -1, time_us + KEEP_US
-
-    def save(self, pipeline: Pipeline, *, last: bool = False) -> bool:
-        """Write the file if its content has changed; return False, the old file kept, where that fails.
-
-        At the `last` saving of a run, no stamp need be reserved for what it will yet send.
-        """
-        kept = store.Kept(pipeline.component.parameters.changed())
-        if signing := pipeline.signing:
-            stamp = signing.last if last else signing.reserved(pipeline.component.codec.utc_us, self.AHEAD)
-            kept = store.Kept(kept.parameters, stamp, signing.streams)
-        if kept == self._kept:
-            return True
-        try:
-            store.save(self._path, kept)
-        except OSError as error:
-            self._notify(states.notice(f"parameters not kept: {error.strerror or error}"))
-            return False
-        self._kept = kept
-        return True

@@ -7,7 +7,7 @@ from pathlib import Path
 from small import START, small_bridge
 
 from magbridge.bridge.events import Start
-from magbridge.bridge.run import SAVE_US, Keeper
+from magbridge.bridge.keeper import SAVE_US, Keeper
 from magbridge.calibration.model import Parameter
 from magbridge.config import load
 from magbridge.link.store import load as kept
