@@ -149,7 +149,8 @@ def _declared(path: Path, found: Layout, names: Sequence[str]) -> dict[int, str]
 def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
     """Find the column that is the time, or those that are it together: date and time of day ..."""
     place = found.names.index("time") if "time" in found.names else None
-    called = [bare(split(heading)[0]) for heading in found.headings]
+    ours = [name if name in found.declared.columns else "" for name in found.names]
+    called = [bare(name or split(theirs)[0]) for name, theirs in zip(ours, found.headings, strict=True)]
     dates = [k for k, name in enumerate(called) if DATED.search(name) and k != place]
     for kind, patterns in JOINED.items():
         places = [[k for k, name in enumerate(called) if re.fullmatch(one, name)] for one in patterns]

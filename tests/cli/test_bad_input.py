@@ -231,8 +231,13 @@ def test_a_name_that_is_not_of_the_locale(deployment: Path, here: Path) -> None:
     assert len(list(here.iterdir())) == 1
 
 
-def test_what_cannot_be_printed_is_no_error(deployment: Path, here: Path) -> None:
-    plain = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii:strict"}
-    done = run("convert", str(deployment), "-o", "\xb5.csv", **plain)
+@pytest.mark.parametrize("encoding", [{"PYTHONIOENCODING": "ascii:strict"}, {}])
+def test_what_cannot_be_printed_is_no_error(encoding: dict[str, str], deployment: Path, here: Path) -> None:
+    plain = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    done = run("convert", str(deployment), "-o", "\xb5.csv", **plain, **encoding)
     assert (done.returncode, done.stderr) == (0, b"")
     assert done.stdout.endswith(b".csv: 3600 rows\n")
+    Path("log.csv").write_text("time,x [\xb5V]\n1600000000,1\n1600000001,2\n", encoding="utf-8")
+    done = run("info", "log.csv", **plain, **encoding)
+    assert done.returncode == 0
+    assert rb"\xb5V" in done.stdout

@@ -117,6 +117,15 @@ def test_the_answer_is_heeded(tmp_path: Path) -> None:
     assert log["time"].values.tolist() == [NOON, NOON + 1]
 
 
+def test_columns_without_headings_may_be_declared_as_parts_of_a_time(tmp_path: Path) -> None:
+    """As LEMI's fluxgates write: year, month, day, hour, minute, second, the field."""
+    rows = "".join(f"2022 05 04 12 00 0{k} 20500.0 -10250.0 45000.0 21.1\n" for k in range(3))
+    names = ["year", "month", "day", "hour", "minute", "second", "mag_x", "mag_y", "mag_z"]
+    log = read(tmp_path, rows, "lemi.txt", column=[f"{name}=column_{k}" for k, name in enumerate(names, 1)])
+    assert log["time"].values.tolist() == [NOON, NOON + 1, NOON + 2]
+    assert log["mag_y"].values.tolist() == [-10_250.0] * 3
+
+
 def test_times_of_day_go_on_after_midnight(tmp_path: Path) -> None:
     stamps = pd.date_range("2022-05-04T23:59:50", periods=2000, freq="60s").strftime("%H:%M:%S")
     log = read(tmp_path, "time,mag_x\n" + "".join(f"{stamp},1\n" for stamp in stamps))
