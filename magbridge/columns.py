@@ -85,7 +85,16 @@ _FACTORS = {
 }
 _SPELLINGS = {
     "deg": (
-        *("degrees", "degree", "Decimal Degrees", "decimal degrees", "angular_degree", "arc_degree", "°"),
+        *(
+            "degrees",
+            "degree",
+            "Decimal Degrees",
+            "decimal degrees",
+            "angular_degree",
+            "arc_degree",
+            "°",
+            "WGS84",
+        ),
         # CF Conventions, sections 4.1 and 4.2
         *(f"degree{s}{sep}{to}" for s in ("", "s") for sep in ("_", "") for to in "NE"),
         *(f"degree{s}_{to}" for s in ("", "s") for to in ("north", "east", "true")),

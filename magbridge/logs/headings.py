@@ -21,9 +21,10 @@ UNITS = {
 }
 """Units by which a row of units under the headings is known."""
 AXES = "x", "y", "z"
+PLACES = "latitude", "longitude", "roll", "pitch", "heading"
 VECTORS = (
     "mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "flux{}", "b{}",
-    "m{}", "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}",
+    "m{}", "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}", "magn{}", "compass{}", "fgm{}",
 )  # fmt: skip
 """What the three axes are called elsewhere, with neither capitals nor punctuation."""
 ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])mag")
@@ -35,18 +36,20 @@ ALIASES = {
         *("juliandate", "julianday", "julian", "exceltime", "exceldate", "datenum", "timeiso", "isoformat"),
         *("zeit", "zeitstempel", "uhrzeit", "heure", "hora", "timeofday", "seconds", "t", "tempo"),
     ),
-    "roll": ("rollangle", "rolldeg"),
-    "pitch": ("pitchangle", "pitchdeg"),
+    "roll": ("rollangle",),
+    "pitch": ("pitchangle",),
     "heading": ("yaw", "hdg", "compassheading", "trueheading", "magneticheading"),
-    "latitude": ("lat", "gpslat", "gpslatitude", "breite", "geobreite"),
-    "longitude": ("lon", "long", "lng", "gpslon", "gpslongitude", "laenge", "lnge", "geolaenge"),
+    "latitude": ("lat", "breite", "geobreite"),
+    "longitude": ("lon", "long", "lng", "laenge", "lnge", "geolaenge"),
     "depth": ("depthm", "tiefe", "profondeur", "profundidad"),
 }
 """Our name -> what others call it, the surest first."""
+AROUND = re.compile("(?:gps|gnss|location|position|pos|nav|ins)?(.+?)(?:deg|degrees|dd|wgs84)?")
+"""What may stand before and behind the names of a place and an attitude."""
 
 
 def split(heading: str) -> tuple[str, str]:
-    """Return the name and the unit of a heading: ``Bx [uT]``, ``Bx (uT)``, ``Bx/uT``, ``Bx_uT``.
+    """Return the name and the unit of a heading: ``Bx [uT]``, ``Bx (uT)``, ``Bx/uT``, ``Bx_uT``, ``Bx, uT``.
 
     Where there is no unit it is empty; a number in brackets, as in ``magADC[0]``, is an index.
     """
@@ -56,8 +59,9 @@ def split(heading: str) -> tuple[str, str]:
     if not name:  # nothing but brackets is a name after all
         return heading.strip(), ""
     if not unit:
-        for sign in "/_":
+        for sign in "/_,":
             header, _, tail = name.rpartition(sign)
+            tail = tail.strip()
             if header and usual(tail) in NT_PER_UNIT and tail not in {"T", "G"}:
                 return header.strip(), tail
     return name, unit.strip()
@@ -82,7 +86,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
     words = list(map(bare, names))
     found: dict[int, str] = {}
 
-    def only(word: str) -> int | None:
+    def only(word: str, words: Sequence[str] = words) -> int | None:
         return words.index(word) if words.count(word) == 1 else None
 
     if not all(f"mag_{axis}" in names for axis in AXES):
@@ -103,6 +107,8 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
             continue
         for word in (name.replace("_", ""), *ALIASES.get(name, ())):
             place = only(word)
+            if place is None and name in PLACES:
+                place = only(word, [match[1] if (match := AROUND.fullmatch(one)) else "" for one in words])
             if place is not None and place not in found and name not in found.values():
                 found[place] = name
                 break

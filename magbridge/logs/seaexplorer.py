@@ -30,6 +30,7 @@ from magbridge.logs.deployment import HISTORY, deployment, named_losses, sliced,
 from magbridge.logs.headings import aliases
 from magbridge.logs.packed import opened
 from magbridge.logs.resample import CIRCLES, degrees, linear
+from magbridge.logs.stamps import epoch
 
 __all__ = ["chunks"]
 
@@ -113,7 +114,7 @@ def _read(path: Path) -> xr.Dataset:
     clock = next((name for name in CLOCKS if name in table), None)
     if clock is None:
         raise FormatError(path, f"expected a SeaExplorer's file, with a column {' or '.join(CLOCKS)}")
-    time = _seconds(table.pop(clock))
+    time = epoch(table.pop(clock), DATE)
     numbers = table.apply(pd.to_numeric, errors="coerce").dropna(axis="columns", how="all")
     columns: dict[str, FloatArray] = {}
     units: dict[str, str] = {}
@@ -144,12 +145,3 @@ def _table(path: Path) -> tuple[pd.DataFrame, int]:
     if not whole:
         raise FormatError(path, "expected rows after the header", row=2)
     return pd.DataFrame(whole, columns=names, dtype=str), len(fields) - len(whole)
-
-
-def _seconds(stamps: pd.Series[str]) -> FloatArray:
-    """Return s since 1970 of ``21/07/2019 23:25:02.737``, UTC; NaN for what is no date. Of (n,): (n,)."""
-    parts = stamps.str.partition(".")
-    days = pd.to_datetime(parts[0], format=DATE, errors="coerce").to_numpy("datetime64[s]")
-    whole = np.where(np.isnat(days), np.nan, days.astype("int64").astype(float))
-    fraction = pd.to_numeric("0." + parts[2].replace("", "0"), errors="coerce").to_numpy(float)
-    return np.asarray(whole + np.nan_to_num(fraction))

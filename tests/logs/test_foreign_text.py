@@ -143,6 +143,7 @@ AXES = {
     "written out": "time,X (micro-Teslas),Y (micro-Teslas),Z (micro-Teslas)\n1.6e9,20.5,-10.25,45\n",
     "mGauss": "time,MagX (mGauss),MagY (mGauss),MagZ (mGauss)\n1.6e9,205,-102.5,450\n",
     "each its own": "time,mag_x [uT],mag_y [mG],mag_z [nT]\n1.6e9,20.5,-102.5,45000\n",
+    "behind a comma": "time;Bx, uT;By, uT;Bz, uT\n1.6e9;20.5;-10.25;45\n",
     "Fortran": "time,mag_x,mag_y,mag_z\n1.6D+09,2.05D+04,-1.025D+04,4.5D+04\n",
     "thousands": 'time,mag_x,mag_y,mag_z\n1.6e9,"20,500","-10,250.0","45,000.00"\n',
     "German thousands": "time;mag_x [nT];mag_y [nT];mag_z [nT]\n1600000000;20.500;-10.250;45.000,00\n",
@@ -210,6 +211,9 @@ def test_a_place_at_0_0_is_a_receiver_without_a_fix(tmp_path: Path) -> None:
 
 
 PLACES = {
+    "a telephone's": ("locationLatitude(WGS84),locationLongitude(WGS84)", "47.5,-52.75", "47.5,-52.75"),
+    "a receiver's": ("GPS_Lat,GPS_Lon", "47.5,-52.75", "47.5,-52.75"),
+    "with their unit": ("latitude_deg,longitude_dd", "47.5,-52.75", "47.5,-52.75"),
     "columns of letters": ("lat,NS,lon,EW", "47.5,N,52.75,W", "47.5,N,52.75,W"),
     "letters behind": ("lat,lon", "47.5N,52.75W", "47.5 N,52.75 W"),
     "letters before": ("latitude,longitude", "N47.5,W52.75", "N 47.5,W 52.75"),
