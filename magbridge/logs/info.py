@@ -13,7 +13,7 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_b
 from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
-from magbridge.logs.naming import EARTHS
+from magbridge.logs.magnetic import EARTHS
 
 __all__ = ["GAP", "USES", "info", "lacking", "movers", "telemetry"]
 

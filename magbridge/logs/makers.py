@@ -34,11 +34,6 @@ MAKERS: dict[str, tuple[set[str], dict[str, Source]]] = {
             "time": Source(heading="TIME", unit="%m/%d/%y %H:%M:%S"),
         },
     ),
-    "SeaSPY's BOB": (
-        {"Reading_Date", "Reading_Time", "Field"},
-        {"total_field": Source(heading="Field", unit="nT")},
-    ),
-    "GEM": ({"nT", "sq"}, {"total_field": Source(heading="nT", unit="nT")}),
     "PX4's vehicle_magnetometer": (
         {"timestamp", "device_id", "magnetometer_ga[0]"},
         {"time": Source(heading="timestamp", unit="us")}

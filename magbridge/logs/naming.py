@@ -7,18 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from magbridge.columns import CHANNELS, COLUMNS, NT_PER_UNIT
+from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import SECONDS_OF_DAY
 from magbridge.logs.headings import NUMBER, aliases, bare, split
+from magbridge.logs.magnetic import find_total, units_of_axes
 from magbridge.logs.stamps import DAY
 
 if TYPE_CHECKING:
     from magbridge.logs.layout import Layout
 
-__all__ = ["EARTHS", "HEMISPHERES", "name_columns"]
+__all__ = ["HEMISPHERES", "name_columns"]
 
 COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 """What is declared to be the time where a file has none: the rows, so many a second."""
@@ -42,8 +41,6 @@ JOINED = {
     ),
 }  # fmt: skip
 """What several columns are together -> what they are called, with neither capitals nor punctuation."""
-EARTHS = 15_000.0, 90_000.0
-"""nT, within which the Earth's field lies, with a vehicle's own."""
 HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 
 
@@ -69,7 +66,8 @@ def name_columns(
     for k, name in enumerate(found.names):
         _take_unit(found, name, headings[k], declares[k])
     _find_time(found, rows)
-    _units_of_axes(found, rows)
+    units_of_axes(found, rows)
+    find_total(found, rows)
     _leave_texts(found, rows)
 
 
@@ -184,42 +182,6 @@ def _in_a_day(cell: str) -> bool:
         return 0.0 <= float(cell or 0) < DAY
     except ValueError:
         return False
-
-
-def _units_of_axes(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find the unit of the axes where the file does not state it: one that has it, or the field's length."""
-    undeclared = found.foreign and not set(CHANNELS) & set(found.declared.columns)
-    if not undeclared or not set(CHANNELS) <= set(found.names):
-        return
-    stated = {found.units.get(name, "") for name in CHANNELS}
-    if stated == {""}:
-        unit = _unit_by_length(found, rows)
-        if unit:
-            found.guesses.append(f"mag_x, mag_y, mag_z in {unit}, by the field's length")
-    elif len(stated) == 2 and "" in stated:
-        unit = max(stated)
-        found.guesses.append(f"mag_x, mag_y, mag_z all in {unit}")
-    else:
-        return
-    if unit:
-        found.units |= dict.fromkeys(CHANNELS, unit)
-
-
-def _unit_by_length(found: Layout, rows: Sequence[Sequence[str]]) -> str:
-    """Return the unit in which the field has the length of the Earth's; "" for nT, or where there is none."""
-    places = [found.names.index(name) for name in CHANNELS]
-    lengths = []
-    for row in rows:
-        try:
-            texts = (row[k].replace(",", ".") if found.decimal == "," else row[k] for k in places)
-            lengths.append(float(np.linalg.norm([float(text) for text in texts])))
-        except (ValueError, IndexError):
-            continue
-    length = float(np.median(lengths)) if lengths else 0.0
-    if EARTHS[0] < length < EARTHS[1]:
-        return ""
-    factors = ((unit, factor) for unit, factor in NT_PER_UNIT.items() if unit != "nT")
-    return next((unit for unit, factor in factors if EARTHS[0] < length * factor < EARTHS[1]), "")
 
 
 def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:

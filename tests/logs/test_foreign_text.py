@@ -235,10 +235,25 @@ def test_what_proton_magnetometers_write_is_the_total_field(tmp_path: Path) -> N
     bob = "/ BOB\nReading_Date,Reading_Time,Field,Depth\n2022-05-04,12:00:00.250,50905.7,3\n"
     gem = "/Gem Systems GSM-19WV\n/ID 1 file 01survey.wmv 04 V 22\n/X Y nT sq cor-nT time\nline  0.00\n"
     gem += "0372.36  5262.88  50905.70 99 0.00 120000.25\n0372.36  5262.88  50905.70 99 0.00 120100.25\n"
-    for name, text in {"m.dat": magmap, "b.csv": bob, "g.txt": gem}.items():
+    base = "Timestamp,F [uT]\n2022-05-04 12:00:00.25,50.9057\n"
+    for name, text in {"m.dat": magmap, "b.csv": bob, "g.txt": gem, "f.csv": base}.items():
         log = read(tmp_path, text, name)
-        assert float(log["total_field"][0]) == 50_905.7
+        assert float(log["total_field"][0]) == pytest.approx(50_905.7)
         assert float(log["time"][0]) % 86_400.0 == pytest.approx(43_200.25)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time,F,Mag\n1.6e9,50000,50001\n",  # which?
+        "time,F [V]\n1.6e9,50000\n",
+        "time,Bz [nT]\n1.6e9,45000\n",
+        "time,residual [nT]\n1.6e9,-12\n",
+        "time,mag_x,mag_y,mag_z,F\n1.6e9,30000,0,40000,50000\n",  # its own sensor's length, perhaps
+    ],
+)
+def test_what_may_be_no_total_field_is_none(text: str, tmp_path: Path) -> None:
+    assert "total_field" not in read(tmp_path, text)
 
 
 def test_a_name_may_stand_twice_and_a_column_have_none(tmp_path: Path) -> None:
