@@ -1,4 +1,4 @@
-"""What outlives the process: parameters that a station changed, and the time stamps of signed streams."""
+"""The file of what outlives a run: parameters that a station changed, and time stamps of signed streams."""
 
 from __future__ import annotations
 
