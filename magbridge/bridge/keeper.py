@@ -1,4 +1,4 @@
-"""What must outlive a bridge's process: parameters set over the link, and the signing time stamps."""
+"""What must outlive a bridge's process: parameters set over the link, time stamps, what was learned."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from contextlib import suppress
 
 from magbridge.bridge import states
 from magbridge.bridge.events import Start
+from magbridge.bridge.learning import keep, kept_path
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.config import Config
@@ -40,6 +41,7 @@ class Keeper:
             self._kept, self._spoilt = store.Kept(), True
         self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
         self._saved_us = self._retry_us = self._revision = 0
+        self._learned = kept_path(config)
 
     def attach(self, edge: LiveEdge) -> None:
         """Tell `edge` when something cannot be kept, or could not be read; then the file is set aside."""
@@ -59,7 +61,10 @@ class Keeper:
         return Start(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
-        """Save changed parameters within `SAVE_US`, the time stamps every `KEEP_US`."""
+        """Save what was learned, changed parameters within `SAVE_US`, and time stamps every `KEEP_US`."""
+        learning, path = pipeline.learning, self._learned
+        if learning is not None and path is not None and (why := keep(learning, path)):
+            self._notify(states.notice(why))
         revision = pipeline.component.parameters.revision
         due = self._key is not None and time_us - self._saved_us > KEEP_US
         if time_us < self._retry_us or (revision == self._revision and not due):

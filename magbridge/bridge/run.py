@@ -17,7 +17,6 @@ from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import Clock
 from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.keeper import Keeper
-from magbridge.bridge.learning import keep, kept_path
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
@@ -66,9 +65,7 @@ def run(path: Path) -> None:
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
     log = _open_log(config, edge, pipeline)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
-            signal.signal(number, lambda *_: edge.stop())
+    _stop_on_signals(edge)
     # not before a signal would end the bridge in good order: who hears it may send one
     Thread(
         target=_print_statustexts, args=(pipeline.component.announcer.texts,), name="voice", daemon=True
@@ -84,8 +81,6 @@ def run(path: Path) -> None:
         pipeline.component.metadata, logs, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.notify
     )
 
-    learned = kept_path(config)
-
     def after(time_us: int) -> None:
         while requests:
             files.ask(requests.popleft())
@@ -94,9 +89,6 @@ def run(path: Path) -> None:
             if messages:
                 edge.answer(station, pipeline.interleaved(messages))
         keeper.look(pipeline, time_us)
-        learning = pipeline.learning
-        if learning is not None and learned is not None and (why := keep(learning, learned)):
-            edge.notify(states.notice(why))
         watch.look(time_us)
         if pipeline.sensor.wrong_device:
             pipeline.sensor.wrong_device = False
@@ -110,6 +102,12 @@ def run(path: Path) -> None:
         edge.close()
         if log is not None:
             log.close()
+
+
+def _stop_on_signals(edge: LiveEdge) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number == signal.SIGINT or signal.getsignal(number) != signal.SIG_IGN:  # as SIGHUP is under nohup
+            signal.signal(number, lambda *_: edge.stop())
 
 
 def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
