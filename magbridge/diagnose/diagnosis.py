@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -23,10 +23,14 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.inference.search import Outcome
-from magbridge.diagnose.seen import Seen, seen
+from magbridge.diagnose.seen import Seen, memory, seen
 from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.unexplained.unlisted import far_from_white
 
-__all__ = ["Diagnosis", "Finding", "counted"]
+__all__ = ["WORTH", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
+
+WORTH = 0.01
+"""Share that what was found must take off the RMS which the calibration's own numbers fitted anew leave."""
 
 
 def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
@@ -140,3 +144,28 @@ class Diagnosis:
     def possible(self) -> list[Candidate]:
         """The causes of the findings, and their competing hypotheses."""
         return [candidate for one in self.findings for candidate in one.possible]
+
+
+def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool:
+    """Say whether what is left without a name is negligible, too, and the residual noise."""
+    if rest is not None and (rest.size is None or rest.size**2 > 2.0 * WORTH * rms(residual) ** 2):
+        return False
+    return not far_from_white(problem, memory(problem, residual / problem.reference_jacobian))
+
+
+def verdict_of(
+    named: Sequence[Hypothesis],
+    wrong: Outliers | None,
+    rest: Leftover | None,
+    total: Improvement,
+    negligible: bool = False,
+) -> str:
+    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part.
+
+    They may be `negligible`, where the calibration's own numbers fitted anew do as well, and leave noise.
+    """
+    if named and wrong is None and negligible:
+        return "negligible"
+    if named or wrong:
+        return "partly_explained" if rest or (named and not total.shown) else "explained"
+    return "unexplained" if rest else "nothing_found"

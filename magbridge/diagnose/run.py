@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.accept import odds_over_random_walk, settle
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
@@ -21,20 +20,20 @@ from magbridge.diagnose.causes.time_dependent import interference_tone
 from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.diagnosis import Diagnosis, Finding, counted
+from magbridge.diagnose.diagnosis import WORTH, Diagnosis, Finding, counted, small, verdict_of
 from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import isolability
 from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.left_out import Improvement, held_out, paired
+from magbridge.diagnose.inference.left_out import held_out, paired
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.seen import memory
-from magbridge.diagnose.unexplained.leftover import Leftover, leftover
-from magbridge.diagnose.unexplained.unlisted import far_from_white, switching, unlisted
+from magbridge.diagnose.unexplained.leftover import leftover
+from magbridge.diagnose.unexplained.unlisted import switching, unlisted
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 
@@ -47,8 +46,6 @@ ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 SLOW = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
-WORTH = 0.01
-"""Share that what was found must take off the RMS which the calibration's own numbers fitted anew leave."""
 
 
 def diagnose(
@@ -144,14 +141,14 @@ def _examine(
             rest = leftover(problem, [], outcome.null, tone)
     rest = rest or unlisted(problem, fit, named, off, after, counts)
     total, beyond = (paired(since, after, problem.survey.dive, counts) for since in (before, alone.residual))
-    negligible = beyond.ratio > 1.0 - WORTH and _small(problem, alone.residual, rest)
+    negligible = beyond.ratio > 1.0 - WORTH and small(problem, alone.residual, rest)
     return Diagnosis(
         problem=problem, outcome=outcome,
         findings=_findings(problem, named, competing, fit, after, counts, outcome),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
-        beyond=beyond, verdict=_verdict(named, wrong, rest, total, negligible), causes=causes,
+        beyond=beyond, verdict=verdict_of(named, wrong, rest, total, negligible), causes=causes,
     )  # fmt: skip
 
 
@@ -232,28 +229,3 @@ def _is_slow(problem: Problem, one: Hypothesis) -> bool:
     """Say whether a cause is slow: most of its power is left in means over many samples."""
     added = one.candidate.columns(slice(0, len(problem))) @ one.fit.coefficients[-one.candidate.size :]
     return memory(problem, added).slow >= SLOW
-
-
-def _small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool:
-    """Say whether what is left without a name is negligible, too, and the residual noise."""
-    if rest is not None and (rest.size is None or rest.size**2 > 2.0 * WORTH * rms(residual) ** 2):
-        return False
-    return not far_from_white(problem, memory(problem, residual / problem.reference_jacobian))
-
-
-def _verdict(
-    named: Sequence[Hypothesis],
-    wrong: Outliers | None,
-    rest: Leftover | None,
-    total: Improvement,
-    negligible: bool = False,
-) -> str:
-    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part.
-
-    They may be `negligible`, where the calibration's own numbers fitted anew do as well, and leave noise.
-    """
-    if named and wrong is None and negligible:
-        return "negligible"
-    if named or wrong:
-        return "partly_explained" if rest or (named and not total.shown) else "explained"
-    return "unexplained" if rest else "nothing_found"

@@ -18,14 +18,13 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.prior import isotropic
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.compare.survey import Channel, _channels
-from magbridge.diagnose.diagnosis import Finding
+from magbridge.diagnose.diagnosis import Finding, small, verdict_of
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import _folded, _outliers, nameless
 from magbridge.diagnose.report.page import improved
-from magbridge.diagnose.run import _small, _verdict
 from magbridge.diagnose.unexplained.leftover import Leftover
 from magbridge.diagnose.words import chance, measured, number, physics, row, sizes
 
@@ -193,11 +192,11 @@ def test_names_that_gain_nothing_explain_only_in_part() -> None:
     candidate = CAUSES["reference_bias"].candidates(right(100))[0]
     named = [Hypothesis(candidate, ratio=25.0, evidence=9.0, p_value=1e-3, fit=None)]
     improvements = [Improvement(588.1, 587.3, 0.999, (0.863, upper)) for upper in (1.021, 0.999)]
-    assert [_verdict(named, None, None, one) for one in improvements] == [
+    assert [verdict_of(named, None, None, one) for one in improvements] == [
         "partly_explained",
         "explained",
     ]
-    assert _verdict([], None, None, improvements[0]) == "nothing_found"
+    assert verdict_of([], None, None, improvements[0]) == "nothing_found"
 
 
 def test_where_the_calibrations_own_numbers_do_as_well_nothing_needs_explaining() -> None:
@@ -205,14 +204,14 @@ def test_where_the_calibrations_own_numbers_do_as_well_nothing_needs_explaining(
     problem, noise = right(1000), 10.0 * np.random.default_rng(2).normal(size=1000)
     named = [Hypothesis(CAUSES["reference_bias"].candidates(problem)[0], 25.0, 9.0, 1e-3, fit=None)]
     total, rest = Improvement(20.0, 10.0, 0.5, (0.4, 0.6)), Leftover("drift", 9.0, 1e-9, 12.0, None, None)
-    assert _verdict(named, None, None, total, negligible=True) == "negligible"
-    assert _small(problem, noise, None)
-    assert [_small(problem, noise, rest._replace(size=size)) for size in (1.0, 3.0, None)] == [
+    assert verdict_of(named, None, None, total, negligible=True) == "negligible"
+    assert small(problem, noise, None)
+    assert [small(problem, noise, rest._replace(size=size)) for size in (1.0, 3.0, None)] == [
         True,
         False,
         False,
     ]
-    assert not _small(problem, noise + 20.0 * (np.arange(1000) > 500), None)
+    assert not small(problem, noise + 20.0 * (np.arange(1000) > 500), None)
 
 
 def test_a_long_table_of_terms_is_folded_to_a_line() -> None:

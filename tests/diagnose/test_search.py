@@ -18,11 +18,10 @@ from magbridge.diagnose.compare.problem import pose
 from magbridge.diagnose.inference.competing import exchanged
 from magbridge.diagnose.inference.evidence import ODDS
 from magbridge.diagnose.inference.hypothesis import Hypothesis
+from magbridge.diagnose.inference.outliers import LOST, switches
 from magbridge.diagnose.inference.search import (
-    LOST,
     _forward_selection,
     _surplus,
-    _switches,
     beside_slow_noise,
     search,
 )
@@ -88,8 +87,8 @@ def test_what_switches_is_not_searched_for_without_end() -> None:
     brief = State(noisy, steps, 2, 2).with_brief_noise()
     model, base = _forward_selection(brief, brief.round([], brief.null))
     assert len(model[0].pieces) == LOST
-    assert _switches(brief, model, base)
-    assert not _switches(brief, [*steps[:2], current], brief.fit([*steps[:2], current]))
+    assert switches(base, model, brief.causes)
+    assert not switches(brief.fit([*steps[:2], current]), [*steps[:2], current], brief.causes)
 
 
 def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +13,15 @@ from scipy.stats import chi2, rankdata
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.residual import robust_scale
+from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.evidence import LEVEL, ODDS
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint
 
-__all__ = ["Outliers", "outliers"]
+__all__ = ["LOST", "Outliers", "outliers", "switches"]
 
+LOST, PLACES = 2, 6
+"""Regressors beside which a level that shifts at more than so many places is no cause of the list."""
 AFTERWARDS = 16
 """Samples beyond the noise's order in which a shift of the level is looked for."""
 
@@ -61,6 +65,14 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
     # through the noise's autoregression a wrong sample also spoils the innovations after it
     first = rows[np.insert(np.diff(rows) > 1, 0, True)]
     return Outliers(first, ratio, p_value, _neighbours(fit, first), _lasting(fit, first))
+
+
+def switches(fit: Joint, model: Sequence[Candidate], causes: int) -> bool:
+    """Say whether the level shifts at many places beside a model's first few regressors."""
+    if sum(len(candidate.pieces) for candidate in model) < LOST:
+        return False
+    off = outliers(fit, causes)
+    return off is not None and off.lasting and off.rows.size > PLACES
 
 
 def _lasting(fit: Joint, rows: IndexArray) -> bool:

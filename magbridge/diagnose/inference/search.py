@@ -10,17 +10,14 @@ causes are exchanged for competing hypotheses (:mod:`.competing`). Last, causes 
 needless are dropped.
 
 Noise that ends up slow may have absorbed what several causes do together: then none alone stands out from it.
-So a second start finds causes beside noise of a short correlation, and weighs them beside noise of any.
-
-What switches without a column of the log that shows it takes regressor after regressor, and none describes
-it. So where the level still shifts at many places beside the first few, nothing more is searched for.
+So a second start finds causes beside noise of a short correlation, and weighs them beside noise of any. What
+switches unseen takes regressor after regressor, and none describes it: where the level still shifts at many
+places beside the first few (:func:`~.outliers.switches`), nothing more is searched for.
 
 What is found, and asserted, is then searched for beside noise that grows towards low frequencies, where that
 gains anything (:mod:`~.compare.slow_noise`), and the likelier is kept: a cause that only stands for such
-noise is not found.
-
-The competing hypotheses are read off one matrix at the end: the information of all candidates under the noise
-that is left, the other causes projected out.
+noise is not found. The competing hypotheses are read off one matrix at the end: the information of all
+candidates under the noise that is left, the other causes projected out.
 """
 
 from __future__ import annotations
@@ -47,7 +44,7 @@ from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.isolability import CONFOUNDED, likeness, most_visible
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.left_out import held_out
-from magbridge.diagnose.inference.outliers import outliers
+from magbridge.diagnose.inference.outliers import switches
 from magbridge.diagnose.inference.profile_likelihood import refined, sharpen
 from magbridge.diagnose.inference.state import State
 
@@ -55,8 +52,6 @@ __all__ = ["Outcome", "beside_slow_noise", "search"]
 
 MOST = 6
 """Regressors found one by one in a log, at most."""
-LOST = 2
-"""Regressors beside which a level that shifts at more than :data:`MOST` places is no cause of the list."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +92,7 @@ def search(
     first = state.round([], state.null) if candidates else []
     p_value = min((h.p_value for h in first), default=1.0)
     model, base = _likeliest(state, first) if first else ([], state.null)
-    switches = _switches(state, model, base)
+    ended = switches(base, model, state.causes)
     chosen, base = _backward_elimination(state, model, base)
     model = [h.candidate for h in chosen]
     info = state.conditional_on(model, base)
@@ -108,7 +103,7 @@ def search(
     evidence = state.value(model, base, plain) - 0.5 * (order + needed)
     return Outcome(
         problem, tuple(chosen), competing, state.null, base, p_value, info, state.look_elsewhere, evidence,
-        switches,
+        ended,
     )  # fmt: skip
 
 
@@ -124,14 +119,14 @@ def beside_slow_noise(found: Outcome, candidates: Sequence[Candidate], causes: i
 def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Return the likelier of the models found beside any noise, and beside a short-lived one if need be."""
     model, base = _forward_selection(state, first)
-    if _switches(state, model, base):
+    if switches(base, model, state.causes):
         return model, base
     if model:
         model, base = exchanged(state, model, base)
     if base.noise.slowest > BRIEFEST:  # it may have absorbed causes
         brief = state.with_brief_noise()
         slow, there = _forward_selection(brief, brief.round([], brief.null))
-        if slow and not _switches(brief, slow, there):
+        if slow and not switches(there, slow, brief.causes):
             start = refined(state, slow, state.fit(slow, rounds=6))
             model, base = max((model, base), exchanged(state, *start), key=lambda entry: state.value(*entry))
     return model, base
@@ -155,18 +150,10 @@ def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Cand
         cause = best.candidate.cause
         strengths[cause] = max(strengths.get(cause, 0.0), _remnant(best))
         model, base = _added(state, model, best)
-        if _switches(state, model, base):
+        if switches(base, model, state.causes):
             break
         found = state.round(model, base)
     return model, base
-
-
-def _switches(state: State, model: Sequence[Candidate], base: Joint) -> bool:
-    """Say whether the level shifts at more places than regressors may be found, beside some that were."""
-    if sum(len(candidate.pieces) for candidate in model) < LOST:
-        return False
-    off = outliers(base, state.causes)
-    return off is not None and off.lasting and off.rows.size > MOST
 
 
 def _remnant(found: Hypothesis) -> float:
