@@ -152,7 +152,7 @@ def test_a_replay_finds_its_way_by_the_field(flown: xr.Dataset, tmp_path: Path, 
         replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal"),
         tmp_path / "c.json",
     )
-    log = flown.isel(time=slice(0, 800))
+    log = flown.isel(time=slice(0, 400))
     log = log.assign({f"mag_{axis}": log[f"truth_field_{axis}"] for axis in "xyz"})
     write(log if motion == "glide" else log.drop_vars("pitch"), tmp_path / "log.nc")
     path = config(tmp_path)
@@ -161,7 +161,7 @@ def test_a_replay_finds_its_way_by_the_field(flown: xr.Dataset, tmp_path: Path, 
     )
     path.write_text(path.read_text() + tables)
     result = replay([tmp_path / "log.nc"], path)
-    assert sum(result["navigation"].values()) > 100
+    assert sum(result["navigation"].values()) > 50
     assert not {"off", "lost"} & set(result["navigation"])
     assert "position updates" in summary(result)
 
