@@ -94,7 +94,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     of_day, unit = unit == SECONDS_OF_DAY, unit if unit in EPOCHS else ""
     present = [text.strip() for text in texts if text.strip()]
     numbers = _numbers(pd.Series(present, dtype="str"))
-    if not unit and _on_a_clock(present):
+    if not unit and _on_a_clock(heading, present):
         return Clock("%H%M%S", OF_A_DAY, boot=True)
     digits = (
         not unit and bool(present) and all(re.fullmatch(r"(19|20)\d{12}(\.\d+)?", one) for one in present)
@@ -105,11 +105,12 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     return _written(heading, present, zone, of_day=of_day)
 
 
-def _on_a_clock(texts: Sequence[str]) -> bool:
+def _on_a_clock(heading: str, texts: Sequence[str]) -> bool:
     """Say whether six digits are hours, minutes and seconds, as 120059 before 120100, and no count."""
     if not texts or not all(re.fullmatch(r"[0-2]\d[0-5]\d[0-5]\d(\.\d+)?", text) for text in texts):
         return False
-    return texts[0].startswith("0") or len({text[2:4] for text in texts}) > 1
+    named = re.search("utc|gmt|hhmmss|of.?day|zeit", heading.lower())
+    return bool(named) or texts[0].startswith("0") or len({text[2:4] for text in texts}) > 1
 
 
 def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> Clock:
@@ -121,7 +122,13 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> Cl
     since = start + scale * float(np.median(numbers)) if len(numbers) else 0.0
     dated = since >= YEAR_1980
     step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
-    if kind == "s" and not unit and whole and step >= SLOW and not (dated and since < SINCE_1980[1]):
+    if (
+        kind == "s"
+        and not unit
+        and whole
+        and step >= SLOW
+        and not (dated and since < SINCE_1980[1] and step < DAY)
+    ):
         ways = " or ".join(f'--column time="{heading} [{one}]"' for one in ("ms", "us", "ns", "s"))
         raise ValueError(f"a count with steps of {step:g}, in a unit that the file does not tell: {ways}")
     boot = bool(len(numbers)) and abs(since) < YEAR_1980 and heading != "time"
@@ -192,7 +199,7 @@ def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
         start, *scales = SUMS[clock.kind]
         parts = cells.astype("string").str.split(expand=True).apply(pd.to_numeric, errors="coerce")
         large, small = parts.to_numpy(np.float64).T
-        if scales[0] == WEEK and np.nanmax(small) > WEEK:
+        if scales[0] == WEEK and np.nanmax(small, initial=0.0) > WEEK:
             small = small * 1e-3  # of the week are then milliseconds
         times = start + large * scales[0] + small * scales[1]
     else:

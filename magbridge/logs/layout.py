@@ -33,7 +33,7 @@ ATTRIBUTE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
 COMMENTS = "#", "%", "/"
 LINE = re.compile(r"\s*(line|tie)[\s:]*[\w.:]+\s*", re.IGNORECASE)
 """What Geosoft and others write between the lines of a survey."""
-SEPARATORS = ";", "\t", ",", "|"
+SEPARATORS = ";", "\t", "|", ","
 BLANKS = " "
 """Stands for any number of blanks between fields."""
 NMEA = "GgaSentence"
@@ -98,9 +98,9 @@ def layout_of(path: Path, lines: Sequence[str], declared: Declared, *, foreign: 
         raise FormatError(path, "expected a header row, the file is empty", row=comments + 1)
     found.separator = declared.separator or _separator(body)
     start = comments + _preamble(lines[comments:], found)
-    headings = cells(lines[start], found.separator)
+    headings = cells(lines[start].lstrip("#% "), found.separator)
     found.first = start + 1
-    if _are_values(headings):
+    if _are_values(headings) or (comments and _mostly_digits(headings)):
         start, headings = _headings_elsewhere(path, lines, comments, start, declared, found)
     found.row = start + 1
     units = _units_row(lines, found)
@@ -127,8 +127,11 @@ def is_remark(line: str) -> bool:
 def _are_values(row: Sequence[str]) -> bool:
     """Whether a row is no headings: all are numbers, or it and most of its cells begin with a digit."""
     there = [cell for cell in row if cell]
-    digits = [cell.lstrip("+-.")[:1].isdigit() for cell in there]
-    return all(map(NUMBER.fullmatch, there)) or (digits[0] and sum(digits) > len(there) / 2)
+    return all(map(NUMBER.fullmatch, there)) or (there[0][0].isdigit() and _mostly_digits(there))
+
+
+def _mostly_digits(row: Sequence[str]) -> bool:
+    return sum(cell.lstrip("+-.")[:1].isdigit() for cell in row) > len(row) / 2
 
 
 def _comments(path: Path, lines: Sequence[str], found: Layout) -> int:
@@ -164,7 +167,7 @@ def _separator(body: Sequence[str]) -> str:
         counts = Counter(_count(line, separator) for line in body)
         most, often = max(counts.items(), key=lambda item: (item[1], item[0]))
         if most > 1 and (often > 1 or len(body) == 1):
-            share = often / len(body)
+            share = often / len(body) + 0.5 * (separator != BLANKS and _count(body[0], separator) == most)
             # a comma may be a decimal's: the headings must have as many fields as the rows
             if _count(body[0], separator) != most and share < 0.5:
                 share *= 0.1

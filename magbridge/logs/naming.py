@@ -21,7 +21,9 @@ __all__ = ["HEMISPHERES", "name_columns"]
 
 COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 """What is declared to be the time where a file has none: the rows, so many a second."""
-HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d(\.\d*)?", re.IGNORECASE)
+HOUR = re.compile(
+    r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d([.,]\d*)?", re.IGNORECASE
+)
 DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyymmdd|ddmmyy)", re.IGNORECASE)
 """What in a heading says that the column holds dates."""
 TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
@@ -179,7 +181,7 @@ def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
 
 def _in_a_day(cell: str) -> bool:
     try:
-        return 0.0 <= float(cell or 0) < DAY
+        return 0.0 <= float(cell.replace(",", ".") or 0) < DAY
     except ValueError:
         return False
 

@@ -66,6 +66,7 @@ class Table:
         heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.pop("time", "")
         first = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
         texts = [" ".join(row[k] for k in layout.stamp) for row in first if max(layout.stamp) < len(row)]
+        texts = [text.replace(layout.decimal, ".") for text in texts]
         try:
             return clock_of(heading, unit, texts, self._declared.zone)
         except ValueError as error:
@@ -168,6 +169,8 @@ class Table:
         column = frame[first]
         for k in others:
             column = column.str.strip() + " " + frame[k].str.strip()
+        if self._layout.decimal == "," and not pd.api.types.is_numeric_dtype(column):
+            column = column.str.replace(",", ".")
         times = seconds(self._clock, column, self._declared.zone)
         if self._clock.is_text and self._clock.boot:
             times = self._unwound(times)
