@@ -43,8 +43,6 @@ class Visible:
 
     cause: str
     channel: str | None
-    sure: float
-    """Signal-to-noise that is found with a chance of 95 %."""
     sizes: dict[str, tuple[float, str]]
     """Coefficient -> (size that is found with 95 %, unit); infinite where the log cannot show it."""
 
@@ -105,7 +103,7 @@ def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: fl
             name: (_plausible(float(x)) * float(w), unit)
             for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
         }
-    return Visible(candidate.cause, candidate.channel, sure, sizes)
+    return Visible(candidate.cause, candidate.channel, sizes)
 
 
 def _plausible(size: float) -> float:

@@ -192,12 +192,12 @@ def visible(diagnosis: Diagnosis) -> list[str]:
     report = diagnosis.isolability
     hidden = [one for one in report.visible if not any(isfinite(size) for size, _ in one.sizes.values())]
     rows = (
-        f'<tr><td>{escape(label(one.cause, one.channel))}</td><td class="n">{one.sure:.1f}</td>'
-        f"<td>{sizes(one.sizes)}</td><td>{_alike(diagnosis, one)}</td></tr>"
+        f"<tr><td>{escape(label(one.cause, one.channel))}</td><td>{sizes(one.sizes)}</td>"
+        f"<td>{_alike(diagnosis, one)}</td></tr>"
         for one in report.visible
         if one not in hidden
     )
-    heads = ("cause", "S/N found in 95 %", "smallest size found in 95 %", "looks like")
+    heads = ("cause", "smallest size found in 95 %", "looks like")
     unseen = "; ".join(escape(label(one.cause, one.channel)) for one in hidden)
     missing = "; ".join(f"{label(name, None)}: {escape(needs)}" for name, needs in report.untestable.items())
     basis = (
