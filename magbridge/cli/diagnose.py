@@ -126,7 +126,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
     # that a cause shows no gain stands in its own line
     against = [one["text"] for one in use["reasons_against"] if one["code"] != "no_improvement"]
-    doubts = [f"  {text}" for text in against] * (use["fit_for_use"] != "yes")
+    doubts = [f"  {text}" for text in against] * (use["fit_for_use"] not in ("yes", "not_needed"))
     return "\n  ".join([f"{verdict}: {rms}", fit, *doubts, *causes_of(facts)])
 
 

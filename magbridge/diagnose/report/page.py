@@ -135,7 +135,10 @@ def _sentence(diagnosis: Diagnosis) -> str:
         remembers = f" that remembers {number(residual.correlation_time, 2)} s" * residual.lasts
         other = f"What is left, {number(residual.rms)} nT RMS, looks like noise{remembers}."
     start = "Nothing needs explaining: what was found makes next to no difference. "
-    return f"{start * (diagnosis.verdict == 'negligible')}Found: {'; '.join(names)}. {worth} {other}"
+    negligible = diagnosis.verdict == "negligible"
+    if rest and negligible:
+        other = "What else is left has no name, and is as small."
+    return f"{start * negligible}Found: {'; '.join(names)}. {worth} {other}"
 
 
 def _or(competing: Sequence[CompetingHypothesis]) -> str:
