@@ -33,6 +33,7 @@ from magbridge.diagnose.words import (
     sizes,
     table,
 )
+from magbridge.wording import counted
 
 __all__ = ["described", "found", "nameless", "remaining", "visible"]
 
@@ -132,7 +133,7 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     )
     return [
         f"<p>{described(rest, residual)}. {nameless(rest, causes)}</p>" if rest else "",
-        f"<p>The level shifts at {len(shifts)} places, {_when(shifts)}.</p>" * bool(len(shifts)),
+        f"<p>The level shifts at {counted(len(shifts), 'place')}, {_when(shifts)}.</p>" * bool(len(shifts)),
         how,
         table(("difference between measured and reference", "RMS"), lines),
         worse * ((budget.after or 0.0) > WORSE * budget.fitted),
