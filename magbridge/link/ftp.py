@@ -109,8 +109,8 @@ class Request(NamedTuple):
 class Session:
     """A file that a station has open."""
 
-    def __init__(self, file: BinaryIO, size: int, now: float) -> None:
-        self.file, self.size, self.used = file, size, now
+    def __init__(self, file: BinaryIO, now: float) -> None:
+        self.file, self.used = file, now
 
     def read(self, offset: int, size: int) -> bytes:
         """Return bytes of the file; none beyond its end."""
@@ -141,11 +141,6 @@ class FtpServer:
             Opcode.READ: self._read,
             Opcode.CRC32: self._crc32,
         }
-
-    @property
-    def sessions(self) -> int:
-        """Number of files that are open."""
-        return len(self._sessions)
 
     def handle(self, sender: Sender, payload: bytes) -> Iterator[bytes]:
         """Yield the payloads of the replies to a request: one, or a burst, read as it is taken.
@@ -221,7 +216,7 @@ class FtpServer:
         number = self._free(sender, request.session)
         with _no_such_file():
             file, size = self._tree.open(request.path)
-        self._sessions[sender, number] = Session(file, size, self._now())
+        self._sessions[sender, number] = Session(file, self._now())
         size_data = min(size, 0xFFFFFFFF).to_bytes(4, "little")
         return request.reply(Opcode.ACK, size_data, session=number)
 
