@@ -30,9 +30,8 @@ __all__ = ["BLANKS", "HEADER", "Layout", "cells", "is_remark", "layout_of"]
 HEADER = 200
 """Lines at the start of a file by which its layout is found."""
 ATTRIBUTE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
-COMMENTS = "#", "%", "/"
-LINE = re.compile(r"\s*(line|tie)[\s:]*[\w.:]+\s*", re.IGNORECASE)
-"""What Geosoft and others write between the lines of a survey."""
+is_remark = re.compile(r"[#%/]|\s*(?:line|tie)[\s:]*[\w.:]+\s*$", re.IGNORECASE).match
+"""Whether a line is no row: a comment, or what Geosoft and others write between the lines of a survey."""
 SEPARATORS = ";", "\t", "|", ","
 BLANKS = " "
 """Stands for any number of blanks between fields."""
@@ -117,11 +116,6 @@ def layout_of(path: Path, lines: Sequence[str], declared: Declared, *, foreign: 
         found.guesses.append(f"columns as {maker} writes them")
     name_columns(path, found, headings, units, rows)
     return found
-
-
-def is_remark(line: str) -> bool:
-    """Whether a line is no row: a comment, or the name of a survey's line."""
-    return line.startswith(COMMENTS) or bool(LINE.fullmatch(line))
 
 
 def _are_values(row: Sequence[str]) -> bool:
