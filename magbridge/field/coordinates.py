@@ -67,6 +67,11 @@ def geographic(
     """
     crs = _reference_system(path, axes.crs)
     if _are_degrees(path, x, y, axes.unit.lower(), crs):
+        gaps = np.diff(x)
+        if gaps.size and gaps.max() > 180.0 > x[-1] - 180.0:  # 179 and -179 are neighbours
+            split = int(gaps.argmax()) + 1
+            x = np.concatenate([x[split:], x[:split] + 360.0])
+            fields = {name: np.roll(values, -split, axis=1) for name, values in fields.items()}
         return x, y, fields
     if crs is None or crs.is_geographic:
         raise FormatError(

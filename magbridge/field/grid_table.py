@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magbridge.arrays import IndexArray, RealArray
+from magbridge.arrays import RealArray
 from magbridge.errors import FormatError
 from magbridge.field.coordinates import LATITUDE, LONGITUDE, PROJECTED, Axes, stated
 from magbridge.field.grid_formats import TEXT
@@ -69,8 +69,9 @@ def table(path: Path) -> Parts:
     rows = _numbers(path, delimiter, skip, places)
     if not header:
         rows = rows[:, _order(path, rows)]
-    x_levels, column = _levels(rows[:, 0])
-    y_levels, row = _levels(rows[:, 1])
+    (x_levels, column), (y_levels, row) = (
+        np.unique(np.round(rows[:, k], 9), return_inverse=True) for k in (0, 1)
+    )
     if x_levels.size * y_levels.size > 4 * len(rows):
         raise FormatError(path, f"expected a grid, found {len(rows)} scattered points: grid them first")
     values = np.full((y_levels.size, x_levels.size), np.nan)
@@ -157,14 +158,3 @@ def _numbers(path: Path, delimiter: str | None, skip: int, places: tuple[int, in
     if not np.isfinite(rows[:, :2]).all() or not len(rows):
         raise FormatError(path, "expected rows of longitude, latitude, anomaly")
     return np.asarray(rows)
-
-
-def _levels(values: RealArray) -> tuple[RealArray, IndexArray]:
-    """Return the distinct coordinates and where each value falls; 179 and -179 are neighbours."""
-    levels, index = np.unique(np.round(values, 9), return_inverse=True)
-    gaps = np.diff(levels)
-    if gaps.size and gaps.max() > 180.0 > levels[-1] - 180.0 and np.abs(levels).max() <= 360.0:
-        split = int(gaps.argmax()) + 1
-        levels = np.concatenate([levels[split:], levels[:split] + 360.0])
-        index = (index - split) % levels.size
-    return levels, index

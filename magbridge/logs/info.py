@@ -41,6 +41,8 @@ USES: dict[str, Needs] = {
 """Command -> what it needs: of each group, one of the alternatives, each a set of columns."""
 GAP = 2.5
 """A pause longer than this many sampling intervals is a gap."""
+ABOVE = 2.0
+"""m above the surface, from which on a vehicle that has a depth at all is hardly there."""
 STATES = {
     *("degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar", "inHg", "V", "s", "m", "m/s", "nT", "arcmin")
 }
@@ -156,6 +158,9 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
         hints.append("times count from a start that the log does not tell: --date says when it was")
     if "heading" in log and "heading_reference" not in log.attrs:
         hints.append("heading is taken as true: say --heading-reference magnetic if it is a compass")
+    depth = log["depth"].dropna("time").to_numpy() if "depth" in log else np.empty(0)
+    if len(depth) and (middle := float(np.median(depth))) < -ABOVE:
+        hints.append(f"depth is {middle:.4g} m (median): if it counts upwards, scale = -1 in columns.toml")
     if moving := movers(log):
         hints.append(f"may move the field, for --parameter: {' '.join(moving)} (auto: those that do)")
     if any(lacking(log, needs) for needs in USES.values()):

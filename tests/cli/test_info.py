@@ -65,6 +65,11 @@ def test_a_field_that_is_the_earths_in_no_unit() -> None:
     assert hint == "the vector's length is 1.178e+05 nT (median)"
 
 
+def test_a_depth_that_counts_upwards_is_doubted() -> None:
+    hints = info(made("log", [START, START + 1], {"depth": np.array([-12.0, np.nan])}))["hints"]
+    assert "depth is -12 m (median): if it counts upwards, scale = -1 in columns.toml" in hints
+
+
 def test_what_moves_the_field_is_no_state_of_the_vehicle() -> None:
     names = {"pump": "A", "water": "degC", "supply": "V", "mast": "1", "speed": "m/s", "still": "A"}
     columns = {name: np.arange(9.0) * (name != "still") for name in names}

@@ -205,6 +205,16 @@ def test_a_table_over_the_antimeridian(tmp_path: Path) -> None:
     assert grid.look_up(-179.9, 54.2).anomaly == pytest.approx(grid.look_up(180.1, 54.2).anomaly)
 
 
+def test_a_grid_over_the_antimeridian_from_west_to_east_by_number(tmp_path: Path) -> None:
+    longitude = (LON + 169.75 + 180) % 360 - 180
+    order = np.argsort(longitude)
+    axes = {"lat": LAT, "lon": longitude[order]}
+    xr.DataArray(MAP[:, order], axes, ("lat", "lon"), "anomaly").to_netcdf(tmp_path / "a.nc")
+    grid = read_grid(tmp_path / "a.nc")
+    np.testing.assert_allclose(grid.anomaly, MAP, atol=1e-9)
+    np.testing.assert_allclose(grid.longitude, LON + 169.75)
+
+
 def test_a_gap_in_a_table_is_a_hole(tmp_path: Path) -> None:
     x, y = np.meshgrid(LON, LAT)
     rows = np.column_stack([x.ravel(), y.ravel(), MAP.ravel()])
