@@ -89,7 +89,9 @@ def _beginning(path: Path) -> tuple[list[str], str | None, int]:
     delimiter = next((mark for mark in ",;\t" if mark in first), None)
     candidates = [first, *(line.strip().lstrip("#%/") for line in reversed(remarks))]
     rows = [[word.strip() for word in line.strip().lower().split(delimiter)] for line in candidates]
-    named = (row for row in rows[1:] if len(row) == len(rows[0]) and {*row} & {*LONGITUDE, *PROJECTED[0]})
+    eastward = {*LONGITUDE, *PROJECTED[0]}
+    alike = (row for row in rows[1:] if len(row) == len(rows[0]))
+    named = (row for row in alike if any(_column(0, word).name in eastward for word in row))
     words = rows[0]
     if all(NUMBERS.fullmatch(word) for word in words):
         return next(named, words), delimiter, len(remarks)

@@ -166,6 +166,7 @@ def marked(path: Path, write: Callable[[Path], None]) -> None:
         ("d.csv", lambda path: table(path, "\ufefflongitude,latitude,anomaly\n")),  # as Excel writes it
         ("e.csv", lambda path: table(path, "\ufeffx,y,z,mag\n", height=True)),
         ("f.csv", lambda path: table(path, "Lon_DD,Lat_DD,Mag Anomaly (nT)\n")),
+        ("g.csv", lambda path: table(path, "/ XYZ\n# Lon_DD,Lat_DD,tmi [uT]\n", scale=1e-3)),
         ("b.xyz", lambda path: table(path, "/ XYZ EXPORT\n/ x y mag\nLine L100:0\n", " ")),
         ("c.xyz", lambda path: table(path, "# a grid\n\n# made by hand\nlon lat nT\n", " ")),
         ("c.asc", lambda path: marked(path, esri)),
