@@ -122,7 +122,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     use = facts["assessment"]
     if facts["findings"] and (refitted := use["rms_nT"]["refitted"]) is not None:
         rms += f"; {number(refitted)} nT by fitting the calibration's own numbers anew"
-    verdict = facts["verdict"] if facts["verdict"] != "negligible" else "nothing needs explaining"
+    verdict = "nothing needs explaining" if use["fit_for_use"] == "not_needed" else facts["verdict"]
     fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
     # that a cause shows no gain stands in its own line
     against = [one["text"] for one in use["reasons_against"] if one["code"] != "no_improvement"]

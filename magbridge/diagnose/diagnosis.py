@@ -117,6 +117,8 @@ class Diagnosis:
     """Of all findings together, over the calibration's own numbers fitted anew, held out."""
     verdict: str
     """As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain."""
+    negligible: bool
+    """What was found makes next to no difference beside the calibration's own numbers fitted anew."""
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
     """The table of causes that were asked about."""
 
@@ -154,18 +156,9 @@ def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool
 
 
 def verdict_of(
-    named: Sequence[Hypothesis],
-    wrong: Outliers | None,
-    rest: Leftover | None,
-    total: Improvement,
-    negligible: bool = False,
+    named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Improvement
 ) -> str:
-    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part.
-
-    They may be `negligible`, where the calibration's own numbers fitted anew do as well, and leave noise.
-    """
-    if named and wrong is None and negligible:
-        return "negligible"
+    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part."""
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"
     return "unexplained" if rest else "nothing_found"

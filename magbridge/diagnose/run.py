@@ -141,14 +141,15 @@ def _examine(
             rest = leftover(problem, [], outcome.null, tone)
     rest = rest or unlisted(problem, fit, named, off, after, counts)
     total, beyond = (paired(since, after, problem.survey.dive, counts) for since in (before, alone.residual))
-    negligible = beyond.ratio > 1.0 - WORTH and small(problem, alone.residual, rest)
+    negligible = bool(named) and wrong is None and beyond.ratio > 1.0 - WORTH
     return Diagnosis(
         problem=problem, outcome=outcome,
         findings=_findings(problem, named, competing, fit, after, counts, outcome),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
         before=before, after=after, total=total,
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
-        beyond=beyond, verdict=verdict_of(named, wrong, rest, total, negligible), causes=causes,
+        beyond=beyond, verdict=verdict_of(named, wrong, rest, total), causes=causes,
+        negligible=negligible and small(problem, alone.residual, rest),
     )  # fmt: skip
 
 

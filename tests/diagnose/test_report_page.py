@@ -53,7 +53,7 @@ def test_without_a_gain_it_does_not_fly(clear: Diagnosis) -> None:
 
 def test_what_makes_no_difference_needs_no_extension(clear: Diagnosis) -> None:
     """And a calibration whose own data do not support it is a doubt of every extension."""
-    small = replace(clear, verdict="negligible")
+    small = replace(clear, negligible=True)
     assert answer(small).fit_for_use == "not_needed"
     assert "Nothing needs explaining: what was found makes" in report_html(small, CAUSES).partition("<h2")[0]
     given = replace(clear.problem.calibration, warnings=("all headings lie within 20 degrees",))

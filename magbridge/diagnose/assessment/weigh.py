@@ -108,12 +108,12 @@ def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
 def _fitness(diagnosis: Diagnosis, use: str, against: Sequence[Note]) -> Fitness:
     if not diagnosis.named:
         return "nothing_added"
+    if diagnosis.negligible:
+        return "not_needed"
     if not use:
         return "reference_only"
     if not diagnosis.total.shown:
         return "no"
-    if diagnosis.verdict == "negligible":
-        return "not_needed"
     return "once_settled" if against else "yes"
 
 

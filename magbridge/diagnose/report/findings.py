@@ -39,6 +39,7 @@ def findings(
         "rms_before_nT": _round(diagnosis.total.before),
         "rms_after_nT": _round(diagnosis.total.after),
         "improvement": _improvement(diagnosis.total, diagnosis),
+        "gain": _improvement(diagnosis.total, diagnosis),
         "findings": listed,
         "unexplained": None
         if rest is None

@@ -135,10 +135,9 @@ def _sentence(diagnosis: Diagnosis) -> str:
         remembers = f" that remembers {number(residual.correlation_time, 2)} s" * residual.lasts
         other = f"What is left, {number(residual.rms)} nT RMS, looks like noise{remembers}."
     start = "Nothing needs explaining: what was found makes next to no difference. "
-    negligible = diagnosis.verdict == "negligible"
-    if rest and negligible:
+    if rest and diagnosis.negligible:
         other = "What else is left has no name, and is as small."
-    return f"{start * negligible}Found: {'; '.join(names)}. {worth} {other}"
+    return f"{start * diagnosis.negligible}Found: {'; '.join(names)}. {worth} {other}"
 
 
 def _or(competing: Sequence[CompetingHypothesis]) -> str:
