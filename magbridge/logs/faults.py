@@ -33,15 +33,17 @@ class Faults:
         self._counts: Counter[str] = Counter()
         self._lines: list[str] = []
 
-    def note(self, column: str, count: int, row: int, expected: str, counter: str = "") -> None:
+    def note(
+        self, column: str, count: int, row: int, expected: str, counter: str = "", *, wrong: bool = True
+    ) -> None:
         """Count what is wrong in a column, also in `counter`; `row` and `expected` are of the first.
 
-        FormatError: `strict`.
+        What is only not known, not `wrong`, may be most of it. FormatError: `strict`.
         """
         error = FormatError(self._file, expected, row=row, column=column or None)
         if self._strict:
             raise error
-        self._wrong[column] += count
+        self._wrong[column] += count * wrong
         if counter:
             self._counts[counter] += count
         if column not in self._first:

@@ -93,7 +93,7 @@ class Table:
             columns[name] = np.where(opposite, -np.abs(columns[name]), columns[name])
         for name, codes in (unknown(columns) if self._layout.foreign else {}).items():
             value = float(columns[name][int(codes.argmax())])
-            self._note(name, codes, kept, f"{EXPECTED}{value!r}")
+            self._note(name, codes, kept, f"{EXPECTED}{value!r}", wrong=False)
             columns[name][codes] = np.nan
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:
@@ -128,10 +128,12 @@ class Table:
         rows = [(line, n) for line, n, bad in zip(lines, numbers, wrong, strict=True) if not bad]
         return [line for line, _ in rows], [number for _, number in rows]
 
-    def _note(self, column: str, wrong: BoolArray, numbers: Sequence[int], expected: str) -> None:
-        """Count the `wrong` (n,) values of a column ("" and ``time``: rows); `expected` is of the first."""
+    def _note(
+        self, column: str, at: BoolArray, numbers: Sequence[int], expected: str, *, wrong: bool = True
+    ) -> None:
+        """Count the values `at` (n,) of a column ("" and ``time``: rows); `expected` is of the first."""
         counter = "rows_dropped" if column in {"", "time"} else "values_dropped"
-        self.faults.note(column, int(wrong.sum()), numbers[int(wrong.argmax())], expected, counter)
+        self.faults.note(column, int(at.sum()), numbers[int(at.argmax())], expected, counter, wrong=wrong)
 
     def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
         layout = self._layout

@@ -45,8 +45,8 @@ def _beyond(values: FloatArray) -> BoolArray:
     wrong: BoolArray = np.abs(values) > HUGE
     codes = np.isin(values, CODES)
     others = values[np.isfinite(values) & ~codes & ~wrong]
-    if codes.any() and len(others):
-        low, high = others.min(), others.max()
+    if codes.any():
+        low, high = (others.min(), others.max()) if len(others) else (0.0, 0.0)
         wrong |= codes & (np.maximum(low - values, values - high) > max(0.5 * (high - low), 1.0))
     return wrong
 

@@ -47,10 +47,6 @@ BAD_CSV = {
         '--column time="time [%d/%m/%Y %H:%M]" or --column time="time [%m/%d/%Y %H:%M]"'
     ),
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
-    "time,heading\n1,-9999\n": "row 2, column 'heading': expected deg, at most 540, not -9999.0",
-    "time,depth\n1,4\n2,1e300\n": (
-        "row 3, column 'depth': expected a value, or nothing where it is not known, not 1e+300"
-    ),
     "time,water [Celsius]\n1,4\n2,-999\n": (
         "row 3, column 'water': expected at least -273.15 degC, or nothing where it is not known, not -999.0"
     ),

@@ -204,6 +204,16 @@ def test_a_field_of_nothing_is_none_and_one_axis_at_0_is(tmp_path: Path) -> None
     assert float(log["mag_x"][6]) == -9999.0
 
 
+def test_a_column_that_is_mostly_unknown_costs_no_more_than_itself(tmp_path: Path) -> None:
+    """A CTD that was switched off, a receiver that never had a fix."""
+    rows = [f"{NOON + k},0,0,{30_000 + k},{-9999 if k else 12.5},-9999" for k in range(20)]
+    log = read(tmp_path, "\n".join(["time,lat,lon,mag_x,ctd,air [degC]", *rows]) + "\n")
+    assert log.sizes["time"] == 20
+    assert not np.isfinite(log["air"].values).any()
+    assert int(np.isfinite(log["ctd"].values).sum()) == 1
+    assert not np.isfinite(log["latitude"].values).any()
+
+
 def test_a_place_at_0_0_is_a_receiver_without_a_fix(tmp_path: Path) -> None:
     log = read(tmp_path, "time,lat,lon\n1600000000,0,0\n1600000001,0,9.5\n1600000002,47.5,0\n")
     assert np.isnan(log["latitude"].values).tolist() == [True, False, False]
