@@ -17,6 +17,7 @@ from magbridge.calibration.fitting import in_place, rounds
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
 from magbridge.calibration.fitting.joint import Sums
+from magbridge.calibration.fitting.latent import Group
 from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
@@ -356,7 +357,11 @@ def test_a_creep_that_shaped_the_rock_for_itself_goes_where_a_search_without_doe
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """All that is offered is kept at first: as where the rock that was searched with it needs it."""
-    monkeypatch.setattr(rounds, "likeliest", lambda *of: of[2])
+
+    def all_of_little_gain(*of: Any, price: float = 0.0) -> tuple[Group, ...]:
+        return tuple(one for one in of[2] if not (price and one.offered))
+
+    monkeypatch.setattr(rounds, "likeliest", all_of_little_gain)
     data, true = flown(legs=10)
     found = fit(slowly(data))
     assert found.creep is None

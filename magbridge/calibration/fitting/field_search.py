@@ -16,6 +16,7 @@ from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.field.place.matern import BURIED, SMOOTHNESS, Matern
 
 __all__ = [
+    "CLEAR",
     "Choice", "Weighed", "choose", "climb", "first_guess", "refined", "same_noise",
 ]  # fmt: skip
 
@@ -24,7 +25,7 @@ RESOLVED = 2.0
 FEWER = 1_500
 """Nodes at most of the smoothest fields, whose precisions are nearly full."""
 CLEAR = 30.0
-"""Nats by which one kind of field is likelier than the other at any smoothness."""
+"""Nats by which one kind of field is likelier than the other at any smoothness, or an offer needed."""
 BENDS = 0.25
 """Fields look alike where the length times this power of alpha - 1 is the same."""
 SMALL = 0.03

@@ -136,7 +136,8 @@ def _settled(survey: SurveySamples, own: PriorFamily) -> tuple[Answer, SurveySam
     """Return where the rounds come to rest, and the samples with the offers that the log needs.
 
     Those of a long log come to rest with every second or tenth sample, and go on with all from there. What is
-    kept of the offers has shaped the field that was searched with it: another search without may do better.
+    kept of the offers has shaped the field that was searched with it: where it gains little, another search
+    without may do better.
 
     Raises
     ------
@@ -146,9 +147,9 @@ def _settled(survey: SurveySamples, own: PriorFamily) -> tuple[Answer, SurveySam
     step = max(len(survey.kept) // SETTLED, 1)
     best = Rounds(survey.thinned(step), own)
     answer = best.settle()
-    for one in [group for group in best.survey.groups if group.offered]:
+    for one in sorted(best.unsure):
         few = survey.thinned(step)
-        few.keep(tuple(group for group in few.groups if group.name in best.names - {one.name}))
+        few.keep(tuple(group for group in few.groups if group.name in best.names - {one}))
         other = Rounds(few, own)
         try:
             found = other.settle()

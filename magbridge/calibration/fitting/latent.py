@@ -186,6 +186,7 @@ def likeliest(
     groups: tuple[Group, ...],
     eta: FloatArray,
     sigma: float,
+    price: float = LIKELIER,
 ) -> tuple[Group, ...]:
     """Return the groups without those that are offered and that the log does not need; one lag at most.
 
@@ -199,6 +200,8 @@ def likeliest(
         All that are in the fit.
     eta, sigma : (h,) array, float
         Widths and noise (nT), from which to climb.
+    price : float
+        Nats that each must gain.
     """
     first, free = _starts(own, groups)
 
@@ -209,7 +212,7 @@ def likeliest(
         part = Quadratic(quadratic.H[np.ix_(i, i)], quadratic.b[i], quadratic.c_0, quadratic.n)
         widths = [*range(len(own.centre)), *(free[one.name] for one in kept if one.spread)]
         terms = sum(one.offered for one in kept)
-        return maximise(part, with_groups(own, kept), eta[widths], sigma).log_evidence - LIKELIER * terms
+        return maximise(part, with_groups(own, kept), eta[widths], sigma).log_evidence - price * terms
 
     return max(_choices(groups), key=score)
 

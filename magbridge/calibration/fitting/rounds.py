@@ -11,6 +11,7 @@ from magbridge.calibration.fitting.answer import Answer, start
 from magbridge.calibration.fitting.evidence import maximise
 from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
+    CLEAR,
     Choice,
     Weighed,
     choose,
@@ -70,6 +71,8 @@ class Rounds:
         self.eta, self.w = self.family.centre, np.zeros(self.choice.field.nodes.size)
         self.nodes = self.choice.field.nodes
         self.last: FloatArray | None = None
+        self.unsure: set[str] = set()
+        """Offers that are kept but gain little: with another field the log may not need them."""
 
     @property
     def names(self) -> set[str]:
@@ -168,7 +171,9 @@ class Rounds:
         survey, choice = self.survey, self.choice
         self.offers = False
         reduced = eliminate(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
-        kept = likeliest(reduced.quadratic, self.own, survey.groups, self.eta, self.sigma)
+        weighed = reduced.quadratic, self.own, survey.groups, self.eta, self.sigma
+        kept, sure = likeliest(*weighed), likeliest(*weighed, price=CLEAR)
+        self.unsure = {one.name for one in kept} - {one.name for one in sure}
         if len(kept) < len(survey.groups):
             self._regroup(kept)
             self.until = turn + SEARCHES
