@@ -100,11 +100,11 @@ class Gridded:
     def at(self, place: FloatArray, depth: FloatArray | float | None = None) -> tuple[FloatArray, FloatArray]:
         """Return the anomaly and its 1-sigma (n,) each, nT, at places (n, 2), m, and depths (n,), m.
 
-        The depth is the map's own if not given.
+        The depth is the map's own if not given; where the samples are kriged it is that of those around.
         """
-        deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
         if self.kriged is not None:
-            return self._beside_samples(place, deeper)
+            return self._beside_samples(place)
+        deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
         scale = self.roughness.at(place)
         outside = ~self.field.nodes.inside(place)
         mean, square = np.zeros(len(place)), np.zeros(len(place))
@@ -116,14 +116,12 @@ class Gridded:
             square += one.weight * (variance + here**2)
         return self.mean + mean, np.sqrt(np.maximum(square - mean**2, 0.0))
 
-    def _beside_samples(self, place: FloatArray, deeper: FloatArray | float) -> tuple[FloatArray, FloatArray]:
-        """Return the same from the nearest samples; what depth and levels do to it is the nodes'."""
+    def _beside_samples(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the same from the nearest samples; what levels and calibration do to it is the nodes'."""
         assert self.kriged is not None
-        mean, variance, depth = self.kriged.at(place)
-        one, scale = self.posteriors[0], diags_array(self.roughness.at(place))
-        here, there = (scale @ one.field.basis(place, at) for at in (deeper, depth - self.middle))
-        variance += ((here @ one.follow) ** 2).sum(axis=1)
-        return mean + (here - there) @ one.w, np.sqrt(variance)
+        mean, variance = self.kriged.at(place)
+        B = csr_array(diags_array(self.roughness.at(place)) @ self.field.basis(place))
+        return mean, np.sqrt(variance + ((B @ self.posteriors[0].follow) ** 2).sum(axis=1))
 
     def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
         """Yield about so many anomalies (n,), nT, at places (n, 2), m, that the data leave open alike."""

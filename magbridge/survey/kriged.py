@@ -48,13 +48,12 @@ CHUNK = 256
 
 @dataclass(frozen=True, eq=False)
 class Kriged:
-    """Samples and what their field is like; it holds at the depth of the samples around."""
+    """Samples and what their field is like; it holds at the height that was flown around."""
 
     place: FloatArray
-    depth: FloatArray
     value: FloatArray
     line: IndexArray
-    """`place`, `depth`, `value`, `line`: (n, 2), (n,) m, (n,) nT and the number of each's line."""
+    """`place`, `value`, `line`: (n, 2) m, (n,) nT and the number of each's line."""
     roughness: Roughness
     tree: cKDTree
     below: float
@@ -65,15 +64,13 @@ class Kriged:
     share: FloatArray
     """(lines,): g, what each alone reads, over the field."""
 
-    def at(self, place: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the field, its variance, and the depth where it holds (n,) each, at places (n, 2), m."""
-        out = np.empty((len(place), 3))
+    def at(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the field and its variance (n,) each, nT and nT², at places (n, 2), m."""
+        out = np.empty((len(place), 2))
         for start in range(0, len(place), CHUNK):
             some = place[start : start + CHUNK]
-            near = self.tree.query(some, NEAREST)[1]
-            out[start : start + CHUNK, :2] = self.given(some, near)
-            out[start : start + CHUNK, 2] = self.depth[near[:, 0]]
-        return out[:, 0], out[:, 1], out[:, 2]
+            out[start : start + CHUNK] = self.given(some, self.tree.query(some, NEAREST)[1])
+        return out[:, 0], out[:, 1]
 
     def of_a_line(self, place: FloatArray) -> FloatArray:
         """Return by how many nT (n,), 1-sigma, a line reads what is not the field at places (n, 2), m."""
@@ -123,7 +120,7 @@ def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
     tree, size = cKDTree(samples.place), float(np.std(value))
     share = np.zeros(int(samples.line.max()) + 1)
     even, score = _likeliest(Kriged(
-        samples.place, samples.depth, value, samples.line, Roughness.even(), tree, length / 2.0, size,
+        samples.place, value, samples.line, Roughness.even(), tree, length / 2.0, size,
         0.02 * size, share,
     ))  # fmt: skip
     rough = Roughness.of(samples, 2.0 * even.below)
