@@ -1,8 +1,7 @@
 """Puts the three channels and the telemetry on one time base, causally.
 
-A multiplexed converter samples channel k at ``t + delay_k``. All channels are interpolated to the time of the
-earliest one, between the previous reading and this one, so no future data are needed and the latency is
-``max(delay) - min(delay)``. The anti-alias filter delays the field by ``filter_delay``; the sample's time is
+A multiplexed converter samples one channel after the other: all are brought to the time of the earliest
+(:mod:`magbridge.one_time`). The anti-alias filter delays the field by ``filter_delay``; the sample's time is
 corrected for that, and the telemetry is looked up at the corrected time.
 
 While the process was held up, readings and telemetry waited. What has a time of its own (the instrument's
@@ -17,6 +16,7 @@ from math import inf, isfinite, isnan, nan
 from typing import Final
 
 from magbridge.config import Align
+from magbridge.one_time import OneTime
 from magbridge.records import Quality, Reading, Vector
 from magbridge.track import NEVER, Input, Track
 
@@ -104,6 +104,7 @@ class Aligner:
         Of the inputs.
     by_name : dict of str to Track
         Of the inputs, and of what else is watched.
+    channels : OneTime
     late_since_us : int
         µs, not 0 while what comes may have waited, at most since then.
     """
@@ -115,8 +116,8 @@ class Aligner:
         self.power_cycle = power_cycle
         self.offset_suspect = False
         self.late_since_us = 0
+        self.channels = OneTime()
         self._before_us = NEVER
-        self._before_field, self._before_delay = (nan, nan, nan), (0.0, 0.0, 0.0)
         self._period_us, self._step_us = 0.0, 0
 
     def watch(self, name: str, max_age: float) -> None:
@@ -174,14 +175,14 @@ class Aligner:
                 self.power_cycle = cycle
             restarted = restarted or cycle != self.power_cycle
         self.offset_suspect = self.offset_suspect or restarted
-        quality, variance = 0, 0.0
-        measured = reading.field
-        field, first_us = self._common_time(measured, delay, time_us)
+        quality, measured = 0, reading.field
+        field, first = self.channels.bring(measured, delay, time_us)
+        variance = self.channels.variance
         if self._is_gap(time_us) or missing:
             quality |= GAP
         x, y, z = measured
         if isfinite(x + y + z):
-            self._before_us, self._before_field, self._before_delay = time_us, measured, delay
+            self._before_us = time_us
         if self.offset_suspect:
             quality |= OFFSET_SUSPECT
             variance += settings.turn_on_sigma**2
@@ -189,7 +190,7 @@ class Aligner:
             quality |= SATURATED
             variance = inf
 
-        sample_us = first_us - nearest(settings.filter_delay * 1e6)
+        sample_us = time_us + nearest(first * 1e6) - nearest(settings.filter_delay * 1e6)
         undated = self.late_since_us != 0 and isnan(reading.device_time)
         values, spans, age, more, growth = self._parameters(sample_us, undated)
         variance += growth
@@ -235,25 +236,6 @@ class Aligner:
                 quality |= LATE_JOIN
                 spans.append((index, *track.guess))
         return tuple(values), tuple(spans), oldest, quality, variance
-
-    def _common_time(self, field: Vector, delay: Vector, time_us: int) -> tuple[Vector, int]:
-        """Interpolate all channels to the time of the earliest; return the field (nT) and that time (µs)."""
-        x_late, y_late, z_late = delay
-        earliest = min(x_late, min(y_late, z_late))  # noqa: PLW3301 - compiled, two numbers need no call
-        first_us = time_us + nearest(earliest * 1e6)
-        if self._before_us == NEVER or x_late == y_late == z_late:
-            return field, first_us
-        step = (time_us - self._before_us) * 1e-6
-        if step <= 0.0:
-            return field, first_us
-        x, y, z = field
-        x_then, y_then, z_then = self._before_field
-        x_was, y_was, z_was = self._before_delay
-        return (
-            x - (x - x_then) * (x_late - earliest) / (step + x_late - x_was),
-            y - (y - y_then) * (y_late - earliest) / (step + y_late - y_was),
-            z - (z - z_then) * (z_late - earliest) / (step + z_late - z_was),
-        ), first_us
 
     def _is_gap(self, time_us: int) -> bool:
         """Say whether samples are missing before `time_us`.

@@ -174,6 +174,7 @@ class Correction:
             reference=main_field,
             where=where,
             age=sample.age,
+            settled=self.aligner.channels.settled,
             watched=[self.aligner.by_name[name].at(sample.time_us)[0] for name in self.learner.watched],
         )
         return self.learner.flags
@@ -185,6 +186,8 @@ class Correction:
         by = self._corrector.replace(calibration, values)
         if self._raised is not None:
             self._raised.replace(calibration.at_level(), values)
+        elif calibration.level:
+            self._raised = Corrector(calibration.at_level())
         if self.plausibility is None:
             self.plausibility = self._plausibility(calibration)
         elif self.learner is not None:

@@ -97,7 +97,7 @@ class Doubt:
         self._amplitude = np.zeros((many, 3))
 
     def propagate(self, estimator: Estimator, F: FloatArray, seconds: float) -> None:
-        """Move what the filter has taken in on, as :meth:`.Estimator.propagate`, which returned F (3, 3)."""
+        """Move what the filter has taken in on, as :meth:`.Estimator.propagate`, which returned F (4, 4)."""
         estimator.advance(self._state, F, seconds)
 
     def test(self, estimator: Estimator, signs: Signs) -> Alarm | None:

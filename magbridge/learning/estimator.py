@@ -1,6 +1,6 @@
 """The calibration's coefficients as the state of a Kalman filter, beside what is not the calibration's.
 
-The state is the coefficients, the slope of the offset (nT/s, an axis), and the three of :mod:`.nuisance`.
+The state is the coefficients, the slope of the offset (nT/s, an axis), and those of :mod:`.nuisance`.
 
 Covariance form: the variance of every prediction, which judging and doubt need with each sample, is then a
 by-product, and a prior that is certain of some combinations (as a fit that could not estimate them, or an
@@ -87,7 +87,7 @@ class Estimator:
         self._nuisance, self._creep = nuisance, creep
         self._sloping, self._lasting = False, LASTING
         self._near: FloatArray | None = None
-        self._mean, self._kept = np.zeros(K), np.zeros(K)
+        self._mean, self._share, self._kept = np.zeros(K), 0.0, np.zeros(K)
         self._stay = 1.0
         self.residual, self.variance, self.telling = 0.0, 1.0, False
         self._h = np.zeros(self.states)
@@ -96,7 +96,7 @@ class Estimator:
     def know(
         self, coefficients: FloatArray, nuisances: FloatArray, covariance: FloatArray, nuisance: Nuisance
     ) -> None:
-        """Take what a fit says for all that is known of coefficients (K,) and nuisance (3,), jointly."""
+        """Take what a fit says for all that is known of coefficients (K,) and nuisance (4,), jointly."""
         self._nuisance = nuisance
         both = np.r_[: self.size, self.states - STATES : self.states]
         self._x[both] = np.concatenate([coefficients, nuisances])
@@ -121,6 +121,12 @@ class Estimator:
     def follow(self, s: float) -> None:
         """Follow how the total field changes with the coefficients; s is the last residual's scale."""
         self._mean += (s * self._h[: self.size] - self._mean) / LONG
+        self._share += (1.0 - self._share) / LONG
+
+    @property
+    def mean(self) -> FloatArray:
+        """The total field's mean derivative (K,) by the coefficients, so far."""
+        return self._mean / self._share if self._share else self._mean
 
     def at_level_of(self, published: FloatArray) -> FloatArray:
         """Return the likeliest coefficients (K,) whose mean field is that of those `published` (K,).
@@ -164,14 +170,14 @@ class Estimator:
         self._sloping = bool(self._P[self.slope, self.slope].any())
 
     def advance(self, state: FloatArray, F: FloatArray, seconds: float) -> None:
-        """Move `state` (n, ...) on in place, over a time; F (3, 3) is the nuisance's transition."""
+        """Move `state` (n, ...) on in place, over a time; F (4, 4) is the nuisance's transition."""
         beside = state[-STATES:]
         beside[:] = (F @ beside.reshape(STATES, -1)).reshape(beside.shape)
         if self._sloping:
             state[self.offsets] += seconds * state[self.slope]
 
     def propagate(self, metres: float, seconds: float) -> FloatArray:
-        """Move on by a way and a time; return the transition (3, 3) of what is not the calibration's."""
+        """Move on by a way and a time; return the transition (4, 4) of what is not the calibration's."""
         P = self._P
         F, Q = self._nuisance.over(metres, seconds)
         self.advance(self._x, F, seconds)
@@ -191,7 +197,7 @@ class Estimator:
         """Take a sample's residual at the present coefficients, its derivatives (K,): set the innovation."""
         K, h = self.size, self._h
         h[:K] = by_coefficients
-        h[-STATES:] = -1.0 / s, 0.0, -1.0
+        h[-STATES:] = self._nuisance.row(s)
         if self._near is None:
             self._near = by_coefficients.copy()
         else:

@@ -47,6 +47,7 @@ class Intake:
         self._held: deque[Sample] = deque(maxlen=MOST_HELD)
         self._last_us = self._looked_us = self._taken_us = self._reported_us = 0
         self._where: tuple[float, float] | None = None
+        self._newest = False
 
     def due(self, time_us: int, *, fit: bool) -> bool:
         """Return whether it is time for another sample, `fit` to learn from or not."""
@@ -64,14 +65,18 @@ class Intake:
             out.append(self._held.popleft())
         return out
 
-    def wait(self, sample: Sample) -> Sample | None:
-        """Let a sample wait; return it where no telemetry could tell of a motion."""
+    def wait(self, sample: Sample) -> None:
+        """Let a sample wait."""
         if not sample.faulty:
             self._taken_us = sample.time_us
-        if not sample.positions:
-            return sample
         self._held.append(sample)
-        return None
+        self._newest = True
+
+    def settle(self, field: Vector | None) -> None:
+        """Take what the next reading says of the field of the one before, nT, if that waits."""
+        if self._newest and self._held and field is not None:
+            self._held[-1] = self._held[-1]._replace(field=field)
+        self._newest = False
 
     def short(self, time_us: int) -> bool:
         """Take note of a sample that is not fit; return whether it is to be told how long there was none."""

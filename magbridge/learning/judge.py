@@ -74,14 +74,14 @@ class Judge:
 
         Parameters
         ----------
-        F, Q : (3, 3) arrays
+        F, Q : (4, 4) arrays
             Of :meth:`.Nuisance.over`.
         e, s : float
             nT, residual of the first calibration, and its scale.
         innovation, variance : float
             nT and nT², what is learned has been wrong by, and expected to be.
         """
-        h = np.array([-1.0 / s, 0.0, -1.0])
+        h = self._nuisance.row(s)
         self._P = F @ self._P @ F.T + Q
         self._m = F @ self._m
         Ph = self._P @ h

@@ -42,7 +42,8 @@ class Learner:
     grid : AnomalyGrid, optional
         What the field differs by from the main field, outside of which nothing is learned.
     spread : float
-        nT, 1-sigma of the Earth's field about its reference.
+        nT, 1-sigma of the Earth's field about its reference: the map, whose level is right, or the main
+        field, whose level is as uncertain.
     turn_on : float
         nT, 1-sigma, by which offsets change at every power-on.
     max_rate : float
@@ -82,7 +83,7 @@ class Learner:
         self.enabled, self.frozen = True, False
         self.notices: list[Notice] = []
         self._now_us = 0
-        nuisance = Nuisance(calibration.noise, spread)
+        nuisance = Nuisance(calibration.noise, spread, 0.0 if grid is not None else spread)
         self._publication = Publication(self._model, calibration, nuisance)
         self._standing = Standing(mapped=grid is not None)
         self._begin(nuisance)
@@ -153,7 +154,7 @@ class Learner:
 
     def _restart(self, nuisance: Nuisance) -> None:
         """Begin to learn from the first calibration, whose offsets may have changed at this power-on."""
-        mapless = Nuisance(self.first.noise, MAPLESS) if self._grid is not None else None
+        mapless = Nuisance(self.first.noise, MAPLESS, MAPLESS) if self._grid is not None else None
         self._knowledge = Knowledge(self._model, self.first, nuisance, mapless, self._turn_on)
 
     def _notify(self, text: str, grave: bool = False) -> None:
@@ -177,6 +178,7 @@ class Learner:
         where: tuple[float, float] | None,
         watched: Sequence[float],
         age: float = 0.0,
+        settled: Vector | None = None,
     ) -> None:
         """Take a sample that was corrected.
 
@@ -204,9 +206,12 @@ class Learner:
             As :attr:`watched`; NaN where unknown.
         age : float
             s, of the parameters' oldest telemetry.
+        settled : tuple of 3 float or None
+            nT, the field of the sample before, if this one tells more of it.
         """
         if not self.enabled:
             return
+        self._intake.settle(settled)
         self._now_us, unfit = time_us, quality & self._unfit
         fit = not (unfit or faulty)
         if unfit & ~MOVING or isnan(reference) or where is None:
@@ -230,8 +235,7 @@ class Learner:
         if unfit:
             return
         new = Sample(time_us, field, reference, phi, positions, where, tuple(watched), faulty)
-        if (now := self._intake.wait(new)) is not None:
-            self._take(now)
+        self._intake.wait(new)
 
     def _nothing(self, time_us: int) -> None:
         """Say once an hour or more passes without a sample to learn from."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
@@ -70,18 +71,23 @@ class Publication:
     def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
         """Return the calibration that an estimator has learned from so many samples, with its origin."""
         first, coefficients, method = self.first, estimator.coefficients, self.first.method
-        covariance = estimator.covariance
+        covariance, level = estimator.covariance, first.level
+        reference = first.reference
         if first.method == NONE:
             method = "learned"
             if self.learned:
                 coefficients = estimator.at_level_of(self.coefficients)
                 by = coefficients - estimator.coefficients
                 covariance = covariance + np.outer(by, by)
+            toward = covariance @ estimator.mean  # how coefficients go with the level, which has this sigma
+            sigma = float(np.sqrt(estimator.mean @ toward))
+            level = tuple((toward[: first.coefficients.size] / sigma).tolist())
+            reference = msgspec.structs.replace(reference, level_sigma=sigma)
         elif "learned" not in method:
             method += ", learned"
         inputs = first.inputs | {f"calibration {calibration_id(first):08x}": f"{samples} samples later"}
         made = self._model.calibration(coefficients, covariance)
-        return replace(made, method=method, inputs=inputs, noise=noise)
+        return replace(made, method=method, inputs=inputs, noise=noise, level=level, reference=reference)
 
     def stale(self, apart: float) -> bool:
         """Whether what is learned is `apart` (nT, of the total field) from what is published of it."""

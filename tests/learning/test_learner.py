@@ -32,16 +32,31 @@ def test_one_sample_is_the_fits_own_residual() -> None:
 
 def test_rock_and_noise_are_stationary_along_the_track() -> None:
     """Whatever the steps: the covariance stays, and far away nothing is known."""
-    nuisance = Nuisance(Noise(2.0, autocorrelation=0.9, interval=4.0, white=0.25), 100.0, 800.0)
+    nuisance = Nuisance(Noise(2.0, autocorrelation=0.9, interval=4.0, white=0.25), 100.0, 50.0, 800.0)
     F, Q = nuisance.over(70.0, 12.0)
     np.testing.assert_allclose(F @ nuisance.initial @ F.T + Q, nuisance.initial, atol=1e-9)
     first, second = nuisance.over(30.0, 5.0)[0], nuisance.over(40.0, 7.0)[0]
     np.testing.assert_allclose(second @ first, F, atol=1e-12)
-    assert np.abs(nuisance.over(1e6, 1e6)[0]).max() < 1e-9
+    far = nuisance.over(1e6, 1e6)[0]
+    np.testing.assert_allclose(far, np.diag([0.0, 0.0, 0.0, 1.0]), atol=1e-9)  # but the level
     assert nuisance.initial[2, 2] + nuisance.white == pytest.approx(4.0)
     # the slow part forgets as the fit's noise does
     assert F[2, 2] == pytest.approx(0.9 ** (12.0 / 4.0))
     assert np.isfinite(whiten(np.ones(3), np.ones(3), 0.9, 0.25)).all()
+
+
+def test_it_learns_from_what_the_next_reading_settles() -> None:
+    """Not from slopes that lag behind, as of channels that are sampled in turn."""
+    known, n = calibration(), 400
+    world = World(known, n)
+    lag = np.zeros((n, 3))
+    lag[1:] = 0.01 * np.diff(world.field, axis=0)
+    exact, settled, lagging = Learner(known), Learner(known), Learner(known)
+    learn(exact, world)
+    learn(settled, world, added=lag, settled=world.field)
+    learn(lagging, world, added=lag)
+    np.testing.assert_array_equal(settled.learned().coefficients, exact.learned().coefficients)
+    assert np.abs(lagging.learned().coefficients - exact.learned().coefficients).max() > 1.0
 
 
 def test_a_changed_offset_is_learned_and_published() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from worlds import FIELD, MASS, World, calibration, error_of, learn
 
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import Calibration
 from magbridge.learning import Learner
 from magbridge.learning.start import FIRST, class_prior
@@ -36,6 +37,16 @@ def test_a_vehicle_without_a_calibration_gets_one() -> None:
     A, T = learned.matrices(world.mass[:, None])
     total = np.linalg.norm(np.matmul(A, (world.field - T)[:, :, None])[:, :, 0], axis=1)
     assert abs(np.mean(total - world.total)) < 2.0 * 145.0
+
+
+def test_no_way_that_is_flown_tells_the_level() -> None:
+    """Some rock is larger than any survey: after twenty kilometres it is as unknown as at first."""
+    world, learner = World(vehicle(), 5000), Learner(class_prior((MASS,), FIELD))
+    learn(learner, world)
+    x, y, z = world.field[-1].tolist()
+    (_, sigma, *_), _ = Corrector(learner.calibration).numbers(0, (x, y, z), (float(world.mass[-1]),), 0)
+    assert 0.9 * 145.0 < sigma < 2.0 * 145.0
+    assert learner.calibration.reference.level_sigma == pytest.approx(sigma, rel=0.02)
 
 
 def test_nothing_is_published_before_all_samples_were_fitted() -> None:

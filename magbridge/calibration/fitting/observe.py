@@ -26,6 +26,8 @@ __all__ = ["observations"]
 
 MAP_ERROR = 20.0
 """nT, 1-sigma of a map that does not state its own."""
+GAP = 10.0
+"""Intervals without a sample, after which what comes has nothing to do with what was."""
 FOLLOWED = (TEMPERATURE, "depth")
 """Columns that move no mass but may be fitted as if they did."""
 
@@ -89,19 +91,26 @@ def observations(
 
 
 def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray:
-    """Interpolate a multiplexed converter's channel to the row's time, as :mod:`magbridge.align` does live.
+    """Bring a multiplexed converter's channel to the row's time by its slope, of a parabola through three.
 
     In a spiral a delay of 0.3 s is a rotation by a degree, always the same way. Left in, it would be absorbed
-    by the coefficients, and remain there when the vehicle flies straight.
+    by the coefficients, and remain there when the vehicle flies straight. So would the lag of the slope that
+    can be known live (:mod:`magbridge.one_time`).
     """
     if f"mag_time_{axis}" not in ds:
         return values
     time, sampled = np.asarray(ds["time"].values, float), _column(ds, f"mag_time_{axis}")
     known = np.isfinite(sampled) & np.isfinite(values)
-    if not known.any():
+    if known.sum() < 2 or np.array_equal(sampled[known], time[known]):
         return values
-    common = np.interp(time, sampled[known], values[known])
-    return np.where(known, common, np.nan)
+    common, f, d = np.full(len(values), np.nan), values[known], (sampled - time)[known]
+    h = np.diff(sampled[known])
+    r = np.diff(f) / h
+    lag = np.zeros(len(f))
+    lag[1:-1] = d[1:-1] * (h[:-1] - d[1:-1]) * np.diff(r) / (h[1:] + h[:-1])
+    lag[1:-1][h[1:] > GAP * h[:-1]] = 0.0
+    common[known] = f - d * np.r_[r[0], r] - lag
+    return common
 
 
 def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple[float, float]]:
@@ -141,4 +150,4 @@ def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
         if name in ds:
             return np.asarray(ds[name].values)
     step = np.diff(time, prepend=time[:1])
-    return np.cumsum(step > 10 * np.median(step[1:])) if len(time) > 1 else np.zeros(len(time), int)
+    return np.cumsum(step > GAP * np.median(step[1:])) if len(time) > 1 else np.zeros(len(time), int)

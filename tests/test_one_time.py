@@ -1,0 +1,59 @@
+"""Channels sampled in turn: what a slope that is known late does to the field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magbridge.one_time import OneTime
+
+SECOND = 1_000_000
+DELAYS = (0.0, 0.3, 0.7)
+
+
+def turning(rate: float, acceleration: float, at: list[float]) -> list[tuple[float, float, float]]:
+    """Return three channels of one field, nT, that changes ever faster, each at its own time."""
+    return [tuple(30_000.0 + rate * t + 0.5 * acceleration * t * t for t in np.add(s, DELAYS)) for s in at]
+
+
+def test_the_parabola_is_exact_where_the_field_turns_ever_faster() -> None:
+    channels, times = OneTime(), [3.0, 7.0, 12.0, 15.0]
+    for k, (t, field) in enumerate(zip(times, turning(20.0, 3.0, times), strict=True)):
+        channels.bring(field, DELAYS, round(t * SECOND))
+        if k < 2:
+            assert channels.settled is None
+        else:
+            truth = 30_000.0 + 20.0 * times[k - 1] + 1.5 * times[k - 1] ** 2
+            np.testing.assert_allclose(channels.settled, truth, atol=1e-6)
+
+
+def test_sigma_is_the_lag_of_the_slopes() -> None:
+    """Steadily faster, a chord lies above the curve by d (h - d) / 2 of the acceleration."""
+    channels, times, out = OneTime(), [4.0, 8.0, 12.0], (0.0, 0.0, 0.0)
+    for t, field in zip(times, turning(20.0, 3.0, times), strict=True):
+        out, _ = channels.bring(field, DELAYS, round(t * SECOND))
+    d = np.array(DELAYS)
+    lag = 0.5 * 3.0 * d * (4.0 - d)
+    np.testing.assert_allclose(np.array(out) - (30_000.0 + 20.0 * 12.0 + 1.5 * 144.0), lag, atol=1e-6)
+    assert channels.variance == pytest.approx(np.sum(np.square(lag)) / 3.0, rel=3e-3)
+
+
+@pytest.mark.parametrize("delays", [(0.0, 0.0, 0.0), (0.2, 0.2, 0.2)])
+def test_channels_of_one_time_stay_as_they_are(delays: tuple[float, float, float]) -> None:
+    channels = OneTime()
+    for k in range(4):
+        field = (1.0 + k * k, 2.0 * k, 3.0)
+        assert channels.bring(field, delays, (k + 1) * SECOND) == (field, delays[0])
+        assert (channels.variance, channels.settled) == (0.0, None)
+
+
+def test_a_reading_without_a_channel_tells_nothing_of_its_neighbours() -> None:
+    channels, times = OneTime(), [4.0, 8.0, 12.0, 16.0]
+    readings = turning(20.0, 0.0, times)
+    readings[2] = (readings[2][0], float("nan"), readings[2][2])
+    out = [channels.bring(f, DELAYS, round(t * SECOND))[0] for t, f in zip(times, readings, strict=True)]
+    assert np.isnan(out[2][1])
+    np.testing.assert_allclose(
+        [out[2][0], out[2][2], *out[3]], 30_000.0 + 20.0 * np.array([12, 12, 16, 16, 16])
+    )
+    np.testing.assert_allclose(channels.settled, 30_000.0 + 20.0 * 8.0)
