@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from magbridge.calibration.fitting.observe import at_one_time
 from magbridge.one_time import OneTime
 
 SECOND = 1_000_000
@@ -57,3 +59,21 @@ def test_a_reading_without_a_channel_tells_nothing_of_its_neighbours() -> None:
         [out[2][0], out[2][2], *out[3]], 30_000.0 + 20.0 * np.array([12, 12, 16, 16, 16])
     )
     np.testing.assert_allclose(channels.settled, 30_000.0 + 20.0 * 8.0)
+
+
+def test_a_log_whose_channels_were_read_in_turn() -> None:
+    """As live once the next reading is known; a row that stands twice, and a gap, harm none of the others."""
+    time = np.array([3.0, 7.0, 7.0, 12.0, 15.0, 400.0, 404.0])
+    read = [np.add(time, delay) for delay in DELAYS]
+    field = {
+        f"mag_{axis}": ("time", 30_000.0 + 20.0 * t + 1.5 * t * t)
+        for axis, t in zip("xyz", read, strict=True)
+    }
+    times = {f"mag_time_{axis}": ("time", t) for axis, t in zip("xyz", read, strict=True)}
+    together = at_one_time(xr.Dataset({**field, **times}, coords={"time": time}))
+    assert not any(str(name).startswith("mag_time") for name in together)
+    truth = 30_000.0 + 20.0 * time + 1.5 * time * time
+    for axis in "xyz":
+        np.testing.assert_allclose(together[f"mag_{axis}"][3], truth[3], atol=1e-6)
+        np.testing.assert_allclose(together[f"mag_{axis}"][:5], truth[:5], atol=30.0)
+        assert np.isfinite(together[f"mag_{axis}"]).all()

@@ -12,6 +12,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.level import apart_from_level
+from magbridge.calibration.fitting.observe import at_one_time
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.correction import Correction
@@ -126,6 +127,7 @@ def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
 
 def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples:
     """Correct a log with its calibration; doubtful samples are left out, the calibration's doubt is kept."""
+    ds = at_one_time(ds)
     corrected = correct_rows(Correction(calibration), ds)
     value = np.where(_doubtful(corrected), np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
     samples = _placed(ds, value, np.zeros(len(value)), label)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["observations"]
+__all__ = ["at_one_time", "observations"]
 
 MAP_ERROR = 20.0
 """nT, 1-sigma of a map that does not state its own."""
@@ -58,6 +58,7 @@ def observations(
     if others := [name for name in parameters if name in COLUMNS and name not in FOLLOWED]:
         raise CalibrationError(f"parameter {others[0]!r} is {COLUMNS[others[0]].long_name}: it moves no mass")
     names = (*CHANNELS, *parameters)
+    ds = at_one_time(ds)
     columns = {name: _column(ds, name) for name in names}
     total, vector, model = earth_field(ds, grid)
     if "daily_variation" in ds:
@@ -69,7 +70,7 @@ def observations(
     time = np.asarray(ds["time"].values, float)
     place, unmapped, origin = _places(ds)
     return Observations(
-        field=np.stack([_at_common_time(ds, axis, columns[f"mag_{axis}"]) for axis in "xyz"], axis=1),
+        field=np.stack([columns[name] for name in CHANNELS], axis=1),
         reference=total,
         parameters=np.stack([columns[name] for name in parameters], axis=1)
         if parameters
@@ -90,25 +91,30 @@ def observations(
     )
 
 
-def _at_common_time(ds: xr.Dataset, axis: str, values: FloatArray) -> FloatArray:
-    """Bring a multiplexed converter's channel to the row's time by its slope, of a parabola through three.
+def at_one_time(ds: xr.Dataset) -> xr.Dataset:
+    """Return a log whose channels were read in turn with all of them at the rows' times.
 
-    In a spiral a delay of 0.3 s is a rotation by a degree, always the same way. Left in, it would be absorbed
-    by the coefficients, and remain there when the vehicle flies straight. So would the lag of the slope that
-    can be known live (:mod:`magbridge.one_time`).
+    Each is brought there by its slope, of the parabola through three readings. In a spiral a delay of 0.3 s
+    is a rotation by a degree, always the same way. Left in, it would be absorbed by the coefficients, and
+    remain there when the vehicle flies straight. So would the lag of the slope that can be known live
+    (:mod:`magbridge.one_time`).
     """
-    if f"mag_time_{axis}" not in ds:
-        return values
-    time, sampled = np.asarray(ds["time"].values, float), _column(ds, f"mag_time_{axis}")
+    late = [axis for axis in "xyz" if {f"mag_{axis}", f"mag_time_{axis}"} <= set(ds.variables)]
+    channels = {f"mag_{axis}": ("time", _at(ds, axis), ds[f"mag_{axis}"].attrs) for axis in late}
+    return ds.assign(channels).drop_vars([f"mag_time_{axis}" for axis in late])
+
+
+def _at(ds: xr.Dataset, axis: str) -> FloatArray:
+    values, sampled = _column(ds, f"mag_{axis}"), _column(ds, f"mag_time_{axis}")
+    time = np.asarray(ds["time"].values, float)
     known = np.isfinite(sampled) & np.isfinite(values)
     if known.sum() < 2 or np.array_equal(sampled[known], time[known]):
         return values
     common, f, d = np.full(len(values), np.nan), values[known], (sampled - time)[known]
     h = np.diff(sampled[known])
-    r = np.diff(f) / h
-    lag = np.zeros(len(f))
-    lag[1:-1] = d[1:-1] * (h[:-1] - d[1:-1]) * np.diff(r) / (h[1:] + h[:-1])
-    lag[1:-1][h[1:] > GAP * h[:-1]] = 0.0
+    r = np.divide(np.diff(f), h, out=np.zeros_like(h), where=h > 0.0)
+    lag, near = np.zeros(len(f)), (h[:-1] > 0.0) & (h[1:] > 0.0) & (h[1:] <= GAP * h[:-1])
+    lag[1:-1][near] = (d[1:-1] * (h[:-1] - d[1:-1]) * np.diff(r))[near] / (h[1:] + h[:-1])[near]
     common[known] = f - d * np.r_[r[0], r] - lag
     return common
 
