@@ -158,7 +158,7 @@ def _biased(found: Fit, sigma: float) -> Fit:
 
 def _refuse_one_attitude(data: Observations) -> None:
     """Refuse samples of one attitude, or axis: they cannot separate the sensor's errors from the field."""
-    if (stuck := np.flatnonzero(np.ptp(data.field, axis=0) == 0.0)).size:
+    if 0 < (stuck := np.flatnonzero(np.ptp(data.field, axis=0) == 0.0)).size < 3:
         which = CHANNELS[int(stuck[0])]
         raise CalibrationError(
             f"{which} is {data.field[0, stuck[0]]:g} in every sample: the channel is stuck"
