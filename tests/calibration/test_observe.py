@@ -50,3 +50,21 @@ def test_a_log_with_its_own_reference_has_a_boresight_too(north: str) -> None:
     assert found.calibration.boresight is not None
     turn = found.calibration.boresight.matrix() @ expected.calibration.boresight.matrix().T
     np.testing.assert_allclose(turn, np.eye(3), atol=1e-6)
+
+
+def test_a_channel_that_is_sampled_more_rarely_than_the_rows_is_brought_to_their_time() -> None:
+    """It repeats its reading, and the time of that: of which no slope is."""
+    time = 100.0 + 0.1 * np.arange(60)
+    sampled = time + 0.03
+    sampled[1::3] = sampled[0::3]
+    sampled[2::3] = sampled[0::3]
+    columns = {f"mag_{axis}": ("time", 20_000.0 + 30.0 * time) for axis in "xy"}
+    columns |= {
+        "mag_z": ("time", 20_000.0 + 30.0 * sampled + 5.0 * (sampled - 100.0) ** 2),
+        "mag_time_z": ("time", sampled),
+        "reference_field": ("time", np.full(60, 5e4)),
+    }
+    field = observations(xr.Dataset(columns, coords={"time": time}), []).field
+    truth = 20_000.0 + 30.0 * time + 5.0 * (time - 100.0) ** 2
+    np.testing.assert_allclose(field[3:-3, 2], truth[3:-3], atol=1e-6)
+    np.testing.assert_allclose(field[:, 2], truth, atol=2.0)

@@ -110,12 +110,17 @@ def _at(ds: xr.Dataset, axis: str) -> FloatArray:
     known = np.isfinite(sampled) & np.isfinite(values)
     if known.sum() < 2 or np.array_equal(sampled[known], time[known]):
         return values
-    common, f, d = np.full(len(values), np.nan), values[known], (sampled - time)[known]
-    h = np.diff(sampled[known])
-    r = np.divide(np.diff(f), h, out=np.zeros_like(h), where=h > 0.0)
-    lag, near = np.zeros(len(f)), (h[:-1] > 0.0) & (h[1:] > 0.0) & (h[1:] <= GAP * h[:-1])
-    lag[1:-1][near] = (d[1:-1] * (h[:-1] - d[1:-1]) * np.diff(r))[near] / (h[1:] + h[:-1])[near]
-    common[known] = f - d * np.r_[r[0], r] - lag
+    s, common = sampled[known], np.full(len(values), np.nan)
+    fresh = np.r_[True, s[1:] > np.maximum.accumulate(s)[:-1]]  # others repeat a reading
+    of, s, f = np.cumsum(fresh) - 1, s[fresh], values[known][fresh]
+    if len(s) < 2:
+        return values
+    h = np.diff(s)
+    r, bend = np.diff(f) / h, np.zeros(len(f))
+    bend[1:-1] = np.diff(r) / (h[1:] + h[:-1])
+    bend[1:-1][h[1:] > GAP * h[:-1]] = 0.0
+    d = s[of] - time[known]
+    common[known] = f[of] - d * np.r_[r[0], r][of] - d * (np.r_[h[0], h][of] - d) * bend[of]
     return common
 
 
