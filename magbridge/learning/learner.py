@@ -209,9 +209,9 @@ class Learner:
         settled : tuple of 3 float or None
             nT, the field of the sample before, if this one tells more of it.
         """
+        self._intake.settle(settled)
         if not self.enabled:
             return
-        self._intake.settle(settled)
         self._now_us, unfit = time_us, quality & self._unfit
         fit = not (unfit or faulty)
         if unfit & ~MOVING or isnan(reference) or where is None:

@@ -81,8 +81,9 @@ class Publication:
                 covariance = covariance + np.outer(by, by)
             toward = covariance @ estimator.mean  # how coefficients go with the level, which has this sigma
             sigma = float(np.sqrt(estimator.mean @ toward))
-            level = tuple((toward[: first.coefficients.size] / sigma).tolist())
-            reference = msgspec.structs.replace(reference, level_sigma=sigma)
+            if sigma:  # no sample, no level
+                level = tuple((toward[: first.coefficients.size] / sigma).tolist())
+                reference = msgspec.structs.replace(reference, level_sigma=sigma)
         elif "learned" not in method:
             method += ", learned"
         inputs = first.inputs | {f"calibration {calibration_id(first):08x}": f"{samples} samples later"}

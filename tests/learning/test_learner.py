@@ -59,6 +59,21 @@ def test_it_learns_from_what_the_next_reading_settles() -> None:
     assert np.abs(lagging.learned().coefficients - exact.learned().coefficients).max() > 1.0
 
 
+def test_what_waits_while_learning_is_off_is_settled_by_its_own_next_reading() -> None:
+    known = calibration()
+    world, found = World(known, 100), []
+    for by in (0.0, 300.0):
+        learner, settled = Learner(known), world.field.copy()
+        settled[61:71] += by  # of readings that came while it was off
+
+        def switch(k: int, learner: Learner = learner) -> None:
+            learner.enabled = not 60 <= k < 70
+
+        learn(learner, world, settled=settled, seen=switch)
+        found.append(learner.learned().coefficients)
+    np.testing.assert_array_equal(found[0], found[1])
+
+
 def test_a_changed_offset_is_learned_and_published() -> None:
     """The published one is as good as the noise lets it be; its id and its history are its own."""
     known, world = calibration(), None

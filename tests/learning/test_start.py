@@ -65,6 +65,7 @@ def test_what_was_learned_from_nothing_can_be_forgotten() -> None:
     learner.forget()
     assert learner.calibration.method == "none"
     assert learner.samples == 0
+    assert learner.learned().level == ()  # of no sample, not NaN
 
 
 def test_a_class_is_as_unknown_as_physics_lets_it_be() -> None:
