@@ -197,7 +197,8 @@ def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
         times = _numbers(cells) * scale + start
     elif clock.kind in SUMS:
         start, *scales = SUMS[clock.kind]
-        parts = cells.astype("string").str.split(expand=True).apply(pd.to_numeric, errors="coerce")
+        parts = cells.astype("string").str.split(n=1, expand=True).reindex(columns=[0, 1])
+        parts = parts.apply(pd.to_numeric, errors="coerce")
         large, small = parts.to_numpy(np.float64).T
         if scales[0] == WEEK and np.nanmax(small, initial=0.0) > WEEK:
             small = small * 1e-3  # of the week are then milliseconds

@@ -233,7 +233,9 @@ def _numbers(name: str, texts: pd.Series, decimal: str) -> FloatArray:
     texts = texts.str.replace(",", ".") if decimal == "," else texts
     texts = texts.str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
     if name in HEMISPHERES:
-        signs = np.where(texts.str.contains("[SWsw]", regex=True), -1.0, 1.0)
-        texts = texts.str.replace("[NSEW\u00b0]", "", regex=True, flags=re.IGNORECASE)
-        return np.asarray(signs * pd.to_numeric(texts, errors="coerce").to_numpy(np.float64))
+        opposite = texts.str.contains("[SW]", regex=True, case=False).to_numpy(bool)
+        # only at the ends: the E of 1.2E-05 is an exponent's
+        texts = texts.str.replace("^[NSEW]|[NSEW]$|\u00b0", "", regex=True, flags=re.IGNORECASE)
+        values = np.asarray(pd.to_numeric(texts, errors="coerce"), np.float64)
+        return np.asarray(np.where(opposite, -np.abs(values), values))
     return np.array(pd.to_numeric(texts, errors="coerce"), np.float64)

@@ -227,6 +227,8 @@ PLACES = {
     "columns of letters": ("lat,NS,lon,EW", "47.5,N,52.75,W", "47.5,N,52.75,W"),
     "letters behind": ("lat,lon", "47.5N,52.75W", "47.5 N,52.75 W"),
     "letters before": ("latitude,longitude", "N47.5,W52.75", "N 47.5,W 52.75"),
+    "a sign beside": ("latitude,longitude", "47.5,-52.75", "47.5,-52.75 W"),
+    "an exponent beside": ("latitude,longitude", "47.5,-5.275E+01", "47.5N,52.75W"),
 }
 
 
@@ -238,6 +240,12 @@ def test_west_is_west(kind: str, tmp_path: Path) -> None:
     )
     assert log["latitude"].values.tolist() == [47.5, 47.5]
     assert log["longitude"].values.tolist() == [-52.75, -52.75]
+
+
+@pytest.mark.parametrize("cell", ["", "345600 7 8"])
+def test_a_time_in_two_columns_that_is_none_is_a_line(cell: str, tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match=r"row 2, column 'time': expected a"):
+        read(tmp_path, f"GPS Week,TOW,mag_x\n{'2208' if cell else ''},{cell},1\n")
 
 
 def test_what_proton_magnetometers_write_is_the_total_field(tmp_path: Path) -> None:
