@@ -94,10 +94,12 @@ def read_points(
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, FloatArray]:
     """Read points: longitude and latitude (n,), deg, depth (n,), m, if known, and m north and east (n, 2).
 
-    FormatError: a column is missing or holds something else than numbers.
+    FormatError: a column is missing or holds something else than numbers, or a place is not known.
     """
     table = _table(path)
     longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
+    if wrong := int((~np.isfinite(longitude + latitude)).sum()):
+        raise FormatError(path, f"expected longitude and latitude in every row, {wrong} lack one")
     heights = [name for name in HEIGHT if name in table]
     depth = -_numbers(path, table, heights[0]) if heights else None
     if "depth" in table:

@@ -255,6 +255,10 @@ def test_command_predicts_at_points(command: Command, table: Path) -> None:
     rows = (table.parent / "out.csv").read_text().splitlines()
     assert rows[0] == "longitude,latitude,anomaly [nT],anomaly_sigma [nT]"
     assert len(rows) == 3
+    points.write_text("longitude,latitude\n-57.9,49.5\n,49.51\n")
+    error = command("survey", table, "--predict", points, "-o", table.parent / "none.csv", code=1).err
+    assert "points.csv: expected longitude and latitude in every row, 1 lack one" in error
+    assert not (table.parent / "none.csv").exists()
 
 
 @pytest.mark.parametrize(
