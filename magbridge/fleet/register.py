@@ -108,9 +108,11 @@ def vehicle_named(catalogue: Catalogue, name: str) -> Row:
 def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     """Put a vehicle, or what is new about it, on record; return how many were added or changed.
 
-    WrongUse: another has that name, or it can be no folder's.
+    WrongUse: another has that name, it can be no folder's, or only of some masses it is said where they sit.
     """
     _check_name(name, "a vehicle")
+    if vehicle.mass and (odd := sorted(vehicle.mass.keys() ^ set(vehicle.parameters))):
+        raise WrongUse(f"{name}: mass: a place for each of parameters, or none; not so for {', '.join(odd)}")
     row = {"vehicle": name, **{key: getattr(vehicle, key) for key in ("serial", "sensor", "order")}}
     row["parameters"] = list(vehicle.parameters)
     row["mass"] = msgspec.json.encode(vehicle.mass, order="sorted").decode()

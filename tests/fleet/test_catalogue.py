@@ -102,6 +102,10 @@ def test_two_vehicles_of_one_name(empty: Catalogue) -> None:
         add_vehicle(empty, "comet", Vehicle(parameters=("battpos",), serial="1", mass=mass))
         assert masses(vehicles(empty)["comet"]) == mass
     assert len(empty.rows("vehicles")) == 4
+    for given in ((), ("battpos", "ballast")):
+        with pytest.raises(WrongUse, match=f"not so for {given[-1] if given else 'battpos'}$"):
+            add_vehicle(empty, "u", Vehicle(parameters=given, mass=where))
+    assert "u" not in vehicles(empty)
     # two people at once, who could not see each other
     first = empty.rows("vehicles")[0]
     empty.add("vehicles", [{**first, "serial": "2"}])
