@@ -92,7 +92,7 @@ def _sensor(answers: Answers) -> list[str]:
         "[sensor.options]",
     ]
     for one in options_of(answers.driver):
-        meaning = " ".join(one.meaning.split()).partition(". ")[0].rstrip(".")
+        meaning = one.meaning.replace("``", "").partition(". ")[0].rstrip(".")
         if one.name in answers.options:
             lines.append(f"{one.name} = {_value(answers.options[one.name])}    # {meaning}")
         elif one.required:

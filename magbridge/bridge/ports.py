@@ -111,7 +111,7 @@ def recognise(data: bytes, seconds: float) -> Recognised:
     line = lines[len(lines) // 2]
     shown = line.decode("ascii", "replace").strip()[:SHOWN]
     numbers = len(NUMBER.findall(line))
-    hint = "; if these are x y z, driver ascii reads them: columns" if numbers >= 3 else ""
+    hint = " (driver ascii reads it, if x y z are among these)" if numbers >= 3 else ""
     return Recognised("text", f"not understood: {shown!r}{hint}")
 
 
