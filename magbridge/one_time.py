@@ -13,7 +13,7 @@ noise but a bias.
 
 from __future__ import annotations
 
-from math import nan
+from math import isnan, nan
 from typing import Final
 
 from magbridge.records import Vector
@@ -76,10 +76,11 @@ class OneTime:
         x_then, y_then, z_then = self._field
         x_late, y_late, z_late = delay
         x_was, y_was, z_was = self._delay
+        x_slope, y_slope, z_slope = self._slope
         return (
-            (x - x_then) / (step + x_late - x_was),
-            (y - y_then) / (step + y_late - y_was),
-            (z - z_then) / (step + z_late - z_was),
+            _slope(x - x_then, step + x_late - x_was, x_slope),
+            _slope(y - y_then, step + y_late - y_was, y_slope),
+            _slope(z - z_then, step + z_late - z_was, z_slope),
         )
 
     def _judge(self, field: Vector, slope: Vector, lever: Vector, share: float) -> None:
@@ -94,3 +95,10 @@ class OneTime:
             self.variance = square / (x * x + y * y + z * z)
             x, y, z = self._out
             self.settled = x - x_was * dx, y - y_was * dy, z - z_was * dz
+
+
+def _slope(change: float, step: float, before: float) -> float:
+    """Return a slope, nT/s: of a channel that was not read anew that of `before`, or 0 where it had none."""
+    if step > 0.0:
+        return change / step
+    return 0.0 if isnan(before) else before

@@ -77,3 +77,14 @@ def test_a_log_whose_channels_were_read_in_turn() -> None:
         np.testing.assert_allclose(together[f"mag_{axis}"][3], truth[3], atol=1e-6)
         np.testing.assert_allclose(together[f"mag_{axis}"][:5], truth[:5], atol=30.0)
         assert np.isfinite(together[f"mag_{axis}"]).all()
+
+
+def test_a_channel_that_repeats_a_reading_has_the_slope_of_those_before() -> None:
+    """As one that is sampled more rarely: its time is that of the reading that it repeats."""
+    channels = OneTime()
+    for k in range(6):
+        t = 4.0 * (k + 1)
+        sampled = t - 4.0 * (k % 2)
+        field = (30_000.0 + 20.0 * t, 30_000.0, 30_000.0 + 20.0 * sampled)
+        out, after = channels.bring(field, (0.0, 0.0, sampled - t), round(t * SECOND))
+        np.testing.assert_allclose(out, (30_000.0 + 20.0 * (t + after), 30_000.0, 30_000.0 + 20.0 * sampled))
