@@ -63,7 +63,8 @@ class Outcome:
     chosen: tuple[Hypothesis, ...]
     """In the order found; each against the model without it."""
     competing: tuple[tuple[CompetingHypothesis, ...], ...]
-    """For each chosen one, all others that it does not beat by :func:`~.evidence.margin`, the best first."""
+    """For each chosen one, all others that it does not beat by
+    :func:`~.evidence.bayes_factor_threshold`, the best first."""
     null: Joint
     fit: Joint
     """`null`, `fit`: fits without any cause, and with the chosen ones."""
