@@ -123,7 +123,7 @@ def lesson(flight: Flight) -> Lesson | str:
     return Lesson(
         f"vehicle {flight.vehicle}", f"refit {flight.number // flight.every}", str(flight.number),
         float(runs["time"][0]), calibration.parameters, term.exponents, calibration.reference.field,
-        found.information,
+        calibration.noise.sensor, found.information,
     )  # fmt: skip
 
 

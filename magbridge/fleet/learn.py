@@ -37,7 +37,8 @@ FIELD = 50_000.0
 class Lesson(NamedTuple):
     """One deployment's calibration as its own data determine it, without any prior.
 
-    `time` is when it began, s since 1970; the others as in :class:`.Known` and :class:`.Information`.
+    `time` is when it began, s since 1970; `noise` that of a sample, nT; the others as in :class:`.Known` and
+    :class:`.Information`.
     """
 
     vehicle: str
@@ -47,6 +48,7 @@ class Lesson(NamedTuple):
     parameters: tuple[Parameter, ...]
     exponents: tuple[Exponents, ...]
     field: float
+    noise: float
     information: Information
 
     def brought(self, parameters: tuple[Parameter, ...], basis: FloatArray) -> Information:

@@ -165,6 +165,6 @@ def _taught(row: Row) -> _Taught:
     assert isinstance(term, Polynomial)
     lesson = Lesson(
         row["vehicle"], row["refit"], row["deployment"], row["start"], calibration.parameters,
-        term.exponents, calibration.reference.field, unpacked(row),
+        term.exponents, calibration.reference.field, calibration.noise.sensor, unpacked(row),
     )  # fmt: skip
     return _Taught(lesson, frozenset(calibration.inputs.values()), row["sensor"], row["job"] == GIVEN)

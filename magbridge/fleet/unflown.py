@@ -12,8 +12,10 @@ from magbridge.version import __version__
 __all__ = ["unflown"]
 
 
-def unflown(fleet: Fleet, vehicle: str, refit: str = "", noise: float = 0.0) -> Calibration:
+def unflown(fleet: Fleet, vehicle: str, refit: str = "") -> Calibration:
     """Return what is expected of a vehicle's next deployment as a calibration.
+
+    Its noise is what that of its deployments was in the mean (of power), or of its fleet's, if it has none.
 
     Parameters
     ----------
@@ -21,10 +23,10 @@ def unflown(fleet: Fleet, vehicle: str, refit: str = "", noise: float = 0.0) -> 
         What has been learnt.
     vehicle, refit : str
         As for :meth:`Fleet.known`.
-    noise : float
-        nT, of a sample.
     """
     known = fleet.known(vehicle, refit)
+    own = [one.noise for one in fleet.lessons if one.vehicle == vehicle]
+    noise = float(np.sqrt(np.mean(np.square(own or [one.noise for one in fleet.lessons]))))
     return Calibration(
         known.parameters, (Polynomial(exponents=known.exponents),), np.asarray(known.mean), known.covariance,
         Noise(noise), Reference(known.field), method="fleet", software=f"magbridge {__version__}",

@@ -53,12 +53,14 @@ def test_planned_runs_beat_table_1(glider: Gliders) -> None:
         plan(before, mission, ned, replace(limits, pitch=(80.0, 85.0)), runs=1)
 
 
-def test_an_extended_calibration_is_not_planned_with() -> None:
+def test_an_extended_or_noiseless_calibration_is_not_planned_with() -> None:
     warm = ChannelEffect(cause="temperature_offset", channel="sensor_temperature")
     extended = replace(identity(), effects=(warm,), coefficients=np.zeros(12), covariance=np.eye(12))
     met = np.tile((20_000.0, 0.0, 45_000.0), (10, 1))
     with pytest.raises(CalibrationError, match="not one that diagnose extended"):
         plan(extended, Mission(met, np.empty((10, 0))), met[0], Limits(), runs=1)
+    with pytest.raises(CalibrationError, match="needs the noise of a sample"):
+        plan(identity(), Mission(met, np.empty((10, 0))), met[0], Limits(), runs=1)
 
 
 def test_a_survey_is_proposed_that_comes_back_to_its_places_on_other_courses(glider: Gliders) -> None:

@@ -210,7 +210,8 @@ def test_what_is_expected_is_a_calibration(done: Catalogue, tmp_path: Path) -> N
     known = load(cal)
     assert known.method == "fleet"
     assert known.warnings
-    (own, _) = (row for row in done.rows("calibrations") if row["vehicle"] == "one")
+    (own, other) = (row for row in done.rows("calibrations") if row["vehicle"] == "one")
+    assert known.noise.sensor**2 == pytest.approx((own["noise"] ** 2 + other["noise"] ** 2) / 2)
     off = known.coefficients[6:9] - decode_calibration(own["calibration"].encode()).coefficients[6:9]
     assert (np.abs(off) < 4.0 * np.sqrt(np.diag(known.covariance)[6:9])).all()
 

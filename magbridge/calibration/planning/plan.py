@@ -94,6 +94,8 @@ class Design:
                 "plan: needs a calibration of polynomials only, as magbridge calibrate makes it, not one "
                 "that diagnose extended"
             )
+        if not calibration.noise.sensor > 0.0:
+            raise CalibrationError("plan: needs the noise of a sample, which the calibration says is 0 nT")
         self.calibration, self.field_ned = calibration, field_ned
         self.exponents = calibration.terms[0].exponents
         phi, g = self.derivative(mission.field_body, mission.parameters)
