@@ -89,8 +89,13 @@ class Table:
             if name and name != "time"
         }
         for name, k in self._layout.hemispheres.items():
-            opposite = frame[k].str.strip().str.upper().isin(["S", "W"]).to_numpy(bool)
-            columns[name] = np.where(opposite, -np.abs(columns[name]), columns[name])
+            side, values = frame[k].str.strip().str.upper(), columns[name]
+            known = side.isin([*HEMISPHERES[name]]).to_numpy(bool)
+            if (unsure := ~known & np.isfinite(values)).any():
+                expected = f"expected {' or '.join(HEMISPHERES[name])} beside it"
+                self._note(name, unsure, kept, expected, wrong=False)
+            values = np.where(side.isin(["S", "W"]), -np.abs(values), values)
+            columns[name] = np.where(known, values, np.nan)
         for name, codes in (unknown(columns) if self._layout.foreign else {}).items():
             value = float(columns[name][int(codes.argmax())])
             self._note(name, codes, kept, f"{EXPECTED}{value!r}", wrong=False)

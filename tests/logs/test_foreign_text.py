@@ -242,6 +242,12 @@ def test_west_is_west(kind: str, tmp_path: Path) -> None:
     assert log["longitude"].values.tolist() == [-52.75, -52.75]
 
 
+def test_a_place_without_its_hemisphere_is_not_known(tmp_path: Path) -> None:
+    log = read(tmp_path, "time,lat,NS,lon,EW\n1600000000,47.5,N,52.7,W\n1600000001,47.5,N,52.7,\n")
+    np.testing.assert_array_equal(log["longitude"], [-52.7, np.nan])
+    assert "row 3, column 'longitude': expected E or W beside it" in log.attrs["losses"]
+
+
 @pytest.mark.parametrize("cell", ["", "345600 7 8"])
 def test_a_time_in_two_columns_that_is_none_is_a_line(cell: str, tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"row 2, column 'time': expected a"):
