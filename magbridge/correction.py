@@ -184,9 +184,11 @@ class Correction:
         self.aligner.follow(calibration.channels)
         values = [track.last for track in self.aligner.tracks]
         by = self._corrector.replace(calibration, values)
-        if self._raised is not None:
+        if not calibration.level:
+            self._raised = None
+        elif self._raised is not None:
             self._raised.replace(calibration.at_level(), values)
-        elif calibration.level:
+        else:
             self._raised = Corrector(calibration.at_level())
         if self.plausibility is None:
             self.plausibility = self._plausibility(calibration)

@@ -27,3 +27,6 @@ def test_level_sigma_is_what_the_level_moves() -> None:
     np.testing.assert_allclose(corrected["level_sigma"], 0.002 * np.linalg.norm(field, axis=1), rtol=1e-6)
     np.testing.assert_allclose(corrected["total_field_sigma"], corrected["level_sigma"], rtol=1e-3)
     assert "level_sigma" not in correct_rows(Correction(plain), rows)
+    back = Correction(levelled)
+    back._use(plain)  # as a learner that goes back to a calibration without one
+    assert "level_sigma" not in correct_rows(back, rows)
