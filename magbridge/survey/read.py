@@ -74,7 +74,9 @@ def read_table(path: Path) -> Samples:
     else:
         depth = -_numbers(path, table, heights[0]) if heights else np.zeros(len(value))
     lines = next((name for name in ("line", "line_number", "line_no") if name in table), None)
-    line = np.unique(table[lines].astype(str), return_inverse=True)[1] if lines else np.zeros(len(value), int)
+    line = np.zeros(len(value), int)
+    if lines:  # an empty cell is a line of its own
+        line = np.unique(table[lines].astype(str).fillna(""), return_inverse=True)[1]
     kind = table["line_type"].astype(str).str.upper() if "line_type" in table else None
     tie = np.zeros(len(value), bool) if kind is None else (kind == "TIE").to_numpy()
     known = np.isfinite(value) & np.isfinite(longitude) & np.isfinite(latitude)

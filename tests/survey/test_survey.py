@@ -19,6 +19,7 @@ from magbridge.field.read import read_grid
 from magbridge.survey import gridding
 from magbridge.survey.crossovers import crossovers
 from magbridge.survey.maps import anomaly_map
+from magbridge.survey.read import read_table
 from magbridge.survey.run import Result, survey
 from magbridge.survey.samples import Samples
 
@@ -259,6 +260,13 @@ def test_command_predicts_at_points(command: Command, table: Path) -> None:
     error = command("survey", table, "--predict", points, "-o", table.parent / "none.csv", code=1).err
     assert "points.csv: expected longitude and latitude in every row, 1 lack one" in error
     assert not (table.parent / "none.csv").exists()
+
+
+def test_rows_without_a_line_are_one(tmp_path: Path) -> None:
+    for first, second in (("L1", "L2"), ("10", "20")):
+        rows = "".join(f"{1 + k / 1e4},2,{k},{(first, '', second)[k % 3]}\n" for k in range(30))
+        (tmp_path / "lines.csv").write_text(f"longitude,latitude,anomaly,line\n{rows}")
+        assert np.bincount(read_table(tmp_path / "lines.csv").line).tolist() == [10, 10, 10]
 
 
 @pytest.mark.parametrize(
