@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from magbridge.bridge.learning import first_calibration, open_learner
 from magbridge.bridge.links import LINKS, open_link
 from magbridge.bridge.needs import unmet
 from magbridge.bridge.serial_port import serial_line
-from magbridge.calibration import file as calibration_file
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, load
 from magbridge.errors import ConfigError, MagbridgeError
@@ -28,6 +28,7 @@ from magbridge.toml import convert, load_toml
 
 __all__ = ["Finding", "access", "findings"]
 
+CALIBRATIONS = ("calibration.file", "learning.prior")
 ROOM = 100e6
 """Bytes that a log's disk should have."""
 
@@ -96,9 +97,10 @@ def _contents(config: Config) -> Iterator[Finding]:
     path = config.path
     yield from _files(config)
     calibration = None
-    if config.calibration is not None and (file := config.resolve(config.calibration.file)).exists():
+    names = config.files
+    if all(config.resolve(name).exists() for key in CALIBRATIONS if (name := names.get(key)) is not None):
         try:
-            calibration = calibration_file.load(file)
+            calibration = first_calibration(config)
         except MagbridgeError as error:
             yield Finding(fatal=True, text=str(error))
     yield from _driver(config)
@@ -117,8 +119,10 @@ def _contents(config: Config) -> Iterator[Finding]:
         yield from _tried(partial(check_publish, {name: rate}, path))
     if calibration is not None:
         yield from _parameters(config, calibration)
-    if config.navigation is not None and config.resolve(config.navigation.map).exists():
+    if config.navigation is not None:
         yield from _map(config, calibration)
+    if (reference := names.get("learning.reference")) is None or config.resolve(reference).exists():
+        yield from _tried(lambda: open_learner(config, calibration))
     yield from _log(config)
 
 
@@ -186,22 +190,26 @@ def _parameters(config: Config, calibration: Calibration) -> Iterator[Finding]:
         return
     for error in unmet(calibration, config):
         yield Finding(fatal=True, text=str(error))
+    key = "calibration.file" if config.calibration else "learning.prior"
     for doubt in calibration.warnings:
-        yield Finding(fatal=False, text=f"{config.path}: calibration.file: {doubt}")
+        yield Finding(fatal=False, text=f"{config.path}: {key}: {doubt}")
 
 
 def _map(config: Config, calibration: Calibration | None) -> Iterator[Finding]:
     from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
 
     assert config.navigation is not None
-    wanted = config.navigation
-    yield from _tried(lambda: open_navigation(config, wanted, calibration))
+    try:
+        open_navigation(config, config.navigation, calibration)
+    except MagbridgeError as error:
+        if isinstance(error, ConfigError) or config.resolve(config.navigation.map).exists():
+            yield Finding(fatal=True, text=str(error))
 
 
 def _log(config: Config) -> Iterator[Finding]:
     if config.log is None:
         yield Finding(
-            fatal=False, text=f"{config.path}: log: none is kept: nothing can be replayed or learned"
+            fatal=False, text=f"{config.path}: log: none is kept: nothing can be replayed or calibrated"
         )
         return
     folder = config.resolve(config.log.directory)

@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from magbridge.bridge.events import Event, Start
-from magbridge.bridge.learning import expected
+from magbridge.bridge.learning import first_calibration
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.calibration import file as calibration_file
 from magbridge.config import Config
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import load_key
@@ -39,11 +38,7 @@ def set_up(config: Config, start: Start) -> Pipeline:
     ConfigError, FormatError, CalibrationError: the content of the configuration, or of a file that it names,
     is wrong.
     """
-    calibration = None
-    if config.calibration is not None:
-        calibration = calibration_file.load(config.resolve(config.calibration.file))
-    elif config.learning is not None:
-        calibration = expected(config)
+    calibration = first_calibration(config)
     key = load_key(config.resolve(config.link.signing_key)) if config.link.signing_key else None
     navigate = None
     if config.navigation is not None:

@@ -18,7 +18,7 @@ from magbridge.link.rates import Rate
 from magbridge.mavlink import spec
 from magbridge.mavlink.dialect import MAG_LEARNING_STATE, MAV_SEVERITY
 
-__all__ = ["Learning", "expected", "keep", "kept_path", "open_learner"]
+__all__ = ["Learning", "first_calibration", "keep", "kept_path", "open_learner"]
 
 LEARNING = spec("MAG_LEARNING")
 ACCEPT, FORGET = 1.0, 2.0
@@ -26,12 +26,14 @@ KEEP_US = 600_000_000
 """µs between files of a calibration that is only renewed."""
 
 
-def expected(config: Config) -> Calibration | None:
-    """Return what ``[learning]`` expects of a vehicle without a calibration; None without that table.
+def first_calibration(config: Config) -> Calibration | None:
+    """Return the calibration that a bridge begins with, or what ``[learning]`` expects; None without either.
 
-    FormatError, CalibrationError: ``learning.prior`` is no calibration.
+    FormatError, CalibrationError: a file is no calibration.
     """
     settings = config.learning
+    if config.calibration is not None:
+        return load(config.resolve(config.calibration.file))
     if settings is None:
         return None
     if settings.prior is not None:

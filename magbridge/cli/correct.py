@@ -149,7 +149,7 @@ def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]
 
     ConfigError: the configuration has no calibration, and no ``[learning]`` that could do without.
     """
-    from magbridge.bridge.learning import expected
+    from magbridge.bridge.learning import first_calibration
     from magbridge.calibration.file import load
     from magbridge.config import Config, Learning, Link, Sensor
     from magbridge.config import load as load_config
@@ -162,9 +162,7 @@ def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]
         settings = load_config(config)
         if settings.learning is None:
             raise ConfigError(config, "learning", "missing")
-    if file is None and settings.calibration is not None:
-        file = settings.resolve(settings.calibration.file)
-    known = load(file) if file is not None else expected(settings)
+    known = load(file) if file is not None else first_calibration(settings)
     assert known is not None
     return known, settings
 

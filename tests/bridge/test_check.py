@@ -91,6 +91,20 @@ def test_each_parameter_that_is_lacking(config: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ('[learning]\nprior = "bridge.toml"', "not a calibration"),
+        ('[learning]\nreference = "bridge.toml"', "expected a grid"),
+        ("[learning]\nranges = {fin = [0.0, 1.0]}", "telemetry.fin: missing"),
+        ('[navigation]\nmap = "none.nc"\nfix = "TELEPATHY"', "navigation.fix: expected one of"),
+    ],
+)
+def test_what_run_would_end_at_without_a_calibration(table: str, words: str, config: Path) -> None:
+    config.write_text(GOOD.replace('[calibration]\nfile = "cal.json"\n', "") + table)
+    assert any(words in line for line in lines(config, fatal=True))
+
+
 def test_a_calibration_of_another_sensor(config: Path) -> None:
     config.write_text(GOOD.replace("hmr2300", "twinleaf"))
     assert any("every sample would be uncalibrated" in line for line in lines(config, fatal=False))
