@@ -149,7 +149,7 @@ class Diagnosis:
 
 
 def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool:
-    """Say whether what is left without a name is negligible, too, and the residual noise."""
+    """Say whether what is left without a name is negligible, too, and the residual (n,), nT, noise."""
     if rest is not None and (rest.size is None or rest.size**2 > 2.0 * WORTH * rms(residual) ** 2):
         return False
     return not far_from_white(problem, memory(problem, residual / problem.reference_jacobian))
