@@ -219,3 +219,16 @@ def test_the_command_line_says_it_in_one_line(
     output = command.refuses("diagnose", "three.nc", "--calibration", "cal.json", "-o", "out")
     assert output == "three.nc (simulated: demo): 3 samples, at least 60 needed"
     assert not Path("out").exists()
+
+
+def test_a_channel_that_repeats_its_reading_is_known_where_it_was_read(
+    plain: tuple[xr.Dataset, Calibration],
+) -> None:
+    """At a time that stands twice there is no slope: so no row was whole."""
+    ds, calibration = plain
+    time = ds["time"].to_numpy()
+    sampled = time + 0.02
+    sampled[1::2] = sampled[::2][: len(sampled[1::2])]
+    late = {f"mag_time_{axis}": ("time", sampled) for axis in "z"}
+    survey = load_survey([ds.assign(late)], calibration)
+    assert len(survey.time) > 0.3 * len(time)

@@ -166,6 +166,10 @@ def _at(time: FloatArray, sampled: FloatArray, values: FloatArray, trusted: floa
     Where the cubic term itself exceeds `trusted`, nT, the axis is not known well enough: NaN.
     """
     out = np.full(time.size, np.nan)
+    fresh = np.append(True, np.diff(sampled) > 0.0)  # others repeat a reading
+    if not fresh.all():
+        out[fresh] = _at(time[fresh], sampled[fresh], values[fresh], trusted)
+        return out
     if time.size < 4:
         return out
     a, b, c, d, t = sampled[:-3], sampled[1:-2], sampled[2:-1], sampled[3:], time[2:-1]
