@@ -144,8 +144,9 @@ def _column(name: str, column: xr.DataArray, time: FloatArray) -> dict[str, Any]
 def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     hints = []
     if set(CHANNELS) <= set(log.data_vars):
-        length = float(np.nanmedian(magnitude(log[list(CHANNELS)].to_array().to_numpy().T)))
-        if not EARTHS[0] < length < EARTHS[1]:
+        lengths = magnitude(log[list(CHANNELS)].to_array().to_numpy().T)
+        length = float(np.median(lengths)) if len(lengths := lengths[np.isfinite(lengths)]) else 0.0
+        if length and not EARTHS[0] < length < EARTHS[1]:
             fitting = [
                 unit for unit, factor in NT_PER_UNIT.items() if EARTHS[0] < length * factor < EARTHS[1]
             ]

@@ -70,6 +70,11 @@ def test_a_depth_that_counts_upwards_is_doubted() -> None:
     assert "depth is -12 m (median): if it counts upwards, scale = -1 in columns.toml" in hints
 
 
+def test_a_vector_that_is_never_known_has_no_length() -> None:
+    unknown = dict.fromkeys(("mag_x", "mag_y", "mag_z"), np.full(2, np.nan))
+    assert not any("length" in hint for hint in info(made("log", [START, START + 1], unknown))["hints"])
+
+
 def test_what_moves_the_field_is_no_state_of_the_vehicle() -> None:
     names = {"pump": "A", "water": "degC", "supply": "V", "mast": "1", "speed": "m/s", "still": "A"}
     columns = {name: np.arange(9.0) * (name != "still") for name in names}
