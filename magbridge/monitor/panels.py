@@ -7,8 +7,9 @@ from math import nan
 
 from nicegui import ui
 
-from magbridge.config import Align
-from magbridge.link import alignment
+from magbridge.config import Align, Telemetry
+from magbridge.link.message_rates import DEFAULTS, LIMITS
+from magbridge.link.parameters import alignment, file_rate, learning, rates, telemetry_ages
 from magbridge.mavlink.dialect import MAV_SEVERITY
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import State
@@ -30,8 +31,13 @@ from magbridge.monitor.words import FLAGS, ago, health, measured, silence, where
 
 __all__ = ["Figures", "Flags", "Health", "Navigation", "Parameters", "Texts"]
 
-TUNABLES = {one.name: one for one in alignment(Align())}
-"""Parameters that every bridge has, with the unit and range that a PARAM_VALUE does not carry."""
+TUNABLES = {
+    one.name: one
+    for one in (*alignment(Align()), *file_rate(), *learning(enabled=True), *rates(DEFAULTS, LIMITS))
+}
+"""The parameters of a bridge, with the unit and range that a PARAM_VALUE does not carry."""
+(AGE,) = telemetry_ages({"telemetry": Telemetry(message="", field="")})
+"""Any telemetry's largest age: which there is depends on the bridge."""
 
 
 class Figures:
@@ -176,8 +182,8 @@ class Parameters:
     def _input(self, name: str) -> ui.number:
         self._changes.forget(name)
         box = ui.number(name).props("dense stack-label").on("keydown.enter", partial(self._set, name))
-        if known := TUNABLES.get(name):
-            box.tooltip(f"{known.doc}; {known.low:g} to {known.high:g} {known.unit}")
+        if known := TUNABLES.get(name, AGE if name.startswith("MB_AGE_") else None):
+            box.tooltip(f"{known.doc}; {known.low:g} to {known.high:g} {known.unit}".rstrip())
             box.props(f'suffix="{known.unit}"')
         return box
 

@@ -38,7 +38,9 @@ def test_page(page: Station) -> None:
             ("MAG_STATUS", {"sensor_state": 3, "uptime": 9}),
             ("MAG_NAVIGATION", {"state": 2, "lat": 495_000_000, "lon": -579_000_000}),
             ("STATUSTEXT", {"severity": 3, "text": "sensor lost: unplugged"}),
-            ("PARAM_VALUE", {"param_id": "MB_SETTLE_TIME", "param_value": 5.0, "param_count": 1}),
+            ("PARAM_VALUE", {"param_id": "MB_SETTLE_TIME", "param_value": 5.0, "param_count": 3}),
+            ("PARAM_VALUE", {"param_id": "MB_AGE_FIN", "param_value": 30.0, "param_count": 3}),
+            ("PARAM_VALUE", {"param_id": "MB_R_FIELD", "param_value": 0.0, "param_count": 3}),
         ):
             sender.sendto(bridge.pack(name, **fields), link)
         shown = (
@@ -49,6 +51,8 @@ def test_page(page: Station) -> None:
             "49.50000, -57.90000",
             "tracking",
             "MB_SETTLE_TIME",
+            "older telemetry is stale; 0.01 to 1e+06 s",
+            "rate of MAG_FIELD; 0 with every sample, -1 off; -1 to 1000 Hz",
             "sensor lost: unplugged",
             "vehicle 1, component 191",
         )
