@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from magbridge.arrays import FloatArray
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import SECONDS_OF_DAY
@@ -15,9 +18,11 @@ from magbridge.logs.magnetic import find_total, units_of_axes
 from magbridge.logs.stamps import DAY
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from magbridge.logs.layout import Layout
 
-__all__ = ["HEMISPHERES", "name_columns"]
+__all__ = ["HEMISPHERES", "name_columns", "on_side"]
 
 COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 """What is declared to be the time where a file has none: the rows, so many a second."""
@@ -204,3 +209,10 @@ def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
             left.append(name)
     if left:
         found.guesses.append(f"left out, no numbers: {', '.join(left)}")
+
+
+def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
+    """Return latitudes or longitudes (n,) on the side that letters (n,) say; NaN where there is none."""
+    side = letters.astype("str").str.strip().str.upper()
+    signed = np.where(side.isin(["S", "W"]), -np.abs(values), values)
+    return np.asarray(np.where(side.isin([*HEMISPHERES[name]]), signed, np.nan))

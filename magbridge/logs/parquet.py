@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import xarray as xr
 
 from magbridge.arrays import FloatArray
@@ -20,7 +19,7 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.clocks import Clock, clock_of, seconds
 from magbridge.logs.deployment import GUESSED, HISTORY, deployment, plain_attrs
 from magbridge.logs.layout import HEADER, Layout
-from magbridge.logs.naming import name_columns
+from magbridge.logs.naming import name_columns, on_side
 from magbridge.logs.unknown import known
 
 try:
@@ -62,6 +61,8 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
             for k, name in enumerate(layout.names)
             if name and name != "time"
         }
+        for name, k in layout.hemispheres.items():
+            columns[name] = on_side(name, columns[name], batch.column(k).to_pandas())
         numbers = range(row, row + batch.num_rows)
         piece = deployment(path, time, columns, layout.units, attrs | layout.attrs, meanings)
         yield known(path, piece) if layout.foreign else piece, numbers
@@ -103,9 +104,9 @@ def _times(batch: Any, layout: Layout, clock: Clock | None) -> FloatArray:
         return _floats(Path(), batch.schema.field(layout.stamp[-1]), columns[-1])
     if len(columns) == 1:
         return seconds(clock, columns[0].to_pandas(), None)
-    joined = pd.concat([column.to_pandas().astype("string") for column in columns], axis=1).agg(
-        " ".join, axis=1
-    )
+    joined, *others = (column.to_pandas().astype("string") for column in columns)
+    for one in others:
+        joined = joined + " " + one
     return seconds(clock, joined, None)
 
 

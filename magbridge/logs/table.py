@@ -17,7 +17,7 @@ from magbridge.errors import FormatError
 from magbridge.logs.clocks import Clock, clock_of, seconds
 from magbridge.logs.faults import Faults
 from magbridge.logs.layout import BLANKS, Layout, cells
-from magbridge.logs.naming import HEMISPHERES
+from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.logs.stamps import DAY
 from magbridge.logs.unknown import EXPECTED, unknown
 from magbridge.records import Quality
@@ -89,13 +89,10 @@ class Table:
             if name and name != "time"
         }
         for name, k in self._layout.hemispheres.items():
-            side, values = frame[k].str.strip().str.upper(), columns[name]
-            known = side.isin([*HEMISPHERES[name]]).to_numpy(bool)
-            if (unsure := ~known & np.isfinite(values)).any():
+            values, columns[name] = columns[name], on_side(name, columns[name], frame[k])
+            if (unsure := np.isnan(columns[name]) & np.isfinite(values)).any():
                 expected = f"expected {' or '.join(HEMISPHERES[name])} beside it"
                 self._note(name, unsure, kept, expected, wrong=False)
-            values = np.where(side.isin(["S", "W"]), -np.abs(values), values)
-            columns[name] = np.where(known, values, np.nan)
         for name, codes in (unknown(columns) if self._layout.foreign else {}).items():
             value = float(columns[name][int(codes.argmax())])
             self._note(name, codes, kept, f"{EXPECTED}{value!r}", wrong=False)

@@ -342,6 +342,16 @@ def test_parquet_of_others(tmp_path: Path) -> None:
         logs.read(tmp_path / "none.parquet")
 
 
+def test_parquet_of_others_with_letters_beside_its_places_and_a_time_in_two_columns(tmp_path: Path) -> None:
+    columns = {"date": [*["2022-05-04"] * 3, None], "time": [f"12:00:0{k}" for k in range(4)]}
+    places = {"lat": 47.5, "NS": "S", "lon": 52.75, "EW": ["W", None, "E", "W"]}
+    pd.DataFrame(columns | places).to_parquet(tmp_path / "a.parquet")
+    log = logs.read(tmp_path / "a.parquet")
+    assert log["time"].values.tolist() == [NOON, NOON + 1, NOON + 2]
+    assert log["latitude"].values.tolist() == [-47.5] * 3
+    np.testing.assert_array_equal(log["longitude"], [-52.75, np.nan, 52.75])
+
+
 def test_a_slocums_text(tmp_path: Path) -> None:
     """What dbd2asc writes: tags, names, units, sizes, then a cycle a line."""
     tags = "dbd_label: DBD_ASC(dinkum_binary_data_ascii)file\nencoding_ver: 2\nnum_ascii_tags: 14\n"
