@@ -127,4 +127,7 @@ class Publication:
     def _change(self, how: str, before: int, after: int) -> str:
         self.renewed = False
         rms = np.sqrt(self.judge.mean_square)
-        return f"{how} {calibration_id(self.calibration):08x}: {rms[before]:.1f} to {rms[after]:.1f} nT"
+        said = f"{how} {calibration_id(self.calibration):08x}"
+        if before == FIRST and self.first.method == NONE:  # no errors to compare with
+            return f"{said} from nothing"
+        return f"{said}: {rms[before]:.1f} to {rms[after]:.1f} nT"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,7 @@ def test_a_vehicle_without_a_calibration_gets_one() -> None:
     assert learner.calibration.method == "none"
     learn(learner, world)
     learned = learner.calibration
+    assert re.fullmatch(r"learned [0-9a-f]{8} from nothing", learner.notices[0].text)
     assert learned.method == "learned"
     assert error_of(learned, world) < 1.5
     assert 0.8 < learned.noise.sensor < 1.2
