@@ -115,6 +115,7 @@ class Decision:
         self._publication.judge.restart(knowledge.nuisance)
         if self._publication.learned:
             self._publication.renew(self.learned(knowledge))
+            self._publication.renewed = False  # what jumped may have been the fit before
         knowledge.go_on()
 
     def _count(self, *, learned: bool) -> None:

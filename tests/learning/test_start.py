@@ -59,6 +59,20 @@ def test_nothing_is_published_before_all_samples_were_fitted() -> None:
     assert "learned" not in published[:FIRST]
 
 
+def test_a_jump_that_a_young_calibration_made_is_over_with_the_next_fit() -> None:
+    """A field that is right again is not flagged for hours."""
+    world, learner = World(vehicle(), 700), Learner(class_prior((MASS,), FIELD))
+    renewed: dict[Calibration, bool] = {}
+
+    def seen(_: int) -> None:
+        renewed.setdefault(learner.calibration, learner.renewed)
+
+    learn(learner, world, seen=seen)
+    values = list(renewed.values())
+    assert values.count(False) >= 4  # nothing, published, and fitted anew at 128, 256 and 512 samples
+    assert True in values
+
+
 def test_what_was_learned_from_nothing_can_be_forgotten() -> None:
     """It then begins with nothing again."""
     learner = Learner(class_prior((MASS,), FIELD))
