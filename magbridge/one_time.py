@@ -14,13 +14,10 @@ noise but a bias.
 from __future__ import annotations
 
 from math import isnan, nan
-from typing import Final
 
 from magbridge.records import Vector
 
 __all__ = ["OneTime"]
-
-NOTHING: Final = (nan, nan, nan)
 
 
 class OneTime:
@@ -38,8 +35,8 @@ class OneTime:
         self.variance = 0.0
         self.settled: Vector | None = None
         self._us, self._step = 0, 0.0
-        self._field, self._delay = NOTHING, (0.0, 0.0, 0.0)
-        self._out, self._slope, self._lever = NOTHING, NOTHING, NOTHING
+        self._field, self._delay = (nan, nan, nan), (0.0, 0.0, 0.0)
+        self._out, self._slope, self._lever = (nan, nan, nan), (nan, nan, nan), (nan, nan, nan)
 
     def bring(self, field: Vector, delay: Vector, time_us: int) -> tuple[Vector, float]:
         """Return a reading's channels at one time, and how long after `time_us` that is, s.
@@ -57,7 +54,7 @@ class OneTime:
         earliest = min(x_late, min(y_late, z_late))  # noqa: PLW3301 - compiled, two numbers need no call
         x_late, y_late, z_late = x_late - earliest, y_late - earliest, z_late - earliest
         step = (time_us - self._us) * 1e-6
-        out, slope, lever = field, NOTHING, NOTHING
+        out, slope, lever = field, (nan, nan, nan), (nan, nan, nan)
         self.variance, self.settled = 0.0, None
         x, y, z = field
         if self._us and step > 0.0 and (x_late or y_late or z_late):

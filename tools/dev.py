@@ -26,8 +26,8 @@ SCRIPTS = "Scripts" if os.name == "nt" else "bin"
 BIN, COMPILED = ROOT / ".venv" / SCRIPTS, ROOT / ".compiled" / SCRIPTS
 UV = "uv==0.13.8"
 LIVE = (
-    "tests/test_align.py", "tests/test_correction.py", "tests/test_plausibility.py", "tests/test_attitude.py",
-    "tests/bridge",
+    "tests/test_align.py", "tests/test_one_time.py", "tests/test_correction.py", "tests/test_plausibility.py",
+    "tests/test_attitude.py", "tests/bridge",
     "tests/calibration/test_correct.py", "tests/link", "tests/mavlink", "tests/sensors",
     "tests/sitl/test_replay.py",
 )  # fmt: skip
