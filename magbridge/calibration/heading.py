@@ -1,0 +1,166 @@
+"""Heading from the corrected field, roll and pitch, with its standard deviation.
+
+Notes
+-----
+The corrected vector b (body axes: forward, starboard, down) is levelled with roll phi and pitch theta, and
+the horizontal part gives the angle from magnetic north (Denne 1979, Magnetic Compass Deviation and
+Correction, chapter 2)::
+
+    h = R_y(theta) R_x(phi) b,     psi_m = atan2(-h_y, h_x),     psi = psi_m + D
+
+With ``L = R_y R_x`` and ``H^2 = h_x^2 + h_y^2``, the heading changes with the vector as
+``g = L^T (h_y, -h_x, 0) / H^2``, with a rotation of the vector (an error of the boresight) as ``w = b x g``,
+and with the tilt as
+
+    dpsi/dphi   = (h_y sin(theta) y_r + h_x z_r) / H^2,     (x_r, y_r, z_r) = R_x(phi) b
+    dpsi/dtheta = h_y h_z / H^2
+
+so that, for independent errors,
+
+    sigma^2 = g^T V g + w^T Omega w + ((dpsi/dphi)^2 + (dpsi/dtheta)^2) sigma_tilt^2 + sigma_D^2
+
+V is the whole covariance of the vector. Its diagonal alone misses the heading's variance, because the errors
+of the three components are correlated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+
+__all__ = ["DEFAULT_TILT_SIGMA_DEG", "Heading", "heading", "level_vector", "model_declination_sigma"]
+
+DEFAULT_TILT_SIGMA_DEG = 0.3
+"""deg, 1-sigma of roll and of pitch where the log does not state one."""
+MODEL_DECLINATION_SIGMA_DEG = 0.26
+"""deg, 1-sigma of a main-field model's declination where the horizontal field is large; error model of the
+World Magnetic Model 2020 (Chulliat et al. 2020, section 3.4): ``sqrt(0.26^2 + (5417 nT / H)^2)``."""
+MODEL_DECLINATION_SIGMA_NT_DEG = 5417.0
+"""deg nT, the part of the same error model that falls with the horizontal field."""
+UNIFORM_SIGMA_DEG = 180.0 / np.sqrt(3.0)
+"""deg, standard deviation of an angle of which nothing is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heading:
+    """Headings of n samples, clockwise from north, deg."""
+
+    magnetic: FloatArray
+    """(n,), from magnetic north, 0 to 360 deg; NaN where vector or tilt is unknown."""
+    true: FloatArray
+    """(n,), from true north, 0 to 360 deg; NaN where the declination is unknown, too."""
+    sigma: FloatArray
+    """(n,), standard deviation of `true`, deg; infinite where `magnetic` is NaN. Where only the declination
+    is unknown it is that of `magnetic`."""
+
+
+def level_vector(vector: FloatArray, roll: FloatArray, pitch: FloatArray) -> FloatArray:
+    """Return vectors (n, 3) in level axes: forward and starboard in the horizontal plane, and down.
+
+    Parameters
+    ----------
+    vector : (n, 3) array
+        Body axes, any unit.
+    roll, pitch : (n,) array
+        rad.
+    """
+    x, y, z = vector.T
+    y_rolled = np.cos(roll) * y - np.sin(roll) * z
+    z_rolled = np.sin(roll) * y + np.cos(roll) * z
+    forward = np.cos(pitch) * x + np.sin(pitch) * z_rolled
+    down = -np.sin(pitch) * x + np.cos(pitch) * z_rolled
+    return np.stack([forward, y_rolled, down], axis=1)
+
+
+def heading(
+    vector: FloatArray,
+    roll: FloatArray,
+    pitch: FloatArray,
+    declination: FloatArray | float = 0.0,
+    *,
+    covariance: FloatArray | None = None,
+    boresight_covariance: FloatArray | None = None,
+    tilt_sigma_deg: FloatArray | float = DEFAULT_TILT_SIGMA_DEG,
+    declination_sigma_deg: FloatArray | float = 0.0,
+) -> Heading:
+    """Compute the heading of every sample and its standard deviation.
+
+    Parameters
+    ----------
+    vector : (n, 3) array
+        nT, corrected field in body axes.
+    roll, pitch : (n,) array
+        rad.
+    declination : (n,) array or float
+        deg, east positive; NaN where unknown.
+    covariance : (n, 3, 3) array, optional
+        nT^2, of `vector` without the boresight's part; zero if not given.
+    boresight_covariance : (3, 3) array, optional
+        rad^2, of the boresight's rotation vector in body axes; zero if not given.
+    tilt_sigma_deg : (n,) array or float
+        deg, 1-sigma of roll and of pitch, independent of each other.
+    declination_sigma_deg : (n,) array or float
+        deg, 1-sigma of the declination.
+
+    Returns
+    -------
+    Heading
+        Where the horizontal field is not larger than its own standard deviation, a heading does not exist:
+        sigma there is that of a uniform angle, 180 / sqrt(3) deg.
+    """
+    vector = np.asarray(vector, float).reshape(-1, 3)
+    roll, pitch = np.broadcast_to(roll, len(vector)), np.broadcast_to(pitch, len(vector))
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        h_x, h_y, h_z = level_vector(vector, roll, pitch).T
+        horizontal_squared = h_x * h_x + h_y * h_y
+        magnetic = np.degrees(np.arctan2(-h_y, h_x)) % 360.0
+        # g = L^T (h_y, -h_x, 0) / H^2, the rows of L written out
+        along, across = h_y / horizontal_squared, -h_x / horizontal_squared
+        gradient = np.stack(
+            [
+                np.cos(pitch) * along,
+                np.sin(pitch) * np.sin(roll) * along + np.cos(roll) * across,
+                np.sin(pitch) * np.cos(roll) * along - np.sin(roll) * across,
+            ],
+            axis=1,
+        )
+        variance = np.zeros(len(vector))
+        if covariance is not None:
+            variance += np.einsum("ni,nij,nj->n", gradient, covariance, gradient)
+        if boresight_covariance is not None:
+            turn = np.cross(vector, gradient)  # w = b x g
+            variance += np.einsum("ni,ij,nj->n", turn, boresight_covariance, turn)
+        # dpsi/dphi and dpsi/dtheta
+        z_rolled = np.sin(roll) * vector[:, 1] + np.cos(roll) * vector[:, 2]
+        by_roll = along * np.sin(pitch) * h_y - across * z_rolled
+        by_pitch = along * h_z
+        variance += (by_roll**2 + by_pitch**2) * np.radians(tilt_sigma_deg) ** 2
+        sigma = np.degrees(np.sqrt(variance))
+        sigma = np.hypot(sigma, np.nan_to_num(declination_sigma_deg))
+        sigma = np.minimum(np.where(np.isnan(sigma), np.inf, sigma), UNIFORM_SIGMA_DEG)
+    unknown = np.isnan(magnetic)
+    return Heading(magnetic, (magnetic + declination) % 360.0, np.where(unknown, np.inf, sigma))
+
+
+def model_declination_sigma(horizontal: FloatArray, crustal_sigma: float = 0.0) -> FloatArray:
+    """Return the standard deviation of a main-field model's declination, deg.
+
+    Parameters
+    ----------
+    horizontal : (n,) array
+        nT, horizontal part of the main field.
+    crustal_sigma : float
+        nT, 1-sigma of the crustal field's total. Its component across the meridian is about
+        ``crustal_sigma / sqrt(2)``, which turns north by that over H.
+
+    Notes
+    -----
+    ``sigma_D^2 = 0.26^2 + (5417 / H)^2 + (180/pi crustal_sigma / (sqrt(2) H))^2`` (Chulliat et al. 2020).
+    """
+    with np.errstate(divide="ignore"):
+        model = np.hypot(MODEL_DECLINATION_SIGMA_DEG, MODEL_DECLINATION_SIGMA_NT_DEG / horizontal)
+        crustal = np.degrees(crustal_sigma / (np.sqrt(2.0) * horizontal))
+    return np.asarray(np.minimum(np.hypot(model, crustal), UNIFORM_SIGMA_DEG))

@@ -1,0 +1,139 @@
+"""Heading with its standard deviation, and the boresight from roll and pitch alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.tilt_boresight import TiltBoresight, boresight_from_tilt
+from magbridge.calibration.heading import heading, level_vector, model_declination_sigma
+from magbridge.errors import CalibrationError
+
+NED = np.array([16e3, -5e3, 49e3])
+TOTAL = float(np.linalg.norm(NED))
+INCLINATION = float(np.arcsin(NED[2] / TOTAL))
+DECLINATION_DEG = float(np.degrees(np.arctan2(NED[1], NED[0])))
+
+
+def body_field(roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:
+    """Return the field in body axes, (n, 3), from angles in rad: the naive oracle."""
+    attitude = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
+    return np.asarray(attitude.inv().apply(np.tile(NED, (len(roll), 1))))
+
+
+def difference_deg(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray((a - b + 180.0) % 360.0 - 180.0)
+
+
+def attitudes(n: int, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-1.0, 1.0, n), rng.uniform(-1.2, 1.2, n), rng.uniform(0.0, 2.0 * np.pi, n)
+
+
+def test_the_heading_of_an_exact_vector_is_the_vehicles() -> None:
+    roll, pitch, yaw = attitudes(200)
+    found = heading(body_field(roll, pitch, yaw), roll, pitch, DECLINATION_DEG)
+    np.testing.assert_allclose(difference_deg(found.true, np.degrees(yaw)), 0.0, atol=1e-9)
+    np.testing.assert_allclose(difference_deg(found.true, found.magnetic), DECLINATION_DEG, atol=1e-9)
+    level = level_vector(body_field(roll, pitch, yaw), roll, pitch)
+    np.testing.assert_allclose(level[:, 2], NED[2], atol=1e-6)
+
+
+@pytest.mark.parametrize("source", ["vector", "boresight", "tilt", "declination"])
+def test_sigma_is_the_scatter_that_each_error_causes(source: str) -> None:
+    n, rng = 40_000, np.random.default_rng(3)
+    roll, pitch, yaw = (np.full(n, angle) for angle in (0.2, -0.45, 2.1))
+    vector = body_field(roll, pitch, yaw)
+    root = rng.normal(0.0, 60.0, (3, 3))
+    covariance, turn, tilt_deg, declination_deg = np.zeros((3, 3)), np.zeros((3, 3)), 0.0, 0.0
+    declination = np.full(n, DECLINATION_DEG)
+    if source == "vector":
+        covariance = root @ root.T
+        vector += rng.normal(size=(n, 3)) @ root.T
+    elif source == "boresight":
+        turn = root @ root.T * 1e-8
+        vector = Rotation.from_rotvec(rng.normal(size=(n, 3)) @ root.T * 1e-4).apply(vector)
+    elif source == "tilt":
+        tilt_deg = 0.4
+        roll, pitch = roll + np.radians(rng.normal(0, 0.4, n)), pitch + np.radians(rng.normal(0, 0.4, n))
+    else:
+        declination_deg = 0.7
+        declination += rng.normal(0.0, 0.7, n)
+    found = heading(
+        vector, roll, pitch, declination, covariance=np.tile(covariance, (n, 1, 1)),
+        boresight_covariance=turn, tilt_sigma_deg=tilt_deg, declination_sigma_deg=declination_deg,
+    )  # fmt: skip
+    scatter = np.std(difference_deg(found.true, np.degrees(yaw)))
+    assert scatter == pytest.approx(float(np.median(found.sigma)), rel=0.03)
+
+
+def test_where_there_is_no_horizontal_field_the_heading_is_unknown() -> None:
+    vector = np.array([[0.5, 0.5, 50_000.0], [np.nan, 1.0, 2.0]])
+    found = heading(vector, np.zeros(2), np.zeros(2), covariance=np.tile(25.0 * np.eye(3), (2, 1, 1)))
+    assert found.sigma[0] == pytest.approx(180.0 / np.sqrt(3.0))
+    assert np.isnan(found.magnetic[1])
+    assert np.isinf(found.sigma[1])
+
+
+def test_the_declinations_sigma_grows_towards_the_pole_and_with_the_crust() -> None:
+    at_20_000, at_2_000 = model_declination_sigma(np.array([20_000.0, 2_000.0]))
+    assert at_20_000 == pytest.approx(np.hypot(0.26, 5417.0 / 20_000.0))
+    assert at_2_000 > 2.7
+    crustal = model_declination_sigma(np.array([20_000.0]), 300.0)[0]
+    assert crustal == pytest.approx(np.hypot(at_20_000, np.degrees(300.0 / np.sqrt(2.0) / 20_000.0)))
+
+
+def simulate_runs(
+    seed: int, pitch_deg: float, scatter: float = 0.02, runs: int = 10
+) -> tuple[TiltBoresight, Rotation]:
+    """Return the boresight of ten runs, alternately down and up, and the true rotation; `scatter` in rad."""
+    rng = np.random.default_rng(seed)
+    run = np.repeat(np.arange(runs), 200)
+    n = len(run)
+    pitch = np.where(run % 2 == 0, -1.0, 1.0) * np.radians(pitch_deg) + scatter * rng.normal(size=n)
+    roll, yaw = 2.5 * scatter * rng.normal(size=n), rng.uniform(0.0, 2.0 * np.pi, n)
+    true = Rotation.from_rotvec(rng.normal(0.0, 0.05, 3))
+    vector = true.inv().apply(body_field(roll, pitch, yaw)) + rng.normal(0.0, 1.0, (n, 3))
+    offset = np.radians(0.2) * rng.normal(size=(runs, 2))
+    noise = np.radians(0.1) * rng.normal(size=(n, 2))
+    measured = np.column_stack([roll, pitch]) + offset[run] + noise
+    found = boresight_from_tilt(
+        vector, measured[:, 0], measured[:, 1], np.full(n, TOTAL), np.full(n, INCLINATION), run
+    )
+    return found, true
+
+
+def test_a_boresight_needs_no_heading_and_its_covariance_holds() -> None:
+    squares = []
+    for seed in range(24):
+        found, true = simulate_runs(seed, 24.0)
+        error = (true * Rotation.from_rotvec(found.rotation).inv()).as_rotvec()
+        squares.append(error @ np.linalg.solve(found.covariance, error) / 3.0)
+        assert np.degrees(np.linalg.norm(error)) < 0.8
+    assert 0.6 < np.mean(squares) < 1.5  # chi squared of 72: 0.7 to 1.35 in 95 %
+
+
+def test_a_vehicle_that_stays_level_leaves_the_heading_of_the_mounting_open() -> None:
+    level, diving = simulate_runs(1, 0.0, scatter=0.0)[0], simulate_runs(1, 24.0)[0]
+    assert level.open_angle[0] == "heading"
+    assert level.open_angle[1] > 30.0 * diving.open_angle[1]
+
+
+def test_a_sensor_mounted_upside_down_is_found() -> None:
+    rng = np.random.default_rng(5)
+    roll, yaw = rng.normal(0.0, 0.1, 600), rng.uniform(0.0, 2.0 * np.pi, 600)
+    pitch = rng.choice([-0.4, 0.4], 600)
+    true = Rotation.from_euler("x", 180.0, degrees=True) * Rotation.from_rotvec([0.02, 0.01, 0.3])
+    found = boresight_from_tilt(
+        true.inv().apply(body_field(roll, pitch, yaw)), roll, pitch, np.full(600, TOTAL),
+        np.full(600, INCLINATION), np.arange(600) // 100,
+    )  # fmt: skip
+    assert np.degrees((true * Rotation.from_rotvec(found.rotation).inv()).magnitude()) < 0.02
+
+
+def test_too_few_samples_have_no_boresight() -> None:
+    few = np.zeros(10)
+    with pytest.raises(CalibrationError, match="expected at least 30 samples"):
+        boresight_from_tilt(np.ones((10, 3)), few, few, few + 1.0, few, np.zeros(10, int))
