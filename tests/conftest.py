@@ -21,6 +21,16 @@ from hypothesis import settings
 settings.register_profile("magbridge", deadline=None, derandomize=True)
 settings.load_profile("magbridge")
 
+MAX_ID_LENGTH = 80
+"""Characters of a parameter that may be part of a test's id."""
+
+
+def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
+    """Return the parameter's name for bytes and long texts; pytest adds the index."""
+    if isinstance(val, bytes) or (isinstance(val, str) and len(val) > MAX_ID_LENGTH):
+        return argname
+    return None
+
 
 @pytest.fixture(scope="session", autouse=True)
 def signals_are_heard() -> Iterator[None]:

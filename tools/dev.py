@@ -38,6 +38,7 @@ CHECKS = (
     ("ruff", "format", "--check", "."),
     ("mypy",),
     ("lint-imports", "--no-cache"),
+    ("python", "tools/collection.py"),
     ("mkdocs", "build", "--quiet", "--site-dir", ".site"),
 )
 
