@@ -2,12 +2,13 @@
 
     python3 tools/dev.py demo [ARG ...]     magbridge demo
     python3 tools/dev.py test [ARG ...]     the tests (pytest ARG ...)
-    python3 tools/dev.py check              lint, format, types, import order
+    python3 tools/dev.py check              lint, format, types, import order, wording, names, size, site
+    python3 tools/dev.py size               lines and modules of each part against its budget
     python3 tools/dev.py compiled [ARG ...] the live path's tests, compiled
     python3 tools/dev.py bench [ARG ...]    tools/bench.py, compiled
 
 The first call makes ``.venv`` and installs the locked dependencies and the checkout itself, editable, into
-it. The last two install the package as a user would, compiled where there is a C compiler, into
+it. ``compiled`` and ``bench`` install the package as a user would, compiled where there is a C compiler, into
 ``.compiled``.
 """
 
@@ -40,6 +41,10 @@ CHECKS = (
     ("lint-imports", "--no-cache"),
     ("python", "tools/collection.py"),
     ("mkdocs", "build", "--quiet", "--site-dir", ".site"),
+    ("python", "tools/prose.py", "--gate"),
+    ("python", "tools/names.py", "--gate"),
+    ("python", "tools/commits.py"),
+    ("python", "tools/size.py", "--gate"),
 )
 
 
@@ -113,6 +118,8 @@ def main() -> None:
         install("dev")
         for command in CHECKS:
             run(BIN / command[0], *command[1:])
+    elif what == "size":
+        run(sys.executable, "tools/size.py")
     elif what == "compiled":
         run_tests(COMPILED / "python", *(arguments or LIVE), **install_compiled())
     elif what == "bench":
