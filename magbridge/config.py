@@ -172,7 +172,7 @@ class Learning(Table, frozen=True):
     expected is then what any vehicle can have."""
     max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
     """Hz: samples that are learned from, at most."""
-    keep: Name | None = None
+    directory: Name | None = None
     """Folder for the calibrations that were learned; by default that of the calibration's file."""
 
     def __post_init__(self) -> None:

@@ -16,12 +16,12 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import RAISED, Calibration, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
+from magbridge.health import Attitude, Plausibility
+from magbridge.health.direction import Direction
+from magbridge.health.notices import Notices
+from magbridge.health.turns import Turns
 from magbridge.learning import Learner
 from magbridge.learning.model import TEMPERATURE
-from magbridge.plausibility import Attitude, Plausibility
-from magbridge.plausibility.direction import Direction
-from magbridge.plausibility.notices import Notices
-from magbridge.plausibility.turns import Turns
 from magbridge.records import BEYOND, Corrected, Reading
 from magbridge.toml import convert
 from magbridge.track import Input

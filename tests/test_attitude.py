@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
-from magbridge.plausibility import Attitude
+from magbridge.health import Attitude
 from magbridge.records import Quality
 
 EARTH = np.array([18_000.0, -5_000.0, 48_000.0])

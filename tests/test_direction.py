@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
-from magbridge.plausibility.direction import Direction
+from magbridge.health.direction import Direction
 from magbridge.records import Quality
 
 NED = np.array([17_000.0, -5_500.0, 48_500.0])

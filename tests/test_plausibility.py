@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.plausibility import Plausibility
+from magbridge.health import Plausibility
 from magbridge.records import Quality
 
 IMPLAUSIBLE, MOVING = int(Quality.IMPLAUSIBLE), int(Quality.MOVING)

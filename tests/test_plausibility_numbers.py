@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.plausibility import Plausibility
-from magbridge.plausibility.jump import GATE, SLOPE_US
-from magbridge.plausibility.level import FAR, LEVEL, NEAR
-from magbridge.plausibility.notices import Notices
-from magbridge.plausibility.scatter import QUIETEST, Scatter
+from magbridge.health import Plausibility
+from magbridge.health.jump import GATE, SLOPE_US
+from magbridge.health.level import FAR, LEVEL, NEAR
+from magbridge.health.notices import Notices
+from magbridge.health.scatter import QUIETEST, Scatter
 from magbridge.records import Quality
 
 FIELD, IMPLAUSIBLE, MOVING = 50_000.0, int(Quality.IMPLAUSIBLE), int(Quality.MOVING)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.plausibility.turns import ALARM, LEAST, Turns
+from magbridge.health.turns import ALARM, LEAST, Turns
 from magbridge.records import Quality
 
 FIELD, SIGMA = 52_000.0, 1.5

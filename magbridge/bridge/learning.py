@@ -93,11 +93,11 @@ def open_learner(
 
 
 def kept_path(config: Config) -> Path | None:
-    """Return where the learned calibration is kept: beside the first, or in ``learning.keep``."""
+    """Return where the learned calibration is kept: beside the first, or in ``learning.directory``."""
     if config.learning is None:
         return None
     first = config.resolve(config.calibration.file if config.calibration else "cal.json")
-    folder = config.resolve(config.learning.keep) if config.learning.keep else first.parent
+    folder = config.resolve(config.learning.directory) if config.learning.directory else first.parent
     return folder / f"{first.stem}-learned.json"
 
 
@@ -125,7 +125,7 @@ class Learning:
         parameters = self._component.parameters
         self.learner.enabled = parameters["MB_LEARN"] >= 0.5
         self.learner.frozen = parameters["MB_LEARN_FREEZE"] >= 0.5
-        if name == "MB_LEARN_DO" and (asked := parameters[name]):
+        if name == "MB_LEARN_CMD" and (asked := parameters[name]):
             if asked == ACCEPT:
                 self.learner.accept()
             elif asked == FORGET:
@@ -158,7 +158,7 @@ class Learning:
         self._component.outbox.send(
             "MAG_LEARNING",
             time_usec=time_us + offset_us,
-            doubt_since=state.since_us + offset_us if state.causes else 0,
+            alarm_since=state.since_us + offset_us if state.causes else 0,
             calibration_id=self._id,
             first_calibration_id=self._first_id,
             samples=state.learned_samples,
@@ -166,7 +166,7 @@ class Learning:
             rms_published=state.rms[1],
             rms_learned=state.rms[2],
             better=state.better,
-            doubt_size=state.size,
+            alarm_amplitude=state.size,
             causes=sum(1 << bit for bit, name in enumerate(CAUSES) if name in state.causes),
             state=MAG_LEARNING_STATE.FROZEN if learner.frozen else going,
         )

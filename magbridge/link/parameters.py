@@ -60,7 +60,7 @@ def learning(enabled: bool) -> list[Tunable]:
     rows = (
         ("MB_LEARN", "enabled", float(enabled), 1, "whether the calibration is learned in flight"),
         ("MB_LEARN_FREEZE", "freeze", 0.0, 1, "1: judge and doubt, but learn nothing"),
-        ("MB_LEARN_DO", "do", 0.0, 2, "1 accepts what was learned, 2 forgets it; goes back to 0"),
+        ("MB_LEARN_CMD", "cmd", 0.0, 2, "1 accepts what was learned, 2 forgets it; goes back to 0"),
     )
     return [
         Tunable(name, f"learning.{key}", default, 0, high, "", doc) for name, key, default, high, doc in rows

@@ -370,7 +370,7 @@ MESSAGES: dict[int, tuple[str, int, str]] = {
     60108: ("MAG_PORT", 171, "Q:time_usec:us:,I:dropped:bytes:,B:port::,B:state::,80s:reason::"),
     60109: ("MAG_COLUMN", 112, "d:scale::,d:offset::,16s:unit::,44s:message::,40s:field::,64s:match::,64s:column::,B:component::"),
     60110: ("MAG_STANDSTILL", 94, "Q:time_usec:us:,I:duration:us:"),
-    60111: ("MAG_LEARNING", 201, "Q:time_usec:us:,Q:doubt_since:us:,I:calibration_id::,I:first_calibration_id::,I:samples::,f:rms_first:nT:,f:rms_published:nT:,f:rms_learned:nT:,f:better::,f:doubt_size:nT:,H:causes::,B:state::,B:sensor_id::"),
+    60111: ("MAG_LEARNING", 157, "Q:time_usec:us:,Q:alarm_since:us:,I:calibration_id::,I:first_calibration_id::,I:samples::,f:rms_first:nT:,f:rms_published:nT:,f:rms_learned:nT:,f:better::,f:alarm_amplitude:nT:,H:causes::,B:state::,B:sensor_id::"),
     60120: ("MAG_SIGNING_STREAM", 216, "Q:stamp::,B:link::,B:system::,B:sender::,B:ahead::"),
     60121: ("MAG_BESIDE", 49, "H:count::"),
 }

@@ -14,7 +14,7 @@ from magbridge.monitor.words import learnt
 __all__ = ["LearningPanel"]
 
 TITLE = "Learning in flight"
-DO = "MB_LEARN_DO"
+DO = "MB_LEARN_CMD"
 ORDERS = {
     "Accept": (1.0, "What was learned is the calibration from now on, and the doubt is acknowledged"),
     "Forget": (2.0, "Go back to the first calibration, and learn anew"),

@@ -24,7 +24,7 @@ SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
 """Samples, parameters, and series of telemetry that are kept at most."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
 """States of the position filter in which it says where the vehicle is."""
-ORDERS = {"MB_LEARN_DO"}
+ORDERS = {"MB_LEARN_CMD"}
 """Parameters that go back to 0 once what was asked is done."""
 FIX_2D = 2
 """GPS_FIX_TYPE from which a receiver knows its place."""

@@ -146,8 +146,8 @@ def learnt(state: State) -> dict[str, tuple[str, bool]]:
     """Return what the bridge says of its learning: each item's name to its text, and whether all is well."""
     get = state.learning.get
     causes = [cause for cause in MAG_CAUSE if get("causes", 0) & cause]
-    since = time.gmtime(min(get("doubt_since", 0) * 1e-6, LAST))
-    size = _figure(get("doubt_size", nan), ".0f", "nT")
+    since = time.gmtime(min(get("alarm_since", 0) * 1e-6, LAST))
+    size = _figure(get("alarm_amplitude", nan), ".0f", "nT")
     doubted = f"{size} since {time.strftime('%d %b %H:%M', since)} UTC"
     names = ", ".join(str(cause.name).lower().replace("_", " ") for cause in causes)
     errors = (_figure(get(f"rms_{which}", nan), ".2f", "nT") for which in ("first", "published"))

@@ -105,8 +105,8 @@ def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
         frame = station.pack("PARAM_SET", param_id=name, param_value=value, **to)
         return received(pipeline.feed(Event(feed[800].time_us + 1, Channel.LINK, frame)))
 
-    answer = named(order("MB_LEARN_DO", 2.0), "PARAM_VALUE")[-1]
-    assert (answer["param_id"], answer["param_value"]) == ("MB_LEARN_DO", 0.0)
+    answer = named(order("MB_LEARN_CMD", 2.0), "PARAM_VALUE")[-1]
+    assert (answer["param_id"], answer["param_value"]) == ("MB_LEARN_CMD", 0.0)
     assert learner.calibration is learner.first
     assert learner.samples == 0
     order("MB_LEARN_FREEZE", 1.0)

@@ -119,10 +119,10 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         browser.close()
     texts = {text.partition(" what")[0] for text in rig.texts()}
     announced = (
-        "MB_LEARN_DO = 1, set by 255:190",
+        "MB_LEARN_CMD = 1, set by 255:190",
         "accepted:",
         "explained again: acknowledged",
-        "MB_LEARN_DO = 2, set by 255:190",
+        "MB_LEARN_CMD = 2, set by 255:190",
         "learning: all forgotten",
     )
     assert texts.issuperset(announced)

@@ -369,7 +369,7 @@ def test_what_is_learned_is_shown_in_words(air: Air) -> None:
     """Both predictions, the doubt with its causes, whatever a stranger sends as its time."""
     air.field(NOW)
     assert learnt(air.state)["Not explained"] == ("nothing", True)
-    doubt = {"doubt_since": 1_780_000_000_000_000, "doubt_size": 12.4, "causes": 1 | 4}
+    doubt = {"alarm_since": 1_780_000_000_000_000, "alarm_amplitude": 12.4, "causes": 1 | 4}
     errors = {"rms_first": 15.25, "rms_published": 1.5, "rms_learned": 1.25, "samples": 4321}
     ids = {"calibration_id": 0xABC, "first_calibration_id": 0xDEF}
     air.feed(NOW, "MAG_LEARNING", state=3, **doubt, **errors, **ids)
@@ -382,16 +382,16 @@ def test_what_is_learned_is_shown_in_words(air: Air) -> None:
     )
     assert shown["Not explained"] == "12 nT since 28 May 20:26 UTC"
     assert shown["Causes that fit"] == "offset step, temperature offset"
-    air.feed(NOW, "MAG_LEARNING", doubt_since=2**64 - 1, doubt_size=nan, causes=0xFFFF, state=9)
+    air.feed(NOW, "MAG_LEARNING", alarm_since=2**64 - 1, alarm_amplitude=nan, causes=0xFFFF, state=9)
     assert learnt(air.state)["Not explained"][1] is False
 
 
 def test_an_order_that_goes_back_to_zero_was_taken(air: Air) -> None:
-    """MB_LEARN_DO answers 0: what was asked is done."""
+    """MB_LEARN_CMD answers 0: what was asked is done."""
     air.field(NOW)
-    air.feed(NOW, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
-    air.state.set("MB_LEARN_DO", 2.0)
+    air.feed(NOW, "PARAM_VALUE", param_id="MB_LEARN_CMD", param_value=0.0, param_count=1)
+    air.state.set("MB_LEARN_CMD", 2.0)
     assert [name for name, _ in air.fleet.due(NOW + 1.0)].count("PARAM_SET") == 1
-    air.feed(NOW + 1.1, "PARAM_VALUE", param_id="MB_LEARN_DO", param_value=0.0, param_count=1)
-    assert air.state.parameters["MB_LEARN_DO"].error == ""
-    assert air.state.parameters["MB_LEARN_DO"].asked is None
+    air.feed(NOW + 1.1, "PARAM_VALUE", param_id="MB_LEARN_CMD", param_value=0.0, param_count=1)
+    assert air.state.parameters["MB_LEARN_CMD"].error == ""
+    assert air.state.parameters["MB_LEARN_CMD"].asked is None

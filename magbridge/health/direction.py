@@ -16,7 +16,7 @@ from __future__ import annotations
 from math import asin, atan2, cos, degrees, inf, isfinite, nan, pi, radians, remainder, sin, sqrt
 from typing import Final
 
-from magbridge.plausibility.notices import Notices
+from magbridge.health.notices import Notices
 from magbridge.records import Quality
 
 __all__ = ["Direction"]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from math import inf
 from typing import Final
 
-from magbridge.plausibility.axes import Axes
-from magbridge.plausibility.jump import GATE, Jump
-from magbridge.plausibility.level import Level
-from magbridge.plausibility.moves import Moves
-from magbridge.plausibility.notices import Notices
-from magbridge.plausibility.scatter import Scatter
+from magbridge.health.axes import Axes
+from magbridge.health.jump import GATE, Jump
+from magbridge.health.level import Level
+from magbridge.health.moves import Moves
+from magbridge.health.notices import Notices
+from magbridge.health.scatter import Scatter
 from magbridge.records import Quality, Vector
 
 __all__ = ["DOUBTFUL", "Plausibility"]

@@ -2,11 +2,11 @@
 
 The total field does not change with the attitude, and changes slowly with the place. The innovation
 ``e = F - L`` from a level L that follows it has the variance ``S = s^2 + (5/7 slope dt)^2 + sigma^2 +
-sigma_L^2``: s (:mod:`magbridge.plausibility.scatter`) and the slope are learned, and the sigmas are those of
+sigma_L^2``: s (:mod:`magbridge.health.scatter`) and the slope are learned, and the sigmas are those of
 the correction, only where a mass may have moved. Where ``e^2 > GATE^2 S``, a Kalman filter's gate (Bar-Shalom
 et al. 2001, *Estimation with Applications to Tracking and Navigation*, section 5.4), the sample is an
 outlier. Outliers that agree with each other are another level, which nothing explains: what follows is
-doubtful by their sum, until it is nothing, and then for a while (:mod:`magbridge.plausibility.moves`).
+doubtful by their sum, until it is nothing, and then for a while (:mod:`magbridge.health.moves`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from __future__ import annotations
 from math import isnan, nan
 from typing import Final
 
-from magbridge.plausibility.moves import Moves
-from magbridge.plausibility.scatter import Scatter
+from magbridge.health.moves import Moves
+from magbridge.health.scatter import Scatter
 
 __all__ = ["GATE", "SLOPE_US", "Jump"]
 

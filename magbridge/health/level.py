@@ -13,7 +13,7 @@ from __future__ import annotations
 from math import isnan
 from typing import Final
 
-from magbridge.plausibility.notices import Notices
+from magbridge.health.notices import Notices
 
 __all__ = ["FAR", "LEVEL", "NEAR", "Level"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from magbridge.plausibility.notices import Notices
+from magbridge.health.notices import Notices
 
 __all__ = ["Moves"]
 

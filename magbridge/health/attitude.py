@@ -3,7 +3,7 @@
 Rock knows nothing of the attitude, and bends slowly; a vehicle rolls, pitches and yaws all the time. Of the
 direction u of the corrected field in body axes, wrong offsets o and gains g change the total field F by
 ``u o + F (g_x u_x^2 + g_y u_y^2)``, to first order and up to a constant (the gain of all axes is none of it,
-:mod:`magbridge.plausibility.level`). The five numbers theta are found by least squares from the changes
+:mod:`magbridge.health.level`). The five numbers theta are found by least squares from the changes
 within half a minute, ``F - F_a = (r - r_a) theta + e``: a ridge regression, whose prior is what a sensor may
 be off by (Hoerl & Kennard 1970, Technometrics 12:55), with Huber's weights (1964, Ann. Math. Stat. 35:73),
 which forgets by half in twenty minutes. Changes that overlap count as one, and the variance of e is learned,
@@ -19,8 +19,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from magbridge.plausibility.judge import DOUBTFUL
-from magbridge.plausibility.notices import Notices
+from magbridge.health.judge import DOUBTFUL
+from magbridge.health.notices import Notices
 
 __all__ = ["Attitude"]
 

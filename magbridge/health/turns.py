@@ -17,8 +17,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from magbridge.plausibility.judge import DOUBTFUL
-from magbridge.plausibility.notices import Notices
+from magbridge.health.judge import DOUBTFUL
+from magbridge.health.notices import Notices
 
 __all__ = ["Turns"]
 

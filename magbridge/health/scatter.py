@@ -14,7 +14,7 @@ from math import nan
 from typing import Final
 
 from magbridge.field.geodesy import separation
-from magbridge.plausibility.notices import Notices
+from magbridge.health.notices import Notices
 
 __all__ = ["QUIETEST", "Scatter"]
 

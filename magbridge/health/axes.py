@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import log, nan
 from typing import Final
 
-from magbridge.plausibility.notices import Notices
+from magbridge.health.notices import Notices
 from magbridge.records import Vector
 
 __all__ = ["Axes"]
