@@ -3,6 +3,7 @@
     python3 tools/dev.py demo [ARG ...]     magbridge demo
     python3 tools/dev.py test [ARG ...]     the tests (pytest ARG ...)
     python3 tools/dev.py check              lint, format, types, import order, wording, names, size, site
+    python3 tools/dev.py baseline --compare what moved beyond its noise since tools/baseline.json
     python3 tools/dev.py size               lines and modules of each part against its budget
     python3 tools/dev.py compiled [ARG ...] the live path's tests, compiled
     python3 tools/dev.py bench [ARG ...]    tools/bench.py, compiled
@@ -14,7 +15,6 @@ it. ``compiled`` and ``bench`` install the package as a user would, compiled whe
 
 from __future__ import annotations
 
-import json
 import os
 import ssl
 import subprocess
@@ -32,8 +32,8 @@ LIVE = (
     "tests/calibration/test_correct.py", "tests/link", "tests/mavlink", "tests/sensors",
     "tests/sitl/test_replay.py",
 )  # fmt: skip
-REAL_TIME, FEW = ("tests/bridge/", "tests/sitl/", "tests/interop/", "tests/monitor/"), 5
-"""Rooms whose tests run in real time, and how many of them a stalled computer may make fail."""
+REAL_TIME = ("tests/bridge", "tests/sitl", "tests/interop", "tests/monitor")
+"""Folders whose tests run in real time, against pseudo-terminals and sockets."""
 CHECKS = (
     ("ruff", "check", "."),
     ("ruff", "format", "--check", "."),
@@ -59,28 +59,26 @@ def run(*command: str | Path, **variables: str) -> None:
         sys.exit(code)
 
 
-def run_tests(python: Path, *arguments: str, **variables: str) -> None:
-    """Run the tests, two at a time; a failure stays red.
+def run_tests(python: Path, *arguments: str) -> None:
+    """Run the tests: first those that only compute, two at a time, then those in real time, one at a time.
 
-    Where nothing failed but tests that run in real time, against ptys and sockets, these are run once more,
-    one at a time, and told: a computer that stalls for half a second makes telemetry stale, as it should.
+    A test that runs in real time would compete for the processor with one that computes.
     """
-    failures = ROOT / ".pytest_cache/v/cache/lastfailed"
-    failures.unlink(missing_ok=True)  # it gathers those of earlier runs
-    code = call(python, "-m", "pytest", "-n", "2", "--dist", "loadfile", *arguments, **variables)
-    if code != 1:
-        sys.exit(code)
-    failed = list(json.loads(failures.read_text()))
-    if len(failed) > FEW or not all(test.startswith(REAL_TIME) for test in failed):
-        sys.exit(code)
-    print("\nOnce more, one at a time, what runs in real time:", *failed, sep="\n  ", flush=True)
-    run(python, "-m", "pytest", *failed, **variables)
+    if arguments:
+        run(python, "-m", "pytest", *arguments)
+        return
+    ignored = [f"--ignore={folder}" for folder in REAL_TIME]
+    codes = [
+        call(python, "-m", "pytest", "-n", "2", "--dist", "loadfile", *ignored),
+        call(python, "-m", "pytest", *REAL_TIME),
+    ]
+    sys.exit(max(codes))
 
 
 def install(extra: str, place: Path = BIN, *options: str) -> None:
     """Install the lock file's versions into an environment, with one extra; other packages in it stay.
 
-    Everything is compiled to bytecode at once, which uv does not do by itself: where Python may not write any
+    Everything is compiled to bytecode at once, which uv does not do: if Python may not write any
     (PYTHONDONTWRITEBYTECODE), each start of the program would compile a thousand modules.
     """
     if not (BIN / "python").exists():
@@ -105,7 +103,7 @@ def install_compiled() -> dict[str, str]:
 
 def main() -> None:
     """Do what the first argument says."""
-    if sys.version_info < (3, 11):  # noqa: UP036 - whoever runs an older one must be told
+    if sys.version_info < (3, 11):  # noqa: UP036 - users of an older version get a message
         sys.exit("magbridge needs Python 3.11 or newer")
     what, *arguments = sys.argv[1:] or ["help"]
     if what == "demo":
@@ -118,10 +116,13 @@ def main() -> None:
         install("dev")
         for command in CHECKS:
             run(BIN / command[0], *command[1:])
+    elif what == "baseline":
+        install("dev")
+        run(BIN / "python", "tools/baseline.py", *arguments)
     elif what == "size":
         run(sys.executable, "tools/size.py")
     elif what == "compiled":
-        run_tests(COMPILED / "python", *(arguments or LIVE), **install_compiled())
+        run(COMPILED / "python", "-m", "pytest", *(arguments or LIVE), **install_compiled())
     elif what == "bench":
         run(COMPILED / "python", "tools/bench.py", *arguments, **install_compiled())
     else:
