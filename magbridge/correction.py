@@ -22,7 +22,8 @@ from magbridge.health.notices import Notices
 from magbridge.health.turns import Turns
 from magbridge.learning import Learner
 from magbridge.learning.model import TEMPERATURE
-from magbridge.records import BEYOND, Corrected, Reading
+from magbridge.parts import OptionalParts
+from magbridge.records import BEYOND, Corrected, Reading, Vector
 from magbridge.toml import convert
 from magbridge.track import Input
 
@@ -70,6 +71,7 @@ class Correction:
         # what has no calibration is not expected to be the Earth's field
         self._found = found = Notices()
         self.notices = found.lines
+        self.parts = OptionalParts(found.lines.append)
         judged = calibration.method != "none"
         self.plausibility = self._plausibility(calibration) if judged else None
         self.turns, self.attitude = Turns(found), Attitude(found)
@@ -121,29 +123,33 @@ class Correction:
         (F, sigma, x, y, z, sx, sy, sz), quality = self._corrector.numbers(
             sample.time_us, sample.field, sample.values, sample.quality
         )
-        judged = 0.0
-        if self.plausibility is not None:
-            if where is not None:
-                self.plausibility.place(sample.time_us, *where)
-            judged = self.plausibility.check(
-                sample.time_us,
-                reading.field,
-                F,
-                sigma,
-                quality,
-                main_field,
-                self.aligner.settings.reference_sigma,
-            )
-            quality |= self.plausibility.flags
-            turns = self.turns.check(sample.time_us, x, y, z, F, sigma * sigma + judged, quality)
-            judged += turns + self.attitude.check(sample.time_us, x, y, z, F, sigma * sigma, quality)
+        parts = self.parts
+        judged, checked = parts.call(
+            "plausibility check",
+            (0.0, 0),
+            self._check_field,
+            sample,
+            reading,
+            (F, sigma),
+            quality,
+            main_field,
+            where,
+        )
+        quality |= checked
+        vector = (x, y, z)
+        judged += parts.call(
+            "attitude check", 0.0, self._check_attitude, sample, vector, F, sigma * sigma, judged, quality
+        )
         turned = 0.0
         if self.direction is not None:
-            turned = self.direction.check(sample.time_us, x, y, z)
-            quality |= self.direction.flags
+            turned, flags = parts.call("direction check", (0.0, 0), self._check_direction, sample, vector)
+            quality |= flags
         if self.learner is not None:
-            quality |= self._learn(sample, quality, main_field, where, restarted=restarted)
-            judged += self.learner.variance
+            flags, variance = parts.call(
+                "learning", (0, 0.0), self._learn, sample, quality, main_field, where, restarted
+            )
+            quality |= flags
+            judged += variance
         if sample.sigma or sample.spans or judged or turned:
             more = judged + (self._more(sample) if sample.sigma or sample.spans else 0.0)
             sigma = sqrt(sigma * sigma + more)
@@ -151,16 +157,48 @@ class Correction:
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
         return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
 
+    def _check_field(
+        self,
+        sample: Sample,
+        reading: Reading,
+        total: tuple[float, float],
+        quality: int,
+        main_field: float,
+        where: tuple[float, float] | None,
+    ) -> tuple[float, int]:
+        """Return the variance (nT^2) and the flags that the checks of the total field add."""
+        if self.plausibility is None:
+            return 0.0, 0
+        if where is not None:
+            self.plausibility.place(sample.time_us, *where)
+        sigma = self.aligner.settings.reference_sigma
+        variance = self.plausibility.check(sample.time_us, reading.field, *total, quality, main_field, sigma)
+        return variance, self.plausibility.flags
+
+    def _check_attitude(
+        self, sample: Sample, vector: Vector, F: float, variance: float, judged: float, quality: int
+    ) -> float:
+        """Return the variance (nT^2) that the checks of the field against the attitude add."""
+        if self.plausibility is None:
+            return 0.0
+        turns = self.turns.check(sample.time_us, *vector, F, variance + judged, quality)
+        return turns + self.attitude.check(sample.time_us, *vector, F, variance, quality)
+
+    def _check_direction(self, sample: Sample, vector: Vector) -> tuple[float, int]:
+        """Return the variance (nT^2) of each component and the flags that the direction's check adds."""
+        assert self.direction is not None
+        variance = self.direction.check(sample.time_us, *vector)
+        return variance, self.direction.flags
+
     def _learn(
         self,
         sample: Sample,
         quality: int,
         main_field: float,
         where: tuple[float, float] | None,
-        *,
         restarted: bool,
-    ) -> int:
-        """Let the learner have the sample; return its flags."""
+    ) -> tuple[int, float]:
+        """Update the learner with the sample; return its flags and its variance, nT^2."""
         assert self.learner is not None
         if restarted:
             self.learner.restarted()
@@ -177,7 +215,7 @@ class Correction:
             settled=self.aligner.channels.settled,
             watched=[self.aligner.by_name[name].at(sample.time_us)[0] for name in self.learner.watched],
         )
-        return self.learner.flags
+        return self.learner.flags, self.learner.variance
 
     def _use(self, calibration: Calibration) -> None:
         """Correct from now on with another calibration, of the same terms or with effects more or fewer."""

@@ -88,8 +88,10 @@ class OneTime:
         dx, dy, dz = share * dx, share * dy, share * dz
         x_lag, y_lag, z_lag = x * x_lever * dx, y * y_lever * dy, z * z_lever * dz
         square = x_lag * x_lag + y_lag * y_lag + z_lag * z_lag
-        if square >= 0.0:  # not NaN, as with the second reading, and where a channel is none
-            self.variance = square / (x * x + y * y + z * z)
+        length = x * x + y * y + z * z
+        # NaN with the second reading and an invalid channel; zero where the sensor reads 0, 0, 0
+        if square >= 0.0 and length > 0.0:
+            self.variance = square / length
             x, y, z = self._out
             self.settled = x - x_was * dx, y - y_was * dy, z - z_was * dz
 

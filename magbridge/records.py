@@ -11,12 +11,14 @@ from typing import Final
 
 import msgspec
 
-__all__ = ["BEYOND", "Channel", "Corrected", "Quality", "Reading", "Vector"]
+__all__ = ["BEYOND", "MAX_DEVICE_TIME_S", "Channel", "Corrected", "Quality", "Reading", "Vector"]
 
 Vector = tuple[float, float, float]
 
 BEYOND: Final = 1e9
 """nT (1 T): a field or a sigma above it is no measurement, but garbage that happens to be a number."""
+MAX_DEVICE_TIME_S: Final = 1e11
+"""s: no instrument counts more than 3,000 years; such a time is an error of transmission."""
 
 
 class Quality(IntFlag):

@@ -17,6 +17,8 @@ from benchmarks.peer import classes
 from commands import Command
 from hypothesis import settings
 
+from magbridge.parts import OptionalParts
+
 # the same examples every time, and none fails because the machine is busy
 settings.register_profile("magbridge", deadline=None, derandomize=True)
 settings.load_profile("magbridge")
@@ -30,6 +32,14 @@ def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
     if isinstance(val, bytes) or (isinstance(val, str) and len(val) > MAX_ID_LENGTH):
         return argname
     return None
+
+
+@pytest.fixture(scope="session", autouse=True)
+def exceptions_pass_through() -> Iterator[None]:
+    """Switch off the net under the live path's optional parts, so that it hides no fault from a test."""
+    OptionalParts.propagate = True
+    yield
+    OptionalParts.propagate = False
 
 
 @pytest.fixture(scope="session", autouse=True)

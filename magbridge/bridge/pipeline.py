@@ -27,6 +27,7 @@ from magbridge.link.message_rates import check_publish
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
+from magbridge.link.validity import is_possible
 from magbridge.mavlink import Message, Signing, Spec, spec
 from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Quality, Reading
@@ -140,6 +141,7 @@ class Pipeline:
         self.navigation = navigate(self.component) if navigate else None
         self.learning = Learning(learner, self.component) if learner is not None else None
         self._raw_rate = self.component.rates["MAG_RAW"]
+        self._parts, self._ignored_positions = self._correction.parts, set[int]()
         self._position = Position(self._report_no_anomaly)
         self._samples = self._lost = self._quality = 0
         self._late = False
@@ -213,7 +215,8 @@ class Pipeline:
         self._lost += missing
         self._times.append(time_us)
         self.sensor.read(reading.field, time_us)
-        main_field = position.main_field(time_us, time_us + component.codec.utc_offset_us)
+        utc_us = time_us + component.codec.utc_offset_us
+        main_field = self._parts.call("position", nan, position.main_field, time_us, utc_us)
         sample, corrected = self._correction.reading(
             reading,
             time_us,
@@ -229,13 +232,13 @@ class Pipeline:
             self._report_doubtful(doubtful)
         anomaly = corrected.total_field - main_field
         if self.navigation is not None:
-            self.navigation.sample(sample.time_us, corrected)
+            self._parts.call("navigation", None, self.navigation.sample, sample.time_us, corrected)
         publisher = component.publisher
         publisher.publish(sample, corrected, anomaly)
         if self.recorder.active and self._raw_rate.hertz != 0:
             self.recorder.raw(component.codec.now_us, publisher.raw_payload(sample))
         if self.learning is not None:
-            self.learning.sample(sample.time_us)
+            self._parts.call("learning", None, self.learning.sample, sample.time_us)
 
     def _receive_link(self, data: bytes, time_us: int) -> None:
         component = self.component
@@ -244,14 +247,30 @@ class Pipeline:
                 if self._sources.admit(name, message.component, time_us):
                     guessed = self._late and when_us == time_us
                     self._correction.telemetry(name, value, when_us, guessed=guessed)
+            if not is_possible(message):
+                self.component.announcer.state(
+                    f"impossible {message.name}", f"{message.name} with impossible values ignored",
+                    MAV_SEVERITY.WARNING,
+                )  # fmt: skip
+                continue
             if message.id == Position.MESSAGE:
-                self._position.update(message, time_us)
+                self._locate(message, time_us)
             elif message.id == ATTITUDE and message.component == self._config.link.autopilot:
-                self._turn(message, time_us)
+                self._parts.call("direction check", None, self._turn, message, time_us)
             if self.navigation is not None:
-                self.navigation.receive(message, time_us)
+                self._parts.call("navigation", None, self.navigation.receive, message, time_us)
         self.recorder.link(time_us, component.received)
         component.received.clear()
+
+    def _locate(self, message: Message, time_us: int) -> None:
+        """Use the autopilot's position; report that another component sends one, too, and ignore that."""
+        if message.component == self._config.link.autopilot:
+            self._parts.call("position", None, self._position.update, message, time_us)
+        elif message.component not in self._ignored_positions:
+            self._ignored_positions.add(message.component)
+            self.component.announcer.send_statustext(
+                f"position of component {message.component} ignored", MAV_SEVERITY.WARNING
+            )
 
     def _turn(self, message: Message, time_us: int) -> None:
         """Take the vehicle's attitude, beside which the vector's direction is judged."""

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import isnan, nan
+from math import hypot, isnan, nan
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from magbridge.errors import MagbridgeError
+from magbridge.field.geodesy import separation
 from magbridge.mavlink import Message, spec
 
 if TYPE_CHECKING:
@@ -20,7 +21,18 @@ MAX_AGE_US: Final = 60_000_000
 CLOCK_SET_US: Final = 10**15
 """µs since 1970, in 2001: a host whose clock says less has none that was set, and the date is not known."""
 REPEAT_US: Final = 1_000_000
-"""µs after which the main field is computed anew."""
+"""µs after which the bridge computes the main field again."""
+MAX_SPEED_M_S: Final = 350.0
+"""m/s: no vehicle that carries a fluxgate is faster."""
+MAX_JUMP_M: Final = 10_000.0
+"""m beyond what MAX_SPEED_M_S allows: the main field changes by 50 nT at most over that, so that a correction
+of a long dead reckoning is no jump."""
+SUSPECT_US: Final = 900_000_000
+"""µs for which the vehicle must stay at a position beyond a jump until the bridge uses that position."""
+LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
+"""Largest magnitudes of GLOBAL_POSITION_INT's lat and lon, 1e-7 deg."""
+ALTITUDE_M: Final = -15_000.0, 100_000.0
+"""m: heights at which the main-field model is defined for vehicles."""
 
 
 class Position:
@@ -29,33 +41,65 @@ class Position:
     Parameters
     ----------
     notify : callable
-        Takes the reason why there is no main field at a known position.
+        Receives the reason why there is no main field at a known position.
 
-    Attributes
-    ----------
-    where : tuple of 2 float or None
-        Latitude and longitude, deg, of the last position; None before the first.
     """
 
     MESSAGE: ClassVar[int] = POSITION.id
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify = notify
-        self.where: tuple[float, float] | None = None
+        self._where: tuple[float, float] | None = None
         self._depth = 0.0
         self._when_us = self._evaluated_us = 0
         self._field = nan
         self._vector = nan, nan, nan
         self._vector_us = 0
         self._model: NearbyField | None = None
+        self._trusted: tuple[float, float] | None = None
+        self._trusted_us = self._jumped_us = 0
+
+    @property
+    def where(self) -> tuple[float, float] | None:
+        """Latitude and longitude of the last position, deg; None before the first and after a jump."""
+        return None if self._jumped_us else self._where
 
     def update(self, message: Message, time_us: int) -> None:
-        """Take a GLOBAL_POSITION_INT."""
-        latitude, longitude, altitude = message["lat"] * 1e-7, message["lon"] * 1e-7, message["alt"] * 1e-3
-        if latitude or longitude:  # an autopilot that does not know its position sends 0, 0
-            if self.where != (latitude, longitude) or self._depth != -altitude:
-                self.where, self._depth, self._evaluated_us = (latitude, longitude), -altitude, 0
-            self._when_us = time_us
+        """Use a GLOBAL_POSITION_INT; ignore one that states an unknown or impossible position.
+
+        After a jump that speed and time do not allow there is no main field, hence no anomaly, until the
+        vehicle is near the former track again or has stayed beyond the jump for :data:`SUSPECT_US`.
+        """
+        lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3
+        # an autopilot that does not know its position sends 0, 0 or INT32_MAX
+        if not (lat or lon) or abs(lat) > LATITUDE_E7 or abs(lon) > LONGITUDE_E7:
+            return
+        if not ALTITUDE_M[0] < altitude < ALTITUDE_M[1]:
+            altitude = 0.0
+        latitude, longitude = lat * 1e-7, lon * 1e-7
+        if self._where != (latitude, longitude) or self._depth != -altitude:
+            self._where, self._depth, self._evaluated_us = (latitude, longitude), -altitude, 0
+        self._when_us = time_us
+        self._watch_for_jumps(time_us)
+
+    def _watch_for_jumps(self, time_us: int) -> None:
+        """Compare the last position with the last one that was trusted."""
+        assert self._where is not None
+        if self._trusted is not None and not self._within_reach(
+            self._trusted, (self._jumped_us or time_us) - self._trusted_us
+        ):
+            if not self._jumped_us:
+                self._jumped_us = time_us
+                self._notify("the position jumps farther than the vehicle can move")
+            if time_us - self._jumped_us < SUSPECT_US:
+                return
+        self._trusted, self._trusted_us, self._jumped_us = self._where, time_us, 0
+
+    def _within_reach(self, trusted: tuple[float, float], elapsed_us: int) -> bool:
+        """Return True if the vehicle can have come from a position (deg) to the present one."""
+        assert self._where is not None
+        north, east = separation(*trusted, *self._where)
+        return hypot(north, east) < MAX_JUMP_M + MAX_SPEED_M_S * abs(elapsed_us) * 1e-6
 
     def main_field(self, time_us: int, utc_us: int) -> float:
         """Return the IGRF's total field in nT; NaN where position or date is not known, or no model holds.
@@ -79,20 +123,20 @@ class Position:
         if abs(utc_us - self._vector_us) > MAX_AGE_US:
             from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
 
-            assert self.where is not None
-            latitude, longitude = self.where
+            assert self._where is not None
+            latitude, longitude = self._where
             north, east, down = igrf(longitude, latitude, self._depth, utc_us * 1e-6)[0].tolist()
             self._vector, self._vector_us = (north, east, down), utc_us
         return self._vector
 
     def _evaluate(self, utc_us: int) -> float:
-        assert self.where is not None
+        assert self._where is not None
         try:
             if self._model is None:
                 from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
 
                 self._model = NearbyField()
-            return self._model.at(*self.where, self._depth, utc_us * 1e-6)[0]
-        except (ImportError, MagbridgeError) as error:
+            return self._model.at(*self._where, self._depth, utc_us * 1e-6)[0]
+        except (ImportError, OSError, MagbridgeError) as error:  # OSError: no file handle is left
             self._notify(str(error))
             return nan

@@ -86,7 +86,9 @@ def worse_axis(nn: Number, ne: Number, ee: Number) -> Number:
     The larger eigenvalue is ``(P_nn + P_ee) / 2 + sqrt((P_nn - P_ee)² / 4 + P_ne²)``.
     """
     half: Number = 0.5 * (nn - ee)
-    sigma: Number = (0.5 * (nn + ee) + (half * half + ne * ne) ** 0.5) ** 0.5
+    variance: Number = 0.5 * (nn + ee) + (half * half + ne * ne) ** 0.5
+    positive: Number = variance * (variance > 0.0)  # rounding may leave a huge covariance negative
+    sigma: Number = positive**0.5
     return sigma
 
 

@@ -37,7 +37,7 @@ import msgspec
 from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
-from magbridge.records import BEYOND, Reading
+from magbridge.records import BEYOND, MAX_DEVICE_TIME_S, Reading
 from magbridge.sensors.framing import Framer, saturated
 
 __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions"]
@@ -46,6 +46,8 @@ LIMIT = 512
 """Longest line, in bytes."""
 COUNTS = 2**31
 """A count that no converter reaches and no message can hold."""
+MAX_COUNT = 2**63
+"""Larger than any count that an instrument can hold."""
 ENCODING = "latin-1"
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 Positive = Annotated[float, Meta(gt=0)]
@@ -77,12 +79,19 @@ def _measured(text: bytes) -> float:
     return number
 
 
+def _count(text: bytes) -> int:
+    number = int(text)
+    if abs(number) > MAX_COUNT:
+        raise ValueError
+    return number
+
+
 KINDS: dict[str, Callable[[bytes], float]] = {
     "time": _finite,
     "temperature": _measured,
     "supply": _measured,
-    "sequence": int,
-    "power_cycle": int,
+    "sequence": _count,
+    "power_cycle": _count,
 }
 """Columns beside x, y and z, and how each is read."""
 
@@ -196,6 +205,8 @@ class Ascii:
         if not largest < BEYOND or (self._counts and not abs(x) + abs(y) + abs(z) < COUNTS):
             raise ValueError
         others: dict[str, Any] = {name: kind(cells[at]) for name, at, kind in self._others}
+        if abs(others.get("time", 0.0) * self._seconds) > MAX_DEVICE_TIME_S:
+            raise ValueError
         return Reading(
             field,
             (int(x), int(y), int(z)) if self._counts else None,

@@ -13,12 +13,12 @@ An instrument without a clock is its own clock when it sends at a steady rate: r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isnan
+from math import isnan, nan
 from typing import Final
 
 import msgspec
 
-from magbridge.records import Reading
+from magbridge.records import MAX_DEVICE_TIME_S, Reading
 from magbridge.sensors import Driver
 from magbridge.sensors.floor import TOLERANCE, Floor
 
@@ -132,6 +132,8 @@ class DeviceClock:
             Whether the relation between the clocks is learned from this reading; False for one that only
             waited for a later one.
         """
+        if not abs(device_time) < MAX_DEVICE_TIME_S:
+            device_time = nan
         timed = not isnan(device_time)
         missing = self._missing(sequence, arrival_us)
         restarted = stepped = False
