@@ -157,7 +157,7 @@ def calibrate(
         parameter = chosen_parameters(parameter, deployment, grid=anomalies, order=order, site_bias=site_bias)
         data = replace(
             observations(deployment, parameter, grid=anomalies),
-            inputs=_digests((*files, *([base] if base else []))),
+            inputs=_digests((*files, *reading.sensor_log, *([base] if base else []))),
         )
         for line in unused_logs(logs, data):
             complain(line)

@@ -6,7 +6,7 @@ import datetime as dt
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -117,6 +117,11 @@ class Reading:
     compass
         Which of several compasses to use: its number, from 0, or its device id. If not given: the one that
         the log says was in use.
+    sensor_log
+        The log of a sensor with its own logger, to be combined with the vehicle's logs; may be repeated. If
+        not given: found by its columns.
+    clock_offset
+        Seconds to add to the times of a sensor's own log.
     strict
         Refuse a log of which anything would be dropped, instead of dropping, counting and naming it.
     column
@@ -128,6 +133,8 @@ class Reading:
 
     date: Day = None
     compass: str | None = None
+    sensor_log: tuple[Path, ...] = ()
+    clock_offset: float = 0.0
     strict: bool = False
     column: tuple[str, ...] = ()
     columns: Path | None = None
@@ -136,7 +143,14 @@ class Reading:
     def options(self) -> Options:
         """The same for :mod:`magbridge.logs`."""
         boot = None if self.date is None else dt.datetime.combine(self.date, dt.time(), dt.UTC).timestamp()
-        return Options(self.strict, boot, self.compass, self.column, self.columns)
+        return Options(
+            self.strict, boot, self.compass, self.sensor_log, self.clock_offset, self.column, self.columns
+        )
+
+    @property
+    def alone(self) -> Options:
+        """The same for a log that is read alone, without the sensor's own logs."""
+        return replace(self.options, sensor_log=(), clock_offset_s=0.0)
 
 
 AS_THEY_SAY = Reading()

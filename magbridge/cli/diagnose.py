@@ -71,15 +71,21 @@ def diagnose(
     from magbridge.diagnose.run import diagnose as examine
     from magbridge.field.read import read_grid
     from magbridge.logs import read
+    from magbridge.logs.sensor_log import combine
 
     known = load(calibration)
     with waiting("reading") as step:
-        logs = [read(path, options=reading.options) for path in files]
+        logs = [read(path, options=reading.alone) for path in files]
+        logs += [read(path, options=reading.alone) for path in reading.sensor_log]
+        named = [False] * len(files) + [True] * len(reading.sensor_log)
+        combined = combine(logs, named, reading.clock_offset)
+        own = [path for path in files if digest(path) in known.inputs.values()]
+        own_logs = [log for path, log in zip(files, logs, strict=False) if path in own]
+        if len(combined) < len(logs):
+            logs, own_logs = combined, combined if own else []
         note_losses(*(log.attrs for log in logs))
         note_unused_grid(grid, *logs)
         remarks = warnings_of(known, calibration)
-        own = [path for path in files if digest(path) in known.inputs.values()]
-        own_logs = [log for path, log in zip(files, logs, strict=True) if path in own]
         others = [path for path in training_logs if path not in files]
         remarks += [f"{path}: {ITSELF}" for path in own]
         remarks += [remark for log in logs for remark in _suspect(log)]
@@ -89,7 +95,7 @@ def diagnose(
             logs,
             known,
             output,
-            training_logs=[*own_logs, *(read(path, options=reading.options) for path in others)],
+            training_logs=[*own_logs, *(read(path, options=reading.alone) for path in others)],
             grid=read_grid(grid) if grid else None,
             progress=step,
             remarks=remarks,

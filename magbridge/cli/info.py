@@ -22,7 +22,7 @@ WIDE = 110
 def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> None:
     """Say what logs hold: columns, units, rates, gaps, ranges, and what could be done with them.
 
-    Several logs are described one after the other.
+    Several logs are described one after the other; a sensor's own log and a vehicle's logs also together.
 
     Parameters
     ----------
@@ -32,16 +32,24 @@ def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> No
     logs_to_read(files)
 
     from magbridge.logs import read
+    from magbridge.logs.deployment import join
     from magbridge.logs.info import info as facts_of
+    from magbridge.logs.sensor_log import combine
 
+    logs = {}
+    with waiting("reading"):
+        for file in dict.fromkeys((*files, *reading.sensor_log)):
+            logs[str(file)] = read(file, options=reading.alone)
+        named = [Path(name) in reading.sensor_log for name in logs]
+        combined = combine(list(logs.values()), named, reading.clock_offset)
+        if len(combined) < len(logs):
+            logs[" and ".join(Path(name).name for name in logs) + " together"] = join(combined)
     found = {}
-    for file in files:
-        with waiting("reading"):
-            log = read(file, options=reading.options)
-        found[str(file)] = facts_of(log)
+    for name, log in logs.items():
+        found[name] = facts_of(log)
         if not json:
             note_losses(log.attrs)
-            _show(str(file), found[str(file)])
+            _show(name, found[name])
     if json:
         print_result(found, "", as_json=True)
 

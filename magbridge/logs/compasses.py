@@ -21,12 +21,14 @@ from magbridge.errors import FormatError
 from magbridge.wording import counted
 
 __all__ = [
-    "HEALTHY", "Compass", "by_columns", "choose", "compass_notes", "compasses_in", "compasses_of", "listed",
-    "rate",
+    "ATTRIBUTE", "HEALTHY", "Compass", "by_columns", "choose", "compass_notes", "compasses_in",
+    "compasses_of", "further", "listed", "rate",
 ]  # fmt: skip
 
 OTHER = re.compile(r"mag[1-9]\d*_x$")
 """Name of the first axis of another compass than the first."""
+AXIS = re.compile(r"mag([1-9]\d*)?_[xyz]$")
+"""Name of an axis of any compass."""
 HEALTHY = 0.5
 """Least share of its samples in which a compass in use is healthy."""
 ATTRIBUTE = "compasses"
@@ -144,6 +146,13 @@ def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
         if name in renamed:
             renamed[name].attrs = dict(COLUMNS[name]._asdict())
     return renamed
+
+
+def further(deployment: xr.Dataset) -> xr.Dataset:
+    """Return a deployment whose ``mag_x`` is ``mag2_x``, or has the first free number after that."""
+    found = {name: match for name in map(str, deployment.data_vars) if (match := AXIS.match(name))}
+    highest = max((int(match[1] or 1) for match in found.values()), default=1)
+    return deployment.rename({name: f"mag{highest + 1}_{name[-1]}" for name in CHANNELS if name in found})
 
 
 def compasses_in(log: xr.Dataset) -> list[Compass]:

@@ -17,8 +17,8 @@ from magbridge.records import Quality
 
 __all__ = [
     "CHANGES", "COUNTERS", "GUESSED", "HISTORY", "LOSSES", "MEANING", "NOTES", "SETTINGS", "deployment",
-    "join", "lasting", "merged", "named_losses", "noted", "passed_over", "plain_attrs", "same_columns",
-    "sliced", "uncounted", "with_losses",
+    "join", "join_attrs", "lasting", "merged", "named_losses", "noted", "passed_over", "plain_attrs",
+    "same_columns", "sliced", "uncounted", "with_losses",
 ]  # fmt: skip
 
 MEANING = {"heading_reference": "true", "time_reference": "utc"}
@@ -35,6 +35,8 @@ COUNTERS = {
     "files_skipped": ("file skipped", "files skipped"),
     "lines_skipped": ("line skipped", "lines skipped"),
     "rows_dropped": ("row dropped", "rows dropped"),
+    "rows_in_gaps": ("row in a gap of the vehicle's logs", "rows in gaps of the vehicle's logs"),
+    "rows_outside": ("row outside the vehicle's logs", "rows outside the vehicle's logs"),
     "values_dropped": ("impossible value dropped", "impossible values dropped"),
 }
 """Attributes that count what reading skipped, with singular and plural. They are summed over pieces, and are
@@ -170,7 +172,7 @@ def join(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         )
         variables[name] = ("time", values[order], attrs)
     joined = merged(xr.Dataset(variables, coords={"time": ("time", time[order], parts[0]["time"].attrs)}))
-    joined.attrs = _join_attrs([part.attrs for part in parts])
+    joined.attrs = join_attrs(parts)
     return with_losses(joined, {"duplicate_rows": len(time) - joined.sizes["time"]})
 
 
@@ -245,10 +247,22 @@ def _first_known(values: FloatArray, starts: IndexArray) -> FloatArray:
     return result
 
 
-def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:
+    """Return the attributes of several deployments as those of one.
+
+    What headings refer to counts only for parts that have headings.
+
+    Raises
+    ------
+    FormatError
+        Two parts disagree on an attribute that changes what values mean.
+    """
+    headed = [part.attrs for part in parts if "heading" in part] or [part.attrs for part in parts]
+    all_attrs: list[Mapping[Any, Any]] = [part.attrs for part in parts]
     for key, default in MEANING.items():
-        first = all_attrs[0].get(key, default)
-        for attrs in all_attrs:
+        declared = headed if key == "heading_reference" else all_attrs
+        first = declared[0].get(key, default)
+        for attrs in declared:
             if (other := attrs.get(key, default)) != first:
                 raise FormatError(attrs.get("source", ""), f"expected {key} {first} as before, not {other}")
     joined: dict[str, Any] = {}
@@ -264,4 +278,7 @@ def _join_attrs(all_attrs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         joined_lines = [line for attrs in all_attrs for line in str(attrs.get(key, "")).splitlines()]
         if joined_lines:
             joined[key] = "\n".join(dict.fromkeys(joined_lines))
+    joined.pop("heading_reference", None)
+    if "heading_reference" in headed[0]:
+        joined["heading_reference"] = headed[0]["heading_reference"]
     return joined | {"source": ", ".join(sources)}

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain, pairwise
 
 import numpy as np
 import xarray as xr
 
 from magbridge.logs.deployment import join, same_columns, uncounted
+from magbridge.logs.sensor_log import VehicleTelemetry, refuse_offset, sensor_logs, with_note
 
 __all__ = ["merge"]
 
@@ -19,14 +21,21 @@ ROOM = 1 << 28
 """Bytes of first pieces that are kept while the others are opened: of small logs, all."""
 
 
-def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
+def merge(
+    sources: Sequence[Open], rows: int, named: Sequence[bool] = (), clock_offset_s: float = 0.0
+) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
     Each log is opened for its first piece, which gives its start and its columns; where there is no room to
     keep that, it is opened again when the stream has reached its start. Short pieces, as of many short logs,
     are joined to pieces of `rows` rows. A log without a piece is left out.
+
+    A sensor's own logs, those `named` or found by :func:`~magbridge.logs.sensor_log.sensor_logs`, get the
+    telemetry of the vehicle's logs, which are held whole.
     """
-    firsts, opened, room = {}, {}, ROOM
+    firsts: dict[int, xr.Dataset] = {}
+    opened: dict[int, Opened] = {}
+    room = ROOM
     for k, source in enumerate(sources):
         pieces = source(rows)
         if (first := next(pieces, None)) is None:
@@ -35,12 +44,28 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
         room -= first.nbytes
         if room > 0:
             opened[k] = first, pieces
+    places = list(firsts)
+    kinds = sensor_logs([firsts[k] for k in places], [k < len(named) and named[k] for k in places])
+    if kinds[0]:
+        sensors, vehicles = ([places[k] for k in kind] for kind in kinds)
+        logs = [part for k in vehicles for part in _pieces(sources[k], opened.get(k), rows)]
+        telemetry = VehicleTelemetry(join(logs), clock_offset_s)
+        combined = {k: telemetry.opener(sources[k], is_first=k == sensors[0]) for k in sensors}
+        opened.clear()
+        stream = merge([combined.get(k, sources[k]) for k in places if k not in vehicles], rows)
+        names = ", ".join(str(firsts[k].attrs["source"]) for k in sensors)
+        for piece, following in pairwise(chain(stream, [None])):
+            if piece is not None:
+                yield piece if following is not None else with_note(piece, telemetry.note(names))
+        return
+    refuse_offset(clock_offset_s)
     whole = join(list(firsts.values()))  # also checks that they agree on units and on what heading means
     columns = {str(name): dict(whole[name].attrs) for name in whole.data_vars}
+    meaning = {key: whole.attrs[key] for key in ("source", "heading_reference") if key in whole.attrs}
 
     def joined(parts: Sequence[xr.Dataset]) -> xr.Dataset:
         # a file's attributes are those of the first piece, and must name all sources
-        return same_columns(join(parts), columns).assign_attrs(source=whole.attrs["source"])
+        return same_columns(join(parts), columns).assign_attrs(meaning)
 
     parts: list[xr.Dataset] = []
     held = 0  # rows in them, counted as they come: of thousands of short logs a sum would be quadratic
@@ -53,6 +78,15 @@ def merge(sources: Sequence[Open], rows: int) -> Iterator[xr.Dataset]:
             parts, held = [], 0
     if parts:
         yield joined(parts)
+
+
+def _pieces(source: Open, opened: Opened | None, rows: int) -> Iterator[xr.Dataset]:
+    """Yield the pieces of a log, of which the first may have been read."""
+    if opened is None:
+        yield from source(rows)
+    else:
+        yield opened[0]
+        yield from opened[1]
 
 
 def _in_order(

@@ -21,6 +21,10 @@ class Options:
     """s since 1970 UTC of the boot, for logs whose times count from it."""
     compass: str | None = None
     """Number (from 0) or device id of the compass to use, of several; None: the one that was in use."""
+    sensor_log: tuple[Path, ...] = ()
+    """Logs of a sensor with its own logger, whose rows get the telemetry of the vehicle's logs."""
+    clock_offset_s: float = 0.0
+    """Added to the times of a sensor's own log, s."""
     column: tuple[str, ...] = ()
     """Columns under our names, each ``NAME="THEIRS [unit]"``."""
     columns: Path | None = None

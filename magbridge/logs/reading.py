@@ -73,13 +73,21 @@ def read(paths: Paths, *, required: Iterable[str] = (), options: Options = DEFAU
 def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
     """Return the deployment that each file holds, a Slocum's flight and science file as one.
 
-    Files that were skipped are counted in the first.
+    A sensor's own logs get the telemetry of the vehicle's logs, which are then not among the results
+    (:mod:`magbridge.logs.sensor_log`). Files that were skipped are counted in the first.
 
     FormatError, MissingExtra: as :func:`read`.
     """
-    files = _Files(_paths(paths), options)
-    whole = [part for k in range(len(files.paths)) for part in files.pieces(k, WHOLE)]
-    return [files.counted(part) for part in whole]
+    from magbridge.logs.sensor_log import combine  # noqa: PLC0415 - xarray is for ashore
+
+    files = _Files(_paths(paths, options), options)
+    whole, named = [], []
+    for k in range(len(files.paths)):
+        parts = list(files.pieces(k, WHOLE))
+        whole += parts
+        named += [files.is_sensor_log(k)] * len(parts)
+    combined = combine(whole, named, options.clock_offset_s)
+    return [files.counted(part) for part in combined]
 
 
 def read_chunks(
@@ -94,11 +102,17 @@ def read_chunks(
     FormatError, MissingExtra: as :func:`read`.
     """
     from magbridge.logs.merge import merge  # noqa: PLC0415 - xarray is for ashore
+    from magbridge.logs.sensor_log import refuse_offset  # noqa: PLC0415
 
-    files = _Files(_paths(paths), options)
+    files = _Files(_paths(paths, options), options)
     sources = [partial(files.pieces, k) for k in range(len(files.paths))]
     required = tuple(required)
-    stream = sources[0](rows) if len(sources) == 1 else merge(sources, rows)
+    if len(sources) == 1:
+        refuse_offset(options.clock_offset_s)
+        stream = sources[0](rows)
+    else:
+        named = [files.is_sensor_log(k) for k in range(len(sources))]
+        stream = merge(sources, rows, named, options.clock_offset_s)
     for dataset, _ in pairwise(chain(stream, [None])):  # one ahead, so that the last can tell of all
         if dataset is not None:
             require(dataset, required)
@@ -126,6 +140,10 @@ class _Files:
             if self._options.strict or len(self._bad) == len(self.paths):
                 raise
 
+    def is_sensor_log(self, k: int) -> bool:
+        """Return True if the user calls a file a sensor's own log."""
+        return self.paths[k] in self._options.sensor_log
+
     def counted(self, dataset: xr.Dataset) -> xr.Dataset:
         """Return a deployment with the files counted and named that were skipped since the last call."""
         from magbridge.logs.deployment import with_losses  # noqa: PLC0415 - xarray is for ashore
@@ -135,11 +153,11 @@ class _Files:
         return with_losses(dataset, {"files_skipped": len(lines)}, lines) if lines else dataset
 
 
-def _paths(paths: Paths) -> list[Path]:
+def _paths(paths: Paths, options: Options) -> list[Path]:
     several = [paths] if isinstance(paths, (str, os.PathLike)) else paths
     if not several:
         raise ValueError("expected at least one file")
-    checked = [Path(path) for path in several]
+    checked = list(dict.fromkeys([*map(Path, several), *options.sensor_log]))
     for path in checked:
         format_of(path if is_bag(path) else existing(path))
     given = set(checked)

@@ -11,11 +11,16 @@ __all__ = ["CIRCLES", "MAX_AGE", "degrees", "latest", "linear"]
 
 MAX_AGE = 30.0
 """s; a value that was received longer ago is not carried to a row."""
-CIRCLES = {"heading": (360.0, 0.0), "longitude": (360.0, -180.0)}
+CIRCLES = {
+    "heading": (360.0, 0.0),
+    "roll": (360.0, -180.0),
+    "longitude": (360.0, -180.0),
+    "dr_longitude": (360.0, -180.0),
+}
 """Columns on a circle: its circumference and its lowest value, in deg."""
 
 
-def latest(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
+def latest(at: FloatArray, time: FloatArray, values: FloatArray, max_age: float = MAX_AGE) -> FloatArray:
     """Return the last value at or before each time, as a live listener would know it.
 
     Parameters
@@ -24,18 +29,20 @@ def latest(at: FloatArray, time: FloatArray, values: FloatArray) -> FloatArray:
         s, the rows.
     time, values : (m,) array
         s, not decreasing, and the values received then; NaN is no value.
+    max_age : float
+        s, of the oldest value that is still used.
 
     Returns
     -------
     (n,) array
-        NaN before the first value, and once the last is older than :data:`MAX_AGE`.
+        NaN before the first value, and once the last is older than `max_age`.
     """
     known = np.isfinite(values)
     time, values = time[known], values[known]
     if not len(time):
         return np.full(len(at), np.nan)
     k = np.searchsorted(time, at, side="right") - 1
-    fresh = (k >= 0) & (at - time[k] <= MAX_AGE)
+    fresh = (k >= 0) & (at - time[k] <= max_age)
     return np.where(fresh, values[k], np.nan)
 
 
@@ -56,8 +63,8 @@ def linear(
     time, values : (m,) array
         s, increasing, and the values measured then; NaN is no value.
     max_gap : float
-        s; the result is NaN between neighbours farther apart, and farther beyond an end. Nearer to an end,
-        the value there is held.
+        s; the result is NaN between neighbours farther apart, except at the neighbours' own times, and
+        farther beyond an end. Nearer to an end, the value there is held.
     period : float, optional
         Circumference of the circle that the values lie on: 360 for a heading in degrees.
     start : float
@@ -76,7 +83,8 @@ def linear(
     result = np.interp(at, time, values)
     right = np.searchsorted(time, at)
     before, after = time[np.maximum(right - 1, 0)], time[np.minimum(right, len(time) - 1)]
-    result[(after - before > max_gap) | (at - time[-1] > max_gap) | (time[0] - at > max_gap)] = np.nan
+    in_gap = (after - before > max_gap) & (at != after) & (at != before)
+    result[in_gap | (at - time[-1] > max_gap) | (time[0] - at > max_gap)] = np.nan
     return result if period is None else result - period * np.floor((result - start) / period)
 
 
