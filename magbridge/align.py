@@ -56,10 +56,6 @@ class Sample:
     spans : tuple of (int, float, float)
         Parameters that are not known exactly: index in `values`, and the two ends of the interval in which
         the value lies.
-
-    Notes
-    -----
-    No msgspec record, because compiled code reads the attributes of a class of its own without a call.
     """
 
     __slots__ = ("age", "field", "quality", "reading", "reading_us", "sigma", "spans", "time_us", "values")

@@ -51,7 +51,7 @@ class OneTime:
             µs.
         """
         x_late, y_late, z_late = delay
-        earliest = min(x_late, min(y_late, z_late))  # noqa: PLW3301 - compiled, two numbers need no call
+        earliest = min(x_late, min(y_late, z_late))  # noqa: PLW3301 - two numbers need no call
         x_late, y_late, z_late = x_late - earliest, y_late - earliest, z_late - earliest
         step = (time_us - self._us) * 1e-6
         out, slope, lever = field, (nan, nan, nan), (nan, nan, nan)

@@ -25,8 +25,6 @@ from rich.console import Console
 from rich.table import Table
 from terminal import command_line, table
 
-from magbridge import align
-
 __all__ = ["BENCHMARKS"]
 
 BENCHMARKS: dict[str, tuple[str, int]] = {
@@ -62,8 +60,7 @@ def show(results: list[dict[str, Any]]) -> Table:
         f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python "
         f"{platform.python_version()}"
     )
-    path = f"live path {'in plain Python' if align.__file__.endswith('.py') else 'compiled'}"
-    shown = table(f"{machine}, {path}", "what", "measured", "floor", "ratio", "asked", "", left=("what", ""))
+    shown = table(machine, "what", "measured", "floor", "ratio", "asked", "", left=("what", ""))
     for result in results:
         for row in result["rows"]:
             asked = f"<= {row.most:g}" if row.most is not None else f">= {row.least:g}" if row.least else ""

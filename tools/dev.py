@@ -5,12 +5,10 @@
     python3 tools/dev.py check              lint, format, types, import order, wording, names, size, site
     python3 tools/dev.py baseline --compare what moved beyond its noise since tools/baseline.json
     python3 tools/dev.py size               lines and modules of each part against its budget
-    python3 tools/dev.py compiled [ARG ...] the live path's tests, compiled
-    python3 tools/dev.py bench [ARG ...]    tools/bench.py, compiled
+    python3 tools/dev.py bench [ARG ...]    tools/bench.py
 
 The first call makes ``.venv`` and installs the locked dependencies and the checkout itself, editable, into
-it. ``compiled`` and ``bench`` install the package as a user would, compiled where there is a C compiler, into
-``.compiled``.
+it.
 """
 
 from __future__ import annotations
@@ -24,14 +22,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = "Scripts" if os.name == "nt" else "bin"
-BIN, COMPILED = ROOT / ".venv" / SCRIPTS, ROOT / ".compiled" / SCRIPTS
+BIN = ROOT / ".venv" / SCRIPTS
 UV = "uv==0.13.8"
-LIVE = (
-    "tests/test_align.py", "tests/test_one_time.py", "tests/test_correction.py", "tests/test_plausibility.py",
-    "tests/test_attitude.py", "tests/bridge",
-    "tests/calibration/test_correct.py", "tests/link", "tests/mavlink", "tests/sensors",
-    "tests/sitl/test_replay.py",
-)  # fmt: skip
 REAL_TIME = ("tests/bridge", "tests/sitl", "tests/interop", "tests/monitor")
 """Folders whose tests run in real time, against pseudo-terminals and sockets."""
 CHECKS = (
@@ -75,7 +67,7 @@ def run_tests(python: Path, *arguments: str) -> None:
     sys.exit(max(codes))
 
 
-def install(extra: str, place: Path = BIN, *options: str) -> None:
+def install(extra: str) -> None:
     """Install the lock file's versions into an environment, with one extra; other packages in it stay.
 
     Everything is compiled to bytecode at once, which uv does not do: if Python may not write any
@@ -88,17 +80,11 @@ def install(extra: str, place: Path = BIN, *options: str) -> None:
     known = ssl.get_default_verify_paths()  # a network's own proxy is known to the system only, not to uv
     run(
         BIN / "uv", "sync", "--quiet", "--locked", "--inexact", "--compile-bytecode",
-        "--extra", extra, *options,
-        UV_PROJECT_ENVIRONMENT=str(place.parent), VIRTUAL_ENV="", UV_PYTHON_DOWNLOADS="never",
+        "--extra", extra,
+        UV_PROJECT_ENVIRONMENT=str(BIN.parent), VIRTUAL_ENV="", UV_PYTHON_DOWNLOADS="never",
         UV_SYSTEM_CERTS=str(bool(known.cafile or known.capath)).lower(),
     )  # fmt: skip
-    run(place / "python", "-m", "compileall", "-q", "magbridge", "sitl")
-
-
-def install_compiled() -> dict[str, str]:
-    """Install the package as a user would; return the variables that find it, and not the checkout."""
-    install("dev", COMPILED, "--no-editable", "--reinstall-package", "magbridge")
-    return {"PYTHONSAFEPATH": "1", "PYTHONPATH": str(ROOT / "tools")}
+    run(BIN / "python", "-m", "compileall", "-q", "magbridge", "sitl")
 
 
 def main() -> None:
@@ -121,10 +107,9 @@ def main() -> None:
         run(BIN / "python", "tools/baseline.py", *arguments)
     elif what == "size":
         run(sys.executable, "tools/size.py")
-    elif what == "compiled":
-        run(COMPILED / "python", "-m", "pytest", *(arguments or LIVE), **install_compiled())
     elif what == "bench":
-        run(COMPILED / "python", "tools/bench.py", *arguments, **install_compiled())
+        install("dev")
+        run(BIN / "python", "tools/bench.py", *arguments)
     else:
         sys.exit(__doc__)
 

@@ -1,7 +1,10 @@
-"""Write ``magbridge/mavlink/dialect.py`` from ``magbridge.xml`` and the definitions that pymavlink ships.
+"""Write ``magbridge/mavlink/dialect.py`` and ``enums.py`` from ``magbridge.xml`` and pymavlink's definitions.
 
-The XML is read with pymavlink's own parser (mavgen's), so lengths, order and CRC are its work. What is
-written is a table, not the classes of mavgen: those take 0.4 s and 115 MB to import for the same messages.
+pymavlink's mavgen writes ``dialect.py``: the classes of our messages and of the few upstream messages that
+the wheel lacks. ``enums.py`` holds what mavgen's Python modules leave out: enumerations as ``IntEnum``, and
+for each field the value that means "not known".
+
+    python tools/dialect.py [--check]
 """
 
 from __future__ import annotations
@@ -9,16 +12,18 @@ from __future__ import annotations
 import argparse
 import re
 import sys
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import pymavlink
-from pymavlink.generator import mavparse
+from pymavlink.generator import mavgen, mavparse
 
 ROOT = Path(__file__).parents[1]
 XML = ROOT / "magbridge" / "mavlink" / "magbridge.xml"
-OUT = XML.with_name("dialect.py")
+DIALECT, ENUMS_FILE = XML.with_name("dialect.py"), XML.with_name("enums.py")
 DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
 INCLUDED = "all.xml"
 """More than our own messages: any that an autopilot sends can become a parameter, and is in logs."""
@@ -58,10 +63,6 @@ ENUMS: dict[str, tuple[str, ...]] = {
     "MAV_TYPE": ("GCS", "SUBMARINE", "ONBOARD_CONTROLLER"),
 }
 """The enumerations that the code uses, and which of their entries; an empty list means all."""
-CODES = {
-    "char": "s", "int8_t": "b", "uint8_t": "B", "int16_t": "h", "uint16_t": "H", "int32_t": "i",
-    "uint32_t": "I", "int64_t": "q", "uint64_t": "Q", "float": "f", "double": "d",
-}  # fmt: skip
 
 
 UPSTREAM = """<?xml version="1.0"?>
@@ -84,13 +85,18 @@ UPSTREAM = """<?xml version="1.0"?>
       <field type="uint32_t" name="file_crc">CRC-32 of the general metadata file.</field>
       <field type="char[100]" name="uri">MAVLink FTP URI of the general metadata file.</field>
     </message>
+    <message id="111" name="TIMESYNC">
+      <description>Time synchronization, with the address.</description>
+      <field type="int64_t" name="tc1" units="ns">Time sync timestamp 1.</field>
+      <field type="int64_t" name="ts1" units="ns">Time sync timestamp 2.</field>
+      <extensions/>
+      <field type="uint8_t" name="target_system">Target system id. Request: 0 (broadcast).</field>
+      <field type="uint8_t" name="target_component">Target component id. Request: 0 (broadcast).</field>
+    </message>
   </messages>
 </mavlink>
 """
 """Messages that upstream has added since the definitions in pymavlink; known by their id and checksum."""
-EXTENSIONS = {"TIMESYNC": ("B:target_system::", "B:target_component::")}
-"""Fields that upstream has added since the definitions in pymavlink; extensions leave the
-checksum as it is."""
 
 
 def collect(path: Path, seen: dict[Path, Any]) -> dict[Path, Any]:
@@ -111,42 +117,37 @@ def invalid(one: Any) -> str:
     return text if re.fullmatch(r"-?\d+", text) else ""
 
 
-def field(one: Any) -> str:
-    """Return ``code:name:unit:invalid`` of a field, the code as in `struct`, with its count for an array."""
-    count = str(one.array_length) if one.array_length else ""
-    text = f"{count}{CODES[one.type]}:{one.name}:{one.units.strip('[]')}:{invalid(one)}"
-    if text.count(":") != 3 or "," in text:
-        raise ValueError(f"a unit that the table cannot hold: {text}")
-    return text
+def definitions() -> dict[Path, Any]:
+    """Return the parsed XML of pymavlink's dialect ``all`` and of ours."""
+    return collect(DEFINITIONS / INCLUDED, collect(XML, {}))
 
 
-def render() -> str:
-    """Return the text of the module."""
-    files = collect(DEFINITIONS / INCLUDED, collect(XML, {}))
-    with TemporaryDirectory() as folder:
-        newer = Path(folder) / "upstream.xml"
-        newer.write_text(UPSTREAM, encoding="utf-8")
-        collect(newer, files)
-    messages = {m.id: m for xml in files.values() for m in xml.message}
-    if len(messages) != sum(len(xml.message) for xml in files.values()):
-        raise ValueError("two messages with one id")
+def render_dialect() -> str:
+    """Return the module that mavgen makes of our XML and of what the wheel lacks."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        ours = XML.read_text(encoding="utf-8").replace("  <include>common.xml</include>\n", "")
+        newer = UPSTREAM.split("<messages>", 1)[1].split("</messages>", 1)[0]
+        (folder / "magbridge.xml").write_text(
+            ours.replace("</messages>", f"{newer}</messages>"), encoding="utf-8"
+        )
+        options = mavgen.Opts(
+            str(folder / "dialect.py"), wire_protocol="2.0", language="Python3", validate=False
+        )
+        with redirect_stdout(StringIO()):
+            mavgen.mavgen(options, [str(folder / "magbridge.xml")])
+        return (folder / "dialect.py").read_text(encoding="utf-8")
+
+
+def render_enums() -> str:
+    """Return the text of ``enums.py``."""
+    files = definitions()
     lines = [
-        (
-            '"""The messages of MAVLink and of magbridge as a table: generated by tools/dialect.py, do not '
-            'edit."""'
-        ),
+        '"""Enumerations, and values that mean "not known": generated by tools/dialect.py, do not edit."""',
         "",
         "from enum import IntEnum",
         "",
-        "MESSAGES: dict[int, tuple[str, int, str]] = {",
-        "    # id: (name, CRC_EXTRA, fields in the order of the wire as code:name:unit:invalid)",
     ]
-    lines += [
-        f'    {m.id}: ("{m.name}", {m.crc_extra}, '
-        f'"{",".join((*map(field, m.ordered_fields), *EXTENSIONS.get(m.name, ())))}"),'
-        for _, m in sorted(messages.items())
-    ]
-    lines += ["}", "", "# the enumerations that the code uses"]
     for name, wanted in ENUMS.items():
         entries = {
             entry.name.removeprefix(f"{name}_"): entry.value
@@ -158,16 +159,30 @@ def render() -> str:
         }
         chosen = ", ".join(f'"{key}": {entries[key]}' for key in wanted or entries)
         lines.append(f'{name} = IntEnum("{name}", {{{chosen}}})')
-    return "\n".join(lines) + "\n"
+    lines += [
+        "",
+        "INVALID: dict[str, dict[str, int]] = {",
+        "    # message: {field: the value that means not known}",
+    ]
+    messages = {message.id: message for xml in files.values() for message in xml.message}
+    for _, message in sorted(messages.items()):
+        unknown = ", ".join(
+            f'"{field.name}": {value}' for field in message.ordered_fields if (value := invalid(field))
+        )
+        if unknown:
+            lines.append(f'    "{message.name}": {{{unknown}}},')
+    return "\n".join([*lines, "}"]) + "\n"
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="only compare; exit 1 where they differ")
-    text = render()
-    if parser.parse_args().check:
-        return int(text != OUT.read_text(encoding="utf-8"))
-    OUT.write_text(text, encoding="utf-8")
+    check = parser.parse_args().check
+    for path, text in ((DIALECT, render_dialect()), (ENUMS_FILE, render_enums())):
+        if check and text != path.read_text(encoding="utf-8"):
+            return 1
+        if not check:
+            path.write_text(text, encoding="utf-8")
     return 0
 
 

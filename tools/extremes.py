@@ -29,7 +29,7 @@ from magbridge.config import load
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write as write_grid
 from magbridge.mavlink import Codec, spec
-from magbridge.mavlink.dialect import MESSAGES
+from magbridge.mavlink.messages import MESSAGES
 from magbridge.parts import OptionalParts
 from magbridge.records import Channel
 

@@ -14,11 +14,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIMITS = ROOT / "tools" / "limits.toml"
+GENERATED = "mavlink/dialect.py", "mavlink/enums.py"
+"""Modules that tools/dialect.py writes; the budget is for code that people maintain."""
 
 
 def count(folder: Path) -> tuple[int, int]:
     """Return lines and modules of the Python files of a folder."""
-    paths = list(folder.rglob("*.py"))
+    paths = [path for path in folder.rglob("*.py") if not path.as_posix().endswith(GENERATED)]
     return sum(len(path.read_bytes().splitlines()) for path in paths), len(paths)
 
 

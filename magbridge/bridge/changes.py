@@ -6,7 +6,7 @@ from magbridge.bridge.position import CLOCK_SET_US
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.link.announcer import Announcer
 from magbridge.mavlink import Codec, spec
-from magbridge.mavlink.dialect import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 
 __all__ = ["Changes"]
 

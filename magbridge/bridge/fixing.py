@@ -8,7 +8,7 @@ from magbridge.bridge.frame import Frame
 from magbridge.link.component import Component
 from magbridge.link.fixes import Fix, Kind, widened
 from magbridge.mavlink import Message, by_id, spec
-from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 from magbridge.navigate.record import Reckoned
 
 __all__ = ["FIX_3D", "Fixing", "Gps"]

@@ -14,7 +14,7 @@ from magbridge.config import Config
 from magbridge.errors import FormatError
 from magbridge.link import store
 from magbridge.mavlink import readable_by_all
-from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 
 __all__ = ["Keeper"]
 

@@ -16,7 +16,7 @@ from magbridge.learning.start import class_prior
 from magbridge.link.component import Component
 from magbridge.link.rates import Rate
 from magbridge.mavlink import spec
-from magbridge.mavlink.dialect import MAG_LEARNING_STATE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_LEARNING_STATE, MAV_SEVERITY
 
 __all__ = ["Learning", "first_calibration", "keep", "kept_path", "open_learner"]
 

@@ -8,7 +8,7 @@ from typing import Any
 from magbridge.bridge.events import Start
 from magbridge.config import Config, Telemetry
 from magbridge.mavlink import Codec
-from magbridge.mavlink.dialect import MAV_PARAM_TYPE
+from magbridge.mavlink.enums import MAV_PARAM_TYPE
 from magbridge.version import __version__
 
 __all__ = ["beginning", "declarations"]

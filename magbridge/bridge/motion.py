@@ -16,7 +16,7 @@ from typing import Any
 from magbridge.bridge.frame import Frame
 from magbridge.link.component import Component
 from magbridge.mavlink import Message, by_id
-from magbridge.mavlink.dialect import MAV_FRAME, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator
 from magbridge.navigate.deadreckoning import GLIDE
 

@@ -20,7 +20,7 @@ from magbridge.link.component import Component
 from magbridge.link.fixes import FIXES, Kind
 from magbridge.link.rates import Rate
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.navigate import Navigator, Options, Record, State
 from magbridge.navigate.depth import at_depth
 from magbridge.navigate.options import informed

@@ -29,7 +29,7 @@ from magbridge.link.reports import Condition
 from magbridge.link.telemetry import TelemetryMap
 from magbridge.link.validity import is_possible
 from magbridge.mavlink import Message, Signing, Spec, spec
-from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Quality, Reading
 from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp

@@ -23,7 +23,7 @@ from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.serial_port import serial_line
 from magbridge.config import Config, load
 from magbridge.logs.tlog import TlogWriter
-from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.records import Channel
 
 __all__ = ["run"]

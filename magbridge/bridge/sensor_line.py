@@ -8,7 +8,7 @@ from typing import Final
 
 from magbridge.link.announcer import Announcer
 from magbridge.link.timers import Timers
-from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Vector
 
 __all__ = ["SensorLine"]

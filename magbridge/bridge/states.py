@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from magbridge.bridge.port import Port
 from magbridge.mavlink.codec import Codec
-from magbridge.mavlink.dialect import MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel
 
 __all__ = ["clock_step", "interleaved", "log_state", "notice", "opened", "port", "standstill", "too_slow"]

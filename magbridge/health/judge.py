@@ -104,7 +104,7 @@ class Plausibility:
 
     def explain(self, by: float, *, jumps: bool) -> None:
         """Take note that another calibration moves the total field `by` nT, and may explain past jumps."""
-        if by == by:  # noqa: PLR0124 - compiled, quicker than a call
+        if by == by:  # noqa: PLR0124 - NaN
             self._jump.explain(by)
             self._scatter.explain(by)
         if jumps:

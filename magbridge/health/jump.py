@@ -148,7 +148,7 @@ class Jump:
         """Follow the mean square of the rate at which the level changes."""
         seconds = 1e-6 * (time_us - self._mark_us)
         rate = (self._level - self._mark) / seconds
-        if rate == rate and seconds < 10e-6 * SLOPE_US:  # noqa: PLR0124 - compiled, quicker than a call
+        if rate == rate and seconds < 10e-6 * SLOPE_US:  # noqa: PLR0124 - NaN
             self._slope += (min(rate * rate, CLIP * self._slope) - self._slope) / MEMORY
             self._slope = max(self._slope, LEAST_SLOPE * LEAST_SLOPE)
         self._mark, self._mark_us = self._level, time_us

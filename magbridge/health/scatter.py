@@ -120,7 +120,7 @@ class Scatter:
             return
         north, east = separation(self._latitude, self._longitude, latitude, longitude)
         speed = (north * north + east * east) ** 0.5 / (1e-6 * apart_us)
-        if speed == speed:  # noqa: PLR0124 - compiled, quicker than a call
+        if speed == speed:  # noqa: PLR0124 - NaN
             self._longest_us = round(1e6 * min(TRAVEL / max(speed, 1e-3), 1e-6 * LONGEST_US))
         self._latitude, self._longitude, self._place_us = latitude, longitude, time_us
 
@@ -128,7 +128,7 @@ class Scatter:
         """Take a sample."""
         bend = abs(total - 2.0 * self._last + self._last_but_one)
         self._last_but_one, self._last = self._last, total
-        if bend == bend:  # noqa: PLR0124 - compiled, quicker than a call
+        if bend == bend:  # noqa: PLR0124 - NaN
             self._next.take(bend)
             self.variance = max(INNOVATION * self._next.median * self._next.median, self.floor)
         if self._longest_us and not 0 <= time_us - self._times[self._at] < self._longest_us * 3 // 32:
@@ -145,7 +145,7 @@ class Scatter:
             early_us = self._times[middle] - self._times[first]
             if late_us <= self._longest_us and abs(late_us - early_us) * 8 <= late_us:
                 bend = abs(total - 2.0 * self._fields[middle] + self._fields[first])
-                if bend == bend:  # noqa: PLR0124 - compiled, quicker than a call
+                if bend == bend:  # noqa: PLR0124 - NaN
                     bends.take(bend)
             if bends.count >= ENOUGH:
                 median, rock = bends.median / (1.0 + UNSURE / bends.count), ROCK * (lag / LAGS[-1]) ** 2

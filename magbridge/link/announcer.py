@@ -6,7 +6,7 @@ from collections import deque
 
 from magbridge.link.outbox import Outbox
 from magbridge.link.timers import Timers
-from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 
 __all__ = ["Announcer"]
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from magbridge.config import Telemetry
 from magbridge.link.announcer import Announcer
 from magbridge.mavlink import Message, Source
-from magbridge.mavlink.dialect import MAV_SEVERITY, MAV_TYPE
+from magbridge.mavlink.enums import MAV_SEVERITY, MAV_TYPE
 
 __all__ = ["Authority", "Sources"]
 

@@ -9,7 +9,7 @@ from magbridge.link.announcer import Announcer
 from magbridge.link.authority import Authority
 from magbridge.link.outbox import Outbox
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
 __all__ = ["Commands"]
 

@@ -20,13 +20,13 @@ from magbridge.link.reports import Condition, Reports
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
-from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.mavlink.framing import is_signed
 
 __all__ = ["TIMESYNC_US", "Component"]
 
 TIMESYNC = spec("TIMESYNC")
-SETUP_SIGNING = spec("SETUP_SIGNING").number
+SETUP_SIGNING = spec("SETUP_SIGNING").id.to_bytes(3, "little")
 TIMESYNC_US = 1_000_000
 MOST_REQUESTS = 64
 """Requests for files that are kept while nobody takes them."""

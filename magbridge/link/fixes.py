@@ -13,13 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from magbridge.link.outbox import Outbox
-from magbridge.mavlink.dialect import (
-    GLOBAL_POSITION_SRC,
-    MAV_AUTOPILOT,
-    MAV_CMD,
-    MAV_ESTIMATOR_TYPE,
-    MAV_FRAME,
-)
+from magbridge.mavlink.enums import GLOBAL_POSITION_SRC, MAV_AUTOPILOT, MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
 from magbridge.mavlink.messages import east_e7
 
 __all__ = ["FIXES", "SENSOR_ID", "Fix", "Kind", "Pose", "widened"]

@@ -6,7 +6,7 @@ from typing import Final
 
 from magbridge.link.announcer import Announcer
 from magbridge.link.timers import Timers
-from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 
 __all__ = ["Losses", "Numbers"]
 

@@ -8,7 +8,7 @@ from magbridge.link.outbox import Outbox
 from magbridge.link.parameters import Parameters
 from magbridge.link.timers import Timers
 from magbridge.mavlink import Message
-from magbridge.mavlink.dialect import MAV_PARAM_TYPE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_PARAM_TYPE, MAV_SEVERITY
 
 __all__ = ["ParameterService"]
 

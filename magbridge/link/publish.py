@@ -11,7 +11,7 @@ from magbridge.align import Sample, nearest
 from magbridge.link.outbox import Outbox
 from magbridge.link.rates import Rate
 from magbridge.mavlink import spec
-from magbridge.mavlink.dialect import MAG_RAW_FLAGS
+from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.records import Corrected
 
 __all__ = ["PUBLISHED", "Publisher"]

@@ -11,7 +11,7 @@ from magbridge.link.metadata import GENERAL, crc32, uri
 from magbridge.link.outbox import Outbox
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import spec
-from magbridge.mavlink.dialect import (
+from magbridge.mavlink.enums import (
     FIRMWARE_VERSION_TYPE,
     MAV_AUTOPILOT,
     MAV_PROTOCOL_CAPABILITY,

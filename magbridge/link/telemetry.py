@@ -11,7 +11,7 @@ from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
 from magbridge.link.clock import VehicleClock
 from magbridge.mavlink import Message, Spec, spec
-from magbridge.mavlink.messages import Field, split_index
+from magbridge.mavlink.messages import IDS, Field, nearest_name, split_index
 
 __all__ = ["TelemetryMap"]
 
@@ -73,9 +73,9 @@ def find(layout: Spec, name: str, path: Path, key: str) -> Field:
     try:
         return layout.fields[name]
     except KeyError:
-        raise ConfigError(
-            path, key, f"{layout.name} has no field {name!r}; it has {', '.join(layout.fields)}"
-        ) from None
+        near = nearest_name(name, layout.fields)
+        hint = f"; did you mean {near}?" if near else f"; it has {', '.join(layout.fields)}"
+        raise ConfigError(path, key, f"{layout.name} has no field {name!r}{hint}") from None
 
 
 class TelemetryMap:
@@ -106,8 +106,10 @@ class TelemetryMap:
             try:
                 layout = spec(what.message)
             except KeyError:
+                near = nearest_name(what.message, IDS)
+                hint = f"; did you mean {near}?" if near else ""
                 raise ConfigError(
-                    path, f"telemetry.{name}.message", f"{what.message!r} is no message of any dialect"
+                    path, f"telemetry.{name}.message", f"unknown MAVLink message {what.message!r}{hint}"
                 ) from None
             self._by_id.setdefault(layout.id, []).append(Extractor(name, what, layout, path))
             self._times[layout.id] = own_time(layout)

@@ -9,7 +9,8 @@ from magbridge.link.clock import VehicleClock
 from magbridge.link.losses import Losses
 from magbridge.link.timers import Timers
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE, MESSAGES
+from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE
+from magbridge.mavlink.messages import MESSAGES
 
 __all__ = ["Vehicle"]
 
@@ -27,8 +28,8 @@ TWICE, CHANGES_US = 5, 10_000_000
 """This many changes between two boot clocks within this many µs mean that there are two autopilots."""
 BOOT_TIMES: Final = {
     number: spec(number).fields["time_boot_ms"]
-    for number, row in MESSAGES.items()
-    if ":time_boot_ms:ms" in row[2]
+    for number, layout in MESSAGES.items()
+    if layout.fieldunits_by_name.get("time_boot_ms") == "ms"
 }
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CORRECTED
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAG_RAW_FLAGS
+from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import split_index
 
 __all__ = [

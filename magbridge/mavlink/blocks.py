@@ -12,11 +12,10 @@ from collections.abc import Iterator
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
-from fastcrc.crc16 import mcrf4xx
 from numpy.typing import NDArray
 
 from magbridge.arrays import IndexArray
-from magbridge.mavlink.framing import AFTER, EXTRA, LAST, SIGNATURE, V1, V2
+from magbridge.mavlink.framing import EXTRA, LAST, SIGNATURE, SIGNED, V1, V2, checksum, message
 from magbridge.mavlink.messages import Message, spec
 from magbridge.mavlink.tlog import LATEST
 
@@ -26,10 +25,11 @@ SIZE = 1 << 22
 """Bytes read at a time."""
 LONGEST = 8 + 10 + 255 + 2 + SIGNATURE + 9
 """Bytes of the longest record, and of what shows that another follows."""
-CLOSE = np.array(AFTER, dtype=np.int64)
 LAYOUT = np.dtype([("stamp", ">u8"), ("head", "u1", 10)])
 KNOWN = np.full(1 << 16, -1, dtype=np.int64)
-KNOWN[[number for number in EXTRA if number < len(KNOWN)]] = [EXTRA[n] for n in EXTRA if n < len(KNOWN)]
+KNOWN[[number for number in EXTRA if number < len(KNOWN)]] = [
+    EXTRA[number][0] for number in EXTRA if number < len(KNOWN)
+]
 """CRC_EXTRA of each message in the dialect, -1 of the others."""
 
 
@@ -65,9 +65,9 @@ class Block(NamedTuple):
 
     def message(self, k: int) -> Message:
         """Return one record's message."""
-        number, start, end = int(self.number[k]), int(self.payload[k]), int(self.end[k])
-        payload = self.data[start:end].ljust(spec(number).size, b"\0")
-        return Message(number, int(self.system[k]), int(self.component[k]), 0, payload, b"", known=True)
+        start, end = int(self.frame[k]), int(self.end[k]) + 2
+        signed = self.data[start] == V2 and self.data[start + 2] & SIGNED
+        return message(self.data[start : end + (SIGNATURE if signed else 0)])
 
 
 def blocks(file: BinaryIO) -> Iterator[Block]:
@@ -124,18 +124,16 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     system, component = np.where(two, header[:, 5], header[:, 3]), np.where(two, header[:, 6], header[:, 4])
     frame = start + 8
     payload = frame + np.where(two, 10, 6)
-    checksum = payload + header[:, 1]
-    end = checksum + 2 + np.where(flags > 0, SIGNATURE, 0)
+    body_end = payload + header[:, 1]
+    end = body_end + 2 + np.where(flags > 0, SIGNATURE, 0)
     extra = np.where(number < len(KNOWN), KNOWN[np.minimum(number, len(KNOWN) - 1)], -1)
     fits = (flags <= 1) & (end <= len(raw)) & (stamp < LATEST)
     known = np.flatnonzero(fits & (extra >= 0))
-    spans = zip((frame[known] + 1).tolist(), checksum[known].tolist(), strict=True)
-    crc = np.array([mcrf4xx(data[first:after]) for first, after in spans], dtype=np.int64)
-    closed = crc >> 8 ^ CLOSE[(crc ^ extra[known]) & 0xFF]
+    spans = zip((frame[known] + 1).tolist(), body_end[known].tolist(), number[known].tolist(), strict=True)
+    crc = np.array([checksum(data[first:after], EXTRA[n]) for first, after, n in spans], dtype=np.int64)
     good = np.zeros(len(start), dtype=bool)
-    good[known] = closed == (
-        raw[checksum[known]].astype(np.int64) | raw[checksum[known] + 1].astype(np.int64) << 8
-    )
+    at = body_end[known]
+    good[known] = crc == (raw[at].astype(np.int64) | raw[at + 1].astype(np.int64) << 8)
     # outside the dialect: believed where another follows
     unknown = np.flatnonzero(fits & (extra < 0) & two & (header[:, 3] == 0) & (number <= LAST))
     after = end[unknown] + 8
@@ -143,6 +141,6 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     good[unknown] = follows | (after >= len(raw))
     found = {
         "time_us": stamp & ~3, "channel": stamp & 3, "number": number, "system": system,
-        "component": component, "frame": frame, "payload": payload, "end": checksum,
+        "component": component, "frame": frame, "payload": payload, "end": body_end,
     }  # fmt: skip
     return start[good], {name: values[good] for name, values in {**found, "stop": end}.items()}

@@ -1,22 +1,11 @@
-"""Bytes to messages and back, for one link."""
+"""Bytes to messages and back, for one link: pymavlink's codec without port, clock and global state."""
 
 from __future__ import annotations
 
 from typing import Any, Final
 
-from fastcrc.crc16 import mcrf4xx
-
-from magbridge.mavlink.framing import (
-    AFTER,
-    BEFORE_V2,
-    HEADER,
-    MORE,
-    SIGNED,
-    V2,
-    find_magic,
-    frame_end,
-    message,
-)
+from magbridge.mavlink import dialect
+from magbridge.mavlink.framing import MORE, find_magic, frame_end, message
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
 from magbridge.mavlink.secrets import SECRET, without_secret
 from magbridge.mavlink.signing import Signing
@@ -51,10 +40,22 @@ class Codec:
         self.system, self.component = system, component
         self.signing = signing
         self.now_us = self.utc_offset_us = 0
-        self.sequence = 0
+        self._mav = dialect.MAVLink(None, system, component)
+        if signing is not None:
+            self._mav.signing = signing
         self.frames = self.bytes_skipped = 0
         self._rest = b""
         self._looked = 0
+
+    @property
+    def sequence(self) -> int:
+        """Sequence number of the next frame."""
+        number: int = self._mav.seq
+        return number
+
+    @sequence.setter
+    def sequence(self, number: int) -> None:
+        self._mav.seq = number
 
     @property
     def utc_us(self) -> int:
@@ -112,17 +113,12 @@ class Codec:
 
     def frame(self, layout: Spec, payload: bytes) -> bytes:
         """Return the frame of a packed payload (``layout.struct.pack(...)``): the cheapest way to send."""
-        if not payload[-1]:  # a call that most payloads need not
-            payload = payload.rstrip(b"\0") or b"\0"
-        signing, number = self.signing, self.sequence
-        self.sequence = number + 1 & 0xFF
-        flags = 0 if signing is None else SIGNED
-        body = HEADER.pack(V2, len(payload), flags, 0, number, self.system, self.component, layout.number)
-        body += payload
-        checksum = mcrf4xx(body, BEFORE_V2)
-        checksum = checksum >> 8 ^ AFTER[(checksum ^ layout.extra) & 0xFF]  # as framing.closed: no call here
-        frame = body + checksum.to_bytes(2, "little")
-        return frame if signing is None else signing.sign(frame, self.utc_us)
+        if self.signing is not None:
+            self.signing.set_clock(self.utc_us)
+        packed = dialect.MAVLink_message(layout.id, layout.name)
+        frame: bytes = packed._pack(self._mav, layout.extra, payload)  # noqa: SLF001 - pymavlink's own packer
+        self._mav.seq = self._mav.seq + 1 & 0xFF
+        return frame
 
     def _skip(self, data: bytes) -> Message:
         self.bytes_skipped += len(data)
@@ -130,7 +126,7 @@ class Codec:
 
     def skip(self, count: int) -> None:
         """Go on as if `count` frames had been sent: a replay does not have these frames."""
-        self.sequence = self.sequence + count & 0xFF
+        self._mav.seq = self._mav.seq + count & 0xFF
         if self.signing:
             self.signing.skip(count, self.utc_us)
 

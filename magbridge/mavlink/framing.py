@@ -1,41 +1,45 @@
-"""Where a MAVLink frame ends, and whether it is one; versions 1 and 2.
+"""Find frames in bytes of a link or of a log; pymavlink computes their checksums and decodes them.
 
-A frame is: a magic byte, a header with length and message id, the payload, a checksum (CRC-16/MCRF4XX) over
-all but the magic byte, closed with a byte that depends on the message's layout, and perhaps a signature.
+This replaces pymavlink's ``parse_char``. After a wrong checksum, that method skips as many bytes as the
+header claimed, so that garbage that looks like a header swallows valid frames (ArduPilot/pymavlink#387).
 """
 
 from __future__ import annotations
 
-from struct import Struct
 from typing import Final
 
-from fastcrc.crc16 import mcrf4xx
-
-from magbridge.mavlink.dialect import MESSAGES
-from magbridge.mavlink.messages import Message, spec
+from magbridge.mavlink.dialect import (
+    MAVLINK_IFLAG_SIGNED,
+    MAVLINK_SIGNATURE_BLOCK_LEN,
+    PROTOCOL_MARKER_V1,
+    PROTOCOL_MARKER_V2,
+    x25crc,
+)
+from magbridge.mavlink.messages import MESSAGES, Message, spec
 
 __all__ = [
-    "AFTER", "BEFORE_V2", "EXTRA", "HEADER", "LAST", "MAGIC", "MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED",
-    "V1", "V2", "find_magic", "frame_end", "is_signed", "message",
+    "EXTRA", "LAST", "MAGIC", "MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED", "V1", "V2", "checksum",
+    "find_magic", "frame_end", "is_signed", "message",
 ]  # fmt: skip
 
-V1: Final = 0xFE
-V2: Final = 0xFD
+V1: Final = PROTOCOL_MARKER_V1
+V2: Final = PROTOCOL_MARKER_V2
 MAGIC = bytes((V1, V2))
-SIGNED: Final = 1
-SIGNATURE: Final = 13
+SIGNED: Final = MAVLINK_IFLAG_SIGNED
+SIGNATURE: Final = MAVLINK_SIGNATURE_BLOCK_LEN
 """bytes: link id, 6 of time stamp, 6 of hash."""
 NOT_A_FRAME: Final = 0
 MORE: Final = -1
 LAST: Final = 0xFFFF
 """The last message id that a message outside the dialect may have."""
-HEADER: Final = Struct("<BBBBBBB3s")
-"""Of version 2: magic byte, length of the payload, flags of two sorts, sequence, sender, message."""
-EXTRA: Final = {number: extra for number, (_, extra, _) in MESSAGES.items()}
-AFTER: Final = [mcrf4xx(bytes((value,)), 0) for value in range(256)]
-"""The checksum of each byte alone, from which that of any bytes follows, one by one."""
-BEFORE_V2: Final = 0x3085
-"""From here, the checksum of a frame with its magic byte is that without it, as it should be."""
+EXTRA: Final = {number: bytes((layout.crc_extra,)) for number, layout in MESSAGES.items()}
+"""CRC_EXTRA of each message, the last byte that its checksum covers."""
+
+
+def checksum(data: bytes, extra: bytes) -> int:
+    """Return the checksum of a frame's bytes after the magic byte, and of its CRC_EXTRA."""
+    crc: int = x25crc(data + extra).crc
+    return crc
 
 
 def find_magic(data: bytes, start: int, stop: int) -> int:
@@ -84,13 +88,13 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     extra = EXTRA.get(number)
     if extra is None and (header == 6 or data[start + 3] or number > LAST):
         return NOT_A_FRAME
-    checksum = start + header + data[start + 1]
-    end = checksum + 2 + (SIGNATURE if flags else 0)
+    body_end = start + header + data[start + 1]
+    end = body_end + 2 + (SIGNATURE if flags else 0)
     if end > stop:
         return MORE
     if extra is not None:
-        right = closed(mcrf4xx(data[start + 1 : checksum]), extra)
-        return end if right == data[checksum] | data[checksum + 1] << 8 else NOT_A_FRAME
+        right = checksum(data[start + 1 : body_end], extra)
+        return end if right == data[body_end] | data[body_end + 1] << 8 else NOT_A_FRAME
     if end + gap >= stop:
         return end if last else MORE
     return end if data[end + gap] in (V1, V2) else NOT_A_FRAME
@@ -110,15 +114,10 @@ def message(frame: bytes) -> Message:
 
 
 def is_signed(frame: bytes) -> bool:
-    """Say whether a frame carries a signature."""
+    """Return True if a frame carries a signature."""
     return frame[0] == V2 and bool(frame[2] & SIGNED)
 
 
 def _number(data: bytes, start: int) -> int:
     """Return the id of the message whose version 2 frame begins at ``data[start]``."""
     return data[start + 7] | data[start + 8] << 8 | data[start + 9] << 16
-
-
-def closed(checksum: int, extra: int) -> int:
-    """Return the checksum of bytes and a last one, `extra`, from that of the bytes."""
-    return checksum >> 8 ^ AFTER[(checksum ^ extra) & 0xFF]

@@ -1,17 +1,23 @@
-"""The layout of messages on the wire, and a received message."""
+"""The messages of pymavlink's dialect ``all`` and of magbridge: their layouts, and a received message."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from difflib import get_close_matches
 from functools import cache
 from struct import Struct
 from typing import Any, Final, TypeVar
 
-import msgspec
+from pymavlink.dialects.v20 import all as upstream
 
-from magbridge.mavlink.dialect import MESSAGES
+from magbridge.mavlink import dialect
+from magbridge.mavlink.enums import INVALID
 
-__all__ = ["BAD_DATA", "REFUSED", "Field", "Message", "Spec", "by_id", "east_e7", "spec", "split_index"]
+__all__ = [
+    "BAD_DATA", "IDS", "MESSAGES", "REFUSED", "Field", "Message", "Spec", "by_id", "east_e7", "nearest_name",
+    "spec", "split_index",
+]  # fmt: skip
 
 BAD_DATA: Final = -1
 """`Message.id` of bytes that belonged to no frame."""
@@ -21,11 +27,18 @@ REFUSED: Final = -2
 T = TypeVar("T")
 TURN_E7 = 3_600_000_000
 """A full circle in 1e-7 deg."""
-IDS = {name: number for number, (name, _, _) in MESSAGES.items()}
+
+MESSAGES: Final[dict[int, Any]] = {**upstream.mavlink_map, **dialect.mavlink_map}
+"""Message id -> pymavlink's class of the message; ours and the few that the wheel lacks take precedence."""
+dialect.mavlink_map.update(MESSAGES)  # the generated parser decodes all of them
+IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
+"""Message name -> id."""
+DECODER: Final = dialect.MAVLink(None)
+"""Decodes frames that were accepted; it holds no key and no buffer."""
 
 
 class Field:
-    """One field of a message: where it lies in the payload, and how it reads.
+    """One field of a message: where it is in the payload, and how it reads.
 
     Attributes
     ----------
@@ -41,13 +54,15 @@ class Field:
 
     __slots__ = ("code", "count", "invalid", "name", "offset", "struct", "unit")
 
-    def __init__(self, text: str, offset: int) -> None:
-        form, self.name, self.unit, invalid = text.split(":")
-        self.invalid = int(invalid) if invalid else None
-        self.count, self.code = int(form[:-1] or 0), form[-1]
+    def __init__(self, layout: Any, index: int, offset: int) -> None:
+        self.name = layout.ordered_fieldnames[index]
+        self.unit = layout.fieldunits_by_name.get(self.name, "")
+        self.invalid = INVALID.get(layout.msgname, {}).get(self.name)
+        self.count = layout.array_lengths[index]
+        self.code = chr(layout.native_format[index + 1]).replace("c", "s")  # after the byte order
         self.offset = offset
-        packed_as_bytes = self.code == "B" and self.count  # 253 integers a message would be slow
-        self.struct = Struct(f"<{self.count}s" if packed_as_bytes else f"<{form}")
+        packed_as_bytes = self.count and self.code in "sB"  # 253 integers a message would be slow
+        self.struct = Struct(f"<{self.count}s" if packed_as_bytes else f"<{self.count or ''}{self.code}")
 
     def get(self, payload: bytes) -> Any:
         """Return the value in a full-length `payload`: int, float, str (text), bytes or a tuple."""
@@ -64,39 +79,38 @@ class Field:
 
 
 class Spec:
-    """The layout of one message.
+    """The layout of one message, as pymavlink's class of it declares it.
 
     Attributes
     ----------
     id : int
     name : str
-    number : bytes
-        The id as it stands on the wire.
     extra : int
         CRC_EXTRA, the last byte that the checksum covers: it differs between different layouts, so that a
         receiver with another layout refuses the frame.
     size : int
         bytes of a full payload.
     struct : Struct
-        Packs the full payload, fields in the order of the wire.
+        Packs the full payload, fields in the order of the wire, arrays of bytes as bytes.
     fields : dict of str to Field
         In the order of the wire.
     """
 
     def __init__(self, number: int) -> None:
+        layout = MESSAGES[number]
         self.id = number
-        self.name, self.extra, text = MESSAGES[number]
-        self.number = number.to_bytes(3, "little")
+        self.name: str = layout.msgname
+        self.extra: int = layout.crc_extra
+        self.size: int = layout.unpacker.size
         self.fields: dict[str, Field] = {}
         offset, form = 0, "<"
-        for part in text.split(","):
-            field = Field(part, offset)
+        for index in range(len(layout.ordered_fieldnames)):
+            field = Field(layout, index, offset)
             self.fields[field.name] = field
             offset += field.struct.size
             form += field.struct.format[1:]
-        self.size = offset
         self.struct = Struct(form)
-        zeros = bytes(offset)
+        zeros = bytes(self.size)
         self._defaults = {name: field.get(zeros) for name, field in self.fields.items()}
         # not one number: texts and arrays
         self._uneven = [field for field in self.fields.values() if field.count or field.code == "s"]
@@ -130,26 +144,50 @@ def spec(message: int | str) -> Spec:
     return Spec(message) if isinstance(message, int) else spec(IDS[message])
 
 
+def nearest_name(name: str, valid: Iterable[str]) -> str:
+    """Return the valid name that is nearest to one that does not exist; empty if none is near."""
+    by_lower = {candidate.lower(): candidate for candidate in valid}
+    found = get_close_matches(name.lower(), by_lower, n=1)
+    return by_lower[found[0]] if found else ""
+
+
 def by_id(**of: T) -> dict[int, T]:
-    """Return what is named after messages, as what handles them, by their ids; KeyError: there is no such."""
-    return {spec(name).id: one for name, one in of.items()}
+    """Return values that are named after messages, by the messages' ids; KeyError: no such message."""
+    return {spec(name).id: value for name, value in of.items()}
 
 
-class Message(msgspec.Struct, frozen=True, gc=False):
-    """A received message. Its fields are read when asked for: ``message["roll"]``."""
+class Message:
+    """A received message. pymavlink decodes it when a field is first read: ``message["roll"]``.
 
-    id: int
-    """Message id; `BAD_DATA` and `REFUSED` for what is not to be read."""
-    system: int
-    component: int
-    sequence: int
-    """`system`, `component`, `sequence`: The sender's."""
-    payload: bytes
-    """Zeros that the sender cut off are put back."""
-    frame: bytes
-    """The whole frame as it came."""
-    known: bool
-    """The message is in the dialect, and its checksum was right."""
+    Attributes
+    ----------
+    id : int
+        Message id; `BAD_DATA` and `REFUSED` for bytes and frames that are not to be read.
+    system, component, sequence : int
+        The sender's.
+    payload : bytes
+        Zeros that the sender cut off are put back.
+    frame : bytes
+        The whole frame as it came.
+    known : bool
+        The message is in the dialect, and its checksum was right.
+    """
+
+    __slots__ = ("_decoded", "component", "frame", "id", "known", "payload", "sequence", "system")
+
+    def __init__(
+        self,
+        number: int,
+        system: int,
+        component: int,
+        sequence: int,
+        payload: bytes,
+        frame: bytes,
+        known: bool,
+    ) -> None:
+        self.id, self.system, self.component, self.sequence = number, system, component, sequence
+        self.payload, self.frame, self.known = payload, frame, known
+        self._decoded: Any = None
 
     @property
     def name(self) -> str:
@@ -161,12 +199,26 @@ class Message(msgspec.Struct, frozen=True, gc=False):
     @property
     def fields(self) -> dict[str, Any]:
         """All fields by name, in the order of the wire; empty where the message is not known."""
-        if not self.known:
-            return {}
-        return {name: field.get(self.payload) for name, field in spec(self.id).fields.items()}
+        return {name: self[name] for name in spec(self.id).fields} if self.known else {}
 
     def __getitem__(self, name: str) -> Any:
-        return spec(self.id).fields[name].get(self.payload)
+        if self._decoded is None:
+            self._decoded = DECODER.decode(bytearray(self.frame))
+        value = getattr(self._decoded, name) if name in MESSAGES[self.id].fieldnames else None
+        if value is None:
+            raise KeyError(f"{spec(self.id).name} has no field {name}")
+        if isinstance(value, list):
+            return bytes(value) if spec(self.id).fields[name].code == "B" else tuple(value)
+        return value
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Message) and (self.id, self.frame) == (other.id, other.frame)
+
+    def __hash__(self) -> int:
+        return hash((self.id, self.frame))
+
+    def __repr__(self) -> str:
+        return f"<Message {self.name} of {self.system}:{self.component}>"
 
 
 def split_index(field: str) -> tuple[str, int | None]:

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import re
 
-from fastcrc.crc16 import mcrf4xx
-
-from magbridge.mavlink.framing import V2
+from magbridge.mavlink.framing import EXTRA, V2, checksum
 from magbridge.mavlink.messages import spec
 
 __all__ = ["SECRET", "without_secret", "without_secrets"]
@@ -29,9 +27,9 @@ def without_secret(frame: bytes) -> bytes:
     header = 10 if frame[0] == V2 else 6
     number = int.from_bytes(frame[7:10], "little") if header == 10 else frame[5]
     body = frame[1:header] + bytes(frame[1])
-    checksum = mcrf4xx(body + bytes((spec(number).extra,)))
     end = header + frame[1]
-    return frame[:1] + body + checksum.to_bytes(2, "little") + frame[end + 2 :]
+    right = checksum(body, EXTRA[number])
+    return frame[:1] + body + right.to_bytes(2, "little") + frame[end + 2 :]
 
 
 def without_secrets(data: bytes) -> bytes:

@@ -23,6 +23,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from magbridge.errors import ConfigError
+from magbridge.mavlink.dialect import MAVLinkSigning
 from magbridge.mavlink.framing import is_signed
 
 __all__ = ["Signing", "Stream", "load_key", "readable_by_all", "timestamp"]
@@ -70,8 +71,11 @@ def readable_by_all(path: str | Path) -> bool:
     return bool(Path(path).stat().st_mode & 0o004)
 
 
-class Signing:
-    """Signs and verifies, in event time.
+class Signing(MAVLinkSigning):
+    """State of signing: pymavlink signs with it; it verifies, in event time.
+
+    The verification replaces pymavlink's ``check_signature``, which stores a stamp before it has verified the
+    hash (ArduPilot/pymavlink#961).
 
     Parameters
     ----------
@@ -98,7 +102,8 @@ class Signing:
     def __init__(
         self, key: bytes, last: int = 0, streams: Iterable[Stream] = (), follow: tuple[int, int] | None = None
     ) -> None:
-        self._key, self._follow = key, follow
+        super().__init__()
+        self.secret_key, self.sign_outgoing, self._key, self._follow = key, True, key, follow
         self.last = last
         self.refused = 0
         self.refusals: dict[str, tuple[int, int]] = {}
@@ -109,11 +114,9 @@ class Signing:
         """The floors, to be kept for the next run."""
         return [(*key, stamp) for key, stamp in self._floors.items()]
 
-    def sign(self, frame: bytes, t_us: int) -> bytes:
-        """Return `frame` with its signature."""
-        self.last = min(max(self.last + 1, timestamp(t_us)), LIMIT)
-        signed = frame + b"\0" + self.last.to_bytes(6, "little")
-        return signed + sha256(self._key + signed).digest()[:6]
+    def set_clock(self, t_us: int) -> None:
+        """Choose the stamp of the next frame that pymavlink signs, at the UNIX time `t_us` (µs)."""
+        self.last = self.timestamp = min(max(self.last + 1, timestamp(t_us)), LIMIT)
 
     def skip(self, count: int, t_us: int) -> None:
         """Use up the stamps that signing `count` frames would: a replay does not have these frames."""

@@ -6,7 +6,7 @@ from math import inf
 from typing import Any
 
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
+from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
 from magbridge.monitor.state import State
 from magbridge.monitor.words import conditions
 

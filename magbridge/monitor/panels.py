@@ -10,7 +10,7 @@ from nicegui import ui
 from magbridge.config import Align, Telemetry
 from magbridge.link.message_rates import DEFAULTS, LIMITS
 from magbridge.link.parameters import alignment, file_rate, learning, rates, telemetry_ages
-from magbridge.mavlink.dialect import MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import State
 from magbridge.monitor.widgets import (

@@ -8,7 +8,7 @@ from math import inf, isclose, isfinite, nan
 from typing import Any, NamedTuple
 
 from magbridge.mavlink import Message, by_id
-from magbridge.mavlink.dialect import MAG_NAVIGATION_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
+from magbridge.mavlink.enums import MAG_NAVIGATION_STATE, MAV_PARAM_TYPE, MAV_SEVERITY
 from magbridge.monitor.alarms import Alarms
 from magbridge.monitor.history import Series, TrackPoint, Trail
 from magbridge.records import Quality

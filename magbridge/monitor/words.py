@@ -7,7 +7,7 @@ from enum import IntEnum
 from math import hypot, isfinite, nan, sqrt
 
 from magbridge.field.geodesy import worse_axis
-from magbridge.mavlink.dialect import (
+from magbridge.mavlink.enums import (
     MAG_CAUSE,
     MAG_LEARNING_STATE,
     MAG_LOG_STATE,

@@ -93,7 +93,7 @@ KINDS: dict[str, Callable[[bytes], float]] = {
     "sequence": _count,
     "power_cycle": _count,
 }
-"""Columns beside x, y and z, and how each is read."""
+"""Function that reads each column other than x, y and z."""
 
 
 class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -109,7 +109,7 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     terminator: Literal["\n", "\r"] = "\n"
     """The last byte of a line; a carriage return before it is dropped."""
     unit: Literal["nT", "uT", "mT", "T", "pT", "fT", "G", "mG", "uG", "counts"] = "nT"
-    """Of the channels."""
+    """Unit of the x, y and z columns."""
     scale: float = 1.0
     """Factor on the channels, with its sign; for counts: nT per count."""
     range: Positive | None = None
@@ -117,7 +117,7 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     checksum: Literal["nmea", "xor", "sum", "crc32"] | None = None
     """In hexadecimal after a ``*`` at the end of the line; ``nmea`` leaves out the first byte, the ``$``."""
     time_unit: Literal["s", "ms", "us"] = "s"
-    """Of the column ``time``."""
+    """Unit of the column ``time``."""
     time_modulo: NotNegative = 0.0
     """s, at which the device's time wraps; 0: never."""
     sequence_modulo: Annotated[int, Meta(ge=0)] = 0
@@ -178,7 +178,7 @@ class Ascii:
         return tuple(command.encode(ENCODING) for command in self._options.start)
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Take bytes as they came; return the readings that they complete."""
+        """Parse bytes in any chunks; return the readings that they complete."""
         readings = []
         for line in self._framer.split(data):
             try:

@@ -33,11 +33,11 @@ the instrument was restarted."""
 HALF: Final = 0.6
 """Fraction of a period: a reading later than this shows that one before it is missing."""
 BASELINE: Final = 1 << 16
-"""Readings over which the interval between them is measured anew: for counting those that are missing."""
+"""Readings after which the interval between readings is measured again, to count missing readings."""
 ENOUGH: Final = 16
 """Readings from which on an interval is better than the one before."""
 KEEP_PHASE: Final = 3
-"""If more readings than this are missing at once, the line is begun anew: the instrument may have stopped."""
+"""Missing readings in a row above which the line is restarted: the instrument may have stopped."""
 
 
 class Stamp(msgspec.Struct, frozen=True, gc=False):
@@ -48,7 +48,7 @@ class Stamp(msgspec.Struct, frozen=True, gc=False):
     restarted: bool = False
     """The instrument's own clock restarted: it was powered on again."""
     stepped: bool = False
-    """One of the two clocks was set; the relation between them is learned anew."""
+    """One of the two clocks was set; the relation between them is estimated again."""
     missing: int = 0
     """Readings that are missing before this one."""
 
@@ -185,7 +185,7 @@ class DeviceClock:
         return max(hole, 0)
 
     def _begin(self, device_time: float, arrival_us: int) -> None:
-        """Learn the relation between the clocks anew, from this reading on."""
+        """Restart the estimate of the relation between the clocks from this reading."""
         self._origin_us = arrival_us
         self._zero, self._turned, self._count = device_time, 0.0, 0
         self._floor.restart(0.0, 0.0)

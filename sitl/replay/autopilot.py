@@ -14,7 +14,7 @@ from typing import Any
 from magbridge.config import Config, Telemetry
 from magbridge.errors import DataError
 from magbridge.mavlink.codec import Codec
-from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
+from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_STATE, MAV_TYPE
 from magbridge.mavlink.messages import east_e7, spec, split_index
 
 __all__ = ["Autopilot"]

@@ -16,7 +16,7 @@ import xarray as xr
 from magbridge.bridge import states
 from magbridge.bridge.events import Event
 from magbridge.config import Config
-from magbridge.mavlink.dialect import MAG_PORT_NAME
+from magbridge.mavlink.enums import MAG_PORT_NAME
 from magbridge.records import Channel, Reading
 from magbridge.sensors import open_driver
 from sitl.fluxgate import Encoder, open_encoder

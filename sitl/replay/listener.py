@@ -9,7 +9,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.mavlink import Codec, spec
-from magbridge.mavlink.dialect import MAG_NAVIGATION_STATE
+from magbridge.mavlink.enums import MAG_NAVIGATION_STATE
 from magbridge.records import Quality
 
 __all__ = ["Listener"]

@@ -19,7 +19,7 @@ from magbridge.columns import CORRECTED
 from magbridge.correction import Correction
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec
-from magbridge.mavlink.dialect import MAV_PARAM_TYPE
+from magbridge.mavlink.enums import MAV_PARAM_TYPE
 from magbridge.records import Channel, Quality
 from magbridge.rows import correct_rows
 

@@ -23,7 +23,7 @@ from magbridge.errors import ConfigError
 from magbridge.learning.causes import CAUSES
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
-from magbridge.mavlink.dialect import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
+from magbridge.mavlink.enums import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
 from magbridge.records import Channel, Quality
 
 

@@ -16,7 +16,7 @@ from magbridge.link.announcer import Announcer
 from magbridge.link.outbox import Outbox
 from magbridge.link.timers import Timers
 from magbridge.mavlink import Codec
-from magbridge.mavlink.dialect import MAG_PORT_NAME
+from magbridge.mavlink.enums import MAG_PORT_NAME
 from magbridge.records import Channel
 
 LINE = b"12340.5 43210.9 -234.5 4.0 %.1f 7\r\n"

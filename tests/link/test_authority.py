@@ -17,7 +17,7 @@ from magbridge.link.authority import Sources
 from magbridge.link.outbox import Outbox
 from magbridge.link.timers import Timers
 from magbridge.mavlink import Codec
-from magbridge.mavlink.dialect import MAV_CMD, MAV_RESULT
+from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT
 from magbridge.records import Channel
 
 GCS, QUADROTOR, ONBOARD = 6, 2, 18

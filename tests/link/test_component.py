@@ -17,7 +17,7 @@ from magbridge.errors import ConfigError
 from magbridge.link import Component, alignment, check_publish
 from magbridge.link.reports import Condition
 from magbridge.mavlink import Codec, FrameLogReader, Signing, spec
-from magbridge.mavlink.dialect import MAG_PORT_STATE
+from magbridge.mavlink.enums import MAG_PORT_STATE
 
 START = 1_700_000_000_000_000
 NOW = START + 100_000

@@ -19,7 +19,7 @@ from magbridge.link.log_transfer import LogTransfer
 from magbridge.link.metadata import crc32
 from magbridge.link.tree import Tree
 from magbridge.mavlink import Codec
-from magbridge.mavlink.dialect import MAV_CMD
+from magbridge.mavlink.enums import MAV_CMD
 
 ME, OTHER = (255, 190), (254, 190)
 TEXTS = {"/general.json": b"{}", "/parameter.json": b"[]"}

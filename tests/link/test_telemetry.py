@@ -14,8 +14,7 @@ from magbridge.errors import ConfigError
 from magbridge.link import TelemetryMap
 from magbridge.link.clock import VehicleClock
 from magbridge.mavlink import SECRET, Codec, LogReader
-from magbridge.mavlink.dialect import MESSAGES
-from magbridge.mavlink.messages import spec
+from magbridge.mavlink.messages import MESSAGES, spec
 
 NOW = 1_700_000_000_000_000
 
@@ -109,10 +108,10 @@ def test_the_first_of_an_array_is_number_zero() -> None:
 @pytest.mark.parametrize(
     ("what", "complaint"),
     [
-        (Telemetry("NO_SUCH", "x"), r"b.toml: telemetry.p.message: 'NO_SUCH' is no message"),
+        (Telemetry("NO_SUCH", "x"), r"b.toml: telemetry.p.message: unknown MAVLink message 'NO_SUCH'"),
         (
             Telemetry("ATTITUDE", "rol"),
-            r"telemetry.p.field: ATTITUDE has no field 'rol'; it has time_boot_ms, roll",
+            r"telemetry.p.field: ATTITUDE has no field 'rol'; did you mean roll?",
         ),
         (Telemetry("ATTITUDE", "roll[0]"), r"telemetry.p.field: roll without an index, not 'roll\[0\]'"),
         (Telemetry("ACTUATOR_OUTPUT_STATUS", "actuator"), r"actuator\[0\] to actuator\[31\], not 'actuator'"),

@@ -17,7 +17,7 @@ import pytest
 from rig import Rig
 from station import get, served
 
-from magbridge.mavlink.dialect import MAV_PARAM_TYPE
+from magbridge.mavlink.enums import MAV_PARAM_TYPE
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator

@@ -10,7 +10,7 @@ import pytest
 
 from magbridge.bridge.links import open_link
 from magbridge.mavlink import Codec
-from magbridge.mavlink.dialect import MAG_PORT_STATE
+from magbridge.mavlink.enums import MAG_PORT_STATE
 from magbridge.monitor.fleet import Fleet
 from magbridge.monitor.track import read_background
 

@@ -13,7 +13,7 @@ import pytest
 
 from magbridge.config import Align, Link
 from magbridge.link import Component, alignment
-from magbridge.mavlink import Codec, Message, spec
+from magbridge.mavlink import Codec, spec
 from magbridge.monitor.bundle import bundle
 from magbridge.monitor.chart import drawn
 from magbridge.monitor.fleet import MOST, Fleet
@@ -239,13 +239,13 @@ def test_nothing_that_is_heard_raises(air: Air) -> None:
         for sigma in (nan, inf, 3e38, -1.0):
             for us in (0, 10**15, 2**64 - 1):
                 air.field(moment, total, 65535, total_field_sigma=sigma, time_usec=us, x=sigma)
-    random = Random(1)
+    random, ear = Random(1), Codec(0, 0)
     for name in [*names, "PARAM_VALUE", "NAMED_VALUE_FLOAT", "GLOBAL_POSITION_INT", "GPS_RAW_INT"]:
         size = spec(name).struct.size
         for payload in [b"\xff" * size, b"\x7f" * size, *(random.randbytes(size) for _ in range(200))]:
             moment += 0.01
             component = 1 if name in ("NAMED_VALUE_FLOAT", "GLOBAL_POSITION_INT", "GPS_RAW_INT") else 191
-            message = Message(spec(name).id, 1, component, 0, payload, b"", known=True)
+            (message,) = ear.parse(Codec(1, component).frame(spec(name), payload))
             air.fleet.receive(message, moment)
             air.fleet.due(moment)
     state = air.state

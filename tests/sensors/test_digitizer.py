@@ -29,7 +29,6 @@ def read(*frames: bytes, **options: float) -> list[Reading]:
 
 def test_the_worked_example() -> None:
     assert framed(MESSAGE) == EXAMPLE
-    # a compiled module has no docstring, so what its source says
     description = ast.get_docstring(ast.parse(SOURCE.read_text(encoding="utf-8")))
     assert MESSAGE.hex(" ").upper() in " ".join(description.split())
     (reading,) = read(EXAMPLE)

@@ -14,7 +14,7 @@ from benchmarks.workload import Feed
 
 from magbridge.link.ftp import DATA, HEADER, Opcode
 from magbridge.mavlink import Codec, spec
-from magbridge.mavlink.dialect import MAV_PARAM_TYPE
+from magbridge.mavlink.enums import MAV_PARAM_TYPE
 
 __all__ = ["files"]
 
@@ -51,7 +51,7 @@ class Download:
 
     def receive(self, data: bytes) -> bytes:
         """Take a datagram; return the next request at the end of a burst."""
-        if data[7:10] != FTP.number:
+        if data[7:10] != FTP.id.to_bytes(3, "little"):
             return b""
         complete = False
         for message in self._ear.parse(data):

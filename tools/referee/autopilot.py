@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from magbridge.field.geodesy import offset, separation
 from magbridge.mavlink import Codec, Message, spec
-from magbridge.mavlink.dialect import MAV_CMD, MAV_FRAME, MAV_RESULT, MAV_TYPE
+from magbridge.mavlink.enums import MAV_CMD, MAV_FRAME, MAV_RESULT, MAV_TYPE
 from magbridge.mavlink.messages import east_e7
 from referee.filter import PositionFilter
 

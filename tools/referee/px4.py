@@ -6,7 +6,7 @@ from math import isnan
 from typing import Any
 
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.dialect import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
+from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
 from referee.autopilot import Autopilot, finite
 
 __all__ = ["Px4"]
