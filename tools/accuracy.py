@@ -1,21 +1,18 @@
-"""How well each calibration does out of sample, over random simulated gliders, beside what is possible.
+"""Measure each calibration out of sample, over random simulated gliders, and compare it with its bound.
 
 Each glider has dipoles of its own, flies the paper's Table 1, is calibrated, and flies a survey on another
 day with other roll and pitch. Printed for each method: the survey's RMS error over its noise floor (the
-error of a calibration that knows the vehicle), as median, 95th percentile and worst of the gliders, the RMS
-in nT on calibration and survey, and whether the predicted sigma is right. The oracle knows that masses are
-dipoles, along which lines they travel, and the distribution of moments, volumes and iron on such gliders:
-its bound is the average error of its fits (Cramér-Rao, with that prior); their error on these very data is
-listed below it. Samples taken while a mass was moving are left out.
+error of a calibration that knows the vehicle), as median, 95th percentile and maximum of the gliders, and the
+standard deviation of the normalised error. The oracle knows that masses are dipoles, along which lines they
+travel, and the distribution of moments, volumes and iron on such gliders: its bound is the average error of
+its fits (Cramér-Rao, with that prior); "reached" is their error on these very data.
 
-    python tools/accuracy.py --seeds 40 --out accuracy/
+    python tools/accuracy.py --seeds 40 --out accuracy.parquet
     python tools/accuracy.py --peers .venv-peers/bin/python        # see tools/peers.py
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import json
 import os
 import subprocess
@@ -23,113 +20,78 @@ import tempfile
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from bonne_bay_trials import METHODS
-from bound import BestFit, oracle
-from engine import add_engine, in_order
-from rich.console import Console
+from bound import BestFit
 from scipy.optimize import least_squares
-from terminal import command_line, table
+from studies import Column, Row, Study, fraction_within, percentile, study_options
+from study_worlds import METHODS, NOISES, Glider, glider, true_field
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
 from magbridge.field.reference import main_field
-from sitl import Twin, load, segments, simulate
-from sitl.dataset import at_rest, channels, corrected, side_by_side
+from sitl import load
+from sitl.dataset import channels, side_by_side
 from sitl.instrument import rotation
-from sitl.platform import Vehicle
 
-NOISES = {"1 nT white": (1.0, 0.0), "5 nT AR(1)": (5.0, 10.0)}
-"""nT of a channel, and samples over which its correlation falls by e."""
 MASSES = {1: ("battpos",), 2: ("battpos", "ballast"), 3: ("battpos", "ballast", "rollpos")}
-TAPE = 0.05
-"""m, 1-sigma of the masses' positions as measured with a tape."""
+TAPE_SIGMA_M = 0.05
+"""Standard deviation of the masses' positions as measured with a tape."""
+TAPE = "auto, positions to 5 cm"
+COLUMNS = {
+    "error / noise: median": Column("ratio", np.median, ".3f"),
+    "95 %": Column("ratio", percentile(95), ".3f"),
+    "maximum": Column("ratio", np.max, ".3f"),
+    "normalised error: median": Column("sigma"),
+    "0.8 to 1.25": Column("sigma", fraction_within(0.8, 1.25), ".0%"),
+}
 
 
-class Case(NamedTuple):
-    """One glider under one noise."""
-
-    seed: int
-    noise: str
-    masses: int
-    methods: tuple[str, ...]
-    peers: str
-
-
-class Row(NamedTuple):
-    """What one method did on one glider; RMS in nT, `sigma` the standardised survey error's deviation."""
-
-    noise: str
-    masses: int
-    method: str
-    seed: int
-    calibration: float
-    survey: float
-    floor: float
-    sigma: float
-    failed: str = ""
+def run(
+    seed: int, noise: str, count: int, methods: tuple[str, ...], peers: str = "", *, oracles: bool = True
+) -> list[Row]:
+    """Simulate a glider with `count` moving masses, calibrate by every method, and score on the survey."""
+    sigma, memory = NOISES[noise]
+    names = MASSES[count]
+    instrument = {"noise_sigma": sigma, "noise_memory": memory}
+    flown = glider(load("random_glider").replace(masses=names, instrument=instrument), seed, names)
+    scores: dict[str, dict[str, Any]] = {method: calibrate(method, flown, names, seed) for method in methods}
+    for at_sigma, name in ((0.5, "oracle"), (TAPE_SIGMA_M, "oracle, positions to 5 cm")) if oracles else ():
+        best = BestFit(flown.vehicle, flown.runs, flown.survey, sigma, memory, at_sigma)
+        scores[f"{name}: bound"] = {"ratio": rms(best.bound) / rms(best.floor)}
+        error = best.error(np.random.default_rng([seed, 98]))
+        scores[f"{name}: reached"] = {"ratio": rms(error) / flown.floor}
+    for name, (A, T, failed) in other_methods(flown.runs, peers) if oracles else ():
+        scores[name] = {"ratio": rms(remainder(A, T, flown.survey)) / flown.floor, "failed": failed}
+    known = {"noise": noise, "masses": count, "seed": seed, "failed": ""}
+    return [known | {"method": method} | score for method, score in scores.items()]
 
 
-def run(case: Case) -> list[Row]:
-    """Simulate, calibrate by every method, and score on the survey."""
-    noise, memory = NOISES[case.noise]
-    names = MASSES[case.masses]
-    instrument = {"noise_sigma": noise, "noise_memory": memory}
-    scenario = load("random_glider").replace(masses=names, instrument=instrument)
-    vehicle = Twin.draw(scenario, case.seed).vehicle
-    assert isinstance(vehicle, Vehicle)
-    parts = {name: at_rest(part, names) for name, part in segments(simulate(scenario, case.seed)).items()}
-    runs, survey = parts["calibration"], parts["survey"]
-    floor = rms(oracle(vehicle, survey) - total(survey))
-    rows = []
-
-    def add(method: str, before: float, after: float, sigma: float = np.nan, failed: str = "") -> None:
-        rows.append(Row(case.noise, case.masses, method, case.seed, before, after, floor, sigma, failed))
-
-    for method in case.methods:
-        try:
-            error, sigma, residual = calibrate(method, vehicle, runs, survey, names, case.seed)
-        except CalibrationError as refused:
-            add(method, np.nan, np.nan, failed=str(refused))
-            continue
-        add(method, residual, rms(error), float(np.std(error / sigma)))
-    for at_sigma, name in ((0.5, "oracle"), (TAPE, "oracle, positions to 5 cm")):
-        best = BestFit(vehicle, runs, survey, noise, memory, at_sigma)
-        add(f"{name}: bound", rms(best.floor), rms(best.bound) / rms(best.floor) * floor)
-        add(f"{name}: reached", np.nan, rms(best.error(np.random.default_rng([case.seed, 98]))))
-    for name, (A, T, failed) in other_methods(runs, case.peers):
-        add(name, rms(left(A, T, runs)), rms(left(A, T, survey)), failed=failed)
-    return rows
-
-
-def calibrate(
-    method: str, vehicle: Vehicle, runs: xr.Dataset, survey: xr.Dataset, names: tuple[str, ...], seed: int
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the survey's error and predicted sigma (n,), and the RMS on the calibration runs, nT."""
+def calibrate(method: str, flown: Glider, names: tuple[str, ...], seed: int) -> dict[str, Any]:
+    """Return the score of a method on a glider's survey, or why it failed."""
     used = () if method == "nominal" else names
-    options = (
-        {"vehicle": tape(vehicle, seed)} if method == "auto, positions to 5 cm" else METHODS.get(method, {})
-    )
-    fitted = fit(observations(runs, used), method.partition(",")[0], **options).calibration
-    before, after = (corrected(part, fitted) for part in (runs, survey))
-    return after.total - total(survey), after.sigma, rms(before.total - total(runs))
+    options = {"vehicle": tape(flown, seed)} if method == TAPE else METHODS.get(method, {})
+    try:
+        fitted = fit(observations(flown.runs, used), method.partition(",")[0], **options)
+    except CalibrationError as error:
+        return {"failed": str(error)}
+    return flown.score(fitted.calibration)
 
 
-def tape(vehicle: Vehicle, seed: int) -> dict[str, dict[str, object]]:
+def tape(flown: Glider, seed: int) -> dict[str, dict[str, object]]:
     """Return the masses' positions with the errors of a measurement; the tables of a ``vehicle.toml``."""
     rng = np.random.default_rng([seed, 99])
     return {
         name: {
-            "at": (np.array(mass.at) + rng.normal(0, TAPE, 3)).tolist(),
-            "at_sigma": TAPE,
+            "at": (np.array(mass.at) + rng.normal(0, TAPE_SIGMA_M, 3)).tolist(),
+            "at_sigma": TAPE_SIGMA_M,
             "travel": list(mass.travel),
         }
-        for name, mass in vehicle.mass.items()
+        for name, mass in flown.vehicle.mass.items()
     }
 
 
@@ -141,31 +103,37 @@ def other_methods(runs: xr.Dataset, peers: str) -> Iterator[tuple[str, tuple[np.
     attitude = rotation(*(runs[name].to_numpy() for name in ("roll", "pitch", "heading")))
     time = runs["time"].to_numpy()
     turned = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(time)[:, None]
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "runs.npz"
-        np.savez(
-            file,
-            field=channels(runs),
-            reference=total(runs),
-            attitude=side_by_side(runs, ("roll", "pitch", "heading")),
-            rates=np.vstack([turned, turned[-1:]]),
-            reference_ned=main_field(runs)[0],
-            time=time,
-        )
-        command = [peers, str(Path(__file__).with_name("peers.py")), str(file)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"{peers}: {done.stderr.strip().splitlines()[-1]}")
-    for name, answer in json.loads(done.stdout).items():
+    arrays = {
+        "field": channels(runs),
+        "reference": true_field(runs),
+        "attitude": side_by_side(runs, ("roll", "pitch", "heading")),
+        "rates": np.vstack([turned, turned[-1:]]),
+        "reference_ned": main_field(runs)[0],
+        "time": time,
+    }
+    for name, answer in ask_peers(peers, arrays).items():
         failed = answer.get("failed", "")
         nothing = np.full((3, 3), np.nan), np.full(3, np.nan)
         yield name, (*(nothing if failed else (np.array(answer["A"]), np.array(answer["T"]))), failed)
 
 
+def ask_peers(interpreter: str, arrays: dict[str, Any], *arguments: str) -> dict[str, Any]:
+    """Return what tools/peers.py answers in another interpreter, by method."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "runs.npz"
+        np.savez(file, **arrays)
+        command = [interpreter, str(Path(__file__).with_name("peers.py")), str(file), *arguments]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{interpreter}: {done.stderr.strip().splitlines()[-1]}")
+    answers: dict[str, Any] = json.loads(done.stdout)
+    return answers
+
+
 def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
     """Fit a free ellipsoid, nine numbers, by scipy from the identity."""
     upper = np.triu_indices(3)
-    size = float(np.mean(total(runs)))
+    size = float(np.mean(true_field(runs)))
 
     def unpack(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         A = np.zeros((3, 3))
@@ -173,104 +141,34 @@ def ellipsoid(runs: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         return A + np.triu(A, 1).T, size * x[6:]
 
     start = np.concatenate([np.eye(3)[upper], np.zeros(3)])
-    found = least_squares(lambda x: left(*unpack(x), runs) / size, start, method="lm", xtol=1e-12, ftol=1e-12)
+    found = least_squares(
+        lambda x: remainder(*unpack(x), runs) / size, start, method="lm", xtol=1e-12, ftol=1e-12
+    )
     return unpack(found.x)
 
 
-def total(part: xr.Dataset) -> np.ndarray:
-    return part["truth_total_field"].to_numpy()
+def remainder(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
+    """Return the error (n,) of ``A (raw - T)``, nT."""
+    return np.asarray(np.linalg.norm((channels(part) - T) @ A.T, axis=1) - true_field(part))
 
 
-def left(A: np.ndarray, T: np.ndarray, part: xr.Dataset) -> np.ndarray:
-    return np.asarray(np.linalg.norm((channels(part) - T) @ A.T, axis=1) - total(part))
-
-
-def show(rows: list[Row], console: Console) -> None:
-    """Print a table for each noise and number of masses."""
-    for noise, masses in dict.fromkeys((row.noise, row.masses) for row in rows):
-        chosen = [row for row in rows if (row.noise, row.masses) == (noise, masses)]
-        gliders = len({row.seed for row in chosen})
-        shown = table(
-            f"{noise}, {masses} moving mass{'es' * (masses > 1)}, {gliders} gliders",
-            "", "over the floor: median", "95 %", "worst", "runs nT", "survey nT", "sigma: median",
-            "0.8 to 1.25",
-        )  # fmt: skip
-        for method in dict.fromkeys(row.method for row in chosen):
-            mine = [row for row in chosen if row.method == method]
-            good = [row for row in mine if np.isfinite(row.survey)]
-            if not good:
-                shown.add_row(method, f"failed: {mine[0].failed}")
-                continue
-            ratio = np.array([row.survey / row.floor for row in good])
-            sigma = np.array([row.sigma for row in good])
-            known = np.isfinite(sigma).any()
-            shown.add_row(
-                method
-                + (f" ({len(mine) - len(good)} of {len(mine)} failed)" if len(good) < len(mine) else ""),
-                *(
-                    f"{value:.3f}" if value < 10 else f"{value:,.0f}"
-                    for value in (*np.quantile(ratio, [0.5, 0.95]), ratio.max())
-                ),
-                *(
-                    f"{np.median([getattr(row, name) for row in good]):,.2f}".replace("nan", "")
-                    for name in ("calibration", "survey")
-                ),
-                f"{np.median(sigma):.2f}" if known else "",
-                f"{np.mean((sigma > 0.8) & (sigma < 1.25)):.0%}" if known else "",
-            )
-        console.print(shown)
-
-
-def arguments() -> argparse.Namespace:
-    """Return what the command line asks for."""
-    parser = command_line(__doc__)
-    parser.add_argument("--seeds", type=int, default=40, help="gliders")
-    parser.add_argument("--masses", type=int, nargs="+", default=[2, 1, 3], choices=sorted(MASSES))
-    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
-    parser.add_argument(
-        "--methods", nargs="+", default=["nominal", "cubic", "auto", "auto, positions to 5 cm"]
-    )
-    parser.add_argument(
-        "--peers",
-        default=os.environ.get("MAGBRIDGE_PEERS", ""),
-        help="interpreter that has magyc and MAVProxy",
-    )
-    parser.add_argument(
-        "--peer-seeds",
-        type=int,
-        default=40,
-        help="gliders that the peers are given (12 s each): two masses, first noise",
-    )
-    add_engine(parser)
-    parser.add_argument("--out", type=Path, help="folder for accuracy.csv and accuracy.txt")
-    return parser.parse_args()
+STUDY = Study(run, ("noise", "masses", "method"), COLUMNS)
 
 
 def main() -> None:
-    chosen = arguments()
-    console = Console(width=150, record=True)
-    if not chosen.peers:
-        console.print(
-            "magyc and MAVProxy's magfit are left out: no --peers interpreter (tools/peers.py says how)"
-        )
+    parser = study_options(__doc__)
+    parser.add_argument("--seeds", type=int, default=40, help="gliders")
+    parser.add_argument("--masses", type=int, nargs="+", default=[2, 1, 3], choices=sorted(MASSES))
+    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
+    parser.add_argument("--methods", nargs="+", default=["nominal", "cubic", "auto", TAPE])
+    peers = os.environ.get("MAGBRIDGE_PEERS", "")
+    parser.add_argument("--peers", default=peers, help="interpreter that has magyc and MAVProxy")
+    chosen = parser.parse_args()
     cases = [
-        Case(
-            seed,
-            noise,
-            masses,
-            tuple(chosen.methods),
-            chosen.peers * (masses == 2 and noise == chosen.noise[0] and seed < chosen.peer_seeds),
-        )
-        for masses, noise, seed in product(chosen.masses, chosen.noise, range(chosen.seeds))
+        (seed, noise, count, tuple(chosen.methods), chosen.peers * (count == 2 and noise == chosen.noise[0]))
+        for count, noise, seed in product(chosen.masses, chosen.noise, range(chosen.seeds))
     ]
-    rows = [row for some in in_order(run, [(case,) for case in cases], chosen) for row in some]
-    show(rows, console)
-    if chosen.out:
-        chosen.out.mkdir(parents=True, exist_ok=True)
-        (chosen.out / "accuracy.txt").write_text(console.export_text())
-        with (chosen.out / "accuracy.csv").open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerows([Row._fields, *rows])
+    STUDY.main(f"{chosen.seeds} random gliders", cases, chosen)
 
 
 if __name__ == "__main__":

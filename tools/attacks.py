@@ -25,7 +25,7 @@ sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
 
 from rich.console import Console
 from rig import Rig
-from terminal import table
+from studies import table
 
 from magbridge.link.ftp import HEADER, Opcode
 from magbridge.mavlink import Codec, Signing

@@ -51,12 +51,11 @@ def calibration(noise: str, seed: int) -> Figures:
     """Calibrate a random glider by the paper's runs and score it on a survey."""
     import accuracy  # noqa: PLC0415
 
-    rows = {row.method: row for row in accuracy.run(accuracy.Case(seed, noise, 2, ("cubic", "auto"), ""))}
-    auto, cubic = rows["auto"], rows["cubic"]
+    rows = {row["method"]: row for row in accuracy.run(seed, noise, 2, ("cubic", "auto"), oracles=False)}
     return {
-        f"{noise}: error / noise": auto.survey / auto.floor,
-        f"{noise}: normalised error": auto.sigma,
-        f"{noise}: cubic, error / noise": cubic.survey / cubic.floor,
+        f"{noise}: error / noise": rows["auto"]["ratio"],
+        f"{noise}: normalised error": rows["auto"]["sigma"],
+        f"{noise}: cubic, error / noise": rows["cubic"]["ratio"],
     }
 
 
@@ -64,14 +63,14 @@ def survey(seed: int) -> Figures:
     """Calibrate a random glider by its survey alone."""
     import survey as study  # noqa: PLC0415
 
-    row = study.run(6.0, 30.0, 1000.0, "1 nT white", 0.0, seed)
+    row = study.run(6.0, 30.0, 1000.0, "1 nT white", 0.0, seed)[0]
     return {
-        "error / noise": row.ratio,
-        "normalised error without bias": row.apart,
-        "normalised error": row.together,
-        "map error along the track / oracle": row.map_along,
-        "map error between the tracks / oracle": row.map_off,
-        "map, normalised error between the tracks": row.sigma_off,
+        "error / noise": row["ratio"],
+        "normalised error without bias": row["without_bias"],
+        "normalised error": row["with_bias"],
+        "map error along the track / oracle": row["map_along"],
+        "map error between the tracks / oracle": row["map_between"],
+        "map, normalised error between the tracks": row["map_between_sigma"],
     }
 
 
@@ -130,9 +129,9 @@ def navigation(rms: float, length: float, seed: int) -> Figures:
 
 def twin(seed: int) -> Figures:
     """Fly the twin of the paper's trials."""
-    from bonne_bay_trials import METHODS, TRIALS, fly  # noqa: PLC0415
+    from study_worlds import METHODS, TRIALS, fly_trials  # noqa: PLC0415
 
-    trials = fly(seed)
+    trials = fly_trials(seed)
     return {
         f"{trial}, {method}: error on the {place}, nT": trials.rms(part, trial, method)
         for trial in TRIALS
@@ -142,33 +141,27 @@ def twin(seed: int) -> Figures:
 
 
 def seaglider(data: Path) -> Figures:
-    """Leave each dive of a real Seaglider out of its calibration."""
-    from seaglider import leave_runs_out  # noqa: PLC0415
+    """Hold each dive of a real Seaglider out of its calibration."""
+    from measured import hold_runs_out  # noqa: PLC0415
 
     from magbridge.calibration.fitting.observe import observations  # noqa: PLC0415
     from magbridge.logs import read  # noqa: PLC0415
 
     log = read(sorted((data / "seaglider_sg167").glob("p*.nc")))
-    masses = leave_runs_out(observations(log, ("pitchCtl", "vbdCC")), "auto", 3)
-    nominal = leave_runs_out(observations(log, ()), "nominal", 0)
+    masses, normalised = hold_runs_out(observations(log, ("pitchCtl", "vbdCC")), "auto", 3)
+    nominal, _ = hold_runs_out(observations(log, ()), "nominal", 0)
     return {
-        "Seaglider, dives left out: auto, nT": masses.rms,
-        "Seaglider, dives left out: nominal, nT": nominal.rms,
-        "Seaglider, dives left out: normalised error": float(np.nanstd(masses.standardised)),
+        "Seaglider, dives held out: auto, nT": float(np.sqrt(np.nanmean(masses**2))),
+        "Seaglider, dives held out: nominal, nT": float(np.sqrt(np.nanmean(nominal**2))),
+        "Seaglider, dives held out: normalised error": float(np.nanstd(normalised)),
     }
 
 
 def flight(data: Path) -> Figures:
     """Calibrate an aircraft on the first half of its flight and diagnose the second."""
-    import real  # noqa: PLC0415
+    import measured  # noqa: PLC0415
 
-    from magbridge.calibration.fitting.fit import fit  # noqa: PLC0415
-    from magbridge.calibration.fitting.observe import observations  # noqa: PLC0415
-    from magbridge.diagnose.run import diagnose  # noqa: PLC0415
-
-    vehicle = real.flight(data)
-    fitted = fit(observations(real.joined(vehicle.known), vehicle.parameters))
-    found = diagnose([real.joined(vehicle.asked)], fitted.calibration)
+    fitted, found = measured.calibrate_and_diagnose(measured.flight(data))
     return {
         "aircraft: second half, nT": found.total.before,
         "aircraft: second half, extended model, nT": found.total.after,
@@ -177,13 +170,13 @@ def flight(data: Path) -> Figures:
 
 
 def ardusub(data: Path) -> Figures:
-    """Fit an ROV's compasses on the first half of a log and test the second."""
-    from drones import compared  # noqa: PLC0415
+    """Fit an underwater robot's compass on the first half of a log and test the second."""
+    from measured import compare_halves  # noqa: PLC0415
 
     from magbridge.logs import Options, read  # noqa: PLC0415
 
     log = read(data / "ardusub" / "small.tlog", options=Options(compass="0"))
-    return {f"ArduSub, second half: {row.method}, nT": row.rms for row in compared(log, "")[1]}
+    return {f"ArduSub, second half: {row.method}, nT": row.rms for row in compare_halves(log)}
 
 
 def replay() -> Figures:
@@ -294,8 +287,8 @@ def moved(before: np.ndarray, after: np.ndarray) -> bool:
 
 def describe(values: np.ndarray) -> str:
     """Return mean, spread and number of values."""
-    if values.size == 1:
-        return f"{values[0]:.4g}"
+    if values.size < 2:
+        return f"{values[0]:.4g}" if values.size else "no value"
     return f"{values.mean():.4g} (spread {values.std(ddof=1):.2g}, {values.size} cases)"
 
 

@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks.row import Row
 from rich.console import Console
 from rich.table import Table
-from terminal import command_line, table
+from studies import command_line, table
 
 __all__ = ["BENCHMARKS"]
 

@@ -14,11 +14,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from engine import add_engine, as_done
+from studies import add_engine, as_done, command_line
 from study.cases import PARTS, case, plan
 from study.figures import plot_confusion, plot_detection
 from study.table import lines
-from terminal import command_line
 
 Row = dict[str, Any]
 

@@ -1,172 +1,131 @@
-"""The twin of the Bonne Bay trials beside the paper: its Tables 1 and 2, and the like of Figures 2 to 6.
+"""Compare the twin of the Bonne Bay trials with the paper: its Table 2, and what ``diagnose`` finds in it.
 
-The twin's glider flies the paper's runs among rock of its own, from a boat at -10 degC into water at
-2 degC. It is calibrated on each trial's spirals (against the IGRF and the aeromagnetic map, as in the paper),
-and the survey between them is corrected with either calibration. Only the sizes in
-``sitl/scenarios/bonne_bay.toml`` were fitted to the paper; the default seed draws a world that comes near it.
+The twin's glider flies the paper's runs over a crustal field of its own, from a boat at -10 degC into water
+at 2 degC. It is calibrated on each trial's spirals (against the IGRF and the aeromagnetic map, as in the
+paper), and the survey between them is corrected with either calibration. Only the amplitudes in
+``sitl/scenarios/bonne_bay.toml`` were fitted to the paper. With ``--diagnose``, the survey of trial 1 is
+diagnosed against the true field, the map continued down to the glider, and the map as flown.
 
-    python tools/bonne_bay.py --out bonne_bay/
-    python tools/bonne_bay.py --seeds 20           # the same tables as medians over 20 worlds
-    python tools/bonne_bay.py --at-depth           # against the map continued down to the glider
+    python tools/bonne_bay.py --seeds 12
+    python tools/bonne_bay.py --at-depth --seeds 6     # against the map continued down to the glider
+    python tools/bonne_bay.py --diagnose --first 21 --seeds 4
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
-
 import numpy as np
-import xarray as xr
-from bonne_bay_figures import draw
-from bonne_bay_trials import METHODS, PAPER, TRIALS, Trials, fly
 from rich.console import Console
-from rich.progress import track
-from rich.table import Table
-from terminal import command_line, table
+from studies import Column, Row, Study, study_options
+from study.deployment import CHARTS
+from study_worlds import MASSES, METHODS, PAPER, TRIALS, Trials, fly_trials, measure_trials, true_field
 
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.residual import rms
-from sitl.mission import TABLE_1
+from magbridge.diagnose.run import diagnose
+from sitl.dataset import corrected
+from sitl.scenario import load
+from sitl.twin import Twin
 
-SEED = 29
-
-
-def table_1(flight: Trials) -> Table:
-    """Return the paper's calibration runs beside the twin's."""
-    one = table(
-        "Table 1: calibration runs, paper and twin",
-        "run", "", "ballast cm³", "pitch deg: paper", "twin", "battery in: trial 1", "twin", "trial 2",
-        "twin",
-    )  # fmt: skip
-    for number, pitch, *battery in TABLE_1:
-        legs = [_leg(flight.parts[trial], number) for trial in TRIALS]
-        one.add_row(
-            str(number),
-            "dive" if pitch < 0 else "climb",
-            f"{legs[0]['ballast'].mean():.0f}",
-            f"{pitch:.0f}",
-            f"{legs[0]['pitch'].mean():.1f}",
-            *(
-                text
-                for p, leg in zip(battery, legs, strict=True)
-                for text in (f"{p:.3f}", f"{leg['battpos'].mean():.3f}")
-            ),
-        )
-    return one
+FIRST_SEED = 29
+"""A world that comes near the paper's."""
 
 
-def table_2(flights: list[Trials]) -> Table:
-    """Return each method's RMS on runs and survey, in the paper and in the twin."""
-    many = f", median of {len(flights)} worlds" if len(flights) > 1 else ""
-    two = table(
-        f"Table 2: RMS nT against the IGRF and the map{many}",
-        "", "runs: paper", "twin", "survey: paper", "twin", "to the truth", "without its mean", "scales",
-    )  # fmt: skip
+def run(seed: int, at_depth: bool) -> list[Row]:
+    """Fly one world; return a row for each trial and method, and whether it shows the paper's signature."""
+    flight = fly_trials(seed, at_depth=at_depth)
+    survey = flight.parts["survey"]
+    reference_error = rms(survey["reference_field"].to_numpy() - true_field(survey))
+    rows: list[Row] = []
     for trial in TRIALS:
         for method in METHODS:
-            good = [flight for flight in flights if (trial, method) not in flight.failed]
-            name = f"{trial}, {method}" + (
-                f" ({len(good)} of {len(flights)})" if len(good) < len(flights) else ""
-            )
-            if not good:
-                two.add_row(name, flights[0].failed[trial, method])
-                continue
-            runs, survey = (f"{value}" for value in PAPER.get((trial, method), ("", "")))
-            on_runs, on_survey, error, spread, scales = _medians(good, trial, method)
-            two.add_row(name, runs, on_runs, survey, on_survey, error, spread, scales)
-        two.add_section()
-    return two
+            error = flight.error("survey", trial, method, "truth_total_field")
+            low, high = flight.scales.get((trial, method), (np.nan, np.nan))
+            paper_runs, paper_survey = PAPER.get((trial, method), (np.nan, np.nan))
+            rows.append(
+                {
+                    "trial": trial, "method": method, "seed": seed,
+                    "failed": flight.failed.get((trial, method), ""),
+                    "runs": flight.rms(trial, trial, method), "paper_runs": paper_runs,
+                    "survey": flight.rms("survey", trial, method), "paper_survey": paper_survey,
+                    "truth": rms(error), "about_mean": float(np.std(error)),
+                    "low": low, "high": high, "map": reference_error,
+                    "signature": float(has_signature(flight)),
+                }
+            )  # fmt: skip
+    return rows
 
 
-def _medians(good: list[Trials], trial: str, method: str) -> tuple[str, ...]:
-    """Return RMS on runs and survey, the error's RMS and standard deviation, and the range of the scales."""
-    errors = [flight.error("survey", trial, method, "truth_total_field") for flight in good]
-    figures = (
-        [flight.rms(trial, trial, method) for flight in good],
-        [flight.rms("survey", trial, method) for flight in good],
-        [rms(error) for error in errors],
-        [np.std(error) for error in errors],
-    )
-    ends = [np.median([flight.scales[trial, method][end] for flight in good]) for end in (0, 1)]
-    return *(f"{np.median(values):.1f}" for values in figures), " to ".join(f"{end:.2f}" for end in ends)
+def has_signature(flight: Trials) -> bool:
+    """Return True if a world shows the paper's signature, by cubic, or by auto if that failed.
 
-
-def tables(flights: list[Trials], console: Console) -> None:
-    """Print the paper's tables beside the twin's."""
-    console.print(table_1(flights[0]))
-    console.print(table_2(flights))
-    surveys = [flight.parts["survey"] for flight in flights]
-    off = np.median([np.sqrt(np.mean((s["truth_total_field"] - s["reference_field"]) ** 2)) for s in surveys])
-    console.print(
-        f"The reference itself is {off:.0f} nT RMS off on the survey, because the map was made from 90 m "
-        "up. A calibration\n"
-        "takes the map's mean error over the spirals for field. Scales are those of A on the runs: a fit "
-        "that shrinks\n"
-        "the field shrinks its errors, and every anomaly with them."
-    )
-
-
-def by_world(flights: list[Trials], seeds: Iterable[int], console: Console) -> None:
-    """Print every world's RMS on runs and survey, and whether it bears the paper's signature."""
-    columns = (f"{trial[-1]}, {method}" for trial in TRIALS for method in METHODS)
-    shown = table("World by world: RMS nT on the runs / on the survey", "seed", *columns, "signature")
-    borne = 0
-    for seed, flight in zip(seeds, flights, strict=True):
-        lacking = signature(flight)
-        borne += not lacking
-        shown.add_row(
-            str(seed),
-            *(
-                "refused"
-                if (trial, method) in flight.failed
-                else f"{flight.rms(trial, trial, method):.0f} / {flight.rms('survey', trial, method):.0f}"
-                for trial in TRIALS
-                for method in METHODS
-            ),
-            lacking or "yes",
-        )
-    console.print(shown)
-    console.print(
-        "the paper's signature (nominal far off; a parameterised fit at least twice as good on its runs as "
-        f"on the survey; trial 1's survey worse than trial 2's): {borne} of {len(flights)} worlds"
-    )
-
-
-def signature(flight: Trials) -> str:
-    """Return which part of the paper's signature a world lacks, if any; cubic's, or auto's if that failed."""
+    One ellipsoid is far off, a parameterised fit is at least twice as good on its runs as on the survey, and
+    trial 1's survey is worse than trial 2's.
+    """
     method = "auto" if any((trial, "cubic") in flight.failed for trial in TRIALS) else "cubic"
     runs, survey = ([flight.rms(part or trial, trial, method) for trial in TRIALS] for part in ("", "survey"))
-    if min(flight.rms(trial, trial, "nominal") for trial in TRIALS) < 3.0 * max(runs):
-        return "nominal is near"
-    if any(after < 2.0 * before for before, after in zip(runs, survey, strict=True)):
-        return "survey is good"
-    return "" if survey[0] > survey[1] else "trial 2 is worse"
+    nominal = min(flight.rms(trial, trial, "nominal") for trial in TRIALS)
+    is_worse_on_survey = all(after >= 2.0 * before for before, after in zip(runs, survey, strict=True))
+    return nominal >= 3.0 * max(runs) and is_worse_on_survey and survey[0] > survey[1]
 
 
-def _leg(part: xr.Dataset, number: int) -> xr.Dataset:
-    return part.isel(time=part["run"] == part["run"].min() + number - 1)
+def run_diagnosis(seed: int, reference: str) -> list[Row]:
+    """Diagnose the survey by trial 1's calibration, without a hint that the cause is a temperature."""
+    telemetry = {"reference": "map" if reference == "map" else "true"}
+    twin = Twin.draw(load("bonne_bay").replace(telemetry=telemetry), seed)
+    parts = measure_trials(twin, at_depth=reference == "map at its depth")
+    calibration = fit(observations(parts["trial 1"], MASSES), "auto").calibration
+    found = diagnose([parts["survey"]], calibration, training_logs=[parts["trial 1"]])
+    survey = parts["survey"]
+    before, after = (
+        rms(corrected(survey, known).total - true_field(survey)) for known in (calibration, found.calibration)
+    )
+    causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
+    return [{"reference": reference, "seed": seed, "causes": causes, "before": before, "after": after}]
+
+
+STUDY = Study(
+    run,
+    ("trial", "method"),
+    {
+        "runs, nT": Column("runs", np.median, ".1f"),
+        "paper": Column("paper_runs", np.median, ".0f"),
+        "survey, nT": Column("survey", np.median, ".1f"),
+        "paper's survey": Column("paper_survey", np.median, ".0f"),
+        "against the truth": Column("truth", np.median, ".1f"),
+        "about its mean": Column("about_mean", np.median, ".1f"),
+        "smallest scale": Column("low"),
+        "largest": Column("high"),
+        "the map's error": Column("map", np.median, ".0f"),
+        "paper's signature": Column("signature", np.mean, ".0%"),
+    },
+)
+DIAGNOSIS = Study(
+    run_diagnosis,
+    ("reference", "causes"),
+    {
+        "before, nT: least": Column("before", np.min, ".1f"),
+        "most": Column("before", np.max, ".1f"),
+        "after: least": Column("after", np.min, ".1f"),
+        "after: most": Column("after", np.max, ".1f"),
+    },
+)
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument(
-        "--seed", type=int, default=SEED, help="the world that is drawn, and the first of --seeds"
-    )
+    parser = study_options(__doc__)
+    parser.add_argument("--first", type=int, default=FIRST_SEED, help="number of the first world")
     parser.add_argument("--seeds", type=int, default=1, help="worlds")
     parser.add_argument("--at-depth", action="store_true", help="continue the map down to the glider")
-    parser.add_argument("--out", type=Path, help="folder for figures and tables.txt")
+    parser.add_argument("--diagnose", action="store_true", help="diagnose the survey instead")
     chosen = parser.parse_args()
-    console = Console(width=134, record=True)
-    seeds = range(chosen.seed, chosen.seed + chosen.seeds)
-    flights = [
-        fly(seed, at_depth=chosen.at_depth) for seed in track(seeds, "worlds", console=Console(stderr=True))
-    ]
-    tables(flights, console)
-    if chosen.seeds > 1:
-        by_world(flights, seeds, console)
-    if chosen.out:
-        for file in draw(flights[0], chosen.out):
-            console.print(f"wrote {file}")
-        (chosen.out / "tables.txt").write_text(console.export_text())
+    seeds = range(chosen.first, chosen.first + chosen.seeds)
+    if chosen.diagnose:
+        cases = [(seed, reference) for reference in ("true", *CHARTS) for seed in seeds]
+        rows = DIAGNOSIS.rows(cases, chosen)
+        Console(width=150).print(DIAGNOSIS.table(f"{chosen.seeds} worlds, survey at +2 degC", rows))
+        return
+    STUDY.main(f"{chosen.seeds} worlds", [(seed, chosen.at_depth) for seed in seeds], chosen)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from msgspec.structs import replace
 from navigation_studies.simulated import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 from referee import ArduPilot, Autopilot, Px4
 from referee.loop import Passage, Run, sail
-from terminal import command_line
+from studies import command_line
 
 LOST, BACK = 600.0, 300.0
 """s: GPS is lost after the first, and back the second before the end."""

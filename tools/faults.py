@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from rich.console import Console
-from terminal import command_line, table
+from studies import command_line, table
 
 from magbridge.arrays import FloatArray
 from magbridge.bridge import states

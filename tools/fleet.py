@@ -1,11 +1,11 @@
-"""What a fleet's memory is worth: the survey's error after two calibration runs, with it and without.
+"""Measure the survey's error after two calibration runs, with a fleet's prior and without.
 
 Each vehicle of a simulated fleet is drawn at random and flies several deployments: ten runs, then a survey on
 another day. From one refit to the next its fixed iron, its masses' places and moments change (`--refit
 battery`: the battery pack is another one, with a moment of its own), from one power-up to the next the
 sensor's offsets. The fleet learns from all deployments but each vehicle's last. That one is calibrated with
 some of its runs, with the fleet's prior and without, and scored on its survey as tools/accuracy.py does. The
-bound is that of who knew the vehicle exactly as it was before, and the sizes of all changes.
+bound assumes that the vehicle before its last refit and the widths of all changes are known exactly.
 
     python tools/fleet.py --vehicles 12 --deployments 8 --runs 0 2 10
 """
@@ -18,10 +18,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import xarray as xr
-from bound import BestFit, oracle
-from engine import add_engine, in_order
+from bound import BestFit
 from rich.console import Console
-from terminal import command_line, table
+from studies import Column, Row, Study, in_order, percentile, study_options
+from study_worlds import MASSES, Glider
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -35,10 +35,9 @@ from magbridge.errors import CalibrationError
 from magbridge.fleet.learn import Lesson, learn_fleet
 from magbridge.fleet.variances import LEVELS
 from sitl import Twin, load, segments, simulate
-from sitl.dataset import at_rest, corrected
+from sitl.dataset import at_rest
 from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle
 
-MASSES = ("battpos", "ballast")
 REFITTED = {"fixed iron": 50.0, "soft iron": 1e-3, "place": 0.005, "moment": 0.1}
 """1-sigma of what a refit changes: nT an axis, nT a nT, m an axis, A m² an axis."""
 POWERED_UP = 5.0
@@ -100,16 +99,6 @@ class Flight(NamedTuple):
         return np.array(widths)
 
 
-class Row(NamedTuple):
-    """A calibration scored on its survey: error over the floor, deviation of the standardised error."""
-
-    runs: int
-    prior: str
-    ratio: float
-    sigma: float
-    failed: str = ""
-
-
 def lesson(flight: Flight) -> Lesson | str:
     """Calibrate a deployment by its own runs."""
     runs, _, _ = flight.fly()
@@ -127,40 +116,33 @@ def lesson(flight: Flight) -> Lesson | str:
     )  # fmt: skip
 
 
-def score(flight: Flight, counts: list[int], known: Known) -> list[Row]:
+def run(flight: Flight, counts: tuple[int, ...], known: Known) -> list[Row]:
     """Calibrate a vehicle's last deployment with some of its runs, with and without its fleet."""
     runs, survey, vehicle = flight.fly()
-    truth = survey["truth_total_field"].to_numpy()
-    floor = rms(oracle(vehicle, survey) - truth)
+    flown = Glider(vehicle, runs, survey)
     labels = np.unique(runs["run"])
-    rows = []
+    rows: list[Row] = []
     for count, (name, prior) in product(counts, {"none": None, "fleet": known}.items()):
+        if not count and prior is None:
+            continue
+        row: Row = {"runs": count, "prior": name, "vehicle": flight.vehicle, "failed": ""}
         part = runs.isel(time=np.isin(runs["run"], labels[:count]))
         try:
-            if count:
-                calibration = (
-                    fit(observations(part, MASSES), known=prior).calibration
-                    if prior
-                    else fit(observations(part, MASSES)).calibration
-                )
-            elif prior:
-                calibration = unflown(prior)
-            else:
-                continue
+            found = fit(observations(part, MASSES), known=prior).calibration if count else expected(known)
+            rows.append(row | flown.score(found))
         except CalibrationError as error:
-            rows.append(Row(count, name, np.nan, np.nan, str(error)))
-            continue
-        after = corrected(survey, calibration)
-        off = after.total - truth
-        rows.append(Row(count, name, rms(off) / floor, float(np.std(off / after.sigma))))
+            rows.append(row | {"failed": str(error)})
     for count in filter(None, counts):
         part = runs.isel(time=np.isin(runs["run"], labels[:count]))
         best = BestFit(vehicle, part, survey, 1.0, widths=flight.widths())
-        rows.append(Row(count, "bound", rms(best.bound) / rms(best.floor), 1.0))
+        ratio = rms(best.bound) / rms(best.floor)
+        rows.append(
+            {"runs": count, "prior": "bound", "vehicle": flight.vehicle, "failed": "", "ratio": ratio}
+        )
     return rows
 
 
-def unflown(known: Known) -> Calibration:
+def expected(known: Known) -> Calibration:
     """Return what a fleet expects as a calibration, without any run."""
     return Calibration(
         known.parameters, (Polynomial(exponents=known.exponents),), known.mean, known.covariance,
@@ -169,17 +151,16 @@ def unflown(known: Known) -> Calibration:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
+    parser = study_options(__doc__)
     parser.add_argument("--vehicles", type=int, default=12)
     parser.add_argument("--deployments", type=int, default=8, help="of each vehicle; the last is scored")
     parser.add_argument("--every", type=int, default=2, help="deployments of each refit")
     parser.add_argument("--refit", choices=["usual", "battery"], default="usual")
     parser.add_argument("--runs", type=int, nargs="+", default=[0, 2, 10])
     parser.add_argument(
-        "--mounted", action="store_true", help="the fleet knows where masses usually sit (drawn: 6 cm off)"
+        "--mounted", action="store_true", help="the fleet has the masses' usual places (drawn: 6 cm off)"
     )
     parser.add_argument("--seed", type=int, default=0)
-    add_engine(parser)
     options = parser.parse_args()
     flights = [
         Flight(vehicle, number, options.refit, options.every, options.seed)
@@ -191,39 +172,33 @@ def main() -> None:
     where = {name: Mounting(MOUNTINGS[name].at, MOUNTINGS[name].travel) for name in MASSES}
     mounted = {f"vehicle {k}": where for k in range(options.vehicles)} if options.mounted else {}
     fleet = learn_fleet([one for one in reported if isinstance(one, Lesson)], mounted)
-    scored = [one for one in flights if one.number == last]
     refit = f"refit {last // options.every}"
-    priors = [fleet.known(f"vehicle {one.vehicle}", refit) for one in scored]
-    cases = [(one, options.runs, prior) for one, prior in zip(scored, priors, strict=True)]
-    rows = [row for some in in_order(score, cases, options) for row in some]
+    cases = [
+        (one, tuple(options.runs), fleet.known(f"vehicle {one.vehicle}", refit))
+        for one in flights
+        if one.number == last
+    ]
     console = Console(width=110)
     for error in (one for one in reported if isinstance(one, str)):
-        console.print(f"not learnt from: {error}")
+        console.print(f"not learned from: {error}")
     widths = np.sqrt(np.median(fleet.population.variances.own, axis=1))
     console.print(
-        f"learnt in {fleet.population.rounds} rounds; median of the physical widths: "
+        f"learned in {fleet.population.rounds} iterations; median of the physical widths: "
         + ", ".join(f"{name} {width:.2g}" for name, width in zip(LEVELS, widths, strict=True))
     )
-    show(rows, options, console)
+    STUDY.main(f"{options.vehicles} vehicles, {options.deployments} deployments", cases, options)
 
 
-def show(rows: list[Row], options: object, console: Console) -> None:
-    """Print the table."""
-    shown = table(
-        f"{options}", "runs", "prior", "over the floor: median", "95 %", "worst", "sigma: median", "failed"
-    )
-    for count, prior in dict.fromkeys((row.runs, row.prior) for row in rows):
-        mine = [row for row in rows if (row.runs, row.prior) == (count, prior)]
-        ratio: FloatArray = np.array([row.ratio for row in mine if not row.failed])
-        sigma = np.array([row.sigma for row in mine if not row.failed])
-        if not len(ratio):
-            shown.add_row(str(count), prior, *[""] * 4, f"{len(mine)}: {mine[0].failed}")
-            continue
-        shown.add_row(
-            str(count), prior, *(f"{value:.3f}" for value in (*np.quantile(ratio, [0.5, 0.95]), ratio.max())),
-            f"{np.median(sigma):.2f}", str(len(mine) - len(ratio)),
-        )  # fmt: skip
-    console.print(shown)
+STUDY = Study(
+    run,
+    ("runs", "prior"),
+    {
+        "error / noise: median": Column("ratio", np.median, ".3f"),
+        "95 %": Column("ratio", percentile(95), ".3f"),
+        "maximum": Column("ratio", np.max, ".3f"),
+        "normalised error: median": Column("sigma"),
+    },
+)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 from fuzz_seeds import SEEDS
 from rich.console import Console
-from terminal import command_line, table
+from studies import command_line, table
 
 from magbridge.errors import MagbridgeError
 

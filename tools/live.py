@@ -28,12 +28,11 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from engine import add_engine, in_order
 from live_bound import best_delay, best_field
 from live_changes import CHANGES, MASSES, hours
 from magnav_online import online
 from rich.console import Console
-from terminal import command_line, table
+from studies import add_engine, command_line, in_order, table
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit

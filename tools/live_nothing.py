@@ -18,7 +18,7 @@ import numpy as np
 from live_changes import MASSES
 from live_changes import hours as hours_of
 from rich.console import Console
-from terminal import command_line, table
+from studies import command_line, table
 
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.residual import rms

@@ -31,7 +31,7 @@ from types import ModuleType
 from typing import Any
 
 from rich.console import Console
-from terminal import command_line, table
+from studies import command_line, table
 
 ROOT = Path(__file__).resolve().parents[1]
 TESTS = {

@@ -50,7 +50,6 @@ from pickle import dumps, loads
 from typing import Any, NamedTuple
 
 import numpy as np
-from bonne_bay_trials import METHODS
 from msgspec.structs import replace as with_options
 from navigation_studies.calibrated import Flown, flown
 from navigation_studies.dived import dived
@@ -73,7 +72,8 @@ from navigation_studies.smoothed import ROUGH, WAVELENGTHS, on_smoothed
 from navigation_studies.unmapped import AIRCRAFT, Located, located
 from navigation_studies.unmapped import GLIDER as UNMAPPED
 from scipy.stats import chi2
-from terminal import command_line
+from studies import command_line
+from study_worlds import METHODS
 
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.model import Block, prior, transition

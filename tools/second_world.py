@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from studies import command_line
 from study.rates import fraction, one_of
-from terminal import command_line
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit

@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from terminal import command_line
+from studies import command_line
 
 from magbridge.bridge import states
 from magbridge.bridge.drive import set_up

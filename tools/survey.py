@@ -1,39 +1,31 @@
-"""How well a survey calibrates itself, and how good its map is, over random simulated gliders.
+"""Measure how well a survey calibrates itself, and how good its map is, over random simulated gliders.
 
-Each glider has dipoles of its own and flies a criss-cross over rock that is a random Gaussian field of a
-given size and length, the same at every depth; no calibration runs, no map, the reference is the IGRF alone.
-The calibration found is tested on another day's survey of the same kind; the map along the track and between
-tracks, up to one length away. Printed are the corrected field's error about its mean over the noise floor
-(the error of a calibration that knows the vehicle), the standardised error with the level and apart from it,
-and the map's error over that of an oracle's (true calibration and rock's size and length known), beside the
-least that one could reach who knows all that the oracle knows but the vehicle.
+Each glider has dipoles of its own and flies a criss-cross over a crustal field that is a random Gaussian
+field of a given amplitude and length, the same at every depth; no calibration runs, no map, the reference is
+the IGRF alone. The calibration is tested on another day's survey of the same kind; the map along the track
+and between tracks, up to one length away. Printed are the corrected field's error about its mean over the
+noise floor, the normalised error with and without the reference bias, and the map's error over that of an
+oracle (true calibration, the field's amplitude and length known). A bound knows all but the vehicle.
 
-    python tools/survey.py --gliders 10 --hours 6 12
-    python tools/survey.py --real ../shared/data      # rows for real surveys, where there are any
+    python tools/survey.py --gliders 10 --hours 6 12 --out survey.parquet
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
 import time
-from collections.abc import Callable, Iterator
 from itertools import product
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+import harmonica as hm
 import numpy as np
 import xarray as xr
 from bound import SurveyBound, oracle
-from engine import add_engine, as_done
-from rich.console import Console
-from survey_map import score_map
-from survey_real import REAL
-from survey_world import MASSES, NOISES, drifted, fly
-from terminal import command_line, table
+from studies import Column, Row, Study, fraction_within, percentile, study_options
+from study_worlds import MASSES, NOISES, GaussianRock, drifted, fly_survey, true_field
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.field_nodes import nodes_for
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observe import observations
@@ -41,181 +33,166 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
 from magbridge.field.geodesy import separation
+from magbridge.field.place.blocks import Factor
+from magbridge.field.place.matern import Matern
+from magbridge.survey.read import from_vector
+from magbridge.survey.run import Result, survey
+from sitl import Twin
 from sitl.platform import Vehicle
 
-DRIFTS = 100.0
-"""m, by how much a fit is told that positions drift, where they do."""
+POSITION_SIGMA_M = 100.0
+"""Drift of the positions that a fit is given, where positions drift."""
+PLACES = 600
+"""Places of the map along the track, and as many up to one length from it."""
+TRACK_DISTANCE_LENGTHS = 0.4
+"""Standard deviation of the distance from the track, north and east, in lengths of the field."""
+MAX_PEER_SAMPLES, PEER_BLOCK_SAMPLES = 2_500, 50
+"""Samples that equivalent sources are given, and samples of a stretch that is held out to choose them."""
+PEER_DEPTHS, PEER_DAMPINGS = (0.5, 1.0, 2.0), (1e-3, 1e-1, 1.0, 10.0)
+"""Depths of the sources in lengths of the field, and dampings of their fit."""
 
 
-class Row(NamedTuple):
-    """What one glider reached; NaN where it was not asked for."""
-
-    hours: float
-    rock: float
-    length: float
-    noise: str
-    drift: float
-    seed: int
-    ratio: float = np.nan
-    bound: float = np.nan
-    runs: float = np.nan
-    apart: float = np.nan
-    together: float = np.nan
-    level: float = np.nan
-    level_sigma: float = np.nan
-    map_along: float = np.nan
-    map_off: float = np.nan
-    map_along_bound: float = np.nan
-    map_off_bound: float = np.nan
-    sigma_along: float = np.nan
-    sigma_off: float = np.nan
-    peer: float = np.nan
-    seconds: float = np.nan
-    failed: str = ""
-
-
-def run(hours: float, rock: float, length: float, noise: str, drift: float, seed: int) -> Row:
+def run(hours: float, size: float, length: float, noise: str, drift: float, seed: int) -> list[Row]:
     """Fly, calibrate from the survey alone and from ten runs with the true field, and score."""
-    twin, parts = fly(hours, rock, length, noise, seed)
-    row = Row(hours, rock, length, noise, drift, seed)
+    twin, parts = fly_survey(hours, size, length, noise, seed)
+    row: Row = {"hours": hours, "crust nT": size, "m": length, "noise": noise, "drift m": drift, "seed": seed}
+    row["failed"] = ""
     log = drifted(parts["survey"], drift) if drift else parts["survey"]
     began = time.process_time()
     try:
         data = observations(log.drop_vars("reference_field"), MASSES)
-        options: dict[str, Any] = {"position_sigma": DRIFTS} if drift else {}
+        options: dict[str, Any] = {"position_sigma": POSITION_SIGMA_M} if drift else {}
         found = fit(data, **options).calibration
     except CalibrationError as refused:
-        return row._replace(failed=str(refused))
-    seconds = time.process_time() - began
+        return [row | {"failed": str(refused)}]
+    row["seconds"] = time.process_time() - began
     assert isinstance(twin.vehicle, Vehicle)
-    other = parts["another day"]
-    error, sigma, level = errors(found, other)
+    other, seen = parts["another day"], parts["survey"]
+    error, sigma, bias = errors(found, other)
     about = error - error.mean()
-    floor = float(np.std(oracle(twin.vehicle, other) - other["truth_total_field"].to_numpy()))
+    floor = float(np.std(oracle(twin.vehicle, other) - true_field(other)))
     with_runs, _, _ = errors(fit(observations(parts["calibration"], MASSES)).calibration, other)
-    seen = parts["survey"]
     where = seen["latitude"].to_numpy(), seen["longitude"].to_numpy()
     place = np.stack(separation(*twin.world.origin, *where), axis=1)
-    best = SurveyBound(twin.vehicle, seen, place, (rock, length), NOISES[noise])
-    row = row._replace(
-        ratio=rms(about) / floor,
-        bound=best.of_field(other),
-        runs=float(np.std(with_runs)) / floor,
-        apart=rms(about / np.sqrt(np.maximum(sigma**2 - level**2, 1e-6))),
-        together=rms(error / sigma),
-        level=float(error.mean()),
-        level_sigma=float(level.mean()),
-        seconds=seconds,
-    )
-    if drift:  # the map is drawn along the track as it was logged
-        return row
-    mapped = score_map(twin, log, found, (rock, length), best)
-    return row._replace(
-        map_along=mapped.along, map_off=mapped.off, map_along_bound=mapped.bound_along,
-        map_off_bound=mapped.bound_off, sigma_along=mapped.sigma_along, sigma_off=mapped.sigma_off,
-        peer=mapped.peer,
-    )  # fmt: skip
+    best = SurveyBound(twin.vehicle, seen, place, (size, length), NOISES[noise])
+    row |= {
+        "ratio": rms(about) / floor,
+        "bound": best.of_field(other),
+        "runs": float(np.std(with_runs)) / floor,
+        "without_bias": rms(about / np.sqrt(np.maximum(sigma**2 - bias**2, 1e-6))),
+        "with_bias": rms(error / sigma),
+        "bias": float(error.mean()) / float(bias.mean()),
+    }
+    if not drift:  # the map is drawn along the track as it was logged
+        row |= score_map(twin, survey(from_vector(log, found, 0)), size, length, best)
+    return [row]
 
 
 def errors(calibration: Calibration, part: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the corrected field's error, its sigma, and the level's share of that, (n,) nT each."""
+    """Return the corrected field's error, its sigma, and the part of it that is a reference bias, (n,) nT."""
     seen = observations(part, MASSES)
     channels = seen.channels(calibration)
     got = correct(calibration, seen.field, channels, seen.time)
-    level = level_of(calibration, seen.field, channels, seen.time)
-    return got.total - part["truth_total_field"].to_numpy(), got.sigma, level
+    bias = level_of(calibration, seen.field, channels, seen.time)
+    return got.total - true_field(part), got.sigma, bias
 
 
-COLUMNS = {
-    "ratio": "over the floor: median", "bound": "bound", "runs": "ten runs", "apart": "apart: median",
-    "map_along": "map over oracle: along", "map_along_bound": "bound", "map_off": "between",
-    "map_off_bound": "bound", "sigma_along": "over sigma: along",
-    "sigma_off": "between", "peer": "harmonica over ours", "seconds": "s",
-}  # fmt: skip
-"""Of the table: medians over the gliders."""
+def score_map(twin: Twin, done: Result, size: float, length: float, best: SurveyBound) -> Row:
+    """Compare a survey's map with the true field, an oracle's map and harmonica's equivalent sources.
+
+    The reference bias, which no survey determines, is each map's mean error along the track.
+    """
+    crust, shift = twin.world.rock, np.array(separation(*twin.world.origin, *done.samples.origin))
+    assert isinstance(crust, GaussianRock)
+    rng, place = np.random.default_rng(0), done.samples.place
+    along = place[rng.integers(len(place), size=PLACES)]
+    places = np.concatenate([along, along + rng.normal(0, TRACK_DISTANCE_LENGTHS * length, along.shape)])
+    true = crust.anomaly(places + shift)
+    anomaly, sigma = done.gridded.at(places)
+    known = _oracle_map(twin, done, places, size, length, crust.anomaly(place + shift))
+    ours, ideal, peer = (
+        _about_track_mean(one - true) for one in (anomaly, known, _equivalent_sources(done, places, length))
+    )
+    least = best.of_map(places + shift, PLACES, vehicle_known=False)
+    row: Row = {"peer": rms(peer) / rms(ours)}
+    for name, half in (("along", slice(PLACES)), ("between", slice(PLACES, None))):
+        row[f"map_{name}"] = rms(ours[half]) / rms(ideal[half])
+        row[f"map_{name}_bound"] = rms(least[half]) / rms(ideal[half])
+        row[f"map_{name}_sigma"] = rms((ours / sigma)[half])
+    return row
 
 
-def show(rows: list[Row], console: Console) -> None:
-    """Print a line for each kind of survey."""
-    shown = table(
-        f"surveys that calibrate themselves, {len({row.seed for row in rows})} gliders",
-        "h", "rock nT", "m", "noise", "drift m", "gliders", *COLUMNS.values(), "95 %", "0.8 to 1.25",
-        "level, off over sigma: RMS", "refused",
-    )  # fmt: skip
-    for key in dict.fromkeys(row[:5] for row in rows):
-        mine = [row for row in rows if row[:5] == key]
-        good = [row for row in mine if not row.failed]
-
-        def column(name: str, of: list[Row] = good) -> FloatArray:
-            return np.array([getattr(row, name) for row in of] or [np.nan])
-
-        apart = column("apart")
-        shown.add_row(
-            *map(str, key),
-            str(len(mine)),
-            *(f"{np.median(column(name)):.{2 if name != 'seconds' else 1}f}" for name in COLUMNS),
-            f"{np.quantile(column('ratio'), 0.95):.2f}",
-            f"{np.mean((apart > 0.8) & (apart < 1.25)):.0%}",
-            f"{rms(column('level') / column('level_sigma')):.2f}",
-            str(len(mine) - len(good)),
-        )
-    console.print(shown)
+def _about_track_mean(error: FloatArray) -> FloatArray:
+    return np.asarray(error - error[:PLACES].mean())
 
 
-def kept(path: Path | None) -> list[Row]:
-    """Return the gliders that a CSV has."""
-    if path is None or not path.exists():
-        return []
-    with path.open(newline="") as file:
-        of: dict[str, Callable[[str], Any]] = {"seed": int, "noise": str, "failed": str}
-        return [Row(**{k: of.get(k, float)(v) for k, v in one.items()}) for one in csv.DictReader(file)]
+def _oracle_map(
+    twin: Twin, done: Result, places: FloatArray, size: float, length: float, crust: FloatArray
+) -> FloatArray:
+    """Return the map of an oracle that knows the calibration and the field's amplitude and length, nT."""
+    place, noise = done.samples.place, twin.scenario.instrument.noise_sigma
+    field = Matern(nodes_for(place, 1.5 * length, 4), 1.5 * length, 4)
+    B = field.basis(place)
+    read = crust + np.random.default_rng(1).normal(0, noise, len(crust))
+    w = Factor(B.T @ B / noise**2 + field.precision / size**2).solve(B.T @ read / noise**2)
+    return np.asarray(field.basis(places) @ w)
 
 
-def keep(row: Row, path: Path) -> None:
-    """Add a glider to a CSV."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        csv.writer(file).writerows([Row._fields, row] if new else [row])
+def _equivalent_sources(done: Result, places: FloatArray, length: float) -> FloatArray:
+    """Return harmonica's map, nT, with the depth and damping that predict held-out stretches best."""
+    thin = slice(None, None, max(len(done.samples.value) // MAX_PEER_SAMPLES, 1))
+    place, value = done.samples.place[thin], done.samples.value[thin]
+    held = np.arange(len(value)) // PEER_BLOCK_SAMPLES % 5 == 0
+
+    def predict(rows: FloatArray, to: FloatArray, depth: float, damping: float) -> FloatArray:
+        sources = hm.EquivalentSources(damping=damping, depth=depth * length, block_size=length / 4.0)
+        where = place[rows, 1], place[rows, 0], np.zeros(int(rows.sum()))
+        mean = value[rows].mean()
+        found = sources.fit(where, value[rows] - mean)
+        return np.asarray(mean + found.predict((to[:, 1], to[:, 0], np.zeros(len(to)))))
+
+    choices = list(product(PEER_DEPTHS, PEER_DAMPINGS))
+    missed = [rms(predict(~held, place[held], *choice) - value[held]) for choice in choices]
+    return predict(np.ones(len(value), bool), places, *choices[int(np.argmin(missed))])
 
 
-def cases(chosen: argparse.Namespace) -> Iterator[tuple[float, float, float, str, float, int]]:
-    """Yield every kind of survey with every glider, glider by glider."""
-    first = chosen.first
-    for seed in range(first, first + chosen.gliders):
-        for kind in product(chosen.hours, chosen.rock, chosen.length, chosen.noise, chosen.drift):
-            yield (*kind, seed)
-
-
-def arguments() -> argparse.Namespace:
-    """Return what the command line asks for."""
-    parser = command_line(__doc__)
-    parser.add_argument("--gliders", type=int, default=10, help="a row")
-    parser.add_argument("--hours", type=float, nargs="+", default=[6.0, 12.0])
-    parser.add_argument("--rock", type=float, nargs="+", default=[8.0, 30.0, 60.0], help="nT RMS")
-    parser.add_argument("--length", type=float, nargs="+", default=[500.0, 1000.0, 1500.0], help="m")
-    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
-    parser.add_argument("--drift", type=float, nargs="+", default=[0.0], help="m, by which positions are off")
-    parser.add_argument("--first", type=int, default=0, help="number of the first glider")
-    parser.add_argument("--real", type=Path, help="folder of real surveys, instead of gliders")
-    parser.add_argument("--out", type=Path, help="CSV of all gliders; those it has are not flown again")
-    add_engine(parser)
-    return parser.parse_args()
+STUDY = Study(
+    run,
+    ("hours", "crust nT", "m", "noise", "drift m"),
+    {
+        "error / noise: median": Column("ratio"),
+        "95 %": Column("ratio", percentile(95)),
+        "bound": Column("bound"),
+        "ten runs": Column("runs"),
+        "normalised, without bias": Column("without_bias"),
+        "0.8 to 1.25": Column("without_bias", fraction_within(0.8, 1.25), ".0%"),
+        "bias / its sigma": Column("bias", rms),
+        "map / oracle: along": Column("map_along"),
+        "bound along": Column("map_along_bound"),
+        "between": Column("map_between"),
+        "bound between": Column("map_between_bound"),
+        "map / sigma: along": Column("map_along_sigma"),
+        "between tracks": Column("map_between_sigma"),
+        "harmonica / map": Column("peer"),
+        "s": Column("seconds", np.median, ".1f"),
+    },
+)
 
 
 def main() -> None:
-    chosen = arguments()
-    console = Console(width=190)
-    if chosen.real:
-        for name, row in REAL.items():
-            console.print(name, *row(chosen.real))
-        return
-    rows = kept(chosen.out)
-    todo = [case for case in cases(chosen) if case not in {row[:6] for row in rows}]
-    for _, flown in as_done(run, todo, chosen):
-        rows.append(flown.result())
-        if chosen.out:
-            keep(rows[-1], chosen.out)
-    show(sorted(rows), console)
+    parser = study_options(__doc__)
+    parser.add_argument("--gliders", type=int, default=10, help="gliders of each kind of survey")
+    parser.add_argument("--hours", type=float, nargs="+", default=[6.0, 12.0])
+    parser.add_argument("--crust", type=float, nargs="+", default=[8.0, 30.0, 60.0], help="nT RMS")
+    parser.add_argument("--length", type=float, nargs="+", default=[500.0, 1000.0, 1500.0], help="m")
+    parser.add_argument("--noise", nargs="+", default=list(NOISES), choices=list(NOISES))
+    parser.add_argument("--drift", type=float, nargs="+", default=[0.0], help="m, position errors")
+    parser.add_argument("--first", type=int, default=0, help="number of the first glider")
+    chosen = parser.parse_args()
+    seeds = range(chosen.first, chosen.first + chosen.gliders)
+    kinds = product(chosen.hours, chosen.crust, chosen.length, chosen.noise, chosen.drift)
+    cases = [(*kind, seed) for kind in kinds for seed in seeds]
+    STUDY.main("surveys that calibrate themselves", cases, chosen)
 
 
 if __name__ == "__main__":

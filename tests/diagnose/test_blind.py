@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -224,15 +222,3 @@ def test_a_channels_name_does_not_decide(
     assert useful(replace(found, findings=both)).endswith(
         "It leaves diurnal variation in the field, which the RMS above has removed."
     )
-
-
-def test_the_study_says_what_it_lacks() -> None:
-    script = (
-        "import runpy, sys; sys.modules['distributed'] = None; sys.argv = ['blind.py', '--help']; "
-        f"sys.path.insert(0, {str(TOOLS)!r}); "
-        f"runpy.run_path({str(TOOLS / 'blind.py')!r}, run_name='__main__')"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.startswith("distributed is not installed: pip install '.[")
-    assert done.stderr.count("\n") == 1

@@ -1,10 +1,10 @@
-"""The independent check of ``tools/real.py``: it finds the eddy currents that are there."""
+"""The independent check of ``tools/measured.py``: it finds the eddy currents that are there."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from real import left_out, tolles_lawson
+from measured import held_out_error, tolles_lawson
 
 
 @pytest.mark.parametrize("eddy", [0.0, 30.0])
@@ -19,6 +19,6 @@ def test_least_squares_finds_eddy_currents_where_they_are(eddy: float) -> None:
     assert still.shape == turning.shape == (n, 9)
     field = 20.0 * still[:, 0] - 15.0 * still[:, 4]
     field = field + eddy * turning[:, 1] / np.std(turning[:, 1]) + rng.normal(size=n)
-    plain, whole = left_out(still, field), left_out(np.hstack([still, turning]), field)
+    plain, whole = held_out_error(still, field), held_out_error(np.hstack([still, turning]), field)
     assert whole == pytest.approx(1.0, abs=0.1)
     assert plain > 0.5 * eddy

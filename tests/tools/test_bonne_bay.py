@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bonne_bay_trials import TRIALS, Trials, fly
+from study_worlds import TRIALS, Trials, fly_trials
 
 
 @pytest.fixture(scope="module")
 def flight() -> Trials:
-    return fly(29, methods=("nominal", "auto"))
+    return fly_trials(29, methods=("nominal", "auto"))
 
 
 def test_the_papers_signature_appears(flight: Trials) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from accuracy import total
-from bonne_bay_trials import MASSES, METHODS
 from msgspec.structs import replace as with_options
+from study_worlds import MASSES, METHODS, true_field
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
@@ -40,7 +39,7 @@ def flown(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
     for method, options in METHODS.items():
         fitted = fit(observations(runs, () if method == "nominal" else MASSES), method, **options).calibration
         corrected = correct_rows(Correction(fitted), survey)
-        error = corrected["total_field"].to_numpy() - total(survey)
+        error = corrected["total_field"].to_numpy() - true_field(survey)
         sigma = corrected["total_field_sigma"].to_numpy()
         claimed = float(np.median(sigma))
         for k, kind in enumerate(kinds):

@@ -1,0 +1,378 @@
+"""Measure calibration, diagnosis and maps on logs of real vehicles, whose truth is not known.
+
+    python tools/measured.py seaglider --data DIR       each dive corrected by a calibration of the others
+    python tools/measured.py halves --data DIR          the second half by a fit of the first; see --log
+    python tools/measured.py diagnose --data DIR        the second half diagnosed, and Tolles-Lawson's terms
+    python tools/measured.py survey --data DIR          tie lines of an airborne survey from its other lines
+
+``halves`` fits by ``nominal``, ``auto``, ``auto --parameter auto`` and, with ``--peers PYTHON`` (see
+tools/peers.py), MAVProxy's magfit. Tested are the samples whose field comes from a direction within 8 deg of
+one that the first half has. A scale far from 1 is a collapse, whatever the RMS, so it is printed.
+``diagnose`` has an independent check: Tolles & Lawson's terms (1950), fitted by least squares to the
+calibration's residuals, eighths of the log held out in turn.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from accuracy import ask_peers
+from rich.console import Console
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from studies import command_line, table
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.fit import Fit, fit
+from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.fitting.offered import best_parameters
+from magbridge.calibration.fitting.validate import in_sensor_units
+from magbridge.calibration.residual import rms
+from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.run import diagnose
+from magbridge.errors import CalibrationError, MagbridgeError
+from magbridge.logs import Options, read
+from magbridge.logs.compasses import compasses_in
+from magbridge.logs.info import movers
+from magbridge.survey.read import read_table
+from magbridge.survey.run import survey
+
+MIN_RUN_SAMPLES, MIN_HALF_SAMPLES = 30, 60
+"""Samples of a run that is held out, and of each half of a log."""
+MAX_DIRECTION_DEG = 8.0
+"""Greatest angle between a tested direction of the field and one that the fit has."""
+SEAGLIDER_CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
+    ("nominal", (), 0),
+    ("auto", ("pitchCtl", "vbdCC"), 1),
+    ("auto", ("pitchCtl", "vbdCC"), 3),
+    ("auto", ("pitchCtl", "rollCtl", "vbdCC"), 3),
+    ("cubic", ("pitchCtl", "vbdCC"), 3),
+)
+"""Method, masses, order."""
+FLIGHT_MIDNIGHT_S = 1592611200.0
+"""Seconds since 1970 at the start of the flight's day (2020-06-20)."""
+FLIGHT_ROWS = 5
+"""Of the flight's rows (10 Hz), every fifth is used: an aircraft turns no faster."""
+HELD_OUT_PARTS = 8
+MAX_LINE_DISTANCE_M = 60.0
+"""Half a step between a line's samples, about."""
+
+
+class Vehicle(NamedTuple):
+    """Logs to calibrate from, logs to test, and the calibration's parameters."""
+
+    known: list[xr.Dataset]
+    asked: list[xr.Dataset]
+    parameters: tuple[str, ...] = ()
+
+
+def flight(folder: Path) -> Vehicle:
+    """Halve an aircraft's calibration flight: permanent, induced and eddy-current fields."""
+    numbers = np.genfromtxt(folder / "magnav_flt1002" / "Flt1002_1002.02.txt", invalid_raise=False)
+    numbers = numbers[::FLIGHT_ROWS]
+    numbers = numbers[np.isfinite(numbers).all(axis=1)]
+    names = ("mag_x", "mag_y", "mag_z", "pitch", "roll", "heading")
+    columns = {name: ("time", numbers[:, k]) for k, name in enumerate(names, 1)}
+    columns["reference_field"] = ("time", np.linalg.norm(numbers[:, 7:10], axis=1))
+    ds = xr.Dataset(columns, {"time": FLIGHT_MIDNIGHT_S + numbers[:, 0]}, {"source": "flight"})
+    for name, column in ds.data_vars.items():
+        column.attrs["units"] = "deg" if name in ("pitch", "roll", "heading") else "nT"
+    return _halves(ds)
+
+
+def seaglider(folder: Path) -> Vehicle:
+    """Return a Seaglider's first three dives, and its next two."""
+    dives = [read(path) for path in sorted((folder / "seaglider_sg167").glob("p*.nc"))]
+    return Vehicle(dives[:3], dives[3:], ("pitchCtl", "vbdCC"))
+
+
+def ardusub(folder: Path) -> Vehicle:
+    """Halve the log of an underwater robot."""
+    return _halves(read(folder / "ardusub" / "small.tlog"))
+
+
+VEHICLES: dict[str, Callable[[Path], Vehicle]] = {
+    "magnav_flt1002": flight,
+    "seaglider_sg167": seaglider,
+    "ardusub": ardusub,
+}
+
+
+def _halves(log: xr.Dataset) -> Vehicle:
+    half = log.sizes["time"] // 2
+    return Vehicle([log.isel(time=slice(half))], [log.isel(time=slice(half, None))])
+
+
+def joined(logs: list[xr.Dataset]) -> xr.Dataset:
+    """Return logs one after the other, with the columns that all have."""
+    return logs[0] if len(logs) == 1 else xr.concat(logs, "time", join="inner").sortby("time")
+
+
+# ---- a Seaglider's dives, each held out --------------------------------------------------------------------
+
+
+def hold_runs_out(data: Observations, method: str, order: int = 3) -> tuple[FloatArray, FloatArray]:
+    """Fit without each run in turn; return that run's errors (n,), nT in sensor axes, and normalised errors.
+
+    Raises
+    ------
+    CalibrationError
+        There are not two runs, or a fit without one fails.
+    """
+    labels, counts = np.unique(data.runs, return_counts=True)
+    labels = labels[counts >= MIN_RUN_SAMPLES]
+    if len(labels) < 2:
+        raise CalibrationError(f"holding runs out: expected 2 runs of {MIN_RUN_SAMPLES} samples or more")
+    error, normalised = np.full(len(data), np.nan), np.full(len(data), np.nan)
+    for label in labels:
+        out = np.asarray(data.runs == label)
+        calibration = fit(data.part(~out), method, order).calibration
+        error[out], normalised[out] = in_sensor_units(calibration, data.part(out))
+    return error, normalised
+
+
+def show_seaglider(data: Path, console: Console) -> None:
+    """Print the error of each choice of masses, dives held out in turn."""
+    log = read(sorted((data / "seaglider_sg167").glob("p*.nc")))
+    shown = table("Seaglider, each dive held out", "method", "order", "masses", "nT", "normalised error")
+    for method, masses, order in SEAGLIDER_CHOICES:
+        try:
+            error, normalised = hold_runs_out(observations(log, masses), method, order)
+            cells = f"{rms(error[np.isfinite(error)]):.1f}", f"{np.nanstd(normalised):.2f}"
+        except CalibrationError as refusal:
+            cells = "refused", str(refusal).partition(";")[0]
+        shown.add_row(method, str(order), ", ".join(masses), *cells)
+    console.print(shown)
+
+
+# ---- halves of a log ---------------------------------------------------------------------------------------
+
+
+class HalfScore(NamedTuple):
+    """Result of one method on one compass: errors in nT, the claimed sigma over the RMS error."""
+
+    method: str
+    rms: float
+    median: float = np.nan
+    claimed: float = np.nan
+    scales: str = ""
+    note: str = ""
+
+
+def compare_halves(deployment: xr.Dataset, peers: str = "") -> list[HalfScore]:
+    """Fit every method on the first half of a log and test it on the second."""
+    bare = observations(deployment, ())
+    half = float(np.median(bare.time))
+    early, late = bare.part(bare.time <= half), bare.part(bare.time > half)
+    known = has_known_direction(late, early)
+    if min(len(early), int(known.sum())) < MIN_HALF_SAMPLES:
+        raise MagbridgeError(f"{len(early)} samples to fit and {int(known.sum())} to test: too few")
+    tested = late.time[known]
+    choices: tuple[tuple[str, tuple[str, ...] | None], ...] = (("nominal", ()), ("auto", ()), ("auto", None))
+    rows = [_score_half(deployment, half, tested, method, names) for method, names in choices]
+    return [*rows, *_magfits(deployment, early, late.part(known), peers)] if peers else rows
+
+
+def has_known_direction(late: Observations, early: Observations) -> BoolArray:
+    """Return which late samples have the Earth's field from a direction that early samples have."""
+    tree = cKDTree(np.nan_to_num(_directions(early), nan=5.0))
+    distance, _ = tree.query(np.nan_to_num(_directions(late), nan=9.0))
+    return np.asarray(distance < 2 * np.sin(np.radians(MAX_DIRECTION_DEG) / 2))
+
+
+def _directions(data: Observations) -> FloatArray:
+    """Return the directions (n, 3) of the Earth's field in the body, by attitude; NaN where not known."""
+    found = np.full((len(data), 3), np.nan)
+    known, attitude, earth = data.directed()
+    roll, pitch, heading = attitude.T
+    turned = Rotation.from_euler("ZYX", np.column_stack([heading, pitch, roll])).inv().apply(earth)
+    found[known] = turned / np.linalg.norm(turned, axis=1)[:, None]
+    return found
+
+
+def _score_half(
+    deployment: xr.Dataset, half: float, tested: FloatArray, method: str, names: tuple[str, ...] | None
+) -> HalfScore:
+    """Return the score of a fit of the first half; `names` None: its parameters are chosen there."""
+    label = method if names is not None else "auto --parameter auto"
+    first = deployment.sel(time=deployment["time"] <= half)
+    try:
+        if names is None:
+            names, _ = best_parameters(first, movers(first))
+        found = fit(observations(first, names), method)
+    except MagbridgeError as refusal:
+        return HalfScore(label, np.nan, note=str(refusal)[:60])
+    data = observations(deployment, names)
+    data = data.part(np.isin(data.time, tested))
+    corrected = correct(found.calibration, data.field, data.parameters, data.time)
+    error = corrected.total - data.reference
+    claimed = rms(corrected.sigma) / rms(error)
+    low, high = found.scales
+    scales = f"{low:.2f}-{high:.2f}"
+    return HalfScore(label, rms(error), float(np.median(np.abs(error))), claimed, scales, " ".join(names))
+
+
+def _magfits(
+    deployment: xr.Dataset, early: Observations, late: Observations, peers: str
+) -> Iterator[HalfScore]:
+    """Yield the scores of MAVProxy's magfit, fitted and tested on the same samples."""
+    if early.attitude is None or early.reference_ned is None:
+        return
+    time = deployment["time"].to_numpy()
+    current = np.zeros(len(time))
+    if "battery_current" in deployment:
+        current = np.nan_to_num(deployment["battery_current"].to_numpy())
+    known, attitude, earth = early.directed()
+    arrays = {
+        "field": early.field[known], "reference": early.reference[known], "attitude": np.degrees(attitude),
+        "reference_ned": earth.mean(axis=0), "current": np.interp(early.time[known], time, current),
+    }  # fmt: skip
+    for name, answer in ask_peers(peers, arrays, "magfit").items():
+        if "failed" in answer:
+            yield HalfScore(name, np.nan, note=answer["failed"][:60])
+            continue
+        A, T, K = (np.array(answer[key]) for key in "ATK")
+        by_current = np.outer(np.interp(late.time, time, current), K)
+        error = np.linalg.norm((late.field - T) @ A.T + by_current, axis=1) - late.reference
+        scales = np.linalg.svd(A, compute_uv=False)
+        median = float(np.median(np.abs(error)))
+        yield HalfScore(name, rms(error), median, scales=f"{scales[-1]:.2f}-{scales[0]:.2f}")
+
+
+def show_halves(paths: list[Path], peers: str, console: Console) -> None:
+    """Print a table for each compass of each log."""
+    for path in paths:
+        for number in [str(one.number) for one in compasses_in(read(path))] or ["0"]:
+            shown = table(
+                f"{path.name}, compass {number}",
+                "method", "RMS, nT", "median", "claimed / error", "scales", "parameters",
+            )  # fmt: skip
+            try:
+                for row in compare_halves(read(path, options=Options(compass=number)), peers):
+                    numbers = f"{row.rms:.0f}", f"{row.median:.0f}", f"{row.claimed:.2f}"
+                    shown.add_row(row.method, *numbers, row.scales, row.note)
+            except MagbridgeError as error:
+                shown.add_row(str(error))
+            console.print(shown)
+
+
+# ---- diagnosis, with an independent check ------------------------------------------------------------------
+
+
+def tolles_lawson(u: FloatArray, time: FloatArray, field: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return permanent and induced terms (n, 9), and those of eddy currents (n, 9).
+
+    `u` (n, 3) are the direction cosines of the field in the body; `time` in s, `field` in nT, (n,).
+    """
+    upper = np.triu_indices(3)
+    static = np.hstack([u, (u[:, upper[0]] * u[:, upper[1]])])
+    rate = np.gradient(u, time, axis=0)
+    return static, (u[:, :, None] * rate[:, None, :]).reshape(-1, 9) * (field / field.mean())[:, None]
+
+
+def held_out_error(X: FloatArray, y: FloatArray) -> float:
+    """Return the RMS residual of y (n,) after least squares on X (n, k), parts held out in turn."""
+    X = np.hstack([np.ones((len(X), 1)), X])
+    part_of = np.arange(len(y)) * HELD_OUT_PARTS // len(y)
+    missed = np.empty_like(y)
+    for part in range(HELD_OUT_PARTS):
+        out = part_of == part
+        missed[out] = y[out] - X[out] @ np.linalg.lstsq(X[~out], y[~out], rcond=1e-8)[0]
+    return float(np.std(missed))
+
+
+def check_by_tolles_lawson(found: Diagnosis) -> tuple[float, float, float]:
+    """Return the residual about its mean, with permanent and induced terms, and with eddy currents, nT."""
+    log, known = found.problem.survey, found.problem.calibration
+    new = ~log.learned
+    got = correct(known, log.field, log.values(known.channels), log.time)
+    u = (got.vector / np.linalg.norm(got.vector, axis=1)[:, None])[new]
+    error = (got.total - log.reference)[new]
+    static, eddy = tolles_lawson(u, log.time[new], log.reference[new])
+    return (
+        float(np.std(error)), held_out_error(static, error), held_out_error(np.hstack([static, eddy]), error),
+    )  # fmt: skip
+
+
+def calibrate_and_diagnose(vehicle: Vehicle) -> tuple[Fit, Diagnosis]:
+    """Return the fit of a vehicle's first logs, and the diagnosis of its others."""
+    fitted = fit(observations(joined(vehicle.known), vehicle.parameters))
+    return fitted, diagnose([joined(vehicle.asked)], fitted.calibration)
+
+
+def show_diagnoses(data: Path, console: Console) -> None:
+    """Print what is found in each vehicle's log, and the independent check."""
+    shown = table(
+        "Measured logs, nT RMS",
+        "log", "scales", "verdict", "found", "before", "held out", "95 %", "about mean", "+ 9 terms",
+        "+ eddy",
+    )  # fmt: skip
+    for name, vehicle in VEHICLES.items():
+        fitted, found = calibrate_and_diagnose(vehicle(data))
+        causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
+        low, high = found.total.interval
+        shown.add_row(
+            name, "{:.2f}-{:.2f}".format(*fitted.scales), found.verdict, causes,
+            f"{found.total.before:.1f}", f"{found.total.after:.1f}", f"{low:.2f}-{high:.2f}",
+            *(f"{value:.1f}" for value in check_by_tolles_lawson(found)),
+        )  # fmt: skip
+    console.print(shown)
+
+
+# ---- an airborne survey ------------------------------------------------------------------------------------
+
+
+def show_survey(data: Path, console: Console) -> None:
+    """Print how well tie lines are predicted from the other lines, and the mis-ties of all."""
+    samples = read_table(data / "rio_magnetic" / "rio-magnetic.csv.xz")
+    done = survey(samples.part(~samples.tie))
+    ties = samples.part(samples.tie)
+    anomaly, sigma = done.gridded.at(ties.place, ties.depth)
+    error = anomaly - ties.value
+    kriged = done.gridded.kriged
+    z = error / np.hypot(sigma, done.gridded.sigma if kriged is None else kriged.of_a_line(ties.place))
+    near = cKDTree(samples.part(~samples.tie).place).query(ties.place)[0] < MAX_LINE_DISTANCE_M
+    joint = survey(samples)
+    for name, values in {
+        "all ties": error,
+        f"within {MAX_LINE_DISTANCE_M:.0f} m of a line": error[near],
+    }.items():
+        console.print(f"{name}: median error {np.median(np.abs(values)):.1f} nT, RMS {rms(values):.0f}")
+    console.print(f"normalised error: RMS {rms(z):.2f}, median / 0.6745 {1.4826 * np.median(np.abs(z)):.2f}")
+    console.print(
+        f"{len(joint.before)} mis-ties: {rms(joint.before):.1f} nT RMS, {rms(joint.after):.1f} levelled"
+    )
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("part", choices=["seaglider", "halves", "diagnose", "survey"])
+    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the measured logs")
+    parser.add_argument("--log", type=Path, action="append", default=[], help="for halves; may be repeated")
+    parser.add_argument("--peers", default="", help="for halves: interpreter that has MAVProxy")
+    chosen = parser.parse_args()
+    warnings.simplefilter("ignore")
+    console = Console(width=170)
+    if chosen.part == "seaglider":
+        show_seaglider(chosen.data, console)
+    elif chosen.part == "halves":
+        show_halves(chosen.log or [chosen.data / "ardusub" / "small.tlog"], chosen.peers, console)
+    elif chosen.part == "diagnose":
+        show_diagnoses(chosen.data, console)
+    else:
+        show_survey(chosen.data, console)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""What the studies share: running cases in parallel, keeping their rows, and the tables of the results.
+
+A study is a function that runs one case and returns its rows, the columns that tell the lines of its table
+apart, and a summary for each further column. ``--out FILE.parquet`` keeps the rows; cases that the file has
+are not run again.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+__all__ = ["Column", "Study", "add_engine", "as_done", "command_line", "in_order", "table"]
+
+Row = dict[str, Any]
+Statistic = Callable[[np.ndarray], float]
+REPORT_EVERY = 10
+"""Cases between two lines of progress where there is no terminal."""
+
+
+def command_line(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser whose help begins with a tool's docstring, as it stands there."""
+    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+def add_engine(parser: argparse.ArgumentParser) -> None:
+    """Add the option that states how many processes a study uses."""
+    parser.add_argument("--workers", type=int, default=2, help="processes")
+
+
+def table(title: str, *headings: str, left: Collection[str] = ("",)) -> Table:
+    """Return an empty table, its numbers to the right."""
+    made = Table(title=title, title_justify="left")
+    for heading in headings:
+        made.add_column(heading, justify="left" if heading in left else "right")
+    return made
+
+
+def as_done(
+    function: Callable[..., Any], cases: Sequence[Any], options: argparse.Namespace
+) -> Iterator[tuple[Any, Future[Any]]]:
+    """Run a function on cases, each the tuple of its arguments; yield case and future as each finishes."""
+    is_terminal = sys.stderr.isatty()
+    with ProcessPoolExecutor(options.workers) as pool:
+        futures = {pool.submit(function, *case): case for case in cases}
+        for count, future in enumerate(as_completed(futures), 1):
+            yield futures[future], future
+            if is_terminal or count % REPORT_EVERY == 0:
+                print(
+                    f"{count} of {len(futures)}",
+                    end="\r" if is_terminal else "\n",
+                    file=sys.stderr,
+                    flush=True,
+                )
+
+
+def in_order(function: Callable[..., Any], cases: Sequence[Any], options: argparse.Namespace) -> list[Any]:
+    """Run a function on cases, each the tuple of its arguments; return the results in that order."""
+    with ProcessPoolExecutor(options.workers) as pool:
+        futures = [pool.submit(function, *case) for case in cases]
+        return [future.result() for future in futures]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a study's table: a statistic of one column of its rows.
+
+    Attributes
+    ----------
+    of : str
+        Column of the rows.
+    statistic : callable
+        Takes the finite values (n,), and returns a number.
+    form : str
+        Format of the number.
+    """
+
+    of: str
+    statistic: Statistic = np.median
+    form: str = ".2f"
+
+    def cell(self, rows: pd.DataFrame) -> str:
+        """Return the statistic of the rows, as text; empty where no row has a value."""
+        values = rows[self.of].to_numpy(dtype=float) if self.of in rows else np.empty(0)
+        values = values[np.isfinite(values)]
+        return f"{self.statistic(values):{self.form}}" if values.size else ""
+
+
+def percentile(per_cent: float) -> Statistic:
+    """Return the statistic that is a percentile."""
+    return lambda values: float(np.percentile(values, per_cent))
+
+
+def fraction_within(low: float, high: float) -> Statistic:
+    """Return the statistic that is the fraction of the values between two limits."""
+    return lambda values: float(np.mean((values > low) & (values < high)))
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study: how a case is run, and the table of its rows.
+
+    Attributes
+    ----------
+    run : callable
+        Takes the parts of a case and returns its rows, each a dictionary. A row whose ``failed`` is not
+        empty is counted and left out of the statistics.
+    by : tuple of str
+        Columns of the rows that tell the lines of the table apart.
+    columns : mapping of str to Column
+        Further columns of the table by heading.
+    """
+
+    run: Callable[..., list[Row]]
+    by: tuple[str, ...]
+    columns: Mapping[str, Column]
+
+    def rows(self, cases: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> pd.DataFrame:
+        """Return the rows of all cases; those in ``--out`` are taken from there."""
+        path: Path | None = options.out
+        kept = pd.read_parquet(path) if path is not None and path.exists() else pd.DataFrame({"case": []})
+        names = [repr(case) for case in cases]
+        todo = [case for case, name in zip(cases, names, strict=True) if name not in set(kept["case"])]
+        for case, future in as_done(self.run, todo, options):
+            new = pd.DataFrame([{"case": repr(case)} | row for row in future.result()])
+            kept = pd.concat([kept, new], ignore_index=True) if len(kept) else new
+            if path is not None:
+                kept.to_parquet(path)
+        return kept[kept["case"].isin(names)].reset_index(drop=True)
+
+    def table(self, title: str, rows: pd.DataFrame) -> Table:
+        """Return the table of rows."""
+        headings = (*self.by, "rows", *self.columns, "failed")
+        made = table(title, *headings, left=(self.by[0], self.by[-1]))
+        for key, group in rows.groupby(list(self.by), sort=False):
+            good = group[group["failed"] == ""] if "failed" in group else group
+            cells = [column.cell(good) for column in self.columns.values()]
+            failed = len(group) - len(good)
+            made.add_row(*map(str, key), str(len(group)), *cells, str(failed) if failed else "")
+        return made
+
+    def main(self, title: str, cases: Sequence[tuple[Any, ...]], options: argparse.Namespace) -> None:
+        """Run the cases and print the table."""
+        Console(width=170).print(self.table(title, self.rows(cases, options)))
+
+
+def study_options(doc: str | None) -> argparse.ArgumentParser:
+    """Return a command line with the options that every study has."""
+    parser = command_line(doc)
+    parser.add_argument("--out", type=Path, help="Parquet file of the rows; its cases are not run again")
+    add_engine(parser)
+    return parser
