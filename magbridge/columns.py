@@ -5,6 +5,7 @@ These names are public (files, command line, the link). Any other name is teleme
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,8 +15,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "NT_PER_UNIT", "Column", "absent",
-    "counts_from_boot", "factor", "may_be", "require", "require_units", "usual",
+    "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "NT_PER_UNIT", "Column",
+    "absent", "counts_from_boot", "factor", "may_be", "require", "require_units", "usual",
 ]  # fmt: skip
 
 
@@ -30,6 +31,8 @@ CHANNELS = ("mag_x", "mag_y", "mag_z")
 """The raw, uncorrected channels in sensor axes (x forward, y starboard, z down)."""
 CHANNEL_TIMES = ("mag_time_x", "mag_time_y", "mag_time_z")
 """When each channel was sampled, where not all were at ``time``."""
+FURTHER_AXIS = re.compile(r"mag[1-9]\d*_[xyz]")
+"""Name of an axis of a further vector sensor, in nT as those of the first."""
 AGE = "age_"
 """Before the name of a parameter: how old its value was, in s, in the log of a bridge."""
 
@@ -139,7 +142,11 @@ def factor(unit: str, column: str) -> float | None:
     A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1. So is that of a unit
     which is undeclared (empty, or the 1 that is then written).
     """
-    if column not in COLUMNS or unit in ("", "1"):
+    if unit in ("", "1"):
+        return 1.0
+    if FURTHER_AXIS.fullmatch(column):
+        return NT_PER_UNIT.get(usual(unit), 1.0)
+    if column not in COLUMNS:
         return 1.0
     wanted, unit = COLUMNS[column].units, usual(unit)
     return 1.0 if unit == wanted else _FACTORS.get((unit, wanted))

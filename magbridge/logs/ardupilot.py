@@ -8,6 +8,7 @@ matrix (``COMPASS_DIA``, ``COMPASS_ODI``) are in the log, too, and are undone, s
 
 UTC is the median of what the GPS fixes say, so one damaged record does not date the log. Of several compasses
 that is read which the estimator names (``XKFS``), or the first that is enabled (``COMPASS_USE``) and healthy.
+Survey magnetometers (``MAGH``, G, of DroneCAN's high-resolution messages) follow the compasses.
 
 References
 ----------
@@ -27,11 +28,21 @@ import xarray as xr
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError
-from magbridge.logs.ardupilot_fields import FIELDS, INSTANCE, WANTED, in_declared_units
+from magbridge.logs.ardupilot_fields import (
+    FIELDS,
+    INSTANCE,
+    SURVEY,
+    SURVEY_AXES,
+    SURVEY_ID,
+    WANTED,
+    in_declared_units,
+    in_hundredths,
+)
 from magbridge.logs.autopilot import Fields, Magnetometer, Run, Series, pieces, values_of
 from magbridge.logs.compasses import Compass, rate
 from magbridge.logs.dataflash import Records, read_binary
 from magbridge.logs.dataflash_text import read_text
+from magbridge.logs.deployment import NOTES
 from magbridge.logs.gps_time import GPS_EPOCH, WEEK, leap_seconds
 from magbridge.logs.order import boots
 
@@ -57,14 +68,14 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     with path.open("rb") as file:
         text = b"FMT," in file.read(4096)
     flash = (read_text if text else read_binary)(path, WANTED)
-    fields = in_declared_units(flash)
+    fields, notes = in_hundredths(flash, in_declared_units(flash))
     records = {name: _in_microseconds(name, one) for name, one in flash.records.items()}
     runs = [run for part in _boots(records) if (run := _run(fields, part)).magnetometers]
     if not runs:
         timeless = ", whose records have times" * any(name.startswith("MAG") for name in records)
         raise FormatError(path, f"expected an ArduPilot log with MAG records{timeless}")
-    lost = {"lines_skipped" if text else "bytes_skipped": flash.skipped}
-    yield from pieces(path, rows, runs, lost, options.compass if options else None)
+    attrs = {"lines_skipped" if text else "bytes_skipped": flash.skipped, NOTES: "\n".join(notes)}
+    yield from pieces(path, rows, runs, attrs, options.compass if options else None)
 
 
 def _run(fields: Fields, records: dict[str, Records]) -> Run:
@@ -75,6 +86,7 @@ def _run(fields: Fields, records: dict[str, Records]) -> Run:
         for number, records_of in _instances(records, "MAG").items()
         if {"MagX", "MagY", "MagZ"} <= records_of.fields.keys()
     ]
+    mags += _survey_magnetometers(records.get(SURVEY), len(mags))
     return Run(mags, _telemetry(fields, records), _utc_offset(records))
 
 
@@ -161,6 +173,23 @@ def _magnetometer(
     )
     nanotesla = NT_PER_UNIT["mG"] * field
     return Magnetometer(compass, time, dict(zip("xyz", nanotesla, strict=True)))
+
+
+def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetometer]:
+    """Return the sensors of ``MAGH`` records, numbered from `first`; their ids are node, sensor and bus."""
+    if records is None or not {"TimeUS", *SURVEY_AXES} <= records.fields.keys():
+        return []
+    fields = records.fields
+    parts = [fields[name] for name in SURVEY_ID if name in fields] or [np.zeros(len(records.at))]
+    found: list[Magnetometer] = []
+    for numbers in np.unique(np.column_stack(parts), axis=0):
+        here = np.all([part == number for part, number in zip(parts, numbers, strict=True)], axis=0)
+        time = fields["TimeUS"][here] * 1e-6
+        device = f"{SURVEY} {':'.join(f'{number:g}' for number in numbers)}"
+        compass = Compass(first + len(found), len(time), rate(time), device)
+        axes = [NT_PER_UNIT["G"] * fields[name][here] for name in SURVEY_AXES]
+        found.append(Magnetometer(compass, time, dict(zip("xyz", axes, strict=True))))
+    return found
 
 
 def _numbered(number: int) -> str:

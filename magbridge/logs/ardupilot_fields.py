@@ -11,7 +11,10 @@ import numpy as np
 from magbridge.logs.autopilot import Fields
 from magbridge.logs.dataflash import OWN_SCALE, Flash
 
-__all__ = ["FIELDS", "INSTANCE", "WANTED", "in_declared_units"]
+__all__ = [
+    "FIELDS", "INSTANCE", "SURVEY", "SURVEY_AXES", "SURVEY_ID", "WANTED", "in_declared_units",
+    "in_hundredths",
+]  # fmt: skip
 
 FIELDS: Fields = {
     "ATT": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
@@ -49,6 +52,11 @@ throttle, Rover's throttle is in THR, that of all motors together in MOTB."""
 INSTANCE = ("I", "Instance", "Inst")
 TIMES = ("TimeUS", "TimeMS")
 """s since the boot in µs, or in ms up to ArduPilot 3.2."""
+SURVEY, SURVEY_ID, SURVEY_AXES = "MAGH", ("Node", "Sensor", "Bus"), ("Mx", "My", "Mz")
+"""Record of a survey magnetometer, what distinguishes several, and their axes in G."""
+POWER = "CURR", "BAT"
+MAX_VOLTAGE_V = 100.0
+"""Larger integers in a log that does not declare its units are in hundredths of V and A."""
 NUMBERED = 8
 MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health", *INSTANCE}
 WANTED: dict[str, set[str]] = {
@@ -57,6 +65,7 @@ WANTED: dict[str, set[str]] = {
         for name, fields in {**FIELDS, "MAG": tuple(("", field, "", 1.0) for field in sorted(MAG))}.items()
         for k in ("", *range(2, NUMBERED + 1))
     },
+    SURVEY: {*TIMES, *SURVEY_ID, *SURVEY_AXES},
     "PARM": {"TimeUS", "Name", "Value"},
     "XKFS": {"TimeUS", "MI"},
     "FMT": {"Type", "Name", "Columns"},
@@ -89,6 +98,28 @@ def in_declared_units(flash: Flash) -> Fields:
         kind: tuple(_converted(row, declared.get((kind, row[1]))) for row in rows)
         for kind, rows in FIELDS.items()
     }
+
+
+def in_hundredths(flash: Flash, fields: Fields) -> tuple[Fields, list[str]]:
+    """Return `fields` with the factor 0.01 for powers in hundredths, and what was found for the user.
+
+    Logs up to 2015 hold voltage and current of ``CURR`` as integers in hundredths, and do not declare it.
+    """
+    found, notes = dict(fields), []
+    declared = _declared(flash)
+    for name in POWER:
+        table = flash.records[name].fields if name in flash.records else {}
+        volts = table.get("Volt", np.empty(0))
+        is_whole = bool((volts == np.round(volts)).all())
+        if (name, "Curr") in declared or not len(volts) or not is_whole or np.median(volts) < MAX_VOLTAGE_V:
+            continue
+        found[name] = tuple(
+            (column, field, unit, 0.01 * factor) for column, field, unit, factor in found[name]
+        )
+        notes.append(
+            f"{name}: current and voltage are read in hundredths of A and V: {np.median(volts):g} V else"
+        )
+    return found, notes
 
 
 def _converted(

@@ -17,7 +17,7 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.logs.compasses import Compass, choose, compass_notes, listed
-from magbridge.logs.deployment import NOTES, deployment, same_columns, sliced, uncounted
+from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sliced, uncounted
 from magbridge.logs.order import in_order
 from magbridge.logs.resample import latest
 
@@ -72,10 +72,10 @@ def pieces(
     """
     dated = [run for run in runs if run.offset is not None]
     chosen = choose(path, [one.compass for one in runs[0].magnetometers], compass)
-    notes = compass_notes(chosen, compass)
+    notes = [*noted(attrs), *compass_notes(chosen, compass)]
     if len(runs) > 1:
         notes.append(f"{len(runs)} boots, each a run of its own")
-    counted = dict(attrs)
+    counted = {name: value for name, value in attrs.items() if name != NOTES}
     if dated and len(dated) < len(runs):
         lost = sum(len(run.magnetometers[0].time) for run in runs if run.offset is None)
         counted["rows_dropped"] = counted.get("rows_dropped", 0) + lost

@@ -17,9 +17,10 @@ import pandas as pd
 
 from magbridge.arrays import FloatArray
 from magbridge.logs.gps_time import GPS_EPOCH, WEEK, leap_seconds
+from magbridge.logs.order import AROUND, boots
 from magbridge.logs.stamps import DAY, HOURS, OF_THE_DAY, epoch, patterns
 
-__all__ = ["SECONDS_OF_DAY", "Clock", "clock_of", "seconds"]
+__all__ = ["SECONDS_OF_DAY", "Clock", "Counter", "clock_of", "date_order", "seconds"]
 
 EPOCHS = {
     "s": (0.0, 1.0),
@@ -55,6 +56,12 @@ YEAR_1980 = 315_532_800.0
 SLOW = 10.0
 """Median step of whole numbers from which on they hardly are seconds since a boot: of milliseconds it is a
 hundred a second."""
+ORDER = re.compile(r"\b(yyyy|yy|mm|dd)\W?(mm|dd)\W?(yyyy|yy|dd)\b", re.IGNORECASE)
+"""What in a heading states in which order a date is written."""
+MIN_RUN_ROWS = 3
+"""Fewest rows after a step back in a count, by which it is a start of the clock and not a wrong value."""
+BETWEEN_RUNS_S = 60.0
+"""s between the runs of a logger that was restarted, whose clock tells nothing of the time between."""
 OF_A_DAY = "times of day, of a day that the file does not tell"
 
 
@@ -79,6 +86,52 @@ class Clock(NamedTuple):
         if self.kind == "s":
             return "seconds since 1970"
         return f"a time as {self.kind}" if self.is_text and self.kind != "iso" else "a time"
+
+
+class Counter(NamedTuple):
+    """The state of a count of ms or us, or of any count from a boot, in the course of a file."""
+
+    shift_s: float
+    """Added to the count, s, for what it has wrapped around and for the runs before."""
+    last: FloatArray
+    """Its last values (n,), s, before the shift."""
+    end_s: float
+    """The last time, s, after the shift."""
+
+    def go_on(self, times: FloatArray, kind: str) -> tuple[Counter, int]:
+        """Add the shift to the next times (n,), s, in place; return the new state and the number of boots.
+
+        A count of 32 bits that wraps around goes on. Where it begins again, a run of its own begins, some
+        time after the last.
+        """
+        period = (1 << 32) * EPOCHS[kind][1] if kind in {"ms", "us", "ns"} else np.inf
+        before = len(self.last)
+        whole = np.concatenate([self.last, times])
+        known = np.flatnonzero(np.isfinite(whole))
+        shift, end, done, boots_found = self.shift_s, self.end_s, before, 0
+        for k in boots(whole[known])[1:].tolist():
+            row, last = int(known[k]), float(whole[known[k - 1]])
+            has_wrapped = last - whole[row] > 0.9 * period
+            # one that was too near to the end of the last rows to be sure of is found with these
+            seen = before if has_wrapped else before - MIN_RUN_ROWS + 1
+            if row < seen or (len(known) - k < MIN_RUN_ROWS and not has_wrapped):
+                continue
+            row = max(row, before)
+            times[done - before : row - before] += shift
+            end = shift + last
+            if has_wrapped:
+                shift += period
+            else:
+                shift = end + BETWEEN_RUNS_S - whole[known[k]]
+                boots_found += 1
+            done = row
+        times[done - before :] += shift
+        return Counter(shift, whole[known[-AROUND:]] if len(known) else self.last, end), boots_found
+
+
+def date_order(headings: Sequence[str]) -> str:
+    """Return the heading that states in which order a date is written, as mm/dd/yyyy; "" for none."""
+    return next((heading for heading in headings if ORDER.search(heading)), "")
 
 
 def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) -> Clock:
@@ -169,6 +222,9 @@ def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bo
     if dated and pd.to_datetime(times, format="ISO8601", utc=True, errors="coerce").notna().all():
         return Clock("iso", zone_note)
     fit = [pattern for pattern in patterns(texts) if pattern.endswith(OF_THE_DAY) == of_day]
+    if order := ORDER.search(heading):
+        letters = [part[0].lower() for part in order.groups()]
+        fit = [pattern for pattern in fit if re.findall("%([ymd])", pattern.lower())[:3] == letters] or fit
     if not fit:
         return Clock("iso")  # each cell will be refused with its row
     if len(fit) > 1:

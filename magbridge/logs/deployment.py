@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.columns import COLUMNS, factor
+from magbridge.columns import COLUMNS, FURTHER_AXIS, NT_PER_UNIT, factor, usual
 from magbridge.errors import FormatError
 from magbridge.records import Quality
 
@@ -107,6 +107,8 @@ def deployment(
 
 def _describe(name: str, unit: str, long_name: str | None) -> dict[str, Any]:
     known = COLUMNS.get(name)
+    if FURTHER_AXIS.fullmatch(name) and usual(unit) in NT_PER_UNIT:
+        unit = "nT"
     if known is None:
         return {"units": unit or "1", "long_name": long_name or name.replace("_", " ")}
     described: dict[str, Any] = known._asdict()

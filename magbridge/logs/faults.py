@@ -50,6 +50,10 @@ class Faults:
             self._first[column] = error
             self._lines.append(str(error))
 
+    def remark(self, line: str) -> None:
+        """Add a line to those that name what was lost."""
+        self._lines.append(line)
+
     def count(self, column: str, known: int) -> None:
         """Count the values that a column has."""
         self._known[column] += known

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from magbridge.columns import COLUMNS, NT_PER_UNIT, usual
 
-__all__ = ["NUMBER", "aliases", "bare", "is_unit", "split"]
+__all__ = ["NUMBER", "WITH_UNIT", "aliases", "bare", "is_unit", "split"]
 
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
+WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)) ?([a-zA-Z°µ%/]+)")
+"""A cell that is a number with its unit."""
 UNITS = {
     *NT_PER_UNIT,
     *(column.units for column in COLUMNS.values() if column.units != "1"),
@@ -21,7 +23,7 @@ UNITS = {
 }
 """Units by which a row of units under the headings is known."""
 AXES = "x", "y", "z"
-PLACES = "latitude", "longitude", "roll", "pitch", "heading"
+PLACES = "latitude", "longitude", "roll", "pitch", "heading", "depth"
 VECTORS = (
     "mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "flux{}", "b{}",
     "m{}", "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}", "magn{}", "compass{}", "fgm{}",
@@ -31,7 +33,17 @@ ENDING = re.compile(r"(.*(?:mag|magnetic|magnetometer|field))([xyz])|(.*)([xyz])
 """What they end in, behind the name of a message or a device: ``rawimuxmag``, ``fieldmagneticfieldx``."""
 ALIASES = {
     "time": (
-        *("timestamp", "datetime", "timeutc", "utctime", "datetimeutc", "dateandtime", "isotime", "unixtime"),
+        *(
+            "timestamp",
+            "ts",
+            "datetime",
+            "timeutc",
+            "utctime",
+            "datetimeutc",
+            "dateandtime",
+            "isotime",
+            "unixtime",
+        ),
         *("unixtimestamp", "posixtime", "epoch", "epochtime", "utc", "gpstime", "gpsseconds", "jd", "mjd"),
         *("juliandate", "julianday", "julian", "exceltime", "exceldate", "datenum", "timeiso", "isoformat"),
         *(
@@ -57,8 +69,14 @@ ALIASES = {
     "depth": ("depthm", "tiefe", "profondeur", "profundidad"),
 }
 """Our name -> what others call it, the surest first."""
-AROUND = re.compile("(?:gps|gnss|location|position|pos|nav|ins)?(.+?)(?:deg|degrees|dd|wgs84)?")
-"""What may stand before and behind the names of a place and an attitude."""
+TOWED = "magnetometer", "mag", "sensor", "towfish", "fish", "tow", "layback"
+"""Words before a position that say that it is the towed sensor's, not the ship's."""
+AROUND = re.compile(
+    rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
+)
+"""Words that may stand before and behind the names of a place and an attitude."""
+MAX_SENSORS = 8
+"""Largest number of a further vector sensor in one file."""
 
 
 def split(heading: str) -> tuple[str, str]:
@@ -115,25 +133,83 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
         else:
             others = ["" if name in COLUMNS else word for name, word in zip(names, words, strict=True)]
             found |= _axes(words, units) or _ending_alike(others)
+        found |= _further_axes(names, words, {name: k for k, name in found.items()})
+    pair = _position(words)
+    if any(names[k] != name for k, name in pair.items()):
+        found |= pair
+    inner = [match[2] if (match := AROUND.fullmatch(word)) else "" for word in words]
     for name in COLUMNS:
-        if name in names or name == "quality":  # a foreign one is not our set of flags
+        if name in names or name in pair.values() or name == "quality":  # a foreign one is not our flags
             continue
-        for word in (name.replace("_", ""), *ALIASES.get(name, ())):
-            place = only(word)
-            if place is None and name in PLACES:
-                place = only(word, [match[1] if (match := AROUND.fullmatch(one)) else "" for one in words])
-            if place is not None and place not in found and name not in found.values():
-                found[place] = name
+        aliases_of = (name.replace("_", ""), *ALIASES.get(name, ()))
+        places = [only(word) for word in aliases_of]
+        if name in PLACES:
+            places += [only(word, inner) for word in aliases_of]
+        there = [place for place in places if place is not None and place not in found]
+        if there:
+            found[there[0]] = name
+    return found
+
+
+def _position(words: Sequence[str]) -> dict[int, str]:
+    """Return the positions of latitude and longitude among bare names, both from columns named alike.
+
+    A towed sensor's position comes before one without such words, and that before any other.
+    """
+    pairs: dict[tuple[str, str], dict[str, int]] = {}
+    for k, word in enumerate(words):
+        match = AROUND.fullmatch(word)
+        for name in ("latitude", "longitude"):
+            if match and match[2] in (name, *ALIASES[name]):
+                pairs.setdefault((match[1] or "", match[3] or ""), {}).setdefault(name, k)
+    whole = {around: pair for around, pair in pairs.items() if len(pair) == 2}
+    if not whole:
+        return {}
+    best = min(whole, key=lambda around: (around[0] not in TOWED, around[0] != "", list(whole).index(around)))
+    return {k: name for name, k in whole[best].items()}
+
+
+def _ending_alike(words: Sequence[str]) -> dict[int, str]:
+    """Return the positions of the three axes among bare names that end in them, if no others do.
+
+    Of several sensors whose names differ by a number, those of the lowest number.
+    """
+    sensors: dict[str, dict[str, int]] = {}
+    for k, word in enumerate(words):
+        if match := ENDING.fullmatch(word):
+            axes = sensors.setdefault(match[1] or match[3], {})
+            axes[match[2] or match[4]] = k
+    alike = len({re.sub(r"\d+", "", name) for name in sensors}) == 1
+    if not alike or any(sorted(axes) != list(AXES) for axes in sensors.values()):
+        return {}
+    return {k: f"mag_{axis}" for axis, k in sensors[min(sensors)].items()}
+
+
+def _further_axes(names: Sequence[str], words: Sequence[str], first: Mapping[str, int]) -> dict[int, str]:
+    """Return the positions of the axes of further sensors, named as the first but for their number."""
+    if not all(f"mag_{axis}" in first for axis in AXES):
+        return {}
+    found: dict[int, str] = {}
+    for number in range(2, MAX_SENSORS + 1):
+        if f"mag{number}_x" in names:
+            continue
+        for numbered in _numberings(number):
+            wanted = [numbered(words[first[f"mag_{axis}"]]) for axis in AXES]
+            places = [words.index(word) for word in wanted if words.count(word) == 1]
+            if len(places) == len(AXES) and not {*places} & {*first.values()}:
+                found |= {k: f"mag{number}_{axis}" for k, axis in zip(places, AXES, strict=True)}
                 break
     return found
 
 
-def _ending_alike(words: Sequence[str]) -> dict[int, str]:
-    """Return the positions of the three axes among bare names that end in them, if no others do."""
-    ends = [(k, match) for k, word in enumerate(words) if (match := ENDING.fullmatch(word))]
-    axes = {k: match[2] or match[4] for k, match in ends}
-    alike = len({match[1] or match[3] for _, match in ends}) == 1 and sorted(axes.values()) == list(AXES)
-    return {k: f"mag_{axis}" for k, axis in axes.items()} if alike else {}
+def _numberings(number: int) -> list[Callable[[str], str]]:
+    """Return the ways in which the name of an axis of sensor `number` is made from that of the first."""
+    return [
+        # b1x, imu0magx: the last 0 or 1 counts
+        lambda word: re.sub(r"([01])(\D*)$", lambda m: f"{int(m[1]) + number - 1}{m[2]}", word),
+        lambda word: f"{word[:-1]}{number}{word[-1]}",
+        lambda word: f"{word}{number}",
+    ]
 
 
 def _axes(words: Sequence[str], units: Sequence[str]) -> dict[int, str]:

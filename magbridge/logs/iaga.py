@@ -76,9 +76,11 @@ def _row(fields: list[str], elements: int) -> list[float] | None:
 
 def _total(elements: dict[str, FloatArray]) -> FloatArray | None:
     """Return the total field (n,), nT, from the elements, (n,) each; None: they do not give it."""
-    total: FloatArray | None = None
-    for names in TOTALS:
-        if set(names) <= elements.keys():
-            length = np.sqrt(sum(np.square(elements[name]) for name in names))
-            total = length if total is None else np.where(np.isnan(total), length, total)
-    return total
+    lengths = [
+        np.asarray(np.sqrt(sum(np.square(elements[name]) for name in names)))
+        for names in TOTALS
+        if set(names) <= elements.keys()
+    ]
+    # one instrument for the whole file: between two there is a step of some nT
+    known = [int(np.isfinite(length).sum()) for length in lengths]
+    return next((one for one, count in zip(lengths, known, strict=True) if 2 * count >= max(known)), None)

@@ -20,9 +20,11 @@ from pathlib import Path
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.headings import NUMBER, is_unit
+from magbridge.logs.magnetic import units_of_angles
 from magbridge.logs.makers import declared_by_maker
 from magbridge.logs.mapping import Declared
 from magbridge.logs.naming import name_columns
+from magbridge.logs.validity import Validity, validity_of
 from magbridge.wording import counted
 
 __all__ = ["BLANKS", "HEADER", "Layout", "cells", "is_remark", "layout_of"]
@@ -58,6 +60,12 @@ class Layout:
     """What the user says of the columns, or their maker."""
     stamp: list[int] = field(default_factory=list)
     """Which fields are the time, joined by blanks: one, or date and time of day ..."""
+    by_hour: bool = False
+    """The time of day is written as HHMM.mmm."""
+    calendar: list[int] = field(default_factory=list)
+    """Fields that give date and time of day next to a time that may count from a boot."""
+    validity: list[Validity] = field(default_factory=list)
+    """Columns that state which values are valid."""
     hemispheres: dict[str, int] = field(default_factory=dict)
     """``latitude``, ``longitude`` -> which field has N or S, E or W."""
     open_ended: bool = False
@@ -85,8 +93,17 @@ def cells(line: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
-def layout_of(path: Path, lines: Sequence[str], declared: Declared, *, foreign: bool = True) -> Layout:
+def layout_of(
+    path: Path,
+    lines: Sequence[str],
+    declared: Declared,
+    *,
+    foreign: bool = True,
+    further: Sequence[str] = (),
+) -> Layout:
     """Return the layout of the file that begins with these lines; `foreign`: nothing stands beside it.
+
+    `further` are lines behind them, by whose values units are found.
 
     FormatError: no headings, two of one name, or a declared column that is not there.
     """
@@ -115,6 +132,12 @@ def layout_of(path: Path, lines: Sequence[str], declared: Declared, *, foreign: 
     if maker:
         found.guesses.append(f"columns as {maker} writes them")
     name_columns(path, found, headings, units, rows)
+    if foreign:
+        rows += [cells(line, found.separator) for line in further if line.strip() and not is_remark(line)]
+        units_of_angles(found, rows)
+        found.validity = validity_of(found.names, rows)
+        for rule in found.validity:
+            found.guesses.append(rule.text)
     return found
 
 

@@ -2,8 +2,9 @@
 
 PX4's topics as ``ulog2csv`` writes them are in microseconds since the boot and in gauss (PX4,
 msg/SensorMag.msg, msg/VehicleMagnetometer.msg). Geometrics' MagMap writes the month first.
-MagArrow's compass has its x to the right, its y aft and its z down (Geometrics, MagArrow user manual, 'Data
-Format'); ``Mag`` is its caesium magnetometer.
+DatCon's ``offsetTime`` counts seconds from the start of a DJI flight. MagArrow's compass has its x to the
+right, its y aft and its z down (Geometrics, MagArrow user manual, 'Data Format'); ``Mag`` is its caesium
+magnetometer.
 """
 
 from __future__ import annotations
@@ -33,6 +34,22 @@ MAKERS: dict[str, tuple[set[str], dict[str, Source]]] = {
             "total_field": Source(heading="READING_1", unit="nT"),
             "time": Source(heading="TIME", unit="%m/%d/%y %H:%M:%S"),
         },
+    ),
+    "DJI's DatCon": (
+        {"Tick#", "offsetTime"},
+        {
+            "time": Source(heading="offsetTime", unit="s"),
+            "latitude": Source(heading="GPS:Lat", unit="deg"),
+            "longitude": Source(heading="GPS:Long", unit="deg"),
+            "roll": Source(heading="IMU_ATTI(0):roll:C", unit="deg"),
+            "pitch": Source(heading="IMU_ATTI(0):pitch:C", unit="deg"),
+            "heading": Source(heading="IMU_ATTI(0):yaw:C", unit="deg"),
+        },
+    ),
+    "an RM3100 logger": (
+        {"ts", "rt", "lt", "x", "y", "z", "rx", "ry", "rz"},
+        {f"mag_{axis}": Source(heading=axis, unit="uT") for axis in "xyz"}
+        | {"sensor_temperature": Source(heading="rt", unit="degC")},
     ),
     "PX4's vehicle_magnetometer": (
         {"timestamp", "device_id", "magnetometer_ga[0]"},

@@ -13,7 +13,7 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import SECONDS_OF_DAY
-from magbridge.logs.headings import NUMBER, aliases, bare, split
+from magbridge.logs.headings import NUMBER, WITH_UNIT, aliases, bare, is_unit, split
 from magbridge.logs.magnetic import find_total, units_of_axes
 from magbridge.logs.stamps import DAY
 
@@ -29,10 +29,18 @@ COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 HOUR = re.compile(
     r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d([.,]\d*)?", re.IGNORECASE
 )
-DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyymmdd|ddmmyy)", re.IGNORECASE)
+DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyy.?mm.?dd|dd.?mm.?yy|mm.?dd.?yy)", re.IGNORECASE)
 """What in a heading says that the column holds dates."""
 TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
 """What in a heading says that the column holds times, if it is the only one."""
+REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
+"""Words in brackets behind a heading that are no unit."""
+MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
+"""A cell that is a date with its time of day."""
+CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
+"""A cell that is a time of day."""
+HOUR_AND_MINUTE = re.compile(r"([01]?\d|2[0-3])?[0-5]?\d(\.\d+)?")
+"""A cell that is a time of day as HHMM.mmm, as in the exchange format MGD77T."""
 OF_THE_DAY = re.compile("day|sod|utc|midnight", re.IGNORECASE)
 """What in a heading says that seconds count from midnight, beside a date."""
 JOINED = {
@@ -48,6 +56,8 @@ JOINED = {
     ),
 }  # fmt: skip
 """What several columns are together -> what they are called, with neither capitals nor punctuation."""
+LENGTHS = "depth", "total_field", "sensor_temperature"
+"""Columns of ours before whose cells a unit may stand, as in 5.8m; a position has its own letters."""
 HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 
 
@@ -73,6 +83,7 @@ def name_columns(
     for k, name in enumerate(found.names):
         _take_unit(found, name, headings[k], declares[k])
     _find_time(found, rows)
+    _find_calendar(found, rows)
     units_of_axes(found, rows)
     find_total(found, rows)
     _leave_texts(found, rows)
@@ -116,13 +127,15 @@ def _named(path: Path, found: Layout, names: list[str], units: Sequence[str]) ->
 
 def _take_unit(found: Layout, name: str, heading: str, unit: str) -> None:
     source = found.declared.columns.get(name)
+    if name == "heading" and (match := re.search(r"\b(magnetic|mag)\b", f"{heading} {unit}".lower())):
+        found.attrs.setdefault("heading_reference", "magnetic")
+        unit = unit.replace(match[1], "").strip(" ,")
+    if name in COLUMNS and unit.lower() in REMARKS:
+        unit = ""
     if source is not None and source.unit is not None:
         unit = source.unit
-    elif source is not None and not unit and source.heading:
-        unit = split(source.heading)[1]
-    if name == "heading" and "magnetic" in f"{heading} {unit}".lower():
-        found.attrs.setdefault("heading_reference", "magnetic")
-        unit = unit.replace("magnetic", "").strip(" ,")
+    elif source is not None and source.heading and source.heading.strip() != heading.strip():
+        unit = split(source.heading)[1] or unit
     if name and unit:
         found.units[name] = unit
 
@@ -164,7 +177,10 @@ def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
             found.units["time"] = kind if len(patterns) == 2 else ""
             break
     else:
-        place = dates[0] if place is None and len(dates) == 1 else place
+        if place is None and len(dates) == 1:
+            clocks = [k for k in range(len(called)) if k not in dates and _all_match(CLOCK, rows, k)]
+            near = [k for k in clocks if called[k][:4] == called[dates[0]][:4]]
+            place = next((group[0] for group in (clocks, near) if len(group) == 1), dates[0])
         found.stamp = [] if place is None else [place]
         if place is not None and len(dates) == 1 and dates != [place]:
             cells = [row[place] for row in rows if len(row) > place]
@@ -172,16 +188,43 @@ def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
             undated = "%" in (unit := found.units.get("time", "")) and not {"%d", "%j"} & {
                 *re.findall("%.", unit)
             }
-            if (any(map(HOUR.fullmatch, cells)) or counted) and not undated:
+            by_hour = not unit and not counted and _by_hour(cells)
+            if (any(map(HOUR.fullmatch, cells)) or counted or by_hour) and not undated:
                 found.stamp = [*dates, place]
-            if counted and not all(map(HOUR.fullmatch, cells)):
+            if by_hour or (counted and not all(map(HOUR.fullmatch, cells))):
                 found.units["time"] = SECONDS_OF_DAY
+                found.by_hour = by_hour
     if found.rate or not found.stamp:
         return
     if len(found.stamp) > 1 or found.names[found.stamp[0]] != "time":
         found.guesses.append(f"time from {' and '.join(repr(found.headings[k]) for k in found.stamp)}")
     for k in found.stamp:
         found.names[k] = "time" if k == found.stamp[-1] else ""
+
+
+def _all_match(pattern: re.Pattern[str], rows: Sequence[Sequence[str]], place: int) -> bool:
+    """Return True if all cells of a column that are not empty match a pattern, and some are there."""
+    values = {row[place] for row in rows if place < len(row) and row[place]}
+    return bool(values) and all(map(pattern.fullmatch, values))
+
+
+def _by_hour(cells: Sequence[str]) -> bool:
+    """Return True if numbers next to a date are times of day as HHMM.mmm."""
+    there = [cell for cell in cells if cell]
+    long = [cell for cell in there if len(cell.partition(".")[0]) >= 3]
+    return bool(long) and all(map(HOUR_AND_MINUTE.fullmatch, there)) and any("." in cell for cell in there)
+
+
+def _find_calendar(found: Layout, rows: Sequence[Sequence[str]]) -> None:
+    """Find the fields, other than those of the time, that give date and time of day."""
+    others = [k for k in range(len(found.headings)) if k not in found.stamp]
+    moments = [k for k in others if _all_match(MOMENT, rows, k)]
+    dates = [k for k in others if DATED.search(found.headings[k])]
+    clocks = [k for k in others if _all_match(CLOCK, rows, k)]
+    if len(moments) == 1:
+        found.calendar = moments
+    elif len(dates) == len(clocks) == 1:
+        found.calendar = [*dates, *clocks]
 
 
 def _in_a_day(cell: str) -> bool:
@@ -196,10 +239,13 @@ def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
     left = []
     for k, name in enumerate(found.names):
         values = {row[k] for row in rows if k < len(row) and row[k]}
-        if not name or name in COLUMNS or not values:
+        if not name or (name in COLUMNS and name not in LENGTHS) or not values:
             continue
         text = [cell.replace(",", ".") if found.decimal == "," else cell for cell in values]
         if any(NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
+            continue
+        if found.foreign and (unit := _unit_behind(text)):
+            found.units.setdefault(name, unit)
             continue
         found.names[k] = ""
         side = [one for one, letters in HEMISPHERES.items() if {v.upper() for v in values} <= {*letters}]
@@ -209,6 +255,13 @@ def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
             left.append(name)
     if left:
         found.guesses.append(f"left out, no numbers: {', '.join(left)}")
+
+
+def _unit_behind(cells: Sequence[str]) -> str:
+    """Return the unit that stands behind each number, as in ``5.8m``; "" where there is none in common."""
+    units = {match[2] if (match := WITH_UNIT.fullmatch(cell)) else "" for cell in cells}
+    unit = units.pop()
+    return unit if not units and unit and is_unit(unit) else ""
 
 
 def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:

@@ -46,11 +46,14 @@ Topics = dict[str, dict[int, Table]]
 Parameters = Mapping[str, float]
 
 FIELDS: Fields = {
-    "vehicle_global_position": (("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
-    "vehicle_local_position": (("depth", "z", "m", 1.0),),
+    "vehicle_global_position": (
+        *(("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
+        ("depth", "alt", "m", -1.0),
+    ),
     "sensor_gps": (
         *(("latitude", "latitude_deg", "deg", 1.0), ("longitude", "longitude_deg", "deg", 1.0)),
         *(("latitude", "lat", "deg", 1e-7), ("longitude", "lon", "deg", 1e-7)),
+        *(("depth", "altitude_msl_m", "m", -1.0), ("depth", "alt", "m", -1e-3)),
     ),
     "battery_status": (
         ("battery#_current", "current_a", "A", 1.0),
@@ -75,6 +78,8 @@ FIELDS: Fields = {
 }
 """Topic to columns; of topics with one column, the first that the log has is taken."""
 FIELDS["vehicle_gps_position"] = FIELDS["sensor_gps"]
+# heights are above the sea; that of the local position is above the start, and the last choice
+FIELDS["vehicle_local_position"] = (("depth", "z", "m", 1.0),)
 GAUSS = tuple(f"magnetometer_ga[{k}]" for k in range(3))
 """The three axes in ``vehicle_magnetometer`` and ``sensor_combined``."""
 NEEDED = {

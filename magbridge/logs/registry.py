@@ -109,7 +109,10 @@ FORMATS: dict[str, Format] = {
     "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002", packed=True),
     "seaglider": Format("magbridge.logs.seaglider_text", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
     "text": Format(
-        "magbridge.logs.text", (".txt", ".tsv", ".dat", ".asc", ".xyz"), maps_columns=True, packed=True
+        "magbridge.logs.text",
+        (".txt", ".tsv", ".dat", ".asc", ".xyz", ".m77t", ".jsonl", ".ndjson"),
+        maps_columns=True,
+        packed=True,
     ),
 }
 """Name to format; the first whose signature matches reads the file."""
@@ -118,7 +121,8 @@ OTHERS = {
     rb"\x28\xb5\x2f\xfd|7z\xbc\xaf|\x1f\x9d|\x1f\x8b|BZh|\xfd7zXZ": "it is compressed: unpack it first",
     rb"MATLAB 5\.0": "a .mat of MATLAB: save it as CSV (writetable)",
     rb"%PDF|\s*<(!DOCTYPE|html|\?xml)": "a document, no table",
-    rb"\s*[{\[]\s*[\"{\[]": "JSON: save it as CSV",
+    rb"#\s*\n# Header Description:": "a log of Android's GnssLogger: save its lines UncalMag as CSV",
+    rb"\s*(?!\{[^\n]*\}\s*\n\s*\{)[{\[]\s*[\"{\[]": "JSON: save it as CSV, or as one object a line (.jsonl)",
     rb"[A-Z]{3} [A-Z]{3}\d{4} \d{3} \d\d [A-Z]{4} ": "INTERMAGNET's IMF: ask for IAGA-2002",
 }
 """First bytes of what is no log, or none that is read -> what it is, and what to do."""

@@ -60,7 +60,7 @@ def _angles(v: Values) -> Columns:
     x, y, z, w = (v[f"q{axis}"] for axis in "xyzw")
     norm = x * x + y * y + z * z + w * w
     known = (np.abs(norm - 1) < 0.1) & (v["unknown"] != -1)  # the first covariance is -1: no orientation
-    if not known.any():
+    if not known.any() or (np.abs(w) == 1.0).all():  # a constant identity is not an attitude
         return
     x, y, z, w = (np.where(known, one, np.nan) for one in (x, y, z, w))
     # of the rotation from FLU to ENU; FRD has the opposite y and z, NED swaps x and y and has the opposite z

@@ -14,13 +14,14 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
-from magbridge.logs.clocks import Clock, clock_of, seconds
+from magbridge.logs.clocks import Clock, Counter, clock_of, date_order, seconds
 from magbridge.logs.faults import Faults
-from magbridge.logs.layout import BLANKS, Layout, cells
+from magbridge.logs.layout import BLANKS, HEADER, Layout, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.logs.stamps import DAY
 from magbridge.logs.unknown import EXPECTED, unknown
 from magbridge.records import Quality
+from magbridge.wording import counted
 
 __all__ = ["Table"]
 
@@ -47,6 +48,7 @@ class Table:
         self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
         self.guesses: list[str] = []
         self._midnights, self._last = 0.0, 0.0
+        self._counter = Counter(0.0, np.empty(0), 0.0)
         if layout.rate:
             self._clock = Clock("s", f"{layout.rate:g} rows a second", boot=True)
         elif layout.stamp:
@@ -54,19 +56,56 @@ class Table:
         else:
             missing = f'{absent("time", layout.headings)}; if none is: --column time="row [20 Hz]", its rate'
             raise FormatError(path, missing, row=layout.row, column="time")
-        if self._clock.assumed:
+        self._start = self._start_by(first_lines)
+        if self._clock.assumed and not self._start:
             self.guesses.insert(0, f"time: {self._clock.assumed}")
-        self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._clock.boot else {}
+        self.attrs: dict[str, Any] = {"time_reference": "boot"} if self._is_from_boot else {}
         if self._declared.heading_reference:
             self.attrs["heading_reference"] = self._declared.heading_reference
+
+    @property
+    def _is_from_boot(self) -> bool:
+        return self._clock.boot and not self._start
+
+    def _start_by(self, first_lines: Sequence[str]) -> float:
+        """Return the s since 1970 of a count's start, by other columns with date and time; 0 without them."""
+        layout = self._layout
+        if not self._clock.boot or not layout.calendar or not layout.stamp:
+            return 0.0
+        rows = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
+        rows = [row for row in rows if max(*layout.calendar, *layout.stamp) < len(row)]
+        texts, counts = (pd.Series([" ".join(row[k] for k in places) for row in rows], dtype="str")
+                         for places in (layout.calendar, layout.stamp))  # fmt: skip
+        headings = [layout.headings[k] for k in layout.calendar]
+        try:
+            clock = clock_of(" ".join(headings), "", texts.tolist(), self._declared.zone)
+        except ValueError:  # a date that can be read in two ways
+            return 0.0
+        if clock.boot:
+            return 0.0
+        moments, since = seconds(clock, texts, self._declared.zone), seconds(self._clock, counts, None)
+        ahead = moments - since
+        if not np.isfinite(ahead).any():
+            return 0.0
+        self.guesses.append(f"dated by {' and '.join(map(repr, headings))}")
+        # whole seconds were cut off: on average by half a second, where there are several rows in one
+        cut = 0.5 if len(np.unique(moments)) < len(moments) and (moments % 1.0 == 0.0).all() else 0.0
+        return float(np.nanmedian(ahead)) + cut
 
     def _clock_by(self, first_lines: Sequence[str]) -> Clock:
         """Return how the column of times is read, by its heading, its unit and its first cells."""
         layout = self._layout
         heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.pop("time", "")
-        first = [cells(line, layout.separator) for line in first_lines[layout.first :] if line.strip()]
-        texts = [" ".join(row[k] for k in layout.stamp) for row in first if max(layout.stamp) < len(row)]
+        if order := date_order([layout.headings[k] for k in layout.stamp]):
+            heading = order
+        lines = first_lines[layout.first : max(HEADER, layout.first + 1)]
+        first = [cells(line, layout.separator) for line in lines if line.strip()]
+        whole = [row for row in first if len(row) == len(layout.headings)] or first
+        texts = [" ".join(row[k] for k in layout.stamp) for row in whole if max(layout.stamp) < len(row)]
         texts = [text.replace(layout.decimal, ".") for text in texts]
+        if layout.by_hour:
+            self.guesses.append(f"{heading!r} as HHMM.mmm")
+            texts = [_seconds_of_day(text) for text in texts]
         try:
             return clock_of(heading, unit, texts, self._declared.zone)
         except ValueError as error:
@@ -99,8 +138,34 @@ class Table:
             columns[name][codes] = np.nan
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:
-                columns[name][columns[source.valid] == 0.0] = np.nan
-        return times, columns, kept
+                self._drop(name, columns, columns[source.valid] == 0.0, kept, source.valid)
+        return self._valid(times, columns, kept)
+
+    def _valid(
+        self, times: FloatArray, columns: dict[str, FloatArray], numbers: list[int]
+    ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
+        """Return times, columns and numbers without what a column of the file states not to be valid."""
+        for rule in self._layout.validity:
+            bad = np.isin(columns[rule.column], list(rule.bad))
+            for name in rule.targets:
+                if name in columns:
+                    self._drop(name, columns, bad, numbers, rule.column)
+            if bad.any() and not rule.targets:
+                self._note("", bad, numbers, f"not valid by {rule.column!r}", wrong=False)
+                good = ~bad
+                times = times[good]
+                columns = {name: values[good] for name, values in columns.items()}
+                numbers = [number for number, is_good in zip(numbers, good.tolist(), strict=True) if is_good]
+        return times, columns, numbers
+
+    def _drop(
+        self, name: str, columns: dict[str, FloatArray], bad: BoolArray, numbers: list[int], by: str
+    ) -> None:
+        """Remove the values of a column that another one states not to be valid, and count them."""
+        there = bad & np.isfinite(columns[name])
+        if there.any():
+            self._note(name, there, numbers, f"not valid by {by!r}", wrong=False)
+            columns[name][there] = np.nan
 
     def _whole(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
         """Return the lines that have as many fields as there are headings, and their numbers."""
@@ -173,13 +238,21 @@ class Table:
         column = frame[first]
         for k in others:
             column = column.str.strip() + " " + frame[k].str.strip()
+        if self._layout.by_hour:
+            column = column.map(_seconds_of_day, na_action="ignore")
         if self._layout.decimal == "," and not pd.api.types.is_numeric_dtype(column):
             column = column.str.replace(",", ".")
         times = seconds(self._clock, column, self._declared.zone)
         if self._clock.is_text and self._clock.boot:
             times = self._unwound(times)
+        elif self._is_from_boot and len(times):
+            self._counter, boots = self._counter.go_on(times, self._clock.kind)
+            if boots:
+                again = counted(boots, "time")
+                self.faults.remark(f"{self._path}: the clock started again {again}: each part is a run")
         wrong = np.isnan(times) & column.notna().to_numpy()
         times[times == self._fill] = np.nan
+        times += self._start
         self.faults.count("time", len(times))
         if wrong.any():
             text = str(column.iloc[int(wrong.argmax())]).strip()
@@ -203,8 +276,9 @@ class Table:
             values = column.to_numpy(np.float64, copy=True)
         else:
             texts = column.astype("str").str.strip()
-            values = _numbers(name, texts, self._layout.decimal)
-            wrong = np.isnan(values) & column.notna().to_numpy() & (texts.str.lower() != "nan").to_numpy()
+            values = _numbers(name, texts, self._layout.decimal, self._layout.units.get(name, ""))
+            nothing = texts.str.lower().isin(["", "nan"]).to_numpy()
+            wrong = np.isnan(values) & column.notna().to_numpy() & ~nothing
             if wrong.any():
                 text = str(column.iloc[int(wrong.argmax())]).strip()
                 self._note(name, wrong, numbers, f"expected a number, not {text!r}")
@@ -227,13 +301,15 @@ class Table:
         return np.array([known[text] for text in texts])
 
 
-def _numbers(name: str, texts: pd.Series, decimal: str) -> FloatArray:
+def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray:
     """Return what texts (n,) mean, also 1.5D+03, 18.300,25 and 52.7 W; NaN for what is no number."""
     group = re.escape("." if decimal == "," else ",")
     grouped = rf"^([-+]?\d{{1,3}}(?:{group}\d{{3}})+)(?=\D|$)"
     texts = texts.str.replace(grouped, lambda match: re.sub(r"[.,]", "", match[1]), regex=True)
     texts = texts.str.replace(",", ".") if decimal == "," else texts
     texts = texts.str.replace(r"(?<=\d)[dD](?=[-+]?\d)", "e", regex=True)
+    if unit:
+        texts = texts.str.removesuffix(unit).str.strip()
     if name in HEMISPHERES:
         opposite = texts.str.contains("[SW]", regex=True, case=False).to_numpy(bool)
         # only at the ends: the E of 1.2E-05 is an exponent's
@@ -241,3 +317,13 @@ def _numbers(name: str, texts: pd.Series, decimal: str) -> FloatArray:
         values = np.asarray(pd.to_numeric(texts, errors="coerce"), np.float64)
         return np.asarray(np.where(opposite, -np.abs(values), values))
     return np.array(pd.to_numeric(texts, errors="coerce"), np.float64)
+
+
+def _seconds_of_day(text: str) -> str:
+    """Return a date and a time as HHMM.mmm with the seconds of the day in place of the time."""
+    date, _, clock = text.rpartition(" ")
+    try:
+        hours, minutes = divmod(float(clock), 100.0)
+    except ValueError:
+        return text
+    return f"{date} {3600.0 * hours + 60.0 * minutes!r}"

@@ -44,6 +44,8 @@ from magbridge.records import Quality
 __all__ = ["FileWriter", "chunks"]
 
 DEFAULTS = Options()
+FURTHER = 3_000
+"""Lines behind the first ones by whose values units are found."""
 LONGEST = 1 << 20
 """Characters of the longest line that is read whole."""
 KEPT = 1000
@@ -101,15 +103,22 @@ def _chunks(
     if reader := captures.reader(header):
         yield from reader(path, chain(header, lines), rows)
         return
+    added = 0
+    if convert := captures.as_table(header):
+        lines, added = convert(chain(header, lines)), 1
+        header = list(islice(lines, HEADER))
+    further = list(islice(lines, FURTHER))
     beside = _attributes(path)
-    layout = layout_of(path, header, options.declared, foreign=not metadata_path(path).is_file())
-    table = Table(path, layout, header, strict=options.strict)
+    layout = layout_of(
+        path, header, options.declared, foreign=not metadata_path(path).is_file(), further=further
+    )
+    table = Table(path, layout, [*header, *further], strict=options.strict)
     attrs = {**beside, **layout.attrs, **table.attrs}
     if guesses := [*guess, *layout.guesses, *table.guesses]:
         note = "; ".join(guesses)
         before = [str(attrs[HISTORY])] if HISTORY in attrs else []
         attrs |= {GUESSED: note, HISTORY: "\n".join([*before, f"{path.name} was read with: {note}"])}
-    numbered = enumerate(chain(header[layout.first :], lines), layout.first + 1)
+    numbered = enumerate(chain(header[layout.first :], further, lines), layout.first + 1 - added)
     wanted = ((row, line) for row, line in numbered if line.strip() and not is_remark(line))
     while block := list(islice(wanted, rows)):
         time, columns, numbers = table.read([line for _, line in block], [row for row, _ in block])

@@ -18,9 +18,11 @@ EXPECTED = "expected a value, or nothing where it is not known, not "
 
 CODES = np.outer([-1.0, 1.0], [
     9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
-    2_147_483_647.0, 69_696_969.0,
+    2_147_483_647.0, 69_696_969.0, 999.0, 999.9, 999.99,
 ])  # fmt: skip
 """As they are met, with either sign."""
+ONLY_AMONG_OTHERS = 1_000.0
+"""Smaller codes count only where the column has other values, too."""
 HUGE = 1e30
 """A larger number is one, too, whatever it measures: 1e31, 1e34, 9.97e36."""
 
@@ -45,6 +47,8 @@ def _beyond(values: FloatArray) -> BoolArray:
     wrong: BoolArray = np.abs(values) > HUGE
     codes = np.isin(values, CODES)
     others = values[np.isfinite(values) & ~codes & ~wrong]
+    if not len(others):
+        codes &= np.abs(values) >= ONLY_AMONG_OTHERS
     if codes.any():
         low, high = (others.min(), others.max()) if len(others) else (0.0, 0.0)
         wrong |= codes & (np.maximum(low - values, values - high) > max(0.5 * (high - low), 1.0))

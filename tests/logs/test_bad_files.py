@@ -47,8 +47,8 @@ BAD_CSV = {
         '--column time="time [%d/%m/%Y %H:%M]" or --column time="time [%m/%d/%Y %H:%M]"'
     ),
     "time,mag_x [V]\n2,2\n": "column 'mag_x': expected nT, not V",
-    "time,water [Celsius]\n1,4\n2,-999\n": (
-        "row 3, column 'water': expected at least -273.15 degC, or nothing where it is not known, not -999.0"
+    "time,water [Celsius]\n1,4\n2,-998\n": (
+        "row 3, column 'water': expected at least -273.15 degC, or nothing where it is not known, not -998.0"
     ),
     "# fill_value = none\ntime,mag_x\n1,2\n": "row 1, column 'fill_value': expected a number, not 'none'",
     "time,quality\n2,splendid\n": "row 2, column 'quality': expected the names of flags, not 'splendid'",

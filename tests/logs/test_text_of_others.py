@@ -378,7 +378,12 @@ def test_sensys(tmp_path: Path) -> None:
         "10; 30000; 5000; 45000; 30001; 5001; 45001; ; ; ; \n"
     )
     log = read(tmp_path, text)
-    assert [float(log[name][0]) for name in ("mag_x", "mag_y", "mag_z", "B2x")] == [3e4, 5e3, 4.5e4, 30_001.0]
+    assert [float(log[name][0]) for name in ("mag_x", "mag_y", "mag_z", "mag2_x")] == [
+        3e4,
+        5e3,
+        4.5e4,
+        30_001.0,
+    ]
     np.testing.assert_array_equal(log["latitude"], [47.6, np.nan])
     assert log.attrs["time_reference"] == "boot"
     np.testing.assert_allclose(np.diff(log["time"]), 0.005)
