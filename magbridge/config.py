@@ -64,7 +64,7 @@ class Link(Table, frozen=True):
     """bit/s, where the link is a serial device."""
     signing_key: Name | None = None
     """File of 32 bytes; packets are signed and unsigned ones refused."""
-    others_rate: NotNegative = 1000.0
+    max_other_peers_rate: NotNegative = 1000.0
     """kB/s that all peers but the autopilot's get together, on ``udpin`` and ``tcpin``."""
     parameters: Name | None = None
     """File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a

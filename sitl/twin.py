@@ -92,7 +92,9 @@ class Twin:
         limits = self.scenario.all_limits
         legs = [leg for part in self.scenario.mission for leg in part.legs(rng, limits)]
         if not legs:
-            raise WrongUse(f"scenario {self.scenario.name!r} has no mission: drive it with a log (--like)")
+            raise WrongUse(
+                f"scenario {self.scenario.name!r} has no mission: drive it with a log (--trajectory-from)"
+            )
         start = (self.scenario.start.timestamp(), *self.world.origin)
         step = min(FINE_STEP, 1 / self.scenario.instrument.rate)
         return fly(legs, start, step, rng, self.scenario.motion, limits)

@@ -154,7 +154,7 @@ def main() -> None:
     parser = study_options(__doc__)
     parser.add_argument("--vehicles", type=int, default=12)
     parser.add_argument("--deployments", type=int, default=8, help="of each vehicle; the last is scored")
-    parser.add_argument("--every", type=int, default=2, help="deployments of each refit")
+    parser.add_argument("--sample-interval", type=int, default=2, help="deployments of each refit")
     parser.add_argument("--refit", choices=["usual", "battery"], default="usual")
     parser.add_argument("--runs", type=int, nargs="+", default=[0, 2, 10])
     parser.add_argument(

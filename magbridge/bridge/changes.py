@@ -10,9 +10,9 @@ from magbridge.mavlink.enums import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE
 
 __all__ = ["Changes"]
 
-INTERLEAVED = spec("MAG_BESIDE").id
+INTERLEAVED = spec("MAG_INTERLEAVED").id
 CLOCK_STEP, NOTICE, PORT, STANDSTILL = (
-    spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT", "MAG_STANDSTILL")
+    spec(name).id for name in ("MAG_CLOCK_STEP", "STATUSTEXT", "MAG_PORT", "MAG_HOST_STALL")
 )
 GRACE_US = 500_000
 """µs after a standstill within which more of what waited comes: what a full buffer had no room for."""

@@ -160,7 +160,7 @@ class Peers:
         self._paid = now
         if size > self._purse:
             self.withheld += size
-            self._notify(f"others get {self._budget / 1e3:g} kB/s in all: link.others_rate", True)
+            self._notify(f"others get {self._budget / 1e3:g} kB/s in all: link.max_other_peers_rate", True)
             return False
         self._purse -= size
         return True

@@ -59,7 +59,12 @@ def run(path: Path) -> None:
     own = config.link
     who, signed = (own.system, own.autopilot), own.signing_key is not None
     link = open_link(
-        own.url, own.baudrate, str(config.path), autopilot=who, budget=1e3 * own.others_rate, signed=signed
+        own.url,
+        own.baudrate,
+        str(config.path),
+        autopilot=who,
+        budget=1e3 * own.max_other_peers_rate,
+        signed=signed,
     )
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)

@@ -21,12 +21,12 @@ def clock_step(time_us: int, step_us: int) -> bytes:
 
 def standstill(time_us: int, duration_us: int) -> bytes:
     """Return the frame that says that until now the bridge stood still for `duration_us` µs."""
-    return _frame("MAG_STANDSTILL", time_usec=time_us, duration=min(duration_us, 2**32 - 1))
+    return _frame("MAG_HOST_STALL", time_usec=time_us, duration=min(duration_us, 2**32 - 1))
 
 
 def interleaved(count: int) -> bytes:
     """Return the frame that says that `count` frames were sent which are not in the log."""
-    return _frame("MAG_BESIDE", count=count)
+    return _frame("MAG_INTERLEAVED", count=count)
 
 
 def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:

@@ -17,7 +17,7 @@ from magbridge.cli.common import (
     Heading,
     Json,
     Log,
-    Picture,
+    Plot,
     Reading,
     Whole,
     check_inputs,
@@ -88,7 +88,7 @@ def simulate(
     *,
     output: Log,
     seed: Annotated[Whole, Parameter(validator=validators.Number(gte=0))] = 0,
-    like: tuple[Path, ...] = (),
+    trajectory_from: tuple[Path, ...] = (),
     reference: Literal["none", "true", "map"] | None = None,
     reading: Reading = AS_THEY_SAY,
     map_output: Annotated[Path | None, Parameter(name="--map", validator=file_to_write(".nc"))] = None,
@@ -100,13 +100,13 @@ def simulate(
     ----------
     scenario
         A scenario file, or one of the built-in demo, survey, bonne_bay, random_glider, comet and seaglider,
-        of which the last two need a log to drive them (--like); or turn_on, warming, bolt, pump and battery,
-        in which the vehicle changes after its calibration.
+        of which the last two need a log to drive them (--trajectory-from); or turn_on, warming, bolt, pump
+        and battery, in which the vehicle changes after its calibration.
     output
         The file to write.
     seed
         Determines everything that the scenario leaves open; the same seed gives the same deployment.
-    like
+    trajectory_from
         A log whose attitude, position and masses drive the simulation instead of the scenario's mission;
         may be repeated. Each call makes a world around its logs: for one world, give all logs in one call.
     reference
@@ -121,15 +121,15 @@ def simulate(
     from sitl.twin import Twin
     from sitl.twin import simulate as simulate_scenario
 
-    check_inputs((scenario, *like), output)
-    check_inputs((scenario, *like, output), map_output)
+    check_inputs((scenario, *trajectory_from), output)
+    check_inputs((scenario, *trajectory_from, output), map_output)
     chosen = load(scenario)
     if reference is not None:
         telemetry = msgspec.structs.replace(chosen.telemetry, reference=reference)
         chosen = msgspec.structs.replace(chosen, telemetry=telemetry)
     with waiting("simulating"):
-        if like:
-            log = read(like, options=reading.options)
+        if trajectory_from:
+            log = read(trajectory_from, options=reading.options)
             note_losses(log.attrs)
             chosen = placed_at(log, chosen)
             deployment = simulate_like(log, chosen, seed)
@@ -147,11 +147,13 @@ def map(  # noqa: A001 - the command's name
     *grids: Path,
     output: Grid,
     altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
-    surveyed: Annotated[tuple[float, ...], Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = (),
+    survey_altitude: Annotated[
+        tuple[float, ...], Parameter(validator=validators.Number(gte=-1e6, lte=1e6))
+    ] = (),
     smooth: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e4))] = 0.0,
     mask: Path | None = None,
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
-    picture: Picture = None,
+    plot: Plot = None,
     json: Json = False,
 ) -> None:
     """Combine the grids of several surveys into one anomaly map: continue upward, merge, mask, smooth.
@@ -164,7 +166,7 @@ def map(  # noqa: A001 - the command's name
         The map to write, netCDF.
     altitude
         Altitude in m to which every grid is continued upward; by default that of the highest.
-    surveyed
+    survey_altitude
         Altitude in m of the surveys whose grids do not say it: one for all grids, or repeated, one for each.
     smooth
         Wavelength in km: of shorter waves less than half stays, and what is taken out counts as the map's
@@ -173,7 +175,7 @@ def map(  # noqa: A001 - the command's name
         A CSV of longitude,latitude (deg): the polygon outside which the map is blank.
     spacing
         Node spacing in deg; by default that of the finest grid.
-    picture
+    plot
         A PNG, PDF or SVG to draw, with every step.
     """
     from magbridge.field.prepare import draw_steps, prepare, surveyed_at
@@ -183,12 +185,12 @@ def map(  # noqa: A001 - the command's name
     polygon = read_polygon(mask) if mask else None
     with waiting("preparing"):
         flown = [read_grid(path) for path in grids]
-        if surveyed:
-            flown = surveyed_at(flown, surveyed)
+        if survey_altitude:
+            flown = surveyed_at(flown, survey_altitude)
         result, steps = prepare(flown, altitude, smooth, polygon, spacing)
     result.save(output)
-    if picture:
-        draw_steps(steps, picture)
+    if plot:
+        draw_steps(steps, plot)
     titles = [step.title for step in steps]
     facts = {"file": str(output), "steps": titles, "rms_nT": result.rms}
     print_result(facts, f"{output}: {', '.join(titles)}", json)

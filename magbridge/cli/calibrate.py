@@ -14,7 +14,7 @@ from magbridge.cli.common import (
     Base,
     Heading,
     Output,
-    Picture,
+    Plot,
     Reading,
     Whole,
     check_inputs,
@@ -40,24 +40,23 @@ ALL = "all"
 
 
 @command("calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
-def calibrate(
+def calibrate(  # noqa: PLR0915 - a statement or two for each option
     *files: Path,
     output: Output,
     parameter: tuple[str, ...] = (),
     order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
     method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto",
-    vehicle: Path | None = None,
+    vehicle: str = "",
     grid: Path | None = None,
     base: Base = None,
-    about_mean: bool = False,
+    reference: Literal["mean"] | None = None,
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
-    filter_corner: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
+    filter_cutoff: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     fleet: str = "",
-    member: str = "",
     refit: str = "",
     heading_reference: Heading = None,
-    picture: Picture = None,
+    plot: Plot = None,
     reading: Reading = AS_THEY_SAY,
     json: bool = False,
 ) -> None:
@@ -86,15 +85,17 @@ def calibrate(
         then polynomials through them: the paper's first stage), horizontal (one ellipsoid, levelled by
         roll and pitch: the alternative that the paper names).
     vehicle
-        A vehicle.toml with the positions of the moving masses relative to the sensor (method auto).
+        A vehicle.toml with the positions of the moving masses relative to the sensor (method auto); with
+        --fleet, the vehicle's name in the fleet, which is known for logs that are catalogued.
     grid
         An anomaly grid to add to the IGRF.
     base
         A base station's log (total_field, or a vector): by how much the Earth's field varied, to add to the
         reference. So is that of an observatory (IAGA-2002) among the logs.
-    about_mean
-        Fit about the mean length of the log's own readings, where neither it nor --date tell what the Earth's
-        field was. The total field then has the sensor's own scale, which site_bias counts: by default 2 %.
+    reference
+        mean: use the mean length of the log's own readings as the reference, if neither the log nor --date
+        gives the Earth's field. The total field then has the sensor's own scale, which site_bias counts: by
+        default 2 %.
     site_bias
         1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
         the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
@@ -103,26 +104,25 @@ def calibrate(
     position_sigma
         1-sigma in m by which dead-reckoned positions slowly drift, where the rock is found with the
         calibration: the track is bent to where the rock repeats itself; 0: positions are exact.
-    filter_corner
-        Corner frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
+    filter_cutoff
+        Cut-off frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
         undone; 0: no filter.
     fleet
         A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from what the
         vehicle's earlier deployments and its fleet let expect, and it is said what that is worth (method
         auto). Two runs are then often enough.
-    member
-        Which of the fleet's vehicles this is; of logs that are catalogued, it is known.
     refit
         Which refit it flies with, if its logs are not catalogued; by default a new one.
-    picture
+    plot
         A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
         each parameter.
     json
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
     given: dict[str, Any] = dict(locals())
-    logs_to_read(files, output, vehicle, grid, base)
-    check_inputs((*files, output), picture)
+    masses = Path(vehicle) if vehicle and not fleet else None
+    logs_to_read(files, output, masses, grid, base)
+    check_inputs((*files, output), plot)
     if reading.compass == ALL:
         _each_compass(**given)
         return
@@ -139,8 +139,8 @@ def calibrate(
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 
-    _refuse_together(parameter, method, vehicle, fleet)
-    start = fleet_start(fleet, member, refit, files) if fleet else None
+    _refuse_together(parameter, method, masses, fleet)
+    start = fleet_start(fleet, vehicle, refit, files) if fleet else None
     parameter = parameter or (start.names if start else ())
     anomalies = read_grid(grid) if grid else None
     with waiting("reading"):
@@ -149,10 +149,10 @@ def calibrate(
     require(deployment, (*CHANNELS, *(name for name in parameter if name != AUTO)))
     deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
-    if about_mean:
+    if reference == "mean":
         deployment, site_bias = _about_mean(deployment, site_bias)
     note_unused_grid(grid, deployment)
-    options: dict[str, Any] = {"vehicle": read_vehicle(vehicle)} if vehicle else {}
+    options: dict[str, Any] = {"vehicle": read_vehicle(masses)} if masses else {}
     with naming(deployment), waiting("fitting"):
         parameter = chosen_parameters(parameter, deployment, grid=anomalies, order=order, site_bias=site_bias)
         data = replace(
@@ -161,17 +161,17 @@ def calibrate(
         )
         for line in unused_logs(logs, data):
             complain(line)
-        data = unfiltered(data, filter_corner) if filter_corner else data
+        data = unfiltered(data, filter_cutoff) if filter_cutoff else data
         options |= drifting(position_sigma, data, method)
         if start:
             found, doubt, worth = from_fleet(start, data, order, site_bias=site_bias, **options)
         else:
             found, doubt, worth = *fitted(logs, data, method, order, site_bias=site_bias, **options), {}
     save(found.calibration, output)
-    if picture:
+    if plot:
         from magbridge.calibration.fitting.draw import draw_fit
 
-        draw_fit(found.calibration, data, picture)
+        draw_fit(found.calibration, data, plot)
     for warning in (*found.warnings, *doubt, *undeclared_columns(deployment, data, found)):
         complain(warning)
     left_out = deployment.sizes["time"] - len(data)
@@ -191,8 +191,8 @@ def _refuse_together(parameter: tuple[str, ...], method: str, vehicle: Path | No
         raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
     if "auto" in parameter and (method != "auto" or fleet or vehicle):
         raise WrongUse("--parameter auto: goes with method auto, and without --vehicle and --fleet")
-    if fleet and (vehicle or method != "auto"):
-        raise WrongUse("--fleet: goes with method auto, and without --vehicle")
+    if fleet and method != "auto":
+        raise WrongUse("--fleet: goes with method auto")
 
 
 def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:
@@ -207,7 +207,7 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
     source = deployment.attrs["source"]
     placed = {"latitude", "longitude"} <= set(deployment.data_vars) and not counts_from_boot(deployment)
     if placed or "reference_field" in deployment:
-        raise WrongUse(f"--about-mean: {source} tells what the field was")
+        raise WrongUse(f"--reference mean: {source} tells what the field was")
     deployment = about_mean(deployment)
     mean = float(deployment["reference_field"][0])
     complain(
@@ -222,7 +222,7 @@ def _of(path: Path, compass: int) -> Path:
 
 
 def _each_compass(
-    files: tuple[Path, ...], output: Path, picture: Path | None, reading: Reading, **options: Any
+    files: tuple[Path, ...], output: Path, plot: Path | None, reading: Reading, **options: Any
 ) -> None:
     """Calibrate every compass of the logs; DataError: not one could be."""
     from magbridge.logs import read_each
@@ -233,7 +233,7 @@ def _each_compass(
         found = {one.number for log in read_each(files, options=first.options) for one in compasses_in(log)}
     failed = 0
     for number in sorted(found) or [0]:
-        own: dict[str, Any] = {"output": _of(output, number), "picture": picture and _of(picture, number)}
+        own: dict[str, Any] = {"output": _of(output, number), "plot": plot and _of(plot, number)}
         try:
             calibrate(*files, reading=replace(reading, compass=str(number)), **own, **options)
         except DataError as error:

@@ -21,7 +21,7 @@ from magbridge.logs import Options, suffixes
 from magbridge.logs.registry import is_bag
 
 __all__ = [
-    "AS_THEY_SAY", "Base", "Day", "Folder", "Grid", "Heading", "Json", "Log", "Output", "Picture", "Reading",
+    "AS_THEY_SAY", "Base", "Day", "Folder", "Grid", "Heading", "Json", "Log", "Output", "Plot", "Reading",
     "Whole", "app", "check_inputs", "command", "complain", "file_to_write", "folder_to_write", "logs_to_read",
     "print_result",
 ]  # fmt: skip
@@ -164,7 +164,7 @@ Heading = Annotated[
     Literal["true", "magnetic"] | None,
     Parameter(help="What headings refer to. If not given: what the log says, else true north."),
 ]
-Picture = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
+Plot = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Whole = Annotated[int, Parameter(converter=_whole)]
 Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
 

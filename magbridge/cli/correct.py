@@ -12,7 +12,7 @@ from magbridge.cli.common import (
     AS_THEY_SAY,
     Json,
     Log,
-    Picture,
+    Plot,
     Reading,
     check_inputs,
     command,
@@ -59,7 +59,7 @@ def correct(
     learn: bool = False,
     config: Path | None = None,
     save: Annotated[Path | None, Parameter(validator=file_to_write())] = None,
-    picture: Picture = None,
+    plot: Plot = None,
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
@@ -91,12 +91,12 @@ def correct(
         is known of the vehicle is then learned from nothing.
     save
         With --learn: where to write the calibration that was published last.
-    picture
+    plot
         A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and what is flagged.
     """
     source = _source(calibration, config, learn=learn)
     logs_to_read(files, output, source)
-    check_inputs((*files, output), picture)
+    check_inputs((*files, output), plot)
 
     from magbridge.logs import Writer, read_chunks
 
@@ -117,13 +117,13 @@ def correct(
             _notify(correction)
             pieces.append(part.attrs)
             tally.add(corrected, part.sizes["time"])
-            if picture:
+            if plot:
                 drawn.append(corrected[list(CORRECTED)])
-    if picture:
+    if plot:
         from magbridge.logs.deployment import join
         from magbridge.logs.draw import draw_corrected
 
-        draw_corrected(join(drawn), picture)
+        draw_corrected(join(drawn), plot)
     note_losses(*pieces)
     note_settings(*pieces)
     if doubt := tally.doubt():

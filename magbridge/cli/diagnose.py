@@ -30,7 +30,7 @@ NOTHING = (-9999.0, -99999.0)
 ITSELF = (
     "the calibration was fitted to this log and has absorbed part of its errors, so that what is left of "
     "them easily gets a wrong name, and nothing is held out; calibrate on separate calibration runs, with "
-    "--filter-corner if the sensor has an anti-alias filter"
+    "--filter-cutoff if the sensor has an anti-alias filter"
 )
 
 

@@ -13,7 +13,7 @@ from magbridge.cli.common import (
     Heading,
     Json,
     Log,
-    Picture,
+    Plot,
     Reading,
     command,
     complain,
@@ -42,8 +42,8 @@ def navigate(
     calibration: Path | None = None,
     config: Path | None = None,
     bound: bool = False,
-    every: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lte=1e6))] = None,
-    picture: Picture = None,
+    sample_interval: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lte=1e6))] = None,
+    plot: Plot = None,
     heading_reference: Heading = None,
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
@@ -71,10 +71,10 @@ def navigate(
         A bridge.toml whose [navigation.options] say how well start, current and map are known.
     bound
         Compute what the map is worth along a planned track.
-    every
+    sample_interval
         Seconds between samples, for --bound. By default those of FILE where it is a log with a magnetometer,
         else those of the calibration, else 4.
-    picture
+    plot
         A PNG, PDF or SVG to draw: the tracks, on the map if there is one, errors and sigma; or the bound.
     """
     logs_to_read(files, output, map, calibration, config)
@@ -89,7 +89,7 @@ def navigate(
                 "--bound: expected --map, what the track is worth depends on it; without one, navigate FILE "
                 "--calibration cal.json says what a survey that was flown is worth, and its bound"
             )
-        _bound(files, map, output, options, known, every, picture, reading, json)
+        _bound(files, map, output, options, known, sample_interval, plot, reading, json)
         return
 
     from magbridge.field.read import read_grid
@@ -112,10 +112,10 @@ def navigate(
     else:
         grid, options = _continued(read_grid(map), options, deployment)
         track = find_way(deployment, grid, options)
-    if picture:
+    if plot:
         from magbridge.navigate.draw import draw_navigation
 
-        draw_navigation(track, grid, picture)
+        draw_navigation(track, grid, plot)
     write(track, output)
     for finding in track.attrs["findings"].splitlines():
         complain(finding)
@@ -189,8 +189,8 @@ def _bound(
     output: Path,
     options: Options | None,
     calibration: Calibration | None,
-    every: float | None,
-    picture: Path | None,
+    sample_interval: float | None,
+    plot: Path | None,
     reading: Reading,
     json: bool,
 ) -> None:
@@ -205,20 +205,20 @@ def _bound(
     grid, options = _continued(read_grid(map), options or Options(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0
-    every = every or _every(plan, calibration)
-    best = position_bound(grid, track[0], track[1], track[2], options, sigma, every=every)
+    sample_interval = sample_interval or _sample_interval(plan, calibration)
+    best = position_bound(grid, track[0], track[1], track[2], options, sigma, every=sample_interval)
     result = as_dataset(best, grid)
-    result.attrs["findings"] += f", with samples of {sigma:.3g} nT every {every:.3g} s"
-    result.attrs |= {"sample_sigma_nT": sigma, "sample_interval_s": every}
+    result.attrs["findings"] += f", with samples of {sigma:.3g} nT every {sample_interval:.3g} s"
+    result.attrs |= {"sample_sigma_nT": sigma, "sample_interval_s": sample_interval}
     write(result, output)
-    if picture:
+    if plot:
         from magbridge.navigate.draw import draw_bound
 
-        draw_bound(best, grid, picture)
+        draw_bound(best, grid, plot)
     print_result({"file": str(output), **result.attrs}, f"{output}: {result.attrs['findings']}", json)
 
 
-def _every(plan: xr.Dataset, calibration: Calibration | None) -> float:
+def _sample_interval(plan: xr.Dataset, calibration: Calibration | None) -> float:
     """Return the s between samples: those of a log, else those that a calibration was fitted to."""
     if plan.sizes["time"] > 2 and {"mag_x", "total_field"} & set(plan.variables):
         return float(plan["time"].diff("time").median())

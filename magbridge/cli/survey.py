@@ -14,7 +14,7 @@ from magbridge.cli.common import (
     Base,
     Json,
     Output,
-    Picture,
+    Plot,
     Reading,
     Whole,
     check_inputs,
@@ -54,7 +54,7 @@ def survey(
     geotiff: Annotated[Path | None, Parameter(validator=file_to_write(".tif", ".tiff"))] = None,
     tracks: Annotated[Path | None, Parameter(validator=file_to_write(".geojson", ".json", ".kml"))] = None,
     crossovers: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
-    picture: Picture = None,
+    plot: Plot = None,
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
@@ -99,7 +99,7 @@ def survey(
         The tracks, as GeoJSON or KML.
     crossovers
         A table of the crossovers with their mis-ties before and after levelling.
-    picture
+    plot
         A PNG, PDF or SVG to draw: map, sigma, track, residuals, crossovers.
     """
     from magbridge.survey.run import facts, summary
@@ -120,7 +120,7 @@ def survey(
     if predict:
         _predict(done, predict, output)
     else:
-        _map(done, output, spacing, altitude, geotiff, picture)
+        _map(done, output, spacing, altitude, geotiff, plot)
     if tracks:
         write_tracks(done.samples, tracks)
     if crossovers:
@@ -220,7 +220,7 @@ def _map(
     spacing: float | None,
     altitude: float | None,
     geotiff: Path | None,
-    picture: Path | None,
+    plot: Path | None,
 ) -> None:
     """Write the map in every form that is asked for."""
     from magbridge.survey.maps import anomaly_map
@@ -230,7 +230,7 @@ def _map(
     grid.save(output)
     if geotiff:
         write_geotiff(grid, geotiff)
-    if picture:
+    if plot:
         from magbridge.survey.draw import draw_survey
 
-        draw_survey(grid, done.samples, done.residual, done.found, (done.before, done.after), picture)
+        draw_survey(grid, done.samples, done.residual, done.found, (done.before, done.after), plot)

@@ -68,7 +68,9 @@ def prepare(
     if isfinite(level) and len(known) < len(grids):
         silent = next(grid.name for grid in grids if not isfinite(grid.altitude))
         raise OutOfRange(
-            "altitude", f"{level:.0f} m", f"{silent} does not say how high it was surveyed (--surveyed)"
+            "altitude",
+            f"{level:.0f} m",
+            f"{silent} does not say how high it was surveyed (--survey-altitude)",
         )
     lifted = []
     for grid in grids:
@@ -100,7 +102,7 @@ def surveyed_at(grids: Sequence[AnomalyGrid], altitudes: Sequence[float]) -> lis
     """
     if len(altitudes) not in (1, len(grids)):
         count = f"{len(altitudes)} altitudes for {len(grids)} grids"
-        raise WrongUse(f"--surveyed: {count}: one for all, or one for each")
+        raise WrongUse(f"--survey-altitude: {count}: one for all, or one for each")
     each = altitudes if len(altitudes) > 1 else [*altitudes] * len(grids)
     return [
         grid if isfinite(grid.altitude) else grid.replaced(altitude=altitude)

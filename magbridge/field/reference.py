@@ -79,7 +79,7 @@ def reference_field(
         raise FormatError(
             source,
             "expected latitude and longitude, or reference_field: the true field is unknown "
-            "(calibrate --about-mean does without)",
+            "(calibrate --reference mean does without)",
         )
     require_date(deployment)
     longitude, latitude, depth = positions(deployment)
@@ -177,7 +177,7 @@ def require_date(deployment: xr.Dataset) -> None:
         raise FormatError(
             deployment.attrs.get("source", "deployment"),
             "its times count from the boot, so the Earth's field is not known: expected the day, by "
-            "--date YYYY-MM-DD, or a column reference_field; calibrate also takes --about-mean",
+            "--date YYYY-MM-DD, or a column reference_field; calibrate also takes --reference mean",
         )
 
 

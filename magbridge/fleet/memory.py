@@ -140,7 +140,7 @@ def owner(catalogue: Catalogue, digests: Iterable[str]) -> tuple[str, str]:
     found = {(row["vehicle"], row["refit"]) for row in rows}
     if len({vehicle for vehicle, _ in found}) != 1:
         note = "of several of its vehicles" if found else "in its catalogue of none"
-        raise WrongUse(f"--fleet {catalogue.name}: the logs are {note}: name the vehicle (--member)")
+        raise WrongUse(f"--fleet {catalogue.name}: the logs are {note}: name the vehicle (--vehicle)")
     return sorted(found)[-1]
 
 

@@ -36,7 +36,7 @@ USES: dict[str, Needs] = {
     "survey": ((CHANNELS, ("total_field",), ("anomaly",)), (POSITION,)),
     "plan --mission": ((ATTITUDE,), (POSITION,)),
     "replay": ((CHANNELS,),),
-    "simulate --like": ((ATTITUDE,), (POSITION,)),
+    "simulate --trajectory-from": ((ATTITUDE,), (POSITION,)),
 }
 """Command -> what it needs: of each group, one of the alternatives, each a set of columns."""
 GAP = 2.5

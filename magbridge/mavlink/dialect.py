@@ -501,10 +501,10 @@ MAVLINK_MSG_ID_MAG_BRIDGE_START = 60106
 MAVLINK_MSG_ID_MAG_CLOCK_STEP = 60107
 MAVLINK_MSG_ID_MAG_PORT = 60108
 MAVLINK_MSG_ID_MAG_COLUMN = 60109
-MAVLINK_MSG_ID_MAG_STANDSTILL = 60110
+MAVLINK_MSG_ID_MAG_HOST_STALL = 60110
 MAVLINK_MSG_ID_MAG_LEARNING = 60111
 MAVLINK_MSG_ID_MAG_SIGNING_STREAM = 60120
-MAVLINK_MSG_ID_MAG_BESIDE = 60121
+MAVLINK_MSG_ID_MAG_INTERLEAVED = 60121
 MAVLINK_MSG_ID_COMPONENT_INFORMATION_BASIC = 396
 MAVLINK_MSG_ID_COMPONENT_METADATA = 397
 MAVLINK_MSG_ID_TIMESYNC = 111
@@ -996,14 +996,14 @@ class MAVLink_mag_column_message(MAVLink_message):
 setattr(MAVLink_mag_column_message, "name", mavlink_msg_deprecated_name_property())
 
 
-class MAVLink_mag_standstill_message(MAVLink_message):
+class MAVLink_mag_host_stall_message(MAVLink_message):
     """
     In logs only: the bridge stood still, and what came meanwhile
     waited.
     """
 
-    id = MAVLINK_MSG_ID_MAG_STANDSTILL
-    msgname = "MAG_STANDSTILL"
+    id = MAVLINK_MSG_ID_MAG_HOST_STALL
+    msgname = "MAG_HOST_STALL"
     fieldnames = ["time_usec", "duration"]
     ordered_fieldnames = ["time_usec", "duration"]
     fieldtypes = ["uint64_t", "uint32_t"]
@@ -1014,16 +1014,16 @@ class MAVLink_mag_standstill_message(MAVLink_message):
     orders = [0, 1]
     lengths = [1, 1]
     array_lengths = [0, 0]
-    crc_extra = 94
+    crc_extra = 158
     unpacker = struct.Struct("<QI")
     instance_field = None
     instance_offset = -1
 
     def __init__(self, time_usec: int, duration: int):
-        MAVLink_message.__init__(self, MAVLink_mag_standstill_message.id, MAVLink_mag_standstill_message.msgname)
-        self._fieldnames = MAVLink_mag_standstill_message.fieldnames
-        self._instance_field = MAVLink_mag_standstill_message.instance_field
-        self._instance_offset = MAVLink_mag_standstill_message.instance_offset
+        MAVLink_message.__init__(self, MAVLink_mag_host_stall_message.id, MAVLink_mag_host_stall_message.msgname)
+        self._fieldnames = MAVLink_mag_host_stall_message.fieldnames
+        self._instance_field = MAVLink_mag_host_stall_message.instance_field
+        self._instance_offset = MAVLink_mag_host_stall_message.instance_offset
         self.time_usec = time_usec
         self.duration = duration
 
@@ -1033,7 +1033,7 @@ class MAVLink_mag_standstill_message(MAVLink_message):
 
 # Define name on the class for backwards compatibility (it is now msgname).
 # Done with setattr to hide the class variable from mypy.
-setattr(MAVLink_mag_standstill_message, "name", mavlink_msg_deprecated_name_property())
+setattr(MAVLink_mag_host_stall_message, "name", mavlink_msg_deprecated_name_property())
 
 
 class MAVLink_mag_learning_message(MAVLink_message):
@@ -1130,14 +1130,14 @@ class MAVLink_mag_signing_stream_message(MAVLink_message):
 setattr(MAVLink_mag_signing_stream_message, "name", mavlink_msg_deprecated_name_property())
 
 
-class MAVLink_mag_beside_message(MAVLink_message):
+class MAVLink_mag_interleaved_message(MAVLink_message):
     """
     In logs only: that frames of a file were sent, which are not in
     the log; a replay needs their number.
     """
 
-    id = MAVLINK_MSG_ID_MAG_BESIDE
-    msgname = "MAG_BESIDE"
+    id = MAVLINK_MSG_ID_MAG_INTERLEAVED
+    msgname = "MAG_INTERLEAVED"
     fieldnames = ["count"]
     ordered_fieldnames = ["count"]
     fieldtypes = ["uint16_t"]
@@ -1148,16 +1148,16 @@ class MAVLink_mag_beside_message(MAVLink_message):
     orders = [0]
     lengths = [1]
     array_lengths = [0]
-    crc_extra = 49
+    crc_extra = 127
     unpacker = struct.Struct("<H")
     instance_field = None
     instance_offset = -1
 
     def __init__(self, count: int):
-        MAVLink_message.__init__(self, MAVLink_mag_beside_message.id, MAVLink_mag_beside_message.msgname)
-        self._fieldnames = MAVLink_mag_beside_message.fieldnames
-        self._instance_field = MAVLink_mag_beside_message.instance_field
-        self._instance_offset = MAVLink_mag_beside_message.instance_offset
+        MAVLink_message.__init__(self, MAVLink_mag_interleaved_message.id, MAVLink_mag_interleaved_message.msgname)
+        self._fieldnames = MAVLink_mag_interleaved_message.fieldnames
+        self._instance_field = MAVLink_mag_interleaved_message.instance_field
+        self._instance_offset = MAVLink_mag_interleaved_message.instance_offset
         self.count = count
 
     def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
@@ -1166,7 +1166,7 @@ class MAVLink_mag_beside_message(MAVLink_message):
 
 # Define name on the class for backwards compatibility (it is now msgname).
 # Done with setattr to hide the class variable from mypy.
-setattr(MAVLink_mag_beside_message, "name", mavlink_msg_deprecated_name_property())
+setattr(MAVLink_mag_interleaved_message, "name", mavlink_msg_deprecated_name_property())
 
 
 class MAVLink_component_information_basic_message(MAVLink_message):
@@ -1312,10 +1312,10 @@ mavlink_map: Dict[int, Type[MAVLink_message]] = {
     MAVLINK_MSG_ID_MAG_CLOCK_STEP: MAVLink_mag_clock_step_message,
     MAVLINK_MSG_ID_MAG_PORT: MAVLink_mag_port_message,
     MAVLINK_MSG_ID_MAG_COLUMN: MAVLink_mag_column_message,
-    MAVLINK_MSG_ID_MAG_STANDSTILL: MAVLink_mag_standstill_message,
+    MAVLINK_MSG_ID_MAG_HOST_STALL: MAVLink_mag_host_stall_message,
     MAVLINK_MSG_ID_MAG_LEARNING: MAVLink_mag_learning_message,
     MAVLINK_MSG_ID_MAG_SIGNING_STREAM: MAVLink_mag_signing_stream_message,
-    MAVLINK_MSG_ID_MAG_BESIDE: MAVLink_mag_beside_message,
+    MAVLINK_MSG_ID_MAG_INTERLEAVED: MAVLink_mag_interleaved_message,
     MAVLINK_MSG_ID_COMPONENT_INFORMATION_BASIC: MAVLink_component_information_basic_message,
     MAVLINK_MSG_ID_COMPONENT_METADATA: MAVLink_component_metadata_message,
     MAVLINK_MSG_ID_TIMESYNC: MAVLink_timesync_message,
@@ -2091,7 +2091,7 @@ class MAVLink(object):
         """
         self.send(self.mag_column_encode(scale, offset, unit, message, field, match, column, component), force_mavlink1=force_mavlink1)
 
-    def mag_standstill_encode(self, time_usec: int, duration: int) -> MAVLink_mag_standstill_message:
+    def mag_host_stall_encode(self, time_usec: int, duration: int) -> MAVLink_mag_host_stall_message:
         """
         In logs only: the bridge stood still, and what came meanwhile waited.
 
@@ -2099,9 +2099,9 @@ class MAVLink(object):
         duration                  : For how long. [us] (type:uint32_t)
 
         """
-        return MAVLink_mag_standstill_message(time_usec, duration)
+        return MAVLink_mag_host_stall_message(time_usec, duration)
 
-    def mag_standstill_send(self, time_usec: int, duration: int, force_mavlink1: bool = False) -> None:
+    def mag_host_stall_send(self, time_usec: int, duration: int, force_mavlink1: bool = False) -> None:
         """
         In logs only: the bridge stood still, and what came meanwhile waited.
 
@@ -2109,7 +2109,7 @@ class MAVLink(object):
         duration                  : For how long. [us] (type:uint32_t)
 
         """
-        self.send(self.mag_standstill_encode(time_usec, duration), force_mavlink1=force_mavlink1)
+        self.send(self.mag_host_stall_encode(time_usec, duration), force_mavlink1=force_mavlink1)
 
     def mag_learning_encode(self, time_usec: int, alarm_since: int, calibration_id: int, first_calibration_id: int, samples: int, rms_first: float, rms_published: float, rms_learned: float, better: float, alarm_amplitude: float, causes: int, state: int, sensor_id: int) -> MAVLink_mag_learning_message:
         """
@@ -2183,7 +2183,7 @@ class MAVLink(object):
         """
         self.send(self.mag_signing_stream_encode(stamp, link, system, sender, ahead), force_mavlink1=force_mavlink1)
 
-    def mag_beside_encode(self, count: int) -> MAVLink_mag_beside_message:
+    def mag_interleaved_encode(self, count: int) -> MAVLink_mag_interleaved_message:
         """
         In logs only: that frames of a file were sent, which are not in the
         log; a replay needs their number.
@@ -2191,9 +2191,9 @@ class MAVLink(object):
         count                     : How many. (type:uint16_t)
 
         """
-        return MAVLink_mag_beside_message(count)
+        return MAVLink_mag_interleaved_message(count)
 
-    def mag_beside_send(self, count: int, force_mavlink1: bool = False) -> None:
+    def mag_interleaved_send(self, count: int, force_mavlink1: bool = False) -> None:
         """
         In logs only: that frames of a file were sent, which are not in the
         log; a replay needs their number.
@@ -2201,7 +2201,7 @@ class MAVLink(object):
         count                     : How many. (type:uint16_t)
 
         """
-        self.send(self.mag_beside_encode(count), force_mavlink1=force_mavlink1)
+        self.send(self.mag_interleaved_encode(count), force_mavlink1=force_mavlink1)
 
     def component_information_basic_encode(self, time_boot_ms: int, capabilities: int, time_manufacture_s: int, vendor_name: bytes, model_name: bytes, software_version: bytes, hardware_version: bytes, serial_number: bytes) -> MAVLink_component_information_basic_message:
         """

@@ -191,7 +191,7 @@ def test_others_share_a_budget_and_the_autopilot_has_none(kind: str) -> None:
         allowed = 2000.0 * (1.0 + time.monotonic() - begun)
         assert got[0] == 20 * 500
         assert 2000 <= got[1] + got[2] <= allowed
-        assert port.notice() == "others get 2 kB/s in all: link.others_rate"
+        assert port.notice() == "others get 2 kB/s in all: link.max_other_peers_rate"
         assert port.notice() == ""
         time.sleep(1.0)
         assert answered(everyone, port) == [0, 1, 2]

@@ -36,7 +36,7 @@ FEW = 40  # rows, which a diagnosis refuses: what it says before is said all the
 
 @pytest.mark.parametrize("like", [False, True], ids=["mission", "like a log"])
 def test_the_simulated_world_has_a_map(deployment: Path, like: bool, command: Command) -> None:
-    driven = ["--like", deployment] if like else []
+    driven = ["--trajectory-from", deployment] if like else []
     command("simulate", "demo", "-o", "twin.nc", "--map", "grid.nc", "--seed", "5", *driven)
     twin = read("twin.nc")
     longitude, latitude = (twin[name].to_numpy() for name in ("truth_longitude", "truth_latitude"))
@@ -95,7 +95,7 @@ def test_a_fit_can_be_looked_at(deployment: Path, command: Command) -> None:
     """Also where the log tells of no attitude, and a parameter has no part in the fit."""
     write(read(deployment).drop_vars(["roll", "pitch", "heading"]), "bare.csv")
     fitted = "calibrate", "bare.csv", "--method", "nominal", "--parameter", "battpos"
-    command(*fitted, "-o", "cal.json", "--picture", "fit.png")
+    command(*fitted, "-o", "cal.json", "--plot", "fit.png")
     assert Path("fit.png").stat().st_size > 40_000
 
 
@@ -120,7 +120,7 @@ def test_what_correct_writes_is_netcdf_that_others_read(
     deployment: Path, calibration: Path, command: Command
 ) -> None:
     command("calibrate", deployment, "--parameter", "battpos", "-o", "cal.json", "--method", "nominal")
-    command("correct", deployment, "--calibration", "cal.json", "-o", "corrected.nc", "--picture", "c.png")
+    command("correct", deployment, "--calibration", "cal.json", "-o", "corrected.nc", "--plot", "c.png")
     assert Path("c.png").read_bytes().startswith(b"\x89PNG")
     with xr.open_dataset("corrected.nc") as theirs:
         assert theirs["TIME"].dtype.kind == "M"
@@ -195,7 +195,18 @@ def test_a_column_that_the_calibration_needs_is_missed_aloud(deployment: Path, c
 
 def test_a_grid_that_is_not_used_is_told(deployment: Path, calibration: Path, command: Command) -> None:
     """It is added to the IGRF, and a log with a reference of its own does without either."""
-    command("simulate", "demo", "-o", "twin.nc", "--map", "grid.nc", "--seed", "5", "--like", deployment)
+    command(
+        "simulate",
+        "demo",
+        "-o",
+        "twin.nc",
+        "--map",
+        "grid.nc",
+        "--seed",
+        "5",
+        "--trajectory-from",
+        deployment,
+    )
     rows = read(deployment).isel(time=slice(0, FEW))
     write(rows, "log.nc")
     write(rows.drop_vars("reference_field"), "bare.nc")

@@ -193,8 +193,8 @@ def test_a_calibration_starts_from_its_fleet(
     write(few.isel(time=np.isin(few["run"], np.unique(few["run"])[:2])), log)
     arguments = ["calibrate", str(log), "--fleet", place, "-o", str(tmp_path / "cal.json"), "--json"]
     assert main(arguments) == 2
-    assert "name the vehicle (--member)" in capsys.readouterr().err
-    assert main([*arguments, "--member", "one", "--refit", "spring"]) == 0
+    assert "name the vehicle (--vehicle)" in capsys.readouterr().err
+    assert main([*arguments, "--vehicle", "one", "--refit", "spring"]) == 0
     found = json.loads(capsys.readouterr().out)["fleet"]
     assert (found["deployments"], found["deployments_of_others"]) == (2, 1)
     assert found["expected_nT"] < 0.5 * found["expected_alone_nT"]

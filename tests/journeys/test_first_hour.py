@@ -190,7 +190,7 @@ def test_a_navigator_with_a_grid_in_microtesla(walk: Walk, here: Path) -> None:
     plan = ["time,latitude,longitude,depth,roll,pitch,heading,water_speed"]
     plan += [f"{1.7e9 + 60 * k},{49.42 + 0.002 * k:.5f},-57.9,20,0,0,0,0.4" for k in range(70)]
     (here / "plan.csv").write_text("\n".join(plan) + "\n")
-    walk("magbridge navigate plan.csv --bound --map map.nc --every 0.2 -o bound.csv")
+    walk("magbridge navigate plan.csv --bound --map map.nc --sample-interval 0.2 -o bound.csv")
     assert Path("bound.csv").exists()
 
 

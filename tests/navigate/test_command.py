@@ -62,7 +62,7 @@ def here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_log_against_its_map(command: Command) -> None:
-    texts = command(*TRACK, *CALIBRATED, "--config", "bridge.toml", "--picture", "track.png", "--json")
+    texts = command(*TRACK, *CALIBRATED, "--config", "bridge.toml", "--plot", "track.png", "--json")
     result = json.loads(texts.out)
     assert result["findings"] == texts.err == ""
     found = read("out.nc")
@@ -83,7 +83,7 @@ def test_a_map_that_cannot_be_meant_is_one_line(command: Command) -> None:
 
 
 def test_a_plan_is_told_what_the_map_is_worth(command: Command) -> None:
-    assert "dead reckoning alone" in command(*BOUND, "plan.csv", "--picture", "bound.png").out
+    assert "dead reckoning alone" in command(*BOUND, "plan.csv", "--plot", "bound.png").out
     bound = read("out.nc")
     assert (bound["sigma"] <= bound["unaided"]).all()
     assert Path("bound.png").stat().st_size > 20_000
@@ -121,7 +121,7 @@ def test_wrong_use_is_one_line(command: Command) -> None:
 
 def test_without_a_map_the_track_is_bent_to_its_own_survey(command: Command, here: Path) -> None:
     """One smoothed track with its covariance; what can only be done with a map is refused in a line."""
-    given = "navigate", "log.nc", *CALIBRATED, "--config", "bridge.toml", "--picture", "own.png"
+    given = "navigate", "log.nc", *CALIBRATED, "--config", "bridge.toml", "--plot", "own.png"
     texts = command(*given, "-o", "own.nc")
     assert "dead reckoning alone" in texts.err
     track = read([Path("own.nc")])
@@ -139,5 +139,9 @@ def test_a_bound_takes_the_log_s_own_rate(command: Command, here: Path) -> None:
     """Samples of a log, else those of the calibration, else one in 4 s; or as it is told."""
     slow = read([Path("log.nc")]).isel(time=slice(None, None, 5))
     write(slow.assign(latitude=slow["truth_latitude"], longitude=slow["truth_longitude"]), "slow.nc")
-    for words, every in ((("slow.nc",), 20.0), (("plan.csv",), 4.0), (("plan.csv", "--every", "0.2"), 0.2)):
+    for words, every in (
+        (("slow.nc",), 20.0),
+        (("plan.csv",), 4.0),
+        (("plan.csv", "--sample-interval", "0.2"), 0.2),
+    ):
         assert json.loads(command(*BOUND, *words, "--json").out)["sample_interval_s"] == pytest.approx(every)

@@ -55,7 +55,7 @@ def _of_numbers(finding: Finding) -> Iterator[Note]:
         yield Note(
             "attenuation",
             f"It shortens a field that turns, as an RC filter of {number(corner, 2)} Hz does. The extended "
-            "calibration is fitted without that, as with calibrate --filter-corner. In turns the corrected "
+            "calibration is fitted without that, as with calibrate --filter-cutoff. In turns the corrected "
             "field stays too short.",
             {"corner_Hz": corner},
         )

@@ -82,7 +82,7 @@ def _shortened(problem: Problem) -> Candidate:
     .. math:: H + \tfrac12 \sigma^2 \ddot H + \dots
 
     For an RC filter sigma is its time constant. A field that turns with omega is shortened by
-    ``sigma^2 omega^2 / 2`` of its turning part. As with ``calibrate --filter-corner``, the calibration is
+    ``sigma^2 omega^2 / 2`` of its turning part. As with ``calibrate --filter-cutoff``, the calibration is
     fitted without it, and nothing is added to a field that turns live. The second derivative is that of
     :attr:`~.compare.problem.Problem.reading`, because it would correlate with the noise of its own sample.
     """
