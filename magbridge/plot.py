@@ -17,8 +17,8 @@ import numpy as np
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.errors import MissingExtra, WrongUse
+from magbridge.estimation.residual import rms
 from magbridge.field.grid import AnomalyGrid
 
 try:

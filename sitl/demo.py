@@ -17,8 +17,8 @@ from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.residual import rms
 from magbridge.config import load as load_config
+from magbridge.estimation.residual import rms
 from magbridge.logs import write
 from magbridge.records import Quality
 from sitl.dataset import channels, corrected, segments

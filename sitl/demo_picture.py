@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.files import atomic_path
 from sitl.dataset import channels
 

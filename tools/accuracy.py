@@ -31,8 +31,8 @@ from study_worlds import METHODS, NOISES, Glider, glider, true_field
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 from magbridge.field.reference import main_field
 from sitl import load
 from sitl.dataset import channels, side_by_side

@@ -21,8 +21,8 @@ from study_worlds import MASSES, METHODS, PAPER, TRIALS, Trials, fly_trials, mea
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.run import diagnose
+from magbridge.estimation.residual import rms
 from sitl.dataset import corrected
 from sitl.scenario import load
 from sitl.twin import Twin

@@ -29,9 +29,9 @@ from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.mounted_masses import Mounting
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Noise, Reference
-from magbridge.calibration.residual import rms
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 from magbridge.fleet.learn import Lesson, learn_fleet
 from magbridge.fleet.variances import LEVELS
 from sitl import Twin, load, segments, simulate

@@ -38,10 +38,10 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.columns import CHANNELS
 from magbridge.config import Align
 from magbridge.correction import Correction
+from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field

@@ -21,7 +21,7 @@ from rich.console import Console
 from studies import command_line, table
 
 from magbridge.calibration.model import Parameter
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.learning import Learner
 from magbridge.learning.start import class_prior
 

@@ -38,10 +38,10 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.fitting.offered import best_parameters
 from magbridge.calibration.fitting.validate import in_sensor_units
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import CalibrationError, MagbridgeError
+from magbridge.estimation.residual import rms
 from magbridge.logs import Options, read
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.info import movers

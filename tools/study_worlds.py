@@ -18,9 +18,9 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.columns import CHANNEL_TIMES, CHANNELS
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import igrf

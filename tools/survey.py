@@ -30,11 +30,11 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.level import level_of
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.residual import rms
+from magbridge.estimation.sparse import SparseFactor
 from magbridge.field.geodesy import separation
-from magbridge.field.place.blocks import Factor
-from magbridge.field.place.matern import Matern
 from magbridge.survey.read import from_vector
 from magbridge.survey.run import Result, survey
 from sitl import Twin
@@ -131,10 +131,10 @@ def _oracle_map(
 ) -> FloatArray:
     """Return the map of an oracle that knows the calibration and the field's amplitude and length, nT."""
     place, noise = done.samples.place, twin.scenario.instrument.noise_sigma
-    field = Matern(nodes_for(place, 1.5 * length, 4), 1.5 * length, 4)
+    field = GaussianField(nodes_for(place, 1.5 * length, 4), 1.5 * length, 4)
     B = field.basis(place)
     read = crust + np.random.default_rng(1).normal(0, noise, len(crust))
-    w = Factor(B.T @ B / noise**2 + field.precision / size**2).solve(B.T @ read / noise**2)
+    w = SparseFactor(B.T @ B / noise**2 + field.precision / size**2).solve(B.T @ read / noise**2)
     return np.asarray(field.basis(places) @ w)
 
 

@@ -27,8 +27,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from magbridge.estimation.residual import PAIRS
+
 __all__ = [
-    "BITS", "COARSE", "FINE", "PAIRS", "Linear", "Numbers", "Prepared", "apply", "for_arrays", "largest",
+    "BITS", "COARSE", "FINE", "Linear", "Numbers", "Prepared", "apply", "for_arrays", "largest",
     "linear", "monomials", "prepare", "split",
 ]  # fmt: skip
 
@@ -43,8 +45,6 @@ six entries Q (6), L (3) and O (1)."""
 Numbers = tuple[float, float, float, float, float, float, float, float]
 Linear = tuple[float, float, float, float, float, float, float, float, float]
 """A's entries xx, yy, zz, xy, xz, yz; T's x, y, z."""
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Row and column of each of a symmetric matrix's six entries, in the order in which they are kept."""
 
 
 def for_arrays() -> Any:

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.arithmetic import COARSE, FINE, PAIRS
+from magbridge.calibration.arithmetic import COARSE, FINE
 from magbridge.calibration.kernel import COLUMNS, Kernel
 from magbridge.calibration.terms import Exponents
+from magbridge.estimation.residual import PAIRS
 
 if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration

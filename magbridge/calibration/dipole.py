@@ -24,9 +24,9 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.arithmetic import PAIRS
 from magbridge.calibration.terms import Expansion, Parameter, PositionTerm
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import PAIRS
 
 __all__ = ["ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
 

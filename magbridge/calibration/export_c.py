@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from string import Template
 
-from magbridge.calibration.arithmetic import PAIRS
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.kernel import COLUMNS
 from magbridge.calibration.model import Calibration
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import PAIRS
 
 __all__ = ["c_header", "c_source"]
 

@@ -13,7 +13,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.terms import symmetric
+from magbridge.estimation.residual import symmetric
 
 __all__ = ["forward"]
 

@@ -25,8 +25,9 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import compile_kernel
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import Effect, Parameter, Polynomial, PositionTerm, symmetric
+from magbridge.calibration.terms import Effect, Parameter, Polynomial, PositionTerm
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import symmetric
 from magbridge.wording import counted
 
 __all__ = [

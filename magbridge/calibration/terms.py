@@ -25,7 +25,7 @@ from magbridge.plugins import load, plugins
 
 __all__ = [
     "HIGHEST", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "Parameter", "Polynomial",
-    "PositionTerm", "Power", "Series", "Step", "Term", "Width", "full_order", "symmetric", "term_class",
+    "PositionTerm", "Power", "Series", "Step", "Term", "Width", "full_order", "term_class",
 ]  # fmt: skip
 
 Exponents = tuple[int, ...]
@@ -216,11 +216,6 @@ def full_order(parameters: int, order: int) -> tuple[Exponents, ...]:
         for degree in range(order + 1)
         for picks in combinations_with_replacement(range(parameters), degree)
     )
-
-
-def symmetric(entries: FloatArray) -> FloatArray:
-    """Return (n, 3, 3) symmetric matrices from their six entries (n, 6 or more), ordered as :data:`SLOTS`."""
-    return entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
 
 
 def term_class(kind: str) -> type[Term]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.assessment.weigh import Assessment, assess
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.causes.candidates import Candidate
@@ -26,6 +25,7 @@ from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.seen import Seen, memory, seen
 from magbridge.diagnose.unexplained.leftover import Leftover
 from magbridge.diagnose.unexplained.unlisted import far_from_white
+from magbridge.estimation.residual import rms
 
 __all__ = ["WORTH", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
 

@@ -12,7 +12,6 @@ from magbridge.arrays import IndexArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals, residuals_of, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.design_columns import Columns
@@ -22,6 +21,7 @@ from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.inference.design import normal
 from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.estimation.residual import residuals, residuals_of, robust_scale
 from magbridge.version import __version__
 
 __all__ = ["extend", "flyable", "relinearised", "with_map_error", "with_misfit"]

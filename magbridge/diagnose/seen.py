@@ -22,9 +22,9 @@ from scipy.special import fdtrc
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import lagged
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.evidence import LEVEL
+from magbridge.estimation.residual import rms
 
 __all__ = ["WHITE", "Memory", "Seen", "memory", "seen"]
 

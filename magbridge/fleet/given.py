@@ -1,7 +1,7 @@
 r"""A calibration that was made elsewhere, put on record and learnt from.
 
 A cal.json holds a posterior N(c, P), not what the data alone say. Its prior is taken to have been the
-physical one, N(0, W) (:mod:`magbridge.calibration.fitting.prior`), and only directions that the data have
+physical one, N(0, W) (:mod:`magbridge.estimation.priors`), and only directions that the data have
 determined count: with :math:`W^{-1/2} P W^{-1/2} = \sum \lambda_k v_k v_k^T`, those with
 :math:`\lambda_k` below :data:`DETERMINED`, with the precision :math:`\lambda_k^{-1} - 1`.
 """
@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.calibration.file import encode_calibration
-from magbridge.calibration.fitting.known import Information
-from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import WrongUse
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.priors import polynomial_prior
 from magbridge.fleet.job import GIVEN
 from magbridge.fleet.learn import packed
 from magbridge.fleet.register import Deployment, vehicle_named
@@ -91,7 +91,7 @@ def _row(
     }  # fmt: skip
 
 
-def _information(calibration: Calibration, order: int) -> Information | None:
+def _information(calibration: Calibration, order: int) -> GaussianInformation | None:
     """Return what its data have determined; None where it is no polynomial of that order alone."""
     term, *others = calibration.terms
     if others or not isinstance(term, Polynomial) or max(map(sum, term.exponents)) != order:
@@ -106,4 +106,4 @@ def _information(calibration: Calibration, order: int) -> Information | None:
     known = left < DETERMINED
     J = (v[:, known] * (1.0 / left[known] - 1.0)) @ v[:, known].T
     h = (v[:, known] / left[known]) @ (v[:, known].T @ to_z @ calibration.coefficients[:size])
-    return Information(to_z.T @ J @ to_z, to_z.T @ h)
+    return GaussianInformation(to_z.T @ J @ to_z, to_z.T @ h)

@@ -42,7 +42,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.known import Information
+from magbridge.estimation.information import GaussianInformation
 from magbridge.fleet.variances import NONE, Shapes, Spread, Sums, Variances, log_prior, renewed, spreads_of
 
 __all__ = ["Observed", "Population", "learn"]
@@ -57,7 +57,7 @@ class Observed:
 
     vehicle: str
     refit: str
-    information: Information
+    information: GaussianInformation
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +68,9 @@ class Population:
     """Of the differences at each of :data:`.LEVELS`."""
     shapes: Shapes
     """How refits move the coefficients of each vehicle."""
-    total: Information
+    total: GaussianInformation
     """Of the fleet's mean, its prior included."""
-    each: dict[str, Information]
+    each: dict[str, GaussianInformation]
     """Vehicle -> its part of that."""
     log_likelihood: float
     """With the variances' prior, up to a constant."""
@@ -94,7 +94,7 @@ class Population:
         others = self.total if known is None else _minus(self.total, known)
         mean, P = _moments(others)
         P = P + by_vehicle.S
-        branches: dict[str, list[Information]] = defaultdict(list)
+        branches: dict[str, list[GaussianInformation]] = defaultdict(list)
         for one in past:
             branches[one.refit].append(_up(one.information, by_power_up).evidence)
         own = branches.pop(refit, [])
@@ -108,7 +108,7 @@ class Population:
 class _Passed:
     """A node's message to its parent, with what the way down needs: ``x | p ~ N(G p + g, R)``."""
 
-    evidence: Information
+    evidence: GaussianInformation
     G: FloatArray
     g: FloatArray
     R: FloatArray
@@ -167,7 +167,7 @@ def _round(
         vehicle: _up(_summed([one.evidence for one in refits.values()]), spreads[vehicle][0])
         for vehicle, refits in middle.items()
     }
-    total = _summed([Information(np.eye(K), np.zeros(K)), *(one.evidence for one in top.values())])
+    total = _summed([GaussianInformation(np.eye(K), np.zeros(K)), *(one.evidence for one in top.values())])
     mean, P = _moments(total)
     score = 0.5 * (total.vector @ mean - np.linalg.slogdet(total.precision)[1])
     sums = Sums(K, len(shapes.groups))
@@ -186,7 +186,7 @@ def _round(
     return Population(variances, shapes, total, each, float(score)), sums
 
 
-def _up(own: Information, spread: Spread) -> _Passed:
+def _up(own: GaussianInformation, spread: Spread) -> _Passed:
     """Integrate a node out whose difference from its parent has that covariance."""
     L = own.precision + spread.W
     factor = cho_factor(L)
@@ -195,7 +195,7 @@ def _up(own: Information, spread: Spread) -> _Passed:
     J = own.precision @ G
     log_L = 2.0 * np.log(np.diag(factor[0])).sum()
     score = 0.5 * (own.vector @ g - log_L - spread.log_det)
-    return _Passed(Information(0.5 * (J + J.T), spread.W @ g), G, g, R, float(score))
+    return _Passed(GaussianInformation(0.5 * (J + J.T), spread.W @ g), G, g, R, float(score))
 
 
 def _down(
@@ -209,25 +209,27 @@ def _down(
 
 
 def _updated(
-    mean: FloatArray, P: FloatArray, evidence: Sequence[Information]
+    mean: FloatArray, P: FloatArray, evidence: Sequence[GaussianInformation]
 ) -> tuple[FloatArray, FloatArray]:
     """Return a Gaussian with what is told of it."""
     if not evidence:
         return mean, P
     J = np.asarray(np.linalg.inv(P), float)
-    return _moments(_summed([Information(J, J @ mean), *evidence]))
+    return _moments(_summed([GaussianInformation(J, J @ mean), *evidence]))
 
 
-def _moments(of: Information) -> tuple[FloatArray, FloatArray]:
+def _moments(of: GaussianInformation) -> tuple[FloatArray, FloatArray]:
     P = np.asarray(cho_solve(cho_factor(of.precision), np.eye(len(of.vector))))
     P = 0.5 * (P + P.T)
     return P @ of.vector, P
 
 
-def _summed(evidence: Sequence[Information]) -> Information:
-    J, h = (np.asarray(np.sum(parts, axis=0)) for parts in zip(*evidence, strict=True))
-    return Information(J, h)
+def _summed(evidence: Sequence[GaussianInformation]) -> GaussianInformation:
+    total, *others = evidence
+    for part in others:
+        total = total + part
+    return total
 
 
-def _minus(total: Information, part: Information) -> Information:
-    return Information(total.precision - part.precision, total.vector - part.vector)
+def _minus(total: GaussianInformation, part: GaussianInformation) -> GaussianInformation:
+    return GaussianInformation(total.precision - part.precision, total.vector - part.vector)

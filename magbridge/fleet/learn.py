@@ -1,7 +1,7 @@
 """From calibrations of single deployments to what their fleet expects of the next.
 
 All deployments are brought to one scale of the positions and one F_0 (:func:`.rescaling`), and to units of
-the coefficients' physical widths (:mod:`magbridge.calibration.fitting.prior`). Coefficients that share a
+the coefficients' physical widths (:mod:`magbridge.estimation.priors`). Coefficients that share a
 monomial and are of one kind (A or T; for the constant: gain, soft iron, hard iron) share their variances.
 """
 
@@ -15,12 +15,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.known import Information, Known, rescaling
+from magbridge.calibration.fitting.known import Known, rescaling
 from magbridge.calibration.fitting.mounted_masses import Mounting
-from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import DataError
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.priors import polynomial_prior
 from magbridge.fleet.hierarchy import Observed, Population, learn
 from magbridge.fleet.shapes import shape_groups, shapes_of
 from magbridge.fleet.variances import NONE, Shapes, Variances
@@ -38,7 +39,7 @@ class Lesson(NamedTuple):
     """One deployment's calibration as its own data determine it, without any prior.
 
     `time` is when it began, s since 1970; `noise` that of a sample, nT; the others as in :class:`.Known` and
-    :class:`.Information`.
+    :class:`.GaussianInformation`.
     """
 
     vehicle: str
@@ -49,9 +50,9 @@ class Lesson(NamedTuple):
     exponents: tuple[Exponents, ...]
     field: float
     noise: float
-    information: Information
+    information: GaussianInformation
 
-    def brought(self, parameters: tuple[Parameter, ...], basis: FloatArray) -> Information:
+    def brought(self, parameters: tuple[Parameter, ...], basis: FloatArray) -> GaussianInformation:
         """Return the information of z: with ``c_own = B z``, ``J = B^T I B`` and ``h = B^T i``.
 
         Parameters
@@ -62,20 +63,21 @@ class Lesson(NamedTuple):
             nT, coefficients there of z.
         """
         B = rescaling(self.exponents, parameters, self.parameters, FIELD, self.field) @ basis
-        return Information(B.T @ self.information.precision @ B, B.T @ self.information.vector)
+        return GaussianInformation(B.T @ self.information.precision @ B, B.T @ self.information.vector)
 
 
-def packed(evidence: Information | None) -> dict[str, bytes]:
+def packed(evidence: GaussianInformation | None) -> dict[str, bytes]:
     """Return information as columns of the catalogue: little-endian doubles, row by row; empty: none."""
     if evidence is None:
         return {"precision": b"", "vector": b""}
-    return {name: np.asarray(part, "<f8").tobytes() for name, part in evidence._asdict().items()}
+    parts = {"precision": evidence.precision, "vector": evidence.vector}
+    return {name: np.asarray(part, "<f8").tobytes() for name, part in parts.items()}
 
 
-def unpacked(row: Mapping[str, bytes]) -> Information:
+def unpacked(row: Mapping[str, bytes]) -> GaussianInformation:
     """Return what :func:`packed` has packed."""
     vector = np.frombuffer(row["vector"], "<f8")
-    return Information(np.frombuffer(row["precision"], "<f8").reshape(len(vector), -1), vector)
+    return GaussianInformation(np.frombuffer(row["precision"], "<f8").reshape(len(vector), -1), vector)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,9 @@ import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.mounted_masses import LATENT, Mounting, mass_columns, mounted_prior
-from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
+from magbridge.estimation.priors import polynomial_prior
 
 __all__ = ["shape_groups", "shapes_of"]
 

@@ -27,7 +27,7 @@ __all__ = ["STATES", "Nuisance"]
 STATES = 4
 """Rock's value (nT) and slope (nT/m), the slow part of the noise, and the level (nT)."""
 LENGTH = 1_000.0
-"""m over which rock changes: what a survey finds where it is not told (see :mod:`magbridge.field.place`)."""
+"""m over which rock changes: what a survey finds where it is not told (as :mod:`magbridge.survey` finds)."""
 QUIETEST = 0.05
 """nT, 1-sigma: white noise that every sample has."""
 

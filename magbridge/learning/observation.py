@@ -1,6 +1,6 @@
 """One sample against its reference: the residual in the sensor's own nanotesla, and its derivatives.
 
-The equations are those of :mod:`magbridge.calibration.residual`, for one sample and without scipy: the live
+The equations are those of :mod:`magbridge.estimation.residual`, for one sample and without scipy: the live
 path runs here.
 """
 

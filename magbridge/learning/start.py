@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
+from magbridge.estimation.priors import polynomial_prior
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import STATES, Nuisance
 from magbridge.learning.observation import Observation, observe
@@ -52,7 +52,7 @@ def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, orde
 
     Notes
     -----
-    The widths are those that the fit begins with (:mod:`magbridge.calibration.fitting.prior`), each with its
+    The widths are those that the fit begins with (:mod:`magbridge.estimation.priors`), each with its
     own uncertainty: the mean of a log-normal's square.
     """
     exponents = full_order(len(parameters), order)

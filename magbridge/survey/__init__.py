@@ -8,6 +8,6 @@
                        |                        |
                   crossovers (before)      crossovers (after)
 
-The field is that of :mod:`magbridge.field.place`, as in a calibration from a survey alone
+The field is that of :mod:`magbridge.estimation.gaussian_field`, as in a calibration from a survey alone
 (:mod:`magbridge.calibration.fitting.in_place`).
 """

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.fitting.evidence import Widths
-from magbridge.calibration.fitting.latent import in_chunks
-from magbridge.field.place.blocks import Factor, NearInverse
-from magbridge.field.place.matern import Matern
+from magbridge.estimation.blocks import in_chunks
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.hyperparameters import Hyperparameters
+from magbridge.estimation.sparse import InverseBlocks, SparseFactor
 from magbridge.survey.kriged import Kriged
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.samples import Samples
@@ -26,7 +26,7 @@ class Posterior:
 
     weight: float
     """How plausible these are."""
-    field: Matern
+    field: GaussianField
     size: float
     sigma: float
     """`size`, `sigma`: nT, the field's standard deviation where the roughness is 1, and the noise's."""
@@ -37,7 +37,7 @@ class Posterior:
     calibration."""
     precision: csr_array
     """(nodes, nodes), in units of the noise's."""
-    inverse: NearInverse
+    inverse: InverseBlocks
     """Of it."""
     levels: FloatArray
     """(n,), nT, what was taken off each sample: its line's level and the slow part, about their mean."""
@@ -50,7 +50,7 @@ class Posterior:
 
     def draw(self, rng: np.random.Generator, number: int) -> FloatArray:
         """Return so many coefficients (nodes, number) that the data leave open, equally likely."""
-        off = self.sigma * Factor(self.precision).draw(rng.normal(size=(len(self.w), number)))
+        off = self.sigma * SparseFactor(self.precision).draw(rng.normal(size=(len(self.w), number)))
         return np.asarray(
             self.w[:, None] + off + self.follow @ rng.normal(size=(self.follow.shape[1], number))
         )
@@ -72,13 +72,13 @@ class Gridded:
     """nT, of all samples, and of the map over them."""
     kept: BoolArray
     """(n,): Which samples are no outliers."""
-    widths: Widths
+    widths: Hyperparameters
     """As the evidence chose them."""
     kriged: Kriged | None = None
     """What predicts instead of the nodes where these are coarser than the rock."""
 
     @property
-    def field(self) -> Matern:
+    def field(self) -> GaussianField:
         """The likeliest field."""
         return self.posteriors[0].field
 

@@ -2,8 +2,9 @@ r"""The map from corrected samples: a Gaussian field in place, with each line's 
 
 .. math:: y_i = f(x_i) + l_{line(i)} + s(t_i) + e_i
 
-f is the field of :mod:`magbridge.field.place` and its size, length and smoothness are chosen by the evidence,
-as those of a survey that calibrates itself are; so are the widths of the levels l and of the slow changes s.
+f is the field of :mod:`magbridge.estimation.gaussian_field`. Its size, length and smoothness are chosen by
+the evidence, as those of a survey that calibrates itself are; so are the widths of the levels l and of
+the slow changes s.
 Map and sigma are the posterior's mean and standard deviation. What the calibration does not know (its
 `modes`) is not fitted again to the same data: it is carried into the sigma as it stands (a *considered*
 uncertainty: Schmidt 1966).
@@ -16,7 +17,6 @@ from dataclasses import replace
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.evidence import Widths, maximise
 from magbridge.calibration.fitting.field_doubt import plausible
 from magbridge.calibration.fitting.field_nodes import about_the_middle, fine_enough, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
@@ -25,18 +25,14 @@ from magbridge.calibration.fitting.field_search import (
     choose,
     climb,
 )
-from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
-from magbridge.calibration.fitting.latent import (
-    NOTHING,
-    Group,
-    likeliest,
-    slow_functions,
-    with_groups,
-)
-from magbridge.calibration.fitting.prior import PriorFamily
-from magbridge.calibration.fitting.solve import covariance_of
-from magbridge.calibration.residual import robust_scale
-from magbridge.field.place.blocks import near_inverse
+from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, slow_functions, with_blocks
+from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
+from magbridge.estimation.hyperparameters import Hyperparameters, maximise_evidence
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.priors import PriorFamily
+from magbridge.estimation.residual import robust_scale
+from magbridge.estimation.select import select_blocks
+from magbridge.estimation.sparse import inverse_blocks
 from magbridge.survey.gridded import Gridded, Posterior
 from magbridge.survey.kriged import kriged
 from magbridge.survey.roughness import Roughness
@@ -82,11 +78,11 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     problem = Rows(samples, _groups(samples), roughness)
     sums = problem.sums(choice.field, every)
     groups = _needed(problem.groups, sums, choice, sigma)
-    family = with_groups(NOTHING, groups)
+    family = with_blocks(NO_COEFFICIENTS, groups)
     weighed = Weighed(family, family.centre, sigma, choice.field.length)
     for turn in range(2):
-        reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
-        widths = maximise(reduced.quadratic, family, weighed.eta, sigma)
+        reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
+        widths = maximise_evidence(reduced.quadratic, family, weighed.eta, sigma)
         z, _ = _solved(reduced, widths, family)
         w = reduced.field(z)
         e = samples.value - problem.mean - problem.D @ z - problem.rock(choice.field, w)
@@ -114,11 +110,11 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     return replace(found, kriged=kriged(samples.part(kept), levelled[kept], choice.field.length))
 
 
-def _left_open(choice: Choice, sums: Sums, weighed: Weighed) -> list[tuple[float, Choice]]:
+def _left_open(choice: Choice, sums: SampleSums, weighed: Weighed) -> list[tuple[float, Choice]]:
     """Return the plausible sizes and lengths of the field, with their weights."""
 
     def score(one: Choice) -> float:
-        reduced = eliminate(sums, one.field, one.ratio, one.rho)
+        reduced = eliminate_field(sums, one.field, one.ratio, one.rho)
         return weighed.score(reduced, one.field, one.ratio)
 
     return plausible(score, choice)
@@ -127,56 +123,62 @@ def _left_open(choice: Choice, sums: Sums, weighed: Weighed) -> list[tuple[float
 def _posterior(
     weight: float,
     choice: Choice,
-    sums: Sums,
+    sums: SampleSums,
     problem: Rows,
     family: PriorFamily,
-    widths: Widths,
+    widths: Hyperparameters,
     shaken: FloatArray,
 ) -> Posterior:
     """Return the field given its size and length; `shaken` (nodes, r): what the calibration does to it."""
-    reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
+    reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
     z, covariance = _solved(reduced, widths, family)
     follow = np.hstack([reduced.follow @ np.linalg.cholesky(covariance), shaken])
     w, mean = reduced.field(z), problem.mean_over_samples(choice.field)
     levels = problem.D @ z
     return Posterior(
         weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, _apart(follow, mean),
-        reduced.precision, near_inverse(reduced.precision, choice.field.edges),
+        reduced.precision, inverse_blocks(reduced.precision, choice.field.edges),
         levels - levels[problem.kept].mean(), float(mean @ w),
     )  # fmt: skip
 
 
-def _groups(samples: Samples) -> tuple[Group, ...]:
+def _groups(samples: Samples) -> tuple[ParameterBlock, ...]:
     """Return the levels, one a line (or log), and what changes slowly within a log."""
     of = np.unique(samples.line, return_inverse=True)[1].ravel()
     levels = np.zeros((len(of), int(of.max()) + 1))
     levels[np.arange(len(of)), of] = 1.0
-    groups = [Group("levels of lines", levels, np.ones(levels.shape[1]), LEVEL, LEVEL_SPREAD)]
+    groups = [ParameterBlock("levels of lines", levels, np.ones(levels.shape[1]), LEVEL, LEVEL_SPREAD)]
     if levels.shape[1] == 1:  # rock of its size may be all on one side of zero along one line
-        groups = [Group("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
+        groups = [ParameterBlock("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
     if np.isfinite(samples.time).all():
         waves, shape = slow_functions(samples.time)
         if len(shape):
-            groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
+            groups.append(
+                ParameterBlock("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True)
+            )
     return tuple(groups)
 
 
-def _needed(groups: tuple[Group, ...], sums: Sums, choice: Choice, sigma: float) -> tuple[Group, ...]:
+def _needed(
+    groups: tuple[ParameterBlock, ...], sums: SampleSums, choice: Choice, sigma: float
+) -> tuple[ParameterBlock, ...]:
     """Return levels and slow changes; these are small unless larger ones make the samples likelier."""
     if not any(one.offered for one in groups):
         return groups
-    reduced = eliminate(sums, choice.field, choice.ratio, choice.rho)
-    kept = likeliest(reduced.quadratic, NOTHING, groups, with_groups(NOTHING, groups).centre, sigma)
+    reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
+    kept = select_blocks(
+        reduced.quadratic, NO_COEFFICIENTS, groups, with_blocks(NO_COEFFICIENTS, groups).centre, sigma
+    )
     return tuple(one if one in kept else replace(one, width=UNSEEN, spread=0.0) for one in groups)
 
 
 def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, Roughness]:
-    """Return the field that a part of the samples, with noise of about `sigma` nT, is likeliest with."""
+    """Return the field that a part of the samples, with noise of about `sigma` nT, is select_blocks with."""
     part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, WIDE))
     step = max(len(part) // SEARCHED, 1)
     few = samples.part(part[::step])
     groups, rows = _groups(few), np.arange(len(few.value))
-    family = with_groups(NOTHING, groups)
+    family = with_blocks(NO_COEFFICIENTS, groups)
     weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))
     even = Roughness.even()
     problem = Rows(few, groups, even)
@@ -197,26 +199,28 @@ def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, R
     return replace(best, rho=rho), chosen
 
 
-def _solved(reduced: Reduced, widths: Widths, family: PriorFamily) -> tuple[FloatArray, FloatArray]:
+def _solved(
+    reduced: FieldEliminated, widths: Hyperparameters, family: PriorFamily
+) -> tuple[FloatArray, FloatArray]:
     """Return z (q,) and its covariance (q, q)."""
-    precision = reduced.quadratic.H / widths.sigma**2 + family.at(widths.eta).precision
-    z = np.linalg.solve(precision, reduced.quadratic.b / widths.sigma**2)
+    precision = reduced.quadratic.precision / widths.sigma**2 + family.at(widths.eta).precision
+    z = np.linalg.solve(precision, reduced.quadratic.vector / widths.sigma**2)
     return np.asarray(z, float), covariance_of(precision)
 
 
 def _considered(
     problem: Rows,
     choice: Choice,
-    reduced: Reduced,
-    widths: Widths,
+    reduced: FieldEliminated,
+    widths: Hyperparameters,
     family: PriorFamily,
     rows: IndexArray,
 ) -> FloatArray:
     """Return how the field's coefficients follow the calibration's modes: (nodes, r), 1-sigma each."""
     q = len(problem.D)
     sums = problem.sums(choice.field, rows, modes=True)
-    all_in = eliminate(sums, choice.field, choice.ratio, choice.rho)
-    H = all_in.quadratic.H / widths.sigma**2
+    all_in = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
+    H = all_in.quadratic.precision / widths.sigma**2
     own = np.linalg.solve(H[:q, :q] + family.at(widths.eta).precision, H[:q, q:])
     return np.asarray(all_in.follow[:, q:] - reduced.follow @ own)
 

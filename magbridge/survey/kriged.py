@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.survey.roughness import Roughness
 from magbridge.survey.samples import Samples
 

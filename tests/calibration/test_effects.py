@@ -13,8 +13,9 @@ from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect,
 from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import HIGHEST, TERMS, Effect, Polynomial, Series, symmetric, term_class
+from magbridge.calibration.terms import HIGHEST, TERMS, Effect, Polynomial, Series, term_class
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import symmetric
 
 START = 1.7e9
 LAG = 100.0

@@ -13,17 +13,19 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.evidence import Quadratic, evidence
 from magbridge.calibration.fitting.fit import LEVEL, METHODS, fit
-from magbridge.calibration.fitting.noise import estimate_noise, memory
 from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, Whitening, normal_equations, residuals, whiten
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
+from magbridge.estimation.hyperparameters import log_evidence
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.noise import Whitening, estimate_noise, fit_slow_and_white, whiten
+from magbridge.estimation.optimise import normal_equations
+from magbridge.estimation.priors import polynomial_prior
+from magbridge.estimation.residual import Samples, residuals
 
 
 def survey_error(calibration: Calibration, glider: Glider) -> tuple[float, float]:
@@ -77,7 +79,7 @@ def test_normal_equations_in_pieces_are_those_of_all(
 ) -> None:
     c = np.random.default_rng(3).normal(size=27) * 500.0
     whole = normal_equations(some_samples, c, None, memory)
-    monkeypatch.setattr("magbridge.calibration.residual.CHUNK", 11)
+    monkeypatch.setattr("magbridge.estimation.optimise.CHUNK_ROWS", 11)
     pieces = normal_equations(some_samples, c, None, memory)
     np.testing.assert_allclose(pieces.hessian, whole.hessian, rtol=1e-10, atol=1e-12)
     np.testing.assert_allclose(pieces.gradient, whole.gradient, rtol=1e-10, atol=1e-8)
@@ -88,11 +90,14 @@ def test_evidence_has_the_slope_it_says(glider: Gliders) -> None:
     samples = polynomial_samples(glider(0).runs, exponents)
     family = polynomial_prior(exponents, ("a", "b"), samples.F_0)
     normal = normal_equations(samples, np.zeros(54))
-    quadratic = Quadratic.about(np.zeros(54), normal, 2250.0)
+    quadratic = GaussianInformation.from_derivatives(np.zeros(54), *normal, 2250.0)
     x = np.append(family.centre, np.log(30.0))
-    _, slope, *_ = evidence(quadratic, family, x[:-1], x[-1])
+    _, slope, *_ = log_evidence(quadratic, family, x[:-1], x[-1])
     numeric = [
-        (evidence(quadratic, family, up[:-1], up[-1])[0] - evidence(quadratic, family, dn[:-1], dn[-1])[0])
+        (
+            log_evidence(quadratic, family, up[:-1], up[-1])[0]
+            - log_evidence(quadratic, family, dn[:-1], dn[-1])[0]
+        )
         / 2e-4
         for up, dn in ((x + h, x - h) for h in 1e-4 * np.eye(len(x)))
     ]
@@ -356,7 +361,7 @@ def test_the_memory_of_noise_is_a_time_at_any_rate(interval: float) -> None:
     slow = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(0.0, 8.0, n))
     steps = np.r_[np.inf, np.ones(n - 1)]
     e = slow + rng.normal(0.0, 4.0, n)
-    found = memory(e, steps, estimate_noise(e, steps, 0.0))
+    found = fit_slow_and_white(e, steps, estimate_noise(e, steps, 0.0))
     assert -interval / np.log(found.autocorrelation) == pytest.approx(60.0, rel=0.25)
     assert found.white == pytest.approx(0.2, abs=0.04)
 

@@ -16,13 +16,13 @@ from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting import in_place, rounds
 from magbridge.calibration.fitting.crossings import too_rough
 from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
-from magbridge.calibration.fitting.joint import Sums
-from magbridge.calibration.fitting.latent import Group
 from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
 from magbridge.calibration.model import Noise, identity
-from magbridge.field.place.matern import Matern
+from magbridge.estimation.blocks import ParameterBlock
+from magbridge.estimation.elimination import SampleSums
+from magbridge.estimation.gaussian_field import GaussianField
 from magbridge.survey.gridding import gridded
 from magbridge.survey.samples import Samples
 
@@ -141,7 +141,7 @@ def test_a_long_survey_is_searched_with_the_part_about_its_middle(
     """The rock's size and length are that part's, the calibration and the nodes those of all samples."""
     used, few = [], rounds.Rounds._few
 
-    def counted(own: rounds.Rounds, field: Matern) -> Sums:
+    def counted(own: rounds.Rounds, field: GaussianField) -> SampleSums:
         sums = few(own, field)
         used.append(sums.samples)
         return sums
@@ -165,7 +165,7 @@ def test_a_long_log_comes_to_rest_with_few_samples_and_ends_with_all(
     data, true, whole = survey
     used, sums = [], rounds.Rounds._sums
 
-    def counted(own: rounds.Rounds, *args: Any) -> Sums:
+    def counted(own: rounds.Rounds, *args: Any) -> SampleSums:
         found = sums(own, *args)
         used.append(found.samples)
         return found
@@ -358,7 +358,7 @@ def test_a_creep_that_shaped_the_rock_for_itself_goes_where_a_search_without_doe
 ) -> None:
     """All that is offered is kept at first: as where the rock that was searched with it needs it."""
 
-    def all_of_little_gain(*of: Any, price: float = 0.0) -> tuple[Group, ...]:
+    def all_of_little_gain(*of: Any, price: float = 0.0) -> tuple[ParameterBlock, ...]:
         return tuple(one for one in of[2] if not (price and one.offered))
 
     monkeypatch.setattr(rounds, "likeliest", all_of_little_gain)

@@ -10,12 +10,13 @@ from gliders import Gliders
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.known import Information, Known, rescaling
+from magbridge.calibration.fitting.known import Known, rescaling
 from magbridge.calibration.fitting.observations import monomials
-from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.priors import Prior
 
 
 def test_rescaled_coefficients_are_the_same_field() -> None:
@@ -40,7 +41,7 @@ def test_information_is_the_posterior_without_its_prior() -> None:
     prior = Prior(np.diag(rng.uniform(0.5, 2.0, 5)), E, offset)
     known = np.linalg.inv(E @ np.linalg.inv(prior.precision) @ E.T)
     P = np.linalg.inv(J + known)
-    reported = Information.left_by(prior, P @ (h + known @ offset), P)
+    reported = GaussianInformation.from_posterior(P @ (h + known @ offset), P, offset, np.linalg.inv(known))
     np.testing.assert_allclose(reported.precision, J, atol=1e-8)
     np.testing.assert_allclose(reported.vector, h, atol=1e-8)
 
@@ -48,7 +49,7 @@ def test_information_is_the_posterior_without_its_prior() -> None:
 def test_an_unknown_direction_is_not_told() -> None:
     J = np.diag([4.0, 9.0])
     v = np.array([1.0, 0.0])
-    reported = Information(J, J @ np.array([2.0, 3.0])).blurred(v, 10.0)
+    reported = GaussianInformation(J, J @ np.array([2.0, 3.0])).blurred(v, 10.0)
     np.testing.assert_allclose(np.linalg.inv(reported.precision), np.linalg.inv(J) + 100.0 * np.outer(v, v))
     np.testing.assert_allclose(np.linalg.solve(reported.precision, reported.vector), [2.0, 3.0])
 

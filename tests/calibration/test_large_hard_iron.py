@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magbridge.calibration.fitting.nominal import check_scales
-from magbridge.calibration.residual import Samples
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import Samples
 
 
 def samples(directions: np.ndarray, offset: float) -> Samples:

@@ -10,8 +10,8 @@ from gliders import Gliders
 from measured import hold_runs_out
 
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 from magbridge.logs import read
 
 COUNT_NT = 100.0

@@ -17,12 +17,12 @@ from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect,
 from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.compare.design_columns import effect_columns
 from magbridge.diagnose.compare.problem import pose, samples_of
 from magbridge.diagnose.compare.survey import Channel, Survey
 from magbridge.errors import FormatError
+from magbridge.estimation.residual import residuals
 
 EFFECTS: list[Effect] = [
     ChannelEffect(cause="temperature_offset", channel="heat", origin=3.0, lag=200.0, stages=2),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.known import Information
+from magbridge.estimation.information import GaussianInformation
 from magbridge.fleet import hierarchy
 from magbridge.fleet.hierarchy import Observed, Population, learn
 from magbridge.fleet.variances import NONE, Shapes, Variances
@@ -26,7 +26,7 @@ def observed(
                 z = refit + sigmas[2] * rng.normal(size=K)
                 H = rng.normal(size=(2, K)) / 0.05
                 y = H @ z + rng.normal(size=2)
-                out.append(Observed(str(v), str(r), Information(H.T @ H, H.T @ y)))
+                out.append(Observed(str(v), str(r), GaussianInformation(H.T @ H, H.T @ y)))
                 truth.append(z)
     return out, truth
 
@@ -87,7 +87,7 @@ def test_refits_that_move_coefficients_together_are_told_from_those_that_do_not(
             z = vehicle + shape @ rng.normal(0, u, 2) + rng.normal(0, size, K)
             H = rng.normal(size=(3, K)) / 0.02
             y = H @ z + rng.normal(size=3)
-            seen.append(Observed(v, str(r), Information(H.T @ H, H.T @ y)))
+            seen.append(Observed(v, str(r), GaussianInformation(H.T @ H, H.T @ y)))
     groups, shapes = np.zeros(K, int), Shapes(D, np.zeros(2, int))
     shaped, plain = learn(seen, groups, shapes), learn(seen, groups)
     assert np.sqrt(shaped.variances.shaped[0]) == pytest.approx(u, rel=0.3)

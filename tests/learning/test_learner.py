@@ -9,7 +9,8 @@ import pytest
 from worlds import FIELD, World, calibration, error_of, grid_of, learn
 
 from magbridge.calibration.model import Calibration, Noise
-from magbridge.calibration.residual import Samples, residuals, whiten
+from magbridge.estimation.noise import whiten
+from magbridge.estimation.residual import Samples, residuals
 from magbridge.learning import Learner
 from magbridge.learning.nuisance import Nuisance
 from magbridge.learning.observation import observe

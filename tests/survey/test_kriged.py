@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.survey import gridding
 from magbridge.survey.kriged import Kriged, kriged
 from magbridge.survey.samples import Samples

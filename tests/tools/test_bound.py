@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from bound import BestFit, SurveyBound, oracle
 
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from sitl import Twin, load, segments, simulate
 from sitl.mission import CrissCross, Spirals
 from sitl.platform import Vehicle

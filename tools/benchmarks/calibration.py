@@ -20,8 +20,8 @@ from magbridge.calibration.fitting.observations import Observations, polynomial_
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order
+from magbridge.estimation.residual import residuals_of
 from sitl import load, segments, simulate
 
 __all__ = ["correcting", "fitting"]

@@ -10,8 +10,8 @@ from study_worlds import MASSES, METHODS, true_field
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.residual import rms
 from magbridge.correction import Correction
+from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import separation
 from magbridge.navigate.options import informed
 from magbridge.rows import correct_rows

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.depth import at_depth
 from magbridge.navigate.options import Options

@@ -11,7 +11,7 @@ import numpy as np
 import xarray as xr
 from msgspec.structs import replace as with_options
 
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field

@@ -14,7 +14,7 @@ import xarray as xr
 from scipy.stats import chi2
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.residual import rms
+from magbridge.estimation.residual import rms
 from magbridge.navigate.options import Options
 from magbridge.navigate.own_survey import localise
 from magbridge.navigate.reference_track import errors

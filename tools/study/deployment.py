@@ -18,8 +18,8 @@ from magbridge.calibration.correct import regressors
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.diagnose.compare.prior import floor
+from magbridge.estimation.residual import Samples, jacobian, residuals
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
 from sitl import Twin, load, simulate

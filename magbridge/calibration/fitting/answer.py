@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.evidence import Widths
 from magbridge.calibration.fitting.field_doubt import plausible
 from magbridge.calibration.fitting.field_search import Choice, Weighed
-from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
-from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.nominal import starts
-from magbridge.calibration.fitting.prior import PriorFamily
-from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
 from magbridge.calibration.fitting.survey_samples import SurveySamples
-from magbridge.calibration.residual import residuals_of, robust_scale
+from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
+from magbridge.estimation.hyperparameters import Hyperparameters
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.noise import NoiseModel
+from magbridge.estimation.optimise import gauss_newton
+from magbridge.estimation.priors import PriorFamily
+from magbridge.estimation.residual import residuals_of, robust_scale
 
 __all__ = ["Answer", "start"]
 
@@ -27,9 +28,9 @@ class Answer:
 
     z: FloatArray
     w: FloatArray
-    sums: Sums
+    sums: SampleSums
     choice: Choice
-    widths: Widths
+    widths: Hyperparameters
     family: PriorFamily
     lacking: FloatArray
     score: float
@@ -42,16 +43,16 @@ class Answer:
         precision = self.family.at(self.widths.eta).precision
         weighed = Weighed(self.family, self.widths.eta, self.widths.sigma, self.middle)
 
-        def reduced(one: Choice) -> Reduced:
-            return eliminate(self.sums, one.field, one.ratio, one.rho)
+        def reduced(one: Choice) -> FieldEliminated:
+            return eliminate_field(self.sums, one.field, one.ratio, one.rho)
 
         total = np.zeros_like(precision)
         for weight, one in plausible(
             lambda one: weighed.score(reduced(one), one.field, one.ratio), self.choice
         ):
             quadratic = reduced(one).quadratic
-            P = covariance_of(quadratic.H / s2 + precision)
-            moved = P @ quadratic.b / s2 - self.z
+            P = covariance_of(quadratic.precision / s2 + precision)
+            moved = P @ quadratic.vector / s2 - self.z
             total += weight * (P + np.outer(moved, moved))
         return total
 

@@ -22,18 +22,18 @@ import numpy as np
 
 from magbridge.calibration.fitting.climb import Climbed, climb, thinned
 from magbridge.calibration.fitting.ends import flown
-from magbridge.calibration.fitting.evidence import is_maximum
 from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.left_out import leave_out, refitted
-from magbridge.calibration.fitting.noise import NoiseModel, memory
 from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, nominal, nominal_samples, starts
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import Vehicle, pose
-from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.fitting.solve import covariance_of
-from magbridge.calibration.residual import Samples, residuals_of
 from magbridge.errors import CalibrationError
+from magbridge.estimation.hyperparameters import is_maximum
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.noise import NoiseModel, fit_slow_and_white
+from magbridge.estimation.priors import PriorFamily
+from magbridge.estimation.residual import Samples, residuals_of
 
 __all__ = ["fit_auto"]
 
@@ -159,7 +159,7 @@ def _remembering(samples: Samples, answer: Climbed) -> Climbed:
     """Return the answer whose noise is a slow part and a white one, where the residuals are of that kind."""
     for _ in range(2):
         e = residuals_of(samples, answer.family.at(answer.widths.eta).coefficients(answer.solution.z))
-        noise = memory(e, samples.steps, answer.noise)
+        noise = fit_slow_and_white(e, samples.steps, answer.noise)
         if noise is answer.noise:
             break
         answer = climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise, shaped=True)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.evidence import Quadratic, Widths, maximise
-from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel, estimate_noise
-from magbridge.calibration.fitting.prior import Prior, PriorFamily
-from magbridge.calibration.fitting.solve import Solution, covariance_of, gauss_newton
-from magbridge.calibration.residual import Samples, Whitening, jacobian, residuals, residuals_of
+from magbridge.estimation.hyperparameters import Hyperparameters, maximise_evidence
+from magbridge.estimation.information import GaussianInformation, covariance_of
+from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, Whitening, estimate_noise
+from magbridge.estimation.optimise import Solution, gauss_newton
+from magbridge.estimation.priors import Prior, PriorFamily
+from magbridge.estimation.residual import Samples, jacobian, residuals, residuals_of
 
 __all__ = ["Climbed", "climb", "thinned"]
 
@@ -26,10 +27,10 @@ class Climbed:
     """Where a climb ended."""
 
     solution: Solution
-    widths: Widths
+    widths: Hyperparameters
     noise: NoiseModel
     family: PriorFamily
-    quadratic: Quadratic
+    quadratic: GaussianInformation
     score: float
 
 
@@ -69,8 +70,8 @@ def climb(
         # the first widths are a guess, and not worth settling at
         solution = gauss_newton(samples, family.at(eta), noise, z, steps=50 if step else 3)
         kept = len(samples.field) - noise.rejected
-        quadratic = Quadratic.about(solution.z, solution.normal, kept)
-        widths = maximise(quadratic, family, eta, noise.sigma)
+        quadratic = GaussianInformation.from_derivatives(solution.z, *solution.normal, kept)
+        widths = maximise_evidence(quadratic, family, eta, noise.sigma)
         eta, z = widths.eta, solution.z
         last, score = score, _score(widths, noise, samples)
         noise = replace(noise, sigma=widths.sigma)
@@ -113,9 +114,9 @@ def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray
     return z, noise
 
 
-def _score(widths: Widths, noise: NoiseModel, samples: Samples) -> float:
+def _score(widths: Hyperparameters, noise: NoiseModel, samples: Samples) -> float:
     """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
-    outlier = np.log(widths.sigma) + 0.5 * OUTLIER**2
+    outlier = np.log(widths.sigma) + 0.5 * OUTLIER_SIGMA**2
     variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance
     whitening = 0.5 * np.log(variance).sum()
     return float(widths.log_evidence - noise.rejected * outlier - whitening)

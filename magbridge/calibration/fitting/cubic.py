@@ -10,15 +10,16 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise
 from magbridge.calibration.fitting.nominal import check_scales, nominal
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
-from magbridge.calibration.residual import residuals_of
 from magbridge.calibration.terms import full_order
 from magbridge.errors import CalibrationError
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.noise import NoiseModel, estimate_noise
+from magbridge.estimation.optimise import gauss_newton
+from magbridge.estimation.priors import Prior
+from magbridge.estimation.residual import residuals_of
 
 __all__ = ["ANYTHING", "fit_cubic"]
 

@@ -11,7 +11,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms, robust_scale
+from magbridge.estimation.residual import rms, robust_scale
 from magbridge.pictures import save
 
 __all__ = ["draw_fit"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.fitting.noise import OUTLIER
-from magbridge.calibration.residual import robust_scale
+from magbridge.estimation.noise import OUTLIER_SIGMA
+from magbridge.estimation.residual import robust_scale
 
 __all__ = ["flown"]
 
@@ -24,7 +24,7 @@ def flown(residual: FloatArray) -> BoolArray:
     residual : (n,) array
         Of a robust fit, in the order of the log, nT.
     """
-    off = np.abs(residual) > OUTLIER * robust_scale(residual)
+    off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)
     kept = np.ones(len(off), bool)
     kept[: _end(off)] = False
     kept[len(off) - _end(off[::-1]) :] = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.field.place.nodes import Nodes, nodes_near
+from magbridge.estimation.nodes import Nodes, nodes_near
 
 __all__ = ["NODES", "SMOOTH", "about_the_middle", "fine_enough", "ladder", "nodes_for"]
 

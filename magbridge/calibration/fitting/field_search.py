@@ -9,11 +9,11 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.evidence import evidence
 from magbridge.calibration.fitting.field_nodes import NODES, SMOOTH, fine_enough, ladder, nodes_for
-from magbridge.calibration.fitting.joint import Reduced, Sums, eliminate
-from magbridge.calibration.fitting.prior import PriorFamily
-from magbridge.field.place.matern import BURIED, SMOOTHNESS, Matern
+from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
+from magbridge.estimation.gaussian_field import BURIED_FACTORS, SMOOTHNESS_POWERS, GaussianField
+from magbridge.estimation.hyperparameters import log_evidence
+from magbridge.estimation.priors import PriorFamily
 
 __all__ = [
     "CLEAR",
@@ -42,7 +42,7 @@ LENGTH_SPREAD = np.log(6.0)
 class Choice:
     """A field for a standard deviation of 1, its size over the noise's, and that noise's autocorrelation."""
 
-    field: Matern
+    field: GaussianField
     ratio: float
     rho: float
     score: float = -np.inf
@@ -58,11 +58,11 @@ class Weighed:
     middle: float
     """m, the length that is expected."""
 
-    def score(self, reduced: Reduced, field: Matern, ratio: float) -> float:
+    def score(self, reduced: FieldEliminated, field: GaussianField, ratio: float) -> float:
         """Return the log evidence, the noise's size being the likeliest one."""
         log_sigma, value = float(np.log(self.sigma)), -np.inf
         for _ in range(4):  # Newton's: in log sigma it is nearly a parabola of curvature -2n
-            value, slope, _ = evidence(reduced.quadratic, self.family, self.eta, log_sigma)
+            value, slope, _ = log_evidence(reduced.quadratic, self.family, self.eta, log_sigma)
             step = float(np.clip(slope[-1] / (2.0 * reduced.quadratic.n), -1.0, 1.0))
             log_sigma += step
             if abs(step) < 1e-3:
@@ -73,7 +73,7 @@ class Weighed:
 
 
 def choose(
-    sums_of: Callable[[Matern], Sums],
+    sums_of: Callable[[GaussianField], SampleSums],
     place: FloatArray,
     weighed: Weighed,
     start: float,
@@ -114,7 +114,7 @@ def choose(
             nodes = nodes_for(place, length, alpha, most)
             if length < RESOLVED * nodes.spacing:
                 continue
-            field = Matern(nodes, float(length), alpha, harmonic)
+            field = GaussianField(nodes, float(length), alpha, harmonic)
             found = climb(
                 sums_of(field), Choice(field, ratio, rho), weighed,
                 move_length=False, move_rho=move_rho, steps=int(24 * effort), near=1.0,
@@ -129,13 +129,13 @@ def choose(
 
     best, enclosed = down(SMOOTH)
     if not enclosed:  # rock is rougher than any of these
-        rough, _ = down(SMOOTHNESS[0])
+        rough, _ = down(SMOOTHNESS_POWERS[0])
         best = rough if rough.score > best.score else best
 
     def tried(one: Choice, alpha: int, harmonic: bool, buried: bool = False) -> Choice:
         length = one.field.length * ((one.field.alpha - 1) / (alpha - 1)) ** BENDS
         nodes = nodes_for(place, length, alpha, most if alpha <= SMOOTH else FEWER)
-        field = Matern(nodes, length, alpha, harmonic, buried)
+        field = GaussianField(nodes, length, alpha, harmonic, buried)
         begin = replace(one, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 
@@ -146,15 +146,15 @@ def choose(
         other = tried(best, best.field.alpha, not best.field.harmonic)
         best = _smoothness(other, tried) if other.score > best.score else best
     if best.field.alpha < SMOOTH:  # the spectrum of sources at a depth falls off slowly, too
-        other = tried(best, BURIED, best.field.harmonic, buried=True)
+        other = tried(best, BURIED_FACTORS, best.field.harmonic, buried=True)
         best = other if other.score > best.score else best
     return best
 
 
 def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> Choice:
     """Climb from a choice through the powers alpha, upwards, and if that is no better downwards."""
-    at = SMOOTHNESS.index(best.field.alpha)
-    for others in (SMOOTHNESS[at + 1 :], SMOOTHNESS[:at][::-1]):
+    at = SMOOTHNESS_POWERS.index(best.field.alpha)
+    for others in (SMOOTHNESS_POWERS[at + 1 :], SMOOTHNESS_POWERS[:at][::-1]):
         before = best
         for alpha in others:
             found = tried(best, alpha, best.field.harmonic)
@@ -170,11 +170,11 @@ def first_guess(place: FloatArray) -> Choice:
     """Return a field to begin with at places (n, 2), m: of the middle length, and of usual size and noise."""
     rungs = ladder(place)
     length = float(rungs[len(rungs) // 2 + 1])
-    return Choice(Matern(nodes_for(place, length, SMOOTH), length, SMOOTH), SIZE, 0.0)
+    return Choice(GaussianField(nodes_for(place, length, SMOOTH), length, SMOOTH), SIZE, 0.0)
 
 
 def climb(
-    sums: Sums,
+    sums: SampleSums,
     start: Choice,
     weighed: Weighed,
     *,
@@ -203,7 +203,7 @@ def climb(
     def downhill(x: FloatArray) -> float:
         one = at(x)
         try:
-            return -weighed.score(eliminate(sums, one.field, one.ratio, one.rho), one.field, one.ratio)
+            return -weighed.score(eliminate_field(sums, one.field, one.ratio, one.rho), one.field, one.ratio)
         except np.linalg.LinAlgError:
             return 1e300
 
@@ -218,7 +218,9 @@ def climb(
     return replace(best, rho=rho, score=-float(found.fun))
 
 
-def refined(sums_of: Callable[[Matern], Sums], place: FloatArray, choice: Choice, weighed: Weighed) -> Choice:
+def refined(
+    sums_of: Callable[[GaussianField], SampleSums], place: FloatArray, choice: Choice, weighed: Weighed
+) -> Choice:
     """Climb from a choice; nodes at places (n, 2), m, are made anew where they no longer suit the length."""
     field = choice.field
     if not fine_enough(field.nodes, field.length, field.alpha):
@@ -227,14 +229,14 @@ def refined(sums_of: Callable[[Matern], Sums], place: FloatArray, choice: Choice
     return climb(sums_of(field), replace(choice, field=field), weighed, steps=30)
 
 
-def same_noise(sums: Sums, choice: Choice, weighed: Weighed) -> Choice:
+def same_noise(sums: SampleSums, choice: Choice, weighed: Weighed) -> Choice:
     """Choose the noise's autocorrelation alone, with all samples, where the rest was chosen with a few."""
 
     def downhill(x: float) -> float:
         try:
             rho = HIGHEST / (1.0 + np.exp(-x))
             return -weighed.score(
-                eliminate(sums, choice.field, choice.ratio, float(rho)), choice.field, choice.ratio
+                eliminate_field(sums, choice.field, choice.ratio, float(rho)), choice.field, choice.ratio
             )
         except np.linalg.LinAlgError:
             return 1e300

@@ -15,9 +15,9 @@ from magbridge.calibration.fitting.judged import judged
 from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
-from magbridge.calibration.residual import robust_scale
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import robust_scale
 from magbridge.field.reference import other_units
 
 __all__ = ["LEVEL", "METHODS", "Fit", "fit"]

@@ -21,12 +21,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.noise import estimate_noise
 from magbridge.calibration.fitting.nominal import HARD_IRON_SIGMA, SCALE_SIGMA, check_scales, nominal_samples
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.residual import residuals_of
 from magbridge.errors import CalibrationError
+from magbridge.estimation.noise import estimate_noise
+from magbridge.estimation.residual import residuals_of
 from magbridge.wording import counted
 
 __all__ = ["fit_horizontal"]

@@ -11,8 +11,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.mission import expected_error, nearby_mission
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.calibration.terms import Polynomial
+from magbridge.estimation.residual import Samples, jacobian, residuals
 from magbridge.wording import counted
 
 __all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "warnings_for"]

@@ -1,22 +1,23 @@
 r"""The fit to a survey: coefficients and the rock below the track, jointly.
 
-Where nobody knows the true field, the reference is the main field, and what it lacks at a place,
+If no true field is known, the reference is the main field, and what it lacks at a place,
 
 .. math:: H_e(x, t) = |\mathrm{IGRF}| + b + f(x) + s(t),
 
-has a level b, a Gaussian field f in place (:mod:`magbridge.field.place`) and a slow part s in time. The
-level is that of the crust far around, so b has a gradient as well: once the level moves by :math:`-g F_0` a
-gain g shows in nothing but how :math:`H_e` varies, and a long log would tell it by the main field's fall with
-height, as if nothing else fell. A criss-cross meets the same rock with another heading, roll and position of
-the masses, so f and the coefficients can be told apart. The errors stand in the readings, as in every fit
-here (:mod:`magbridge.calibration.residual`): without the weight of :math:`|A^T u|` a joint fit would shrink A
-to have less rock to explain.
+has a level b, a Gaussian field f in place (:mod:`magbridge.estimation.gaussian_field`) and a slow part s in
+time. The level is that of the crust far around, so b has a gradient as well: once the level moves by
+:math:`-g F_0`, a gain g shows in the variation of :math:`H_e` only, and a long log would determine it by the
+main field's decrease with height, as if no other part decreased. A criss-cross survey meets the same crustal
+field with another heading, roll and position of the masses, so that f and the coefficients are
+distinguishable. The errors are in the readings, as in every fit here (:mod:`magbridge.estimation.residual`):
+without the weight of :math:`|A^T u|` a joint fit would shrink A, to have a smaller crustal field to explain.
 
 Notes
 -----
 Rounds of Gauss-Newton about the last answer (:mod:`.rounds`); in each the sparse field is eliminated
-(:mod:`.joint`), the prior's widths are chosen by the evidence of what remains (:mod:`.evidence`), and the
-field's size and length and the noise's autocorrelation by that of the whole (:mod:`.field_search`).
+(:mod:`magbridge.estimation.elimination`), the prior's widths are chosen by the evidence of what remains
+(:mod:`magbridge.estimation.hyperparameters`), and the field's size and length and the noise's autocorrelation
+by that of the whole (:mod:`.field_search`).
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ from magbridge.calibration.fitting.answer import Answer
 from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder
 from magbridge.calibration.fitting.known import Known
-from magbridge.calibration.fitting.latent import Group, slow_functions
 from magbridge.calibration.fitting.level import with_level
-from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.nominal import check_scales
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep, offered, with_creep, with_temperature
 from magbridge.calibration.fitting.pose import Vehicle, pose
-from magbridge.calibration.fitting.prior import Prior, PriorFamily
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.fitting.rounds import SEARCHED, SETTLED, WIDE, Rounds
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
-from magbridge.calibration.residual import rms
 from magbridge.errors import CalibrationError
+from magbridge.estimation.blocks import ParameterBlock, slow_functions
+from magbridge.estimation.noise import NoiseModel
+from magbridge.estimation.priors import Prior, PriorFamily
+from magbridge.estimation.residual import rms
 
 __all__ = ["fit_in_place"]
 
@@ -119,16 +120,16 @@ def fit_in_place(
     )
 
 
-def _groups(data: Observations, level: float) -> tuple[Group, ...]:
+def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
     """Return the unknowns beside coefficients and field: the level, its slope, what changes with time."""
     assert data.place is not None
     away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REACH
     level = max(level, 1e-3)
-    groups = [Group("level", np.ones((len(data), 1)), np.ones(1), level)]
-    groups.append(Group("gradient", away, np.ones(3), level))
+    groups = [ParameterBlock("level", np.ones((len(data), 1)), np.ones(1), level)]
+    groups.append(ParameterBlock("gradient", away, np.ones(3), level))
     waves, shape = slow_functions(data.time)
     if len(shape):
-        groups.append(Group("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
+        groups.append(ParameterBlock("slow change with time", waves, shape, SLOW, SLOW_SPREAD, offered=True))
     return tuple(groups)
 
 

@@ -18,58 +18,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import comb
-from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.prior import Prior, PriorFamily
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
+from magbridge.estimation.priors import PriorFamily
 
-__all__ = ["DEPARTURE", "Information", "Known", "rescaling"]
+__all__ = ["DEPARTURE", "Known", "rescaling"]
 
 DEPARTURE = "departure from what was known"
 """Name of the width of z among ``widths_nT``: 1 where a deployment is as it was expected."""
 SPREAD = np.log(1.5)
 """1-sigma of the logarithm of that width."""
-
-
-class Information(NamedTuple):
-    """What data alone say of coefficients c: ``-c^T precision c / 2 + vector . c``, in a log likelihood.
-
-    `precision` is (K, K), nT⁻², and may be singular; `vector` is (K,), nT⁻¹.
-    """
-
-    precision: FloatArray
-    vector: FloatArray
-
-    @classmethod
-    def left_by(cls, prior: Prior, coefficients: FloatArray, covariance: FloatArray) -> Information:
-        """Return what is left of a posterior (K,), (K, K) without the prior that it was found with."""
-        scale = np.sqrt(np.diag(covariance))
-        known = _inverse(prior.E @ np.linalg.inv(prior.precision) @ prior.E.T, scale)
-        found = _inverse(covariance, scale)
-        centre = np.broadcast_to(prior.offset, coefficients.shape) / scale
-        values, vectors = np.linalg.eigh(found - known)
-        precision = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        vector = found @ (coefficients / scale) - known @ centre
-        return cls(precision / np.outer(scale, scale), vector / scale)
-
-    def divided(self, ratio: float) -> Information:
-        """Return the same with all errors `ratio` times larger."""
-        return Information(self.precision / ratio**2, self.vector / ratio**2)
-
-    def blurred(self, direction: FloatArray, sigma: float) -> Information:
-        """Return the same where an unknown number of 1-sigma `sigma` moves c along `direction` (K,)."""
-        Iv = self.precision @ direction
-        share = Iv / (1.0 / sigma**2 + direction @ Iv)
-        return Information(
-            self.precision - np.outer(share, Iv), self.vector - share * (direction @ self.vector)
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,11 +121,3 @@ def rescaling(
                 powers = zip(p, q, s, t, strict=True)
                 M[row, column] = np.prod([comb(a, b) * s_k**b * t_k ** (a - b) for a, b, s_k, t_k in powers])
     return np.asarray(np.kron(M, np.diag([field_new / field_old] * 6 + [1.0] * 3)))
-
-
-def _inverse(covariance: FloatArray, scale: FloatArray) -> FloatArray:
-    """Inverse of a covariance (K, K) in units of `scale` (K,)."""
-    scaled = covariance / np.outer(scale, scale)
-    own = np.sqrt(np.diag(scaled))
-    inverse = cho_solve(cho_factor(scaled / np.outer(own, own)), np.eye(len(own))) / np.outer(own, own)
-    return np.asarray(0.5 * (inverse + inverse.T))

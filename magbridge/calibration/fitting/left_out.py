@@ -26,19 +26,11 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.noise import OUTLIER, NoiseModel
-from magbridge.calibration.fitting.prior import Prior
-from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
-from magbridge.calibration.residual import (
-    NormalEquations,
-    Samples,
-    independent,
-    jacobian,
-    normal_equations,
-    residuals,
-    residuals_of,
-    robust_scale,
-)
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, effective_fraction
+from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_equations
+from magbridge.estimation.priors import Prior
+from magbridge.estimation.residual import Samples, jacobian, residuals, residuals_of, robust_scale
 
 __all__ = ["LeftOut", "leave_out", "refitted"]
 
@@ -109,7 +101,7 @@ def _left_out(
 ) -> LeftOut:
     """Predict each of the `parts` from the others."""
     c = prior.coefficients(z)
-    normals = [prior.reduce(_normal(samples, c, noise, rows)) for rows in parts]
+    normals = [_normal(samples, c, noise, rows).reduced(prior.E) for rows in parts]
     hessian = np.sum([normal.hessian for normal in normals], axis=0)
     every = max(len(samples.field) // TESTED, 1)
     counted = np.ones(len(samples.field), bool)
@@ -123,7 +115,9 @@ def _left_out(
         J = jacobian(tested.phi, g) @ prior.E
         e.append(off + J @ (P @ normal.gradient / noise.sigma**2))
         s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
-    return _judged(np.concatenate(e), np.concatenate(s2), len(samples.field) * independent(*noise.shape))
+    return _judged(
+        np.concatenate(e), np.concatenate(s2), len(samples.field) * effective_fraction(*noise.shape)
+    )
 
 
 def refitted(
@@ -142,7 +136,7 @@ def refitted(
         kept.steps[1:][np.diff(others) > 1] = np.inf
         found = gauss_newton(kept, prior, replace(noise, weight=weight[others]), z, steps=STEPS)
         e[rows] = residuals_of(samples.part(rows), prior.coefficients(found.z))
-    limit = OUTLIER * robust_scale(e)
+    limit = OUTLIER_SIGMA * robust_scale(e)
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
 
 
@@ -150,11 +144,11 @@ def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
     """Return the ratio of errors (n,) over their variances, of which `count` are independent."""
     ratio2 = 1.0
     for _ in range(20):  # an outlier counts as one just at the limit, and the limit grows with the ratio
-        last, limit = ratio2, OUTLIER**2 * ratio2
+        last, limit = ratio2, OUTLIER_SIGMA**2 * ratio2
         ratio2 = max(float(np.minimum(e * e / s2, limit).mean()), 1.0)
         if ratio2 < 1.01 * last:
             break
-    rms = float(np.sqrt(np.minimum(e * e, OUTLIER**2 * ratio2 * s2).mean()))
+    rms = float(np.sqrt(np.minimum(e * e, OUTLIER_SIGMA**2 * ratio2 * s2).mean()))
     chance = 1.0 + CHANCE * np.sqrt(2.0 / max(count, 1.0))
     return LeftOut(rms, float(np.sqrt(ratio2)) if ratio2 > chance else 1.0)
 

@@ -15,8 +15,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.model import RAISED, Calibration, Reference
-from magbridge.calibration.residual import Samples, jacobian, residuals
-from magbridge.calibration.terms import symmetric
+from magbridge.estimation.residual import Samples, jacobian, residuals, symmetric
 
 __all__ = ["apart_from_level", "level_of", "sizes", "with_level"]
 

@@ -23,10 +23,10 @@ from numpy.polynomial import chebyshev
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.dipole import dipole_columns, expand_dipole
-from magbridge.calibration.fitting.prior import FACTOR_MASS, PriorFamily, gain_rotation
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
+from magbridge.estimation.priors import FACTOR_MASS, PriorFamily, gain_rotation
 from magbridge.toml import check_entries, convert, load_toml
 
 __all__ = ["LATENT", "Mounting", "mass_columns", "mounted_prior", "read_vehicle"]
@@ -122,7 +122,7 @@ def mounted_prior(
     Parameters
     ----------
     free : PriorFamily
-        The result of :func:`~magbridge.calibration.fitting.prior.polynomial_prior`.
+        The result of :func:`~magbridge.estimation.priors.polynomial_prior`.
     exponents : tuple of tuple of int
         Its monomials.
     parameters : tuple of Parameter

@@ -16,13 +16,14 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.left_out import leave_out
-from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise, memory
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
-from magbridge.calibration.residual import Samples, independent, residuals_of, scales_and_offsets
 from magbridge.errors import CalibrationError
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.noise import NoiseModel, effective_fraction, estimate_noise, fit_slow_and_white
+from magbridge.estimation.optimise import gauss_newton
+from magbridge.estimation.priors import Prior
+from magbridge.estimation.residual import Samples, residuals_of, scales_and_offsets
 
 __all__ = [
     "GAIN_SIGMA", "HARD_IRON_SIGMA", "SCALE_SIGMA", "check_scales", "fit_nominal", "nominal",
@@ -105,7 +106,7 @@ def nominal(
         for _ in range(4):
             found = gauss_newton(samples, prior, noise, z)
             z = found.z
-            # the moving masses are still in the residual: do not whiten, but count fewer independent samples
+            # the moving masses are still in the residual: do not whiten, but count fewer samples
             noise = estimate_noise(residuals_of(samples, E @ z), samples.steps, len(keep))
             rho, noise = noise.autocorrelation, replace(noise, autocorrelation=0.0)
         value = found.normal.cost
@@ -115,8 +116,10 @@ def nominal(
         check_scales(samples, E @ z)  # a fit on its way to collapse never settles: that is the better message
         raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
     _, found, noise, rho = best
-    noise = memory(residuals_of(samples, E @ found.z), samples.steps, replace(noise, autocorrelation=rho))
-    precision = found.normal.hessian * independent(*noise.shape) / noise.sigma**2 + prior.precision
+    noise = fit_slow_and_white(
+        residuals_of(samples, E @ found.z), samples.steps, replace(noise, autocorrelation=rho)
+    )
+    precision = found.normal.hessian * effective_fraction(*noise.shape) / noise.sigma**2 + prior.precision
     covariance = E @ covariance_of(precision) @ E.T
     coefficients = E @ found.z
     check_scales(samples, coefficients)

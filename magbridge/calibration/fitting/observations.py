@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration, Parameter
-from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import Samples
 from magbridge.records import BEYOND
 
 __all__ = ["TEMPERATURE", "Observations", "monomials", "polynomial_samples"]

@@ -16,9 +16,9 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, held, lagged
-from magbridge.calibration.fitting.latent import Group, Offset, slow_functions
 from magbridge.calibration.fitting.observations import TEMPERATURE, Observations
 from magbridge.calibration.model import Calibration
+from magbridge.estimation.blocks import OffsetBlock, ParameterBlock, slow_functions
 
 __all__ = ["Creep", "in_words", "offered", "with_creep", "with_temperature"]
 
@@ -48,7 +48,7 @@ class Creep:
         return np.stack([np.interp(time, self.time, one) for one in self.offset.T], axis=1)
 
 
-def offered(data: Observations) -> tuple[Offset, ...]:
+def offered(data: Observations) -> tuple[OffsetBlock, ...]:
     """Return the terms that may be in a log: the temperature at every lag, where there is any, and creep."""
     groups = []
     if data.temperature is not None and TEMPERATURE not in data.names:
@@ -57,10 +57,14 @@ def offered(data: Observations) -> tuple[Offset, ...]:
             if np.std(warm) > VARIES:
                 column = (warm - warm.mean())[:, None]
                 name = f"offset by temperature, lag {lag:.0f} s"
-                groups.append(Offset(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag))
+                groups.append(
+                    OffsetBlock(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag)
+                )
     waves, shape = slow_functions(data.time, FASTEST)
     if len(shape):
-        groups.append(Offset("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD, offered=True))
+        groups.append(
+            OffsetBlock("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD, offered=True)
+        )
     return tuple(groups)
 
 
@@ -74,7 +78,7 @@ def _temperature(data: Observations, lag: float) -> FloatArray:
 def with_temperature(
     calibration: Calibration,
     data: Observations,
-    groups: tuple[Group, ...],
+    groups: tuple[ParameterBlock, ...],
     found: tuple[FloatArray, FloatArray, FloatArray],
 ) -> Calibration:
     """Return the calibration with the effect of the temperature that was found, if any.
@@ -85,7 +89,7 @@ def with_temperature(
         Its position terms.
     data : Observations
         Of the fit.
-    groups : tuple of Group
+    groups : tuple of ParameterBlock
         That are in the fit, in order.
     found : tuple of (q,), (q, q), (9 m, q) arrays
         The unknowns, their covariance, and what they do to the coefficients.
@@ -93,7 +97,7 @@ def with_temperature(
     z, covariance, E = found
     row = E.shape[1] - sum(len(one.shape) for one in groups)
     for one in groups:
-        if isinstance(one, Offset) and one.lag is not None:
+        if isinstance(one, OffsetBlock) and one.lag is not None:
             origin = float(_temperature(data, one.lag).mean())
             both = np.vstack([E, np.eye(3, len(z), row)])
             return replace(

@@ -13,11 +13,11 @@ from typing import Any
 from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.mounted_masses import Mounting, mounted_prior
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
-from magbridge.calibration.fitting.prior import PriorFamily, polynomial_prior
 from magbridge.calibration.model import Parameter
-from magbridge.calibration.residual import Samples
 from magbridge.calibration.terms import Exponents, full_order
 from magbridge.errors import CalibrationError
+from magbridge.estimation.priors import PriorFamily, polynomial_prior
+from magbridge.estimation.residual import Samples
 
 __all__ = ["Posed", "Vehicle", "pose"]
 

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.known import Information
 from magbridge.calibration.fitting.left_out import LeftOut
-from magbridge.calibration.fitting.noise import NoiseModel
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep
-from magbridge.calibration.fitting.prior import Prior
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
-from magbridge.calibration.residual import Samples, residuals_of, rms, scales_and_offsets
 from magbridge.calibration.terms import Polynomial
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.noise import NoiseModel
+from magbridge.estimation.priors import Prior
+from magbridge.estimation.residual import Samples, residuals_of, rms, scales_and_offsets
 from magbridge.version import __version__
 from magbridge.wording import counted
 
@@ -40,7 +40,7 @@ class Fit:
     """The data as fitted, for :mod:`.identify`."""
     open: tuple[str, ...] = ()
     """What the track leaves open, which is a reason for an error that is large."""
-    information: Information | None = None
+    information: GaussianInformation | None = None
     """What the data alone say of the coefficients; None where the method's prior is none of all of them."""
     creep: Creep | None = None
     """How the sensor's offset crept meanwhile, where the data show that it did."""
@@ -110,7 +110,7 @@ def assemble(
         Of all coefficients, as they were fitted with it.
     """
     e = residuals_of(samples, coefficients)
-    information = Information.left_by(prior, coefficients, covariance) if prior is not None else None
+    information = None if prior is None else _without_prior(prior, coefficients, covariance)
     if left_out is not None:
         information = information and information.divided(left_out.ratio)
         noise, covariance = replace(noise, sigma=noise.sigma * left_out.ratio), covariance * left_out.ratio**2
@@ -136,6 +136,13 @@ def assemble(
         software=f"magbridge {__version__}",
     )
     return Fit(calibration, e, (), details or {}, samples, information=information)
+
+
+def _without_prior(prior: Prior, coefficients: FloatArray, covariance: FloatArray) -> GaussianInformation:
+    """Return the information of the data alone, from the posterior (K,), (K, K) and its prior."""
+    before = prior.E @ np.linalg.inv(prior.precision) @ prior.E.T
+    centre = np.broadcast_to(prior.offset, coefficients.shape)
+    return GaussianInformation.from_posterior(coefficients, covariance, centre, before)
 
 
 def _runs(data: Observations, e: FloatArray) -> tuple[Run, ...]:

@@ -8,7 +8,6 @@ import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.answer import Answer, start
-from magbridge.calibration.fitting.evidence import maximise
 from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
     CLEAR,
@@ -19,13 +18,15 @@ from magbridge.calibration.fitting.field_search import (
     refined,
     same_noise,
 )
-from magbridge.calibration.fitting.joint import Reduced, Sums, add_up, eliminate
-from magbridge.calibration.fitting.latent import LIKELIER, Group, likeliest, with_groups
-from magbridge.calibration.fitting.prior import PriorFamily
 from magbridge.calibration.fitting.survey_samples import SurveySamples
-from magbridge.calibration.residual import Samples, residuals_of, robust_scale
 from magbridge.errors import CalibrationError
-from magbridge.field.place.matern import Matern
+from magbridge.estimation.blocks import ParameterBlock, with_blocks
+from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field, sum_rows
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.hyperparameters import maximise_evidence
+from magbridge.estimation.priors import PriorFamily
+from magbridge.estimation.residual import Samples, residuals_of, robust_scale
+from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
 
 __all__ = ["SEARCHED", "SETTLED", "WIDE", "Rounds"]
 
@@ -61,7 +62,7 @@ class Rounds:
         self.survey, self.own, self.q = survey, own, own.E.shape[1]
         self.until = GUESSED + SEARCHES
         self.offers = any(one.offered for one in survey.groups)
-        self.family = with_groups(own, survey.groups)
+        self.family = with_blocks(own, survey.groups)
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
         self.step = max(int(self.part.sum()) // SEARCHED, 1)
         self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
@@ -83,7 +84,11 @@ class Rounds:
         """Return its log evidence: a sample left out counts as one at the limit, an offer has its price."""
         survey, each = self.survey, 0.5 * OUTLIER**2 + float(np.log(answer.widths.sigma))
         left_out = int((survey.at_rest & ~survey.kept).sum())
-        return answer.score - left_out * each - LIKELIER * sum(one.offered for one in survey.groups)
+        return (
+            answer.score
+            - left_out * each
+            - BLOCK_LOG_EVIDENCE_PRICE * sum(one.offered for one in survey.groups)
+        )
 
     def go_on(self, survey: SurveySamples, step: int) -> None:
         """Go on with `survey`, of which the samples so far were every `step`-th one; nothing is searched."""
@@ -102,7 +107,7 @@ class Rounds:
         for turn in range(ROUNDS):
             if self.own.renew is not None and turn:
                 self.own = self.own.renew(self.z[: self.q])
-                self.family = with_groups(self.own, survey.groups)
+                self.family = with_blocks(self.own, survey.groups)
             answer = self._round(turn)
             e = self._residuals(answer.z, answer.lacking)
             if self.last is not None:
@@ -127,11 +132,14 @@ class Rounds:
         sums = self._sums(self.choice.field)
         if searched and self.step > 1:
             self.choice = same_noise(sums, self.choice, weighed)
-        choice, reduced = self.choice, eliminate(sums, self.choice.field, self.choice.ratio, self.choice.rho)
-        widths = maximise(reduced.quadratic, self.family, self.eta, self.sigma)
+        choice, reduced = (
+            self.choice,
+            eliminate_field(sums, self.choice.field, self.choice.ratio, self.choice.rho),
+        )
+        widths = maximise_evidence(reduced.quadratic, self.family, self.eta, self.sigma)
         self.eta, self.sigma = widths.eta, widths.sigma
-        precision = reduced.quadratic.H / self.sigma**2 + self.family.at(self.eta).precision
-        step = np.linalg.solve(precision, reduced.quadratic.b / self.sigma**2) - self.z
+        precision = reduced.quadratic.precision / self.sigma**2 + self.family.at(self.eta).precision
+        step = np.linalg.solve(precision, reduced.quadratic.vector / self.sigma**2) - self.z
         self.z, lacking = self._damped(np.asarray(step, float), reduced, choice.field)
         self.w, self.nodes = reduced.field(self.z), choice.field.nodes
         if self.survey.drift is not None:
@@ -170,15 +178,15 @@ class Rounds:
         """
         survey, choice = self.survey, self.choice
         self.offers = False
-        reduced = eliminate(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
+        reduced = eliminate_field(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
         weighed = reduced.quadratic, self.own, survey.groups, self.eta, self.sigma
-        kept, sure = likeliest(*weighed), likeliest(*weighed, price=CLEAR)
+        kept, sure = select_blocks(*weighed), select_blocks(*weighed, price=CLEAR)
         self.unsure = {one.name for one in kept} - {one.name for one in sure}
         if len(kept) < len(survey.groups):
             self._regroup(kept)
             self.until = turn + SEARCHES
 
-    def _regroup(self, groups: tuple[Group, ...]) -> None:
+    def _regroup(self, groups: tuple[ParameterBlock, ...]) -> None:
         """Go on with other groups of unknowns; those that were there stay where they are."""
         at, width, row, column = {}, {}, self.q, len(self.own.centre)
         for one in self.survey.groups:
@@ -189,9 +197,11 @@ class Rounds:
         self.z = np.concatenate([self.z[: self.q], *z])
         self.eta = np.concatenate([self.eta[: len(self.own.centre)], *eta])
         self.survey.keep(groups)
-        self.family = with_groups(self.own, groups)
+        self.family = with_blocks(self.own, groups)
 
-    def _damped(self, step: FloatArray, reduced: Reduced, field: Matern) -> tuple[FloatArray, FloatArray]:
+    def _damped(
+        self, step: FloatArray, reduced: FieldEliminated, field: GaussianField
+    ) -> tuple[FloatArray, FloatArray]:
         """Return z after the step (q,), shortened while it overshoots, as it may far off; what lacks there.
 
         A track that bends from the last answer's to that of z meets the field's slopes on its way.
@@ -212,10 +222,10 @@ class Rounds:
             part *= 0.5
         return self.z + part * step, here + part * change
 
-    def _few(self, field: Matern) -> Sums:
+    def _few(self, field: GaussianField) -> SampleSums:
         return self._sums(field, np.flatnonzero(self.survey.kept & self.part)[:: self.step], self.step)
 
-    def _sums(self, field: Matern, rows: IndexArray | None = None, step: int = 1) -> Sums:
+    def _sums(self, field: GaussianField, rows: IndexArray | None = None, step: int = 1) -> SampleSums:
         """Return the sums of all samples, or of `rows`, every `step`-th one, about the last answer.
 
         Where the nodes are new they are about a field of 0.
@@ -223,7 +233,7 @@ class Rounds:
         w = self.w if field.nodes is self.nodes else np.zeros(field.nodes.size)
         self.survey.bend(field, w, self.z[self.q :])
         rows = np.flatnonzero(self.survey.kept) if rows is None else rows
-        return add_up(self.survey.linear(self.family, self.z, field, w, rows, step))
+        return sum_rows(self.survey.linear(self.family, self.z, field, w, rows, step))
 
     def _slow(self, z: FloatArray) -> FloatArray:
         return self.survey.slow(z[self.q :])

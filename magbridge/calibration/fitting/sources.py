@@ -11,9 +11,9 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
-from magbridge.calibration.residual import rms
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import rms
 
 if TYPE_CHECKING:
     import xarray as xr

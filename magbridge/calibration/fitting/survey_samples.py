@@ -11,14 +11,21 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
-from magbridge.calibration.fitting.joint import Linear
-from magbridge.calibration.fitting.latent import CHUNK, Columns, Group, Offset, Waves, in_chunks
 from magbridge.calibration.fitting.level import sizes
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.prior import PriorFamily
-from magbridge.calibration.residual import Samples, jacobian, residuals
 from magbridge.config import Align
-from magbridge.field.place.matern import Matern
+from magbridge.estimation.blocks import (
+    BLOCK_ROWS,
+    BlockColumns,
+    OffsetBlock,
+    ParameterBlock,
+    SlowFunctions,
+    in_chunks,
+)
+from magbridge.estimation.elimination import LinearisedRows
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.priors import PriorFamily
+from magbridge.estimation.residual import Samples, jacobian, residuals
 
 __all__ = ["Drift", "SurveySamples", "beside_motion"]
 
@@ -26,7 +33,7 @@ __all__ = ["Drift", "SurveySamples", "beside_motion"]
 class Drift(NamedTuple):
     """How positions drift with time: functions (n, r), their widths (r,) over `sigma`, and that, m."""
 
-    waves: FloatArray | Waves
+    waves: FloatArray | SlowFunctions
     shape: FloatArray
     sigma: float
 
@@ -69,14 +76,18 @@ class SurveySamples:
         With places; where `unmapped` is 0 the reference is the true field.
     samples : Samples
         The same, with the monomials of the positions.
-    groups : tuple of Group
+    groups : tuple of ParameterBlock
         Unknowns beside the coefficients.
     drift : Drift, optional
         How positions may be off: further unknowns, which act through the field's slope.
     """
 
     def __init__(
-        self, data: Observations, samples: Samples, groups: tuple[Group, ...], drift: Drift | None = None
+        self,
+        data: Observations,
+        samples: Samples,
+        groups: tuple[ParameterBlock, ...],
+        drift: Drift | None = None,
     ) -> None:
         assert data.place is not None
         assert data.unmapped is not None
@@ -90,7 +101,8 @@ class SurveySamples:
         if drift is not None:
             nothing = np.zeros((len(samples.field), 0))
             groups = (
-                *groups, *(Group(f"position {way}", nothing, drift.shape, drift.sigma) for way in ("n", "e"))
+                *groups,
+                *(ParameterBlock(f"position {way}", nothing, drift.shape, drift.sigma) for way in ("n", "e")),
             )  # fmt: skip
         self.keep(groups)
 
@@ -105,11 +117,11 @@ class SurveySamples:
         few.keep(tuple(replace(group, functions=group.functions[rows]) for group in self.groups))
         return few
 
-    def keep(self, groups: tuple[Group, ...]) -> None:
+    def keep(self, groups: tuple[ParameterBlock, ...]) -> None:
         """Go on with these groups of unknowns: those that add to the reference come first, then offsets."""
         self.groups = groups
-        self.offsets = [group for group in groups if isinstance(group, Offset)]
-        self.steady = Columns([group for group in groups if not isinstance(group, Offset)])
+        self.offsets = [group for group in groups if isinstance(group, OffsetBlock)]
+        self.steady = BlockColumns([group for group in groups if not isinstance(group, OffsetBlock)])
         self.bent = len(self.steady) + sum(len(group.shape) for group in self.offsets)
         """Where the unknowns of the positions begin."""
         many = 0 if self.drift is None else len(self.drift.shape)
@@ -119,7 +131,7 @@ class SurveySamples:
         """Return what the reference lacks beside the rock (n,), nT: its level and slow changes."""
         return (self.steady @ latent[: len(self.steady)]) * self.unmapped
 
-    def offset(self, latent: FloatArray, of: Sequence[Offset] | None = None) -> FloatArray:
+    def offset(self, latent: FloatArray, of: Sequence[OffsetBlock] | None = None) -> FloatArray:
         """Return the sensor's offset (n, 3), nT, beside what depends on the positions.
 
         `latent` (p,) are the unknowns of all groups; `of` are the offsets that count, by default all.
@@ -132,16 +144,16 @@ class SurveySamples:
                 out += group.functions @ d.reshape(3, -1).T
         return out
 
-    def basis(self, field: Matern, rows: IndexArray | slice) -> csr_array:
+    def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:
         """Return what the field's coefficients add to the reference at `rows`: (m, nodes)."""
         known = field.basis(self.place[rows], self.deeper[rows])
         return csr_array(diags_array(self.unmapped[rows]) @ known)
 
-    def rock(self, field: Matern, w: FloatArray) -> FloatArray:
+    def rock(self, field: GaussianField, w: FloatArray) -> FloatArray:
         """Return what coefficients w (nodes,) or (nodes, k) add at every sample: (n,) or (n, k), nT."""
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
-    def bend(self, field: Matern, w: FloatArray, latent: FloatArray) -> None:
+    def bend(self, field: GaussianField, w: FloatArray, latent: FloatArray) -> None:
         """Move the track to where it is with the unknowns `latent` (p,), and take the field's slope there.
 
         `w` (nodes,) are the field's coefficients, nT.
@@ -158,11 +170,11 @@ class SurveySamples:
         self,
         family: PriorFamily,
         z: FloatArray,
-        field: Matern,
+        field: GaussianField,
         w: FloatArray,
         rows: IndexArray,
         step: int = 1,
-    ) -> Iterator[Linear]:
+    ) -> Iterator[LinearisedRows]:
         """Yield `rows` (m,), every `step`-th sample, linearised about z (q,) and w (nodes,)."""
         latent = z[family.E.shape[1] - sum(len(group.shape) for group in self.groups) :]
         slow, offset = self.slow(latent), self.offset(latent)
@@ -170,8 +182,8 @@ class SurveySamples:
         follows[1:] = self._apart(rows) == step
         c = family.E @ z + family.offset
         E = family.E[:, : len(z) - len(latent)]
-        for start in range(0, len(rows), CHUNK):
-            part = slice(max(start - 1, 0), start + CHUNK)
+        for start in range(0, len(rows), BLOCK_ROWS):
+            part = slice(max(start - 1, 0), start + BLOCK_ROWS)
             mine = rows[part]
             B, samples = self.basis(field, mine), self.samples.part(mine)
             piece = replace(
@@ -184,7 +196,9 @@ class SurveySamples:
             slopes = -self.slopes[mine] / size[:, None]
             D = np.hstack([jacobian(piece.phi, g) @ E, steady, *offsets, slopes])
             here = csr_array(diags_array(-1.0 / size) @ B)
-            yield Linear(np.column_stack([e - D @ z - here @ w, D]), here, follows[part], overlap=start > 0)
+            yield LinearisedRows(
+                np.column_stack([e - D @ z - here @ w, D]), here, follows[part], overlap=start > 0
+            )
 
     def _apart(self, rows: IndexArray) -> FloatArray:
         """Return sampling intervals between successive `rows`; infinite across runs."""

@@ -24,13 +24,14 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import monomials
-from magbridge.calibration.fitting.prior import polynomial_prior
 from magbridge.calibration.forward import forward
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.planning.limits import Limits, PlannedRun, candidate_runs
-from magbridge.calibration.residual import Samples, independent, jacobian, residuals
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError
+from magbridge.estimation.noise import effective_fraction
+from magbridge.estimation.priors import polynomial_prior
+from magbridge.estimation.residual import Samples, jacobian, residuals
 
 __all__ = ["Design", "Plan", "evaluate_runs", "expected_calibration", "plan"]
 
@@ -117,7 +118,7 @@ class Design:
         truth = field_body(attitude, np.tile(self.field_ned, (HEADINGS, 1)))
         phi, g = self.derivative(truth, np.tile(run.parameters, (HEADINGS, 1)))
         noise = self.calibration.noise
-        share = independent(noise.autocorrelation, noise.white)
+        share = effective_fraction(noise.autocorrelation, noise.white)
         weight = SAMPLES / HEADINGS / noise.sensor**2 * share
         values, vectors = np.linalg.eigh(g.T @ g * weight)
         return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)

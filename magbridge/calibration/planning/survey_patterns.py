@@ -2,7 +2,7 @@
 
 The vehicle trims, rolls and moves its masses as in the mission; a pattern gives each leg its course, and may
 bank every other leg. With the jacobians of the samples it would take and a Gaussian field in place
-(:mod:`~magbridge.calibration.fitting.joint`), the coefficients' covariance follows before it is flown.
+(:mod:`~magbridge.estimation.elimination`), the coefficients' covariance follows before it is flown.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import field_body
 from magbridge.calibration.fitting.crossings import courses, crossed, left_open_by
 from magbridge.calibration.fitting.field_nodes import nodes_for
-from magbridge.calibration.fitting.joint import Linear, add_up, eliminate
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
-from magbridge.calibration.fitting.prior import polynomial_prior
-from magbridge.calibration.fitting.solve import covariance_of
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.planning.plan import Design
-from magbridge.calibration.residual import jacobian
 from magbridge.errors import CalibrationError
-from magbridge.field.place.matern import Matern
+from magbridge.estimation.elimination import LinearisedRows, eliminate_field, sum_rows
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.priors import polynomial_prior
+from magbridge.estimation.residual import jacobian
 
 __all__ = ["Proposal", "facts", "propose", "summary"]
 
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
-"""nT, m and Matern's power of the rock that is expected, as nobody has been there."""
+"""nT, m and power of the rock that is expected, as nobody has been there."""
 LEVEL = 145.0
 """nT, 1-sigma of the main field's level."""
 SAMPLES = 1_500
@@ -143,9 +143,9 @@ def _expected(
     names = tuple(one.name for one in calibration.parameters)
     family = polynomial_prior(design.exponents, names, calibration.reference.field)
     D = np.column_stack([np.zeros(len(phi)), jacobian(phi, g) @ family.E, -np.ones(len(phi))])
-    field = Matern(nodes_for(place, LENGTH, SMOOTH), LENGTH, SMOOTH)
-    sums = add_up([Linear(D, -field.basis(place), np.zeros(len(phi), bool))])
-    H = eliminate(sums, field, ROCK / noise, 0.0).quadratic.H / noise**2
+    field = GaussianField(nodes_for(place, LENGTH, SMOOTH), LENGTH, SMOOTH)
+    sums = sum_rows([LinearisedRows(D, -field.basis(place), np.zeros(len(phi), bool))])
+    H = eliminate_field(sums, field, ROCK / noise, 0.0).quadratic.precision / noise**2
     prior = np.append(family.widths(family.centre), LEVEL) ** -2.0
     P = covariance_of(H + np.diag(prior))[:-1, :-1]
     points = (design.points - design.points.mean(axis=0)) @ family.E

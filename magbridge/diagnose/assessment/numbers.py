@@ -11,12 +11,12 @@ from scipy.stats import chi2
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import residuals, residuals_of, rms
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
 from magbridge.diagnose.inference.evidence import LEVEL
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.estimation.residual import residuals, residuals_of, rms
 
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding

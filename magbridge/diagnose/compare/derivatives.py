@@ -7,7 +7,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, jacobian
+from magbridge.estimation.residual import Samples, jacobian
 
 __all__ = ["CHUNK", "derivatives"]
 

@@ -10,10 +10,11 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, robust_scale, whiten
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
+from magbridge.estimation.noise import whiten
+from magbridge.estimation.residual import Samples, robust_scale
 
 __all__ = ["FALL", "floor", "isotropic", "noise_sigma", "prior"]
 

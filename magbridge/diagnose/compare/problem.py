@@ -2,7 +2,7 @@ r"""The comparison as a linear problem: a calibration's residuals, and what each
 
 Notes
 -----
-With the scalar residual e of :mod:`magbridge.calibration.residual` and its derivative g by the nine
+With the scalar residual e of :mod:`magbridge.estimation.residual` and its derivative g by the nine
 coefficients at every sample, a term or an effect that adds ``sum_rs phi_r C_krs`` to slot s moves it by
 
 .. math:: \partial e_t / \partial c_k = \sum_{rs} \phi_r(t)\, C_{krs}\, g_s(t)
@@ -38,13 +38,13 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, residuals
 from magbridge.calibration.terms import Effect, Series
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import noise_sigma, prior
 from magbridge.diagnose.compare.slow_noise import slow_columns, waves
 from magbridge.diagnose.compare.survey import Survey
+from magbridge.estimation.residual import Samples, residuals
 
 __all__ = ["DELAY", "DELAYS", "Problem", "once", "pose", "samples_of", "with_slow_noise"]
 
@@ -72,7 +72,7 @@ class Problem:
     jacobian: FloatArray
     """(n, 9) g."""
     reference_jacobian: FloatArray
-    """(n,) 1/s of :mod:`magbridge.calibration.residual`: e per nT by which the true field exceeds the
+    """(n,) 1/s of :mod:`magbridge.estimation.residual`: e per nT by which the true field exceeds the
     reference."""
     delay_jacobian: FloatArray
     """(n, 3) ``-de/dz`` of the delays, in units of :data:`DELAY`."""

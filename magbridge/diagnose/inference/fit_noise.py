@@ -7,10 +7,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import gammaln
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.compare.derivatives import CHUNK
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
+from magbridge.estimation.residual import robust_scale
 
 __all__ = ["BRIEFEST", "LONGEST", "TAILS", "autoregressive_order", "fit_noise"]
 

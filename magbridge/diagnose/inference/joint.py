@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.problem import DELAYS, Problem
 from magbridge.diagnose.inference.design import Design, in_threads, normal, precomputed
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
+from magbridge.estimation.residual import robust_scale
 
 __all__ = ["FLAT", "RIDGE", "Joint", "fit_joint", "volume_of"]
 

@@ -12,11 +12,11 @@ from scipy.special import gammaln
 from scipy.stats import chi2, rankdata
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.residual import robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.evidence import LEVEL, ODDS
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint
+from magbridge.estimation.residual import robust_scale
 
 __all__ = ["LOST", "Outliers", "outliers", "switches"]
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.isolability import CONFOUNDED, Visible
@@ -33,6 +32,7 @@ from magbridge.diagnose.words import (
     sizes,
     table,
 )
+from magbridge.estimation.residual import rms
 from magbridge.wording import counted
 
 __all__ = ["described", "found", "nameless", "remaining", "visible"]

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from magbridge.calibration.file import encode_calibration
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.assessment.numbers import Delays
 from magbridge.diagnose.assessment.weigh import Assessment, Fitness
 from magbridge.diagnose.causes import CAUSES, Cause
@@ -23,6 +22,7 @@ from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.details import described, found, remaining, visible
 from magbridge.diagnose.report.findings import findings_json
 from magbridge.diagnose.words import bold, figure, goes_with, listed, measured, number, table
+from magbridge.estimation.residual import rms
 from magbridge.files import atomic_path, new_folder
 
 __all__ = ["improved", "late", "report_html", "write"]

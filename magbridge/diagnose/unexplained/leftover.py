@@ -18,7 +18,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.residual import rms, robust_scale
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.design_columns import Columns, places, times
 from magbridge.diagnose.compare.problem import Problem
@@ -31,6 +30,7 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Ridge, Statistic
 from magbridge.diagnose.unexplained.descriptions import Description, descriptions
+from magbridge.estimation.residual import rms, robust_scale
 
 __all__ = ["Leftover", "leftover"]
 

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import REMNANT
@@ -17,6 +16,7 @@ from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers
 from magbridge.diagnose.seen import Memory, memory
 from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.estimation.residual import rms
 
 __all__ = ["far_from_white", "switching", "unlisted"]
 

@@ -8,19 +8,17 @@ width may be any.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.evidence import Quadratic, maximise
-from magbridge.calibration.fitting.prior import PriorFamily
+from magbridge.estimation.priors import PriorFamily
 
 __all__ = [
-    "CHUNK", "LIKELIER", "NOTHING", "Columns", "Group", "Offset", "Waves", "in_chunks", "likeliest",
-    "slow_functions", "with_groups",
+    "BLOCK_ROWS", "NO_COEFFICIENTS", "BlockColumns", "OffsetBlock", "ParameterBlock", "SlowFunctions",
+    "in_chunks", "slow_functions", "with_blocks",
 ]  # fmt: skip
 
 APART = 3.0 * 3600.0
@@ -29,22 +27,20 @@ FASTEST = 1.5 * 3600.0
 """s, half the period of the fastest slow change."""
 MOST = 60
 """Slow functions of one stretch of a log, at most."""
-LIKELIER = 6.0
-"""Nats that what is offered must gain (400:1: the best of several lags gains 3 where there is nothing)."""
-CHUNK = 16_384
+BLOCK_ROWS = 16_384
 """Rows at a time."""
-NOTHING = PriorFamily(
+NO_COEFFICIENTS = PriorFamily(
     np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros(0), np.zeros(0), ()
 )
 """A prior of no coefficients."""
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class ParameterBlock:
     """Unknowns of one kind that share a width."""
 
     name: str
-    functions: FloatArray | Waves
+    functions: FloatArray | SlowFunctions
     """(n, r): What they add to the reference at every sample, nT a unit."""
     shape: FloatArray
     """(r,): Width of each over the group's."""
@@ -57,7 +53,7 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
-class Offset(Group):
+class OffsetBlock(ParameterBlock):
     """Unknowns that add to the sensor's offset along each axis, and not to the reference.
 
     `functions` are (n, r), the unknowns (3 r,), axis by axis. With a temperature `lag` is that through which
@@ -67,7 +63,7 @@ class Offset(Group):
     lag: float | None = None
 
 
-class Waves:
+class SlowFunctions:
     """Functions of time that change slowly, (n, r) as an array; made for the rows that are asked for.
 
     `first` (m,) is the first sample of each stretch without a gap, `span` (m,) how long that is, s, and
@@ -104,10 +100,10 @@ class Waves:
         return in_chunks(len(self.time), lambda rows: self[rows] @ weights)
 
 
-class Columns:
+class BlockColumns:
     """The functions of several groups side by side, (n, p) as an array."""
 
-    def __init__(self, groups: Sequence[Group]) -> None:
+    def __init__(self, groups: Sequence[ParameterBlock]) -> None:
         self.parts = [group.functions for group in groups]
         self.edges = np.cumsum([0, *(part[:1].size for part in self.parts)])
 
@@ -123,7 +119,7 @@ class Columns:
         return np.asarray(sum(part @ mine for part, mine in pieces))
 
 
-def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[Waves, FloatArray]:
+def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[SlowFunctions, FloatArray]:
     """Return functions of time that change slowly (n, r), and their widths (r,) as those of a random walk.
 
     Notes
@@ -131,13 +127,15 @@ def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[Waves, F
     A random walk over a time T is the sum of ``sqrt(2) cos(pi k t/T)`` with independent weights that fall
     as 1/k (Karhunen-Loeve), beside where it starts. After a gap of :data:`APART` it starts anew.
     """
-    waves = Waves(time, fastest)
+    waves = SlowFunctions(time, fastest)
     return waves, waves.shape
 
 
 def in_chunks(n: int, made: Callable[[slice], FloatArray]) -> FloatArray:
     """Return what is `made` of n rows, (n, ...), some at a time: bounded memory."""
-    return np.concatenate([made(slice(start, start + CHUNK)) for start in range(0, max(n, 1), CHUNK)])
+    return np.concatenate(
+        [made(slice(start, start + BLOCK_ROWS)) for start in range(0, max(n, 1), BLOCK_ROWS)]
+    )
 
 
 def stretches(time: FloatArray) -> IndexArray:
@@ -145,7 +143,7 @@ def stretches(time: FloatArray) -> IndexArray:
     return np.cumsum(np.diff(time, prepend=time[:1]) > APART)
 
 
-def with_groups(family: PriorFamily, groups: tuple[Group, ...]) -> PriorFamily:
+def with_blocks(family: PriorFamily, groups: tuple[ParameterBlock, ...]) -> PriorFamily:
     """Return a family of priors with the groups' unknowns behind its own; they move no coefficient."""
     q, h = family.design.shape
     many = sum(len(group.shape) for group in groups)
@@ -166,7 +164,7 @@ def with_groups(family: PriorFamily, groups: tuple[Group, ...]) -> PriorFamily:
 
     def renew(z: FloatArray) -> PriorFamily:
         assert family.renew is not None
-        return with_groups(family.renew(z[:q]), groups)
+        return with_blocks(family.renew(z[:q]), groups)
 
     return replace(
         family,
@@ -178,57 +176,3 @@ def with_groups(family: PriorFamily, groups: tuple[Group, ...]) -> PriorFamily:
         names=family.names + tuple(group.name for group in free),
         renew=renew if family.renew is not None else None,
     )
-
-
-def likeliest(
-    quadratic: Quadratic,
-    own: PriorFamily,
-    groups: tuple[Group, ...],
-    eta: FloatArray,
-    sigma: float,
-    price: float = LIKELIER,
-) -> tuple[Group, ...]:
-    """Return the groups without those that are offered and that the log does not need; one lag at most.
-
-    Parameters
-    ----------
-    quadratic : Quadratic
-        In the unknowns of all groups, behind those of `own`.
-    own : PriorFamily
-        Of the coefficients.
-    groups : tuple of Group
-        All that are in the fit.
-    eta, sigma : (h,) array, float
-        Widths and noise (nT), from which to climb.
-    price : float
-        Nats that each must gain.
-    """
-    first, free = _starts(own, groups)
-
-    def score(kept: tuple[Group, ...]) -> float:
-        rows = [np.arange(own.E.shape[1])]
-        rows += [first[one.name] + np.arange(len(one.shape)) for one in kept]
-        i = np.concatenate(rows)
-        part = Quadratic(quadratic.H[np.ix_(i, i)], quadratic.b[i], quadratic.c_0, quadratic.n)
-        widths = [*range(len(own.centre)), *(free[one.name] for one in kept if one.spread)]
-        terms = sum(one.offered for one in kept)
-        return maximise(part, with_groups(own, kept), eta[widths], sigma).log_evidence - price * terms
-
-    return max(_choices(groups), key=score)
-
-
-def _choices(groups: tuple[Group, ...]) -> Iterator[tuple[Group, ...]]:
-    """Yield all choices: none first, so that it is taken where nothing is likelier."""
-    lags = [one for one in groups if isinstance(one, Offset) and one.lag is not None]
-    others = [one for one in groups if one.offered and one not in lags]
-    for chosen in product([None, *lags], *([None, one] for one in others)):
-        yield tuple(one for one in groups if not one.offered or one in chosen)
-
-
-def _starts(own: PriorFamily, groups: tuple[Group, ...]) -> tuple[dict[str, int], dict[str, int]]:
-    """Return where the unknowns of each group begin, and where its width stands."""
-    first, free, row, column = {}, {}, own.E.shape[1], len(own.centre)
-    for one in groups:
-        first[one.name], free[one.name] = row, column
-        row, column = row + len(one.shape), column + bool(one.spread)
-    return first, free

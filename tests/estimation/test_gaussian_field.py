@@ -7,10 +7,10 @@ import pytest
 from scipy.sparse import csr_array
 
 from magbridge.calibration.fitting.field_nodes import nodes_for
-from magbridge.calibration.fitting.joint import Linear, add_up, eliminate
-from magbridge.field.place.blocks import Factor, near_inverse
-from magbridge.field.place.matern import Matern
-from magbridge.field.place.nodes import nodes_near
+from magbridge.estimation.elimination import LinearisedRows, eliminate_field, sum_rows
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.nodes import nodes_near
+from magbridge.estimation.sparse import SparseFactor, inverse_blocks
 
 
 @pytest.mark.parametrize(
@@ -24,14 +24,14 @@ def test_prior_has_unit_variance_and_its_inverse_is_exact(alpha: int, harmonic: 
     """
     rng = np.random.default_rng(alpha)
     place = np.cumsum(rng.normal(0, 60, (1500, 2)), axis=0)
-    field = Matern(nodes_near(place, 400.0, 1000.0), 1000.0, alpha, harmonic, buried)
+    field = GaussianField(nodes_near(place, 400.0, 1000.0), 1000.0, alpha, harmonic, buried)
     Q = field.precision.toarray()
     B = field.basis(place[::9])
-    variance = near_inverse(field.precision, field.edges).variances(B)
+    variance = inverse_blocks(field.precision, field.edges).variances(B)
     np.testing.assert_allclose(variance, np.einsum("ni,ij,nj->n", B.toarray(), np.linalg.inv(Q), B.toarray()))
     np.testing.assert_allclose(variance, 1.0, atol=0.2 if buried else 0.05)
     assert field.log_determinant == pytest.approx(np.linalg.slogdet(Q)[1])
-    factor = Factor(field.precision)
+    factor = SparseFactor(field.precision)
     assert factor.log_determinant == pytest.approx(field.log_determinant)
     root = factor.draw(np.eye(field.nodes.size))
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(Q), atol=1e-6 * np.abs(np.linalg.inv(Q)).max())
@@ -45,7 +45,7 @@ def test_sums_are_those_of_the_whitened_samples_however_they_are_cut(rho: float)
     follows = np.ones(12, bool)
     follows[[0, 3, 4, 8]] = False
     pieces = [(0, 4), (3, 9), (8, 12)]
-    sums = add_up(Linear(V[a:b], csr_array(B[a:b]), follows[a:b], overlap=a > 0) for a, b in pieces)
+    sums = sum_rows(LinearisedRows(V[a:b], csr_array(B[a:b]), follows[a:b], overlap=a > 0) for a, b in pieces)
     both = np.hstack([V, B])
     white = both.copy()
     white[follows] = (both[follows] - rho * both[np.flatnonzero(follows) - 1]) / np.sqrt(1.0 - rho**2)
@@ -60,9 +60,9 @@ def test_sources_at_a_depth_reach_far_and_are_smooth_nearby() -> None:
     """Their correlation begins to fall as a Gaussian's of the length, and ends as a layer of dipoles'."""
     length = 600.0
     place = np.stack([np.linspace(0.0, 4.0 * length, 33), np.zeros(33)], axis=1)
-    field = Matern(nodes_near(place, 120.0, 3000.0), length, 4, buried=True)
+    field = GaussianField(nodes_near(place, 120.0, 3000.0), length, 4, buried=True)
     B = field.basis(place)
-    covariance = B @ Factor(field.precision).solve(B.T.toarray())
+    covariance = B @ SparseFactor(field.precision).solve(B.T.toarray())
     correlation = covariance[0] / covariance[0, 0]
     depth = length * np.sqrt(0.75)  # of a layer whose correlation (1 + r²/4d²)^-3/2 begins to fall so
     layer = (1.0 + place[:, 0] ** 2 / (4.0 * depth**2)) ** -1.5
@@ -76,10 +76,12 @@ def test_nodes_too_fine_for_a_long_field_are_refused() -> None:
     values = np.sin(place[:, 0] / 900.0)
 
     def evidence(fine: float) -> float:
-        field = Matern(nodes_near(place, 1500.0 / fine, 1500.0), 1500.0, 16)
-        sums = add_up([Linear(np.ones((200, 1)) * values[:, None], field.basis(place), np.zeros(200, bool))])
-        reduced = eliminate(sums, field, 50.0, 0.0)
-        return reduced.log_evidence - 0.5 * reduced.quadratic.c_0
+        field = GaussianField(nodes_near(place, 1500.0 / fine, 1500.0), 1500.0, 16)
+        sums = sum_rows(
+            [LinearisedRows(np.ones((200, 1)) * values[:, None], field.basis(place), np.zeros(200, bool))]
+        )
+        reduced = eliminate_field(sums, field, 50.0, 0.0)
+        return reduced.log_evidence - 0.5 * reduced.quadratic.constant
 
     assert evidence(5.0) == pytest.approx(evidence(4.0), abs=0.5)
     with pytest.raises(np.linalg.LinAlgError, match="too fine"):
@@ -100,7 +102,7 @@ def test_a_wave_falls_off_upwards_as_laplace_demands(waves: float, deeper: float
     """A wave of wave number k is larger by exp(k d) where the track is d deeper."""
     length = 900.0
     x = np.linspace(-4000.0, 4000.0, 400)
-    field = Matern(nodes_near(np.stack([x, 0.0 * x], axis=1), 300.0, 2000.0), length, 6, harmonic=True)
+    field = GaussianField(nodes_near(np.stack([x, 0.0 * x], axis=1), 300.0, 2000.0), length, 6, harmonic=True)
     k = waves / length
     u = np.cos(k * field.nodes.places[:, 0])
     inner = np.stack([np.linspace(-1500.0, 1500.0, 60), np.zeros(60)], axis=1)
@@ -114,7 +116,7 @@ def test_slopes_are_the_splines_derivatives() -> None:
     w, x = rng.normal(size=nodes.size), np.array([[100.0, 50.0], [2900.0, 600.0]])
     step = np.array([[0.5, 0.0]])
     for harmonic in (False, True):
-        field = Matern(nodes, 900.0, 4, harmonic)
+        field = GaussianField(nodes, 900.0, 4, harmonic)
         north, east = (slope @ w for slope in field.slopes(x))
         np.testing.assert_allclose(north, (field.basis(x + step) - field.basis(x - step)) @ w, rtol=1e-4)
         np.testing.assert_allclose(

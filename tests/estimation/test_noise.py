@@ -1,4 +1,4 @@
-"""The noise of residuals: its size and memory as it was drawn, whatever the outliers."""
+"""The noise of residuals: its size and autocorrelation as it was drawn, whatever the outliers."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.noise import NoiseModel, estimate_noise, memory
+from magbridge.estimation.noise import NoiseModel, estimate_noise, fit_slow_and_white
 
 N = 4000
 STEPS = np.r_[np.inf, np.ones(N - 1)]
@@ -105,11 +105,11 @@ def test_what_a_fit_has_absorbed_of_slow_noise_is_given_back() -> None:
 
 def test_a_slow_part_is_believed_only_where_it_is_likelier() -> None:
     alone = estimate_noise(drawn(0.5), STEPS, 0.0)
-    assert memory(drawn(0.5), STEPS, alone) is alone
+    assert fit_slow_and_white(drawn(0.5), STEPS, alone) is alone
     short = NoiseModel(4.0, 0.19)
-    assert memory(drawn(0.19), STEPS, short) is short
+    assert fit_slow_and_white(drawn(0.19), STEPS, short) is short
     both = drawn(0.98, 8.0) + drawn(0.0, 4.0, seed=2)
-    found = memory(both, STEPS, estimate_noise(both, STEPS, 0.0))
+    found = fit_slow_and_white(both, STEPS, estimate_noise(both, STEPS, 0.0))
     assert found.autocorrelation == pytest.approx(0.98, abs=0.01)
     assert found.white == pytest.approx(0.2, abs=0.05)
     again = estimate_noise(both, STEPS, 0.0, shape=found.shape)

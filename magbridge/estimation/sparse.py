@@ -25,13 +25,13 @@ from scipy.sparse.linalg import splu, spsolve_triangular
 
 from magbridge.arrays import FloatArray, IndexArray
 
-__all__ = ["Factor", "NearInverse", "near_inverse"]
+__all__ = ["InverseBlocks", "SparseFactor", "inverse_blocks"]
 
 SMALL, FULL = 1_500, 0.02
 """Rows, and share of a matrix that is not zero, to which and from which on LAPACK is faster than SuperLU."""
 
 
-class Factor:
+class SparseFactor:
     """A symmetric positive definite sparse matrix (n, n), factorised; one that is nearly full as if it were.
 
     Raises
@@ -81,7 +81,7 @@ class Factor:
 
 
 @dataclass(frozen=True, eq=False)
-class NearInverse:
+class InverseBlocks:
     """Blocks of an inverse that begin at `edges`: those on the diagonal, and those right of it."""
 
     edges: IndexArray
@@ -110,7 +110,7 @@ class NearInverse:
         return out
 
 
-def near_inverse(matrix: csr_array, edges: IndexArray) -> NearInverse:
+def inverse_blocks(matrix: csr_array, edges: IndexArray) -> InverseBlocks:
     """Return the inverse's blocks on and beside the diagonal, of a block-tridiagonal matrix (n, n).
 
     LinAlgError: it is not positive definite.
@@ -139,7 +139,7 @@ def near_inverse(matrix: csr_array, edges: IndexArray) -> NearInverse:
             below[i] = np.empty(0)  # large, and not needed again
             off_diagonal[i] = -G @ own[i + 1]
             own[i] -= off_diagonal[i] @ G.T
-    return NearInverse(np.asarray(edges), tuple(own), tuple(off_diagonal))
+    return InverseBlocks(np.asarray(edges), tuple(own), tuple(off_diagonal))
 
 
 def _lower(L: FloatArray, right: FloatArray) -> FloatArray:

@@ -9,11 +9,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.noise import NoiseModel
-from magbridge.calibration.fitting.prior import Prior
-from magbridge.calibration.fitting.solve import covariance_of, gauss_newton
-from magbridge.calibration.residual import Samples, residuals
 from magbridge.errors import CalibrationError
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.noise import NoiseModel
+from magbridge.estimation.optimise import gauss_newton
+from magbridge.estimation.priors import Prior
+from magbridge.estimation.residual import Samples, residuals
 
 FIELD = 5e4
 NOISE = NoiseModel(5.0)

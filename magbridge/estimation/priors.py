@@ -18,15 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.terms import Exponents
 
-if TYPE_CHECKING:
-    from magbridge.calibration.residual import NormalEquations  # it brings scipy, which the live path lacks
+Exponents = tuple[int, ...]
 
 __all__ = ["FACTOR_MASS", "Prior", "PriorFamily", "gain_rotation", "polynomial_prior"]
 
@@ -54,12 +51,6 @@ class Prior:
     def coefficients(self, z: FloatArray) -> FloatArray:
         """(K,) ``c = E z + offset`` of z (q,)."""
         return np.asarray(self.E @ z + self.offset)
-
-    def reduce(self, normal: NormalEquations) -> NormalEquations:
-        """Return normal equations in c (K) as those in z (q)."""
-        return normal._replace(
-            hessian=self.E.T @ normal.hessian @ self.E, gradient=self.E.T @ normal.gradient
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +100,7 @@ def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F
     names : tuple of str
         Of the parameters.
     F_0 : float
-        nT, as in :class:`~magbridge.calibration.residual.Samples`.
+        nT, as in :class:`~magbridge.estimation.residual.Samples`.
     """
     labels = ["gain", "soft iron", "hard iron"]
     centre = [np.log(np.sqrt(3.0) * GAIN * F_0), np.log(SOFT_IRON * F_0), np.log(HARD_IRON)]

@@ -21,18 +21,18 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.fitting.evidence import Quadratic
-from magbridge.field.place.blocks import Factor
-from magbridge.field.place.matern import Matern
+from magbridge.estimation.gaussian_field import GaussianField
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.sparse import SparseFactor
 
-__all__ = ["Linear", "Products", "Reduced", "Sums", "add_up", "eliminate"]
+__all__ = ["ColumnProducts", "FieldEliminated", "LinearisedRows", "SampleSums", "eliminate_field", "sum_rows"]
 
 WORST = 1e16
 """Condition of a prior's precision at most: beyond it rounding moves the evidence by 3 to 10 nats, and such
 steps were climbed to fields of ten times the length."""
 
 
-class Linear(NamedTuple):
+class LinearisedRows(NamedTuple):
     """Linearised samples: ``V = [y | D]`` (n, 1 + q), B (n, nodes), and which follow the one before (n,).
 
     The first row may be one that was counted already (`overlap`): then only its successor looks at it.
@@ -45,25 +45,25 @@ class Linear(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Products:
+class ColumnProducts:
     """Inner products of weighted columns: ``V^T V``, ``V^T B``, ``B^T B``."""
 
     VV: FloatArray
     VB: FloatArray
     BB: csr_array
 
-    def plus(self, other: Products, factor: float = 1.0) -> Products:
+    def plus(self, other: ColumnProducts, factor: float = 1.0) -> ColumnProducts:
         """Return the sum with `factor` times another."""
-        return Products(
+        return ColumnProducts(
             self.VV + factor * other.VV, self.VB + factor * other.VB, csr_array(self.BB + factor * other.BB)
         )
 
-    def times(self, factor: float) -> Products:
+    def times(self, factor: float) -> ColumnProducts:
         """Return them `factor` times."""
-        return Products(factor * self.VV, factor * self.VB, csr_array(factor * self.BB))
+        return ColumnProducts(factor * self.VV, factor * self.VB, csr_array(factor * self.BB))
 
     @classmethod
-    def of(cls, V: FloatArray, B: csr_array, weight: FloatArray | None = None) -> Products:
+    def of(cls, V: FloatArray, B: csr_array, weight: FloatArray | None = None) -> ColumnProducts:
         """Return those of rows V (n, 1 + q) and B (n, nodes), each counted `weight` (n,) times."""
         if weight is None:
             return cls(V.T @ V, np.asarray((B.T @ V).T), csr_array(B.T @ B))
@@ -72,12 +72,12 @@ class Products:
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
+class SampleSums:
     r"""All samples in three sums, whatever their noise's autocorrelation.
 
     Attributes
     ----------
-    every, ends, changes : Products
+    every, ends, changes : ColumnProducts
         T of all samples; X of those that follow none, and of those that none follows (of one that is both,
         twice); C of the differences between a sample and the one it follows. With autocorrelation rho,
 
@@ -89,13 +89,13 @@ class Sums:
     samples, pairs : int
     """
 
-    every: Products
-    ends: Products
-    changes: Products
+    every: ColumnProducts
+    ends: ColumnProducts
+    changes: ColumnProducts
     samples: int
     pairs: int
 
-    def whitened(self, rho: float) -> Products:
+    def whitened(self, rho: float) -> ColumnProducts:
         """Return the products of the whitened rows."""
         if not rho:
             return self.every
@@ -103,9 +103,9 @@ class Sums:
         return ends.plus(self.changes, rho / (1.0 - rho * rho))
 
 
-def add_up(pieces: Iterable[Linear]) -> Sums:
+def sum_rows(pieces: Iterable[LinearisedRows]) -> SampleSums:
     """Add up pieces of a log in order."""
-    total: list[Products] | None = None
+    total: list[ColumnProducts] | None = None
     samples = pairs = 0
     for V, B, followers, overlap in pieces:
         new, follows = slice(int(overlap), None), followers.copy()
@@ -116,22 +116,22 @@ def add_up(pieces: Iterable[Linear]) -> Sums:
             ends[0] = -float(ahead[0])
         some, pair = np.flatnonzero(ends), np.flatnonzero(follows)
         found = [
-            Products.of(V[new], B[new]),
-            Products.of(V[some], B[some], ends[some]),
-            Products.of(V[pair] - V[pair - 1], csr_array(B[pair] - B[pair - 1])),
+            ColumnProducts.of(V[new], B[new]),
+            ColumnProducts.of(V[some], B[some], ends[some]),
+            ColumnProducts.of(V[pair] - V[pair - 1], csr_array(B[pair] - B[pair - 1])),
         ]
         total = found if total is None else [a.plus(b) for a, b in zip(total, found, strict=True)]
         samples, pairs = samples + len(V) - int(overlap), pairs + len(pair)
     assert total is not None
     every, ends, changes = total
-    return Sums(every, ends, changes, samples, pairs)
+    return SampleSums(every, ends, changes, samples, pairs)
 
 
 @dataclass(frozen=True, eq=False)
-class Reduced:
+class FieldEliminated:
     """What remains for z, and how w follows from it."""
 
-    quadratic: Quadratic
+    quadratic: GaussianInformation
     """In z."""
     log_evidence: float
     """What eliminating w and whitening add to it."""
@@ -147,14 +147,14 @@ class Reduced:
         return np.asarray(self.shift + self.follow @ z)
 
 
-def eliminate(sums: Sums, field: Matern, ratio: float, rho: float) -> Reduced:
+def eliminate_field(sums: SampleSums, field: GaussianField, ratio: float, rho: float) -> FieldEliminated:
     """Eliminate the field in place.
 
     Parameters
     ----------
-    sums : Sums
+    sums : SampleSums
         Of the samples.
-    field : Matern
+    field : GaussianField
         The prior of w for a field of unit variance.
     ratio : float
         The field's standard deviation over that of the noise.
@@ -170,12 +170,12 @@ def eliminate(sums: Sums, field: Matern, ratio: float, rho: float) -> Reduced:
         raise np.linalg.LinAlgError("the nodes are too fine for so long a field")
     products = sums.whitened(rho)
     precision = csr_array(products.BB + field.precision / ratio**2)
-    factor = Factor(precision)
+    factor = SparseFactor(precision)
     solved = -factor.solve(products.VB.T)
     left = products.VV + products.VB @ solved
     H = 0.5 * (left[1:, 1:] + left[1:, 1:].T)
     nodes = field.nodes.size
     gained = 0.5 * (field.log_determinant - 2.0 * nodes * np.log(ratio) - factor.log_determinant)
     whitening = -0.5 * sums.pairs * np.log(1.0 - rho * rho)
-    quadratic = Quadratic(H, -left[1:, 0], float(left[0, 0]), float(sums.samples))
-    return Reduced(quadratic, float(gained + whitening), precision, solved[:, 0], solved[:, 1:])
+    quadratic = GaussianInformation(H, -left[1:, 0], float(left[0, 0]), float(sums.samples))
+    return FieldEliminated(quadratic, float(gained + whitening), precision, solved[:, 0], solved[:, 1:])

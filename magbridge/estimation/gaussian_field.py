@@ -1,4 +1,4 @@
-r"""The prior of a field in place: Matern's covariance as a sparse precision, and how rock falls off upwards.
+r"""A Gaussian random field in place with a sparse precision, and how a crustal field falls off upwards.
 
 Of coefficients w on nodes h apart, with the nodes' Laplacian L,
 
@@ -34,14 +34,14 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from scipy.sparse.linalg import matrix_power
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.field.place.blocks import Factor
-from magbridge.field.place.nodes import Nodes
+from magbridge.estimation.nodes import Nodes
+from magbridge.estimation.sparse import SparseFactor
 
-__all__ = ["BURIED", "SMOOTHNESS", "Matern"]
+__all__ = ["BURIED_FACTORS", "SMOOTHNESS_POWERS", "GaussianField"]
 
-SMOOTHNESS = (2, 3, 4, 6, 10, 16)
+SMOOTHNESS_POWERS = (2, 3, 4, 6, 10, 16)
 """Powers alpha that are tried: from rough to as good as a Gaussian."""
-BURIED, FIRST = 4, 0.6705
+BURIED_FACTORS, FIRST = 4, 0.6705
 """Factors of sources at a depth, and their first kappa times the length: so the correlation begins to fall as
 that of a Gaussian of that length."""
 SPLINE, FALLING = 4, 8
@@ -57,14 +57,14 @@ WAVES = 96
 
 
 @dataclass(frozen=True, eq=False)
-class Matern:
+class GaussianField:
     """A field of unit variance on nodes."""
 
     nodes: Nodes
     length: float
     """m, over which the correlation falls (Matern's)."""
     alpha: int
-    """One of :data:`SMOOTHNESS`."""
+    """One of :data:`SMOOTHNESS_POWERS`."""
     harmonic: bool = False
     """Whether it falls off upwards as Laplace's equation demands; else it is the same at every depth."""
     buried: bool = False
@@ -146,8 +146,8 @@ class Matern:
     def log_determinant(self) -> float:
         """Of the precision."""
         n, variance = self.nodes.size, float(self._spectrum[1].mean())
-        lifted = 2.0 * Factor(self._lift).log_determinant if self.harmonic else 0.0
-        roots = sum(times * Factor(root).log_determinant for root, times in self._roots)
+        lifted = 2.0 * SparseFactor(self._lift).log_determinant if self.harmonic else 0.0
+        roots = sum(times * SparseFactor(root).log_determinant for root, times in self._roots)
         return float(n * np.log(variance) + roots + lifted)
 
     def basis(self, place: FloatArray, deeper: FloatArray | float = 0.0) -> csr_array:

@@ -21,38 +21,22 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from scipy.optimize import minimize
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.prior import PriorFamily
-from magbridge.calibration.residual import NormalEquations
+from magbridge.estimation.information import GaussianInformation
+from magbridge.estimation.priors import PriorFamily
 
-__all__ = ["Quadratic", "Widths", "evidence", "is_maximum", "maximise"]
+__all__ = ["Hyperparameters", "is_maximum", "log_evidence", "maximise_evidence"]
 
-FARTHEST = 10.0
+MAX_PRIOR_SIGMA = 10.0
 """Sigmas of the prior of eta, and of log sigma from where it starts: nothing physical lies beyond, and exp
 must not overflow."""
-STILL = 0.01
+MIN_EVIDENCE_GAIN = 0.01
 """Log evidence: two answers that differ by less count as the same."""
-SIGMA_STEP = 0.1
+LOG_SIGMA_SCALE = 0.1
 """Scales log sigma as a prior's sigma scales eta."""
 
 
 @dataclass(frozen=True, eq=False)
-class Quadratic:
-    """``cost(z) = c_0 - 2 b.z + z^T H z``, of n samples; H (q, q) and b (q,)."""
-
-    H: FloatArray
-    b: FloatArray
-    c_0: float
-    n: float
-
-    @classmethod
-    def about(cls, z: FloatArray, normal: NormalEquations, n: float) -> Quadratic:
-        """Return the quadratic whose value, gradient and Hessian at `z` (q,) are `normal`'s."""
-        H, g = normal.hessian, normal.gradient
-        return cls(H, H @ z - g, float(normal.cost - 2.0 * g @ z + z @ H @ z), n)
-
-
-@dataclass(frozen=True, eq=False)
-class Widths:
+class Hyperparameters:
     """Where the evidence is largest: eta (h,), the noise (sensor nT), log Z."""
 
     eta: FloatArray
@@ -62,67 +46,69 @@ class Widths:
     """How many numbers the data, not the prior, determined: ``q - tr M^-1``."""
 
 
-def evidence(
-    quadratic: Quadratic, family: PriorFamily, eta: FloatArray, log_sigma: float
+def log_evidence(
+    information: GaussianInformation, family: PriorFamily, eta: FloatArray, log_sigma: float
 ) -> tuple[float, FloatArray, float]:
-    """Return log evidence, its gradient by (eta, log sigma), and `Widths.determined`.
+    """Return log evidence, its gradient by (eta, log sigma), and `Hyperparameters.determined`.
 
-    `eta` is (h,), the gradient (h + 1,); `log_sigma` that of the noise in sensor nT. With no finite evidence
-    the first is -inf and the others are zero.
+    `eta` is (h,), the gradient (h + 1,); `log_sigma` that of the noise in sensor nT. If the evidence is not
+    finite, the first is -inf and the others are zero.
     """
     w = family.widths(eta)
     s2 = np.exp(2.0 * log_sigma)
-    M = (w[:, None] * quadratic.H * w) / s2
+    M = (w[:, None] * information.precision * w) / s2
     M.flat[:: len(w) + 1] += 1.0
     factor, info = dpotrf(M, overwrite_a=True)
     if info:
         return -np.inf, np.zeros(len(eta) + 1), 0.0
-    Wb = w * quadratic.b / s2
+    Wb = w * information.vector / s2
     y = dpotrs(factor, Wb)[0]
     off = (eta - family.centre) / family.spread
     value = (
-        -quadratic.n * log_sigma
-        - 0.5 * quadratic.c_0 / s2
+        -information.n * log_sigma
+        - 0.5 * information.constant / s2
         + 0.5 * Wb @ y
         - np.log(np.diag(factor)).sum()
         - 0.5 * off @ off
     )
     inverse = np.diag(dpotri(factor, overwrite_c=True)[0])
     z = w * y
-    cost = quadratic.c_0 - 2.0 * quadratic.b @ z + z @ quadratic.H @ z
+    cost = information.constant - 2.0 * information.vector @ z + z @ information.precision @ z
     determined = float(len(w) - inverse.sum())
     by_eta = family.design.T @ (y * y + inverse - 1.0) - off / family.spread
-    return float(value), np.append(by_eta, -quadratic.n + cost / s2 + determined), determined
+    return float(value), np.append(by_eta, -information.n + cost / s2 + determined), determined
 
 
-def maximise(quadratic: Quadratic, family: PriorFamily, eta: FloatArray, sigma: float) -> Widths:
+def maximise_evidence(
+    information: GaussianInformation, family: PriorFamily, eta: FloatArray, sigma: float
+) -> Hyperparameters:
     """Climb from `eta` (h,) and `sigma` (sensor nT) to where the evidence is largest."""
     middle = np.append(family.centre, np.log(sigma))
-    scale = np.append(family.spread, SIGMA_STEP)
+    scale = np.append(family.spread, LOG_SIGMA_SCALE)
 
     def downhill(x: FloatArray) -> tuple[float, FloatArray]:
         # (where sigma vanishes the cost is but what rounding leaves of it, and the evidence has no end)
-        if np.abs(x[:-1]).max(initial=0.0) > FARTHEST or abs(scale[-1] * x[-1]) > FARTHEST:
+        if np.abs(x[:-1]).max(initial=0.0) > MAX_PRIOR_SIGMA or abs(scale[-1] * x[-1]) > MAX_PRIOR_SIGMA:
             return 1e300, 0.0 * x
         at = middle + scale * x
-        value, slope, _ = evidence(quadratic, family, at[:-1], at[-1])
+        value, slope, _ = log_evidence(information, family, at[:-1], at[-1])
         return (-value if np.isfinite(value) else 1e300), -slope * scale
 
     start = np.append((eta - family.centre) / family.spread, 0.0)
     x = middle + scale * minimize(downhill, start, jac=True, method="BFGS", options={"gtol": 1e-2}).x
-    value, _, determined = evidence(quadratic, family, x[:-1], x[-1])
-    return Widths(x[:-1], float(np.exp(x[-1])), value, determined)
+    value, _, determined = log_evidence(information, family, x[:-1], x[-1])
+    return Hyperparameters(x[:-1], float(np.exp(x[-1])), value, determined)
 
 
-def is_maximum(quadratic: Quadratic, family: PriorFamily, widths: Widths) -> bool:
+def is_maximum(information: GaussianInformation, family: PriorFamily, widths: Hyperparameters) -> bool:
     """Return whether the evidence curves down in every direction and a Newton step would gain nothing."""
     x = np.append(widths.eta, np.log(widths.sigma))
-    scale = np.append(family.spread, SIGMA_STEP)
+    scale = np.append(family.spread, LOG_SIGMA_SCALE)
 
     def slope(at: FloatArray) -> FloatArray:
-        return np.asarray(evidence(quadratic, family, at[:-1], at[-1])[1] * scale)
+        return np.asarray(log_evidence(information, family, at[:-1], at[-1])[1] * scale)
 
     bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
     values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))
     rise = 0.5 * np.sum((vectors.T @ slope(x)) ** 2 / np.maximum(values, 1e-300))
-    return bool(values[0] > 0.0 and rise < STILL)
+    return bool(values[0] > 0.0 and rise < MIN_EVIDENCE_GAIN)

@@ -1,0 +1,279 @@
+r"""The noise of residuals: size, autocorrelation, white fraction and outliers.
+
+Noise is the sum of a slow part, a first-order autoregressive process AR(1) of autocorrelation :math:`\rho`
+at one sampling interval, and a white part with the fraction f of the variance. :class:`NoiseModel` states
+it, :class:`Whitening` removes its correlation, :func:`estimate_noise` and :func:`fit_slow_and_white` estimate
+it from the residuals of a fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg.lapack import dtbtrs
+from scipy.optimize import minimize
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.estimation.residual import robust_scale
+
+__all__ = [
+    "OUTLIER_SIGMA", "NoiseModel", "Whitening", "effective_fraction", "estimate_noise", "fit_slow_and_white",
+    "whiten",
+]  # fmt: skip
+
+OUTLIER_SIGMA = 5.0
+"""Robust standard deviations beyond which a residual is left out; Gaussian noise exceeds them once in 1.7
+million samples."""
+CLIP_SIGMA = 3.0
+"""Robust standard deviations at which residuals are clipped before the autocorrelation is estimated."""
+MIN_SLOW_AUTOCORRELATION = 0.2
+"""Autocorrelation of neighbours from which on noise may be a slow part and a white part."""
+MIN_LOG_LIKELIHOOD_GAIN = 5.0
+"""Gain in log likelihood that a white part must bring over an AR(1) process alone."""
+MAX_AUTOCORRELATION = 0.99
+"""Largest autocorrelation that :func:`estimate_noise` returns."""
+MIN_PAIRS = 30
+"""Pairs of successive samples from which on their autocorrelation is estimated."""
+STEADY_STATE_TOLERANCE = 1e-13
+"""Relative change of the filter's variance below which it counts as steady."""
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """The noise of residuals, and which samples are outliers."""
+
+    sigma: float
+    """Standard deviation of a sample, nT in sensor axes."""
+    autocorrelation: float = 0.0
+    """Autocorrelation of the slow part at one sampling interval (rho of the AR(1) process)."""
+    white: float = 0.0
+    """Fraction of the variance that is white."""
+    weight: FloatArray | None = None
+    """(n,): 1 for a sample that counts, 0 for an outlier; None if all samples count."""
+
+    @property
+    def shape(self) -> tuple[float, float]:
+        """Autocorrelation and white fraction."""
+        return self.autocorrelation, self.white
+
+    @property
+    def rejected(self) -> int:
+        """Number of outliers."""
+        return 0 if self.weight is None else int((self.weight == 0.0).sum())
+
+    def whiten(self, values: FloatArray, steps: FloatArray) -> FloatArray:
+        """Return values (n, ...) with their noise made white, of standard deviation `sigma`.
+
+        Parameters
+        ----------
+        values : (n, ...) array
+            Residuals, or columns of their Jacobian.
+        steps : (n,) array
+            Sampling intervals since the previous sample; infinite at the first of a run.
+        """
+        return Whitening(steps, *self.shape).apply(values)
+
+    def log_det(self, steps: FloatArray) -> float:
+        """Return the logarithm of the determinant of the covariance of n samples, nT²; arguments as above."""
+        variance = Whitening(steps, *self.shape).variance
+        return float(np.log(variance).sum() + 2.0 * len(steps) * np.log(self.sigma))
+
+
+class Whitening:
+    """Whitens noise of unit variance in blocks of rows, in order.
+
+    Parameters
+    ----------
+    steps : (n,) array
+        Sampling intervals since the previous sample; infinite at the first of a run.
+    rho : float
+        Autocorrelation of the slow part at one sampling interval.
+    white : float
+        Fraction of the variance that is white.
+
+    Attributes
+    ----------
+    variance : (n,) array
+        Variance of each innovation; the determinant of the covariance is their product.
+
+    Notes
+    -----
+    The innovations of a Kalman filter that follows the slow part s, of variance ``1 - f`` in addition to the
+    white noise's f, and predicts m (Harvey 1989, Forecasting, structural time series models, section 3.2)::
+
+        v_t = y_t - m_t,   S_t = P_t + f,   K_t = P_t / S_t
+        m_t+1 = r (m_t + K_t v_t),   P_t+1 = r^2 (1 - K_t) P_t + (1 - f)(1 - r^2),   r = rho^steps
+
+    and ``v / sqrt(S)`` is white, of unit variance. With f = 0 it is ``(y_t - r y_t-1) / sqrt(1 - r^2)``.
+    """
+
+    def __init__(self, steps: FloatArray, rho: float, white: float = 0.0) -> None:
+        self.decay = np.full(len(steps), rho)
+        irregular = np.flatnonzero(steps != 1)
+        self.decay[irregular] = rho ** steps[irregular]
+        self.variance, self._gain = _innovations(self.decay, white)
+        self._row = 0
+        self._slow: FloatArray | None = None  # the filtered slow part at the row before
+
+    def apply(self, values: FloatArray) -> FloatArray:
+        """Whiten the next k rows, (k, ...)."""
+        rows = slice(self._row, self._row + len(values))
+        y = values.reshape(len(values), -1)
+        r, K, S = self.decay[rows, None], self._gain[rows, None], self.variance[rows, None]
+        before = np.zeros(y.shape[1]) if self._slow is None else self._slow
+        # m_t + K_t v_t = (1 - K_t) m_t + K_t y_t: a bidiagonal system in the filtered slow part
+        filtered = y
+        if (K != 1.0).any():
+            filtered = K * y
+            filtered[0] += (1.0 - K[0]) * r[0] * before
+            band = np.ones((2, len(y)))
+            band[1, :-1] = -((1.0 - K) * r)[1:, 0]
+            filtered, _ = dtbtrs(band, filtered, uplo="L", diag="U")
+        # innovations, computed in place: allocation costs more than the arithmetic
+        v = np.empty_like(y)
+        v[0] = r[0] * before
+        np.multiply(r[1:], filtered[:-1], out=v[1:])
+        np.subtract(y, v, out=v)
+        v /= np.sqrt(S)
+        self._row, self._slow = rows.stop, filtered[-1].copy()
+        return v.reshape(values.shape)
+
+
+def _innovations(decay: FloatArray, white: float) -> tuple[FloatArray, FloatArray]:
+    """Return variance S and gain K (n,) of the filter of :class:`Whitening`, for each row's decay r (n,)."""
+    if white == 0.0:
+        return 1.0 - decay**2, np.ones(len(decay))
+    variance = np.empty(len(decay))
+    slow, after, last = 1.0 - white, 0.0, -1.0
+    # within a stretch of equal intervals the filter approaches its steady state
+    ends = np.flatnonzero(np.diff(decay, append=-1.0))
+    start = 0
+    for end in ends.tolist():
+        for t in range(start, end + 1):
+            ahead = decay[t] ** 2 * after + slow * (1.0 - decay[t] ** 2)
+            variance[t] = ahead + white
+            after = ahead * white / variance[t]
+            if abs(after - last) < STEADY_STATE_TOLERANCE * slow:
+                variance[t : end + 1] = variance[t]
+                break
+            last = after
+        start, last = end + 1, -1.0
+    return variance, 1.0 - white / variance
+
+
+def whiten(values: FloatArray, steps: FloatArray, rho: float, white: float = 0.0) -> FloatArray:
+    """Return whitened noise (n, ...), gaps included; arguments as for :class:`Whitening`."""
+    return Whitening(steps, rho, white).apply(values)
+
+
+def effective_fraction(rho: float, white: float = 0.0) -> float:
+    """Return the fraction of the samples that are independent in a mean.
+
+    Notes
+    -----
+    ``1 / (f + (1 - f)(1 + rho) / (1 - rho))``: Kay 1993, Fundamentals of statistical signal processing, 6.
+    """
+    return (1.0 - rho) / (white * (1.0 - rho) + (1.0 - white) * (1.0 + rho))
+
+
+def estimate_noise(
+    e: FloatArray,
+    steps: FloatArray,
+    free: float,
+    absorbed: tuple[float, float] = (0.0, 0.0),
+    shape: tuple[float, float] | None = None,
+) -> NoiseModel:
+    """Estimate the noise model from the residuals of a fit.
+
+    Parameters
+    ----------
+    e : (n,) array
+        Residuals, nT.
+    steps : (n,) array
+        Sampling intervals since the previous sample.
+    free : float
+        Number of parameters that the data determined.
+    absorbed : tuple of 2 float
+        Variance of the fitted model at a sample, nT², and its covariance with the next sample. A fit absorbs
+        that much of the noise, mostly of its slow part: ``Cov e = R - J P J^T`` (R: covariance of the noise,
+        P: posterior covariance of the coefficients).
+    shape : tuple of 2 float, optional
+        Autocorrelation and white fraction, if they are known: see :func:`fit_slow_and_white`.
+    """
+    if shape is None:
+        shape = (_autocorrelation(_clipped(e), steps == 1, absorbed), 0.0)
+    white = whiten(e, steps, *shape)
+    weight = (np.abs(white) <= OUTLIER_SIGMA * _scale(white)).astype(float)
+    kept = weight.sum()
+    sigma = float(np.sqrt((weight * white * white).sum() / max(kept - free, 1.0)))
+    return NoiseModel(sigma or 1e-9, *shape, None if weight.all() else weight)
+
+
+def fit_slow_and_white(e: FloatArray, steps: FloatArray, noise: NoiseModel) -> NoiseModel:
+    """Return the noise as a slow and a white part, if that is likelier than the given AR(1) process.
+
+    The correlation time of noise is a property of the sensor. In a log that is sampled often, neighbours are
+    nearly equal whatever white noise is between them, and an AR(1) process alone then underestimates one of
+    the two.
+
+    Parameters
+    ----------
+    e : (n,) array
+        Residuals, nT.
+    steps : (n,) array
+        Sampling intervals since the previous sample.
+    noise : NoiseModel
+        The result of :func:`estimate_noise`.
+    """
+    if noise.autocorrelation < MIN_SLOW_AUTOCORRELATION:
+        return noise
+    e, rho = _clipped(e), noise.autocorrelation
+    longest = float(np.isfinite(steps).sum()) + 2.0
+
+    def negative_log_likelihood(rho: float, white: float) -> float:
+        # sigma is profiled out: n/2 log(v^T v) + 1/2 sum log S
+        whitening = Whitening(steps, rho, white)
+        v = whitening.apply(e)
+        return float(0.5 * len(e) * np.log(v @ v) + 0.5 * np.log(whitening.variance).sum())
+
+    def shape(x: FloatArray) -> tuple[float, float]:
+        # x: logarithm of the correlation time in samples, logit of the white fraction
+        return float(np.exp(-np.exp(-x[0]))), float(1.0 / (1.0 + np.exp(-x[1])))
+
+    bounds = [(np.log(1.0), np.log(longest)), (-12.0, 6.0)]
+    starts = ((-1.0 / np.log(rho), 0.05), (longest / 20.0, 0.3))
+    answers = [
+        minimize(
+            lambda x: negative_log_likelihood(*shape(x)), np.log(start), method="L-BFGS-B", bounds=bounds
+        )
+        for start in starts
+    ]
+    best = min(answers, key=lambda answer: answer.fun)
+    if best.fun > negative_log_likelihood(rho, 0.0) - MIN_LOG_LIKELIHOOD_GAIN:
+        return noise
+    rho, white = shape(best.x)
+    return replace(noise, autocorrelation=rho, white=white)
+
+
+def _clipped(e: FloatArray) -> FloatArray:
+    """Return the residuals with those beyond :data:`CLIP_SIGMA` moved there."""
+    scale = _scale(e)
+    return np.asarray(np.clip(e, -CLIP_SIGMA * scale, CLIP_SIGMA * scale))
+
+
+def _scale(e: FloatArray) -> float:
+    """Return the robust scale, or the mean magnitude if more than half of the residuals are zero."""
+    return robust_scale(e) or float(np.abs(e).mean()) or 1e-9
+
+
+def _autocorrelation(e: FloatArray, follows: BoolArray, absorbed: tuple[float, float]) -> float:
+    """Return the autocorrelation of successive residuals; 0 if it is below three of its standard errors."""
+    late, early = e[1:][follows[1:]], e[:-1][follows[1:]]
+    if len(late) < MIN_PAIRS:
+        return 0.0
+    # the noise's moments are those of the residuals plus what the fit absorbed
+    n, (variance, covariance) = len(late), absorbed
+    squares = np.sqrt((late @ late + n * variance) * (early @ early + n * variance))
+    rho = float((late @ early + n * covariance) / (squares + 1e-300))
+    return min(rho, MAX_AUTOCORRELATION) if rho > 3.0 / np.sqrt(len(late)) else 0.0

@@ -1,0 +1,138 @@
+"""The scalar residual of a calibration, in errors-in-variables form, with its analytic derivatives.
+
+Notes
+-----
+Noise sits in the reading, inside ``A(.)``: least squares on ``|A(H_r - T)| - H_e`` would shrink A and bias T.
+The errors-in-variables residual (Sampson's; Kukush, Markovsky & Van Huffel 2004) is in the sensor's
+own nanotesla::
+
+    d = H_r - T,  b = A d,  F = |b|,  u = b / F,  w = A u
+    e = (F - H_e) / s,   s^2 = kappa^2 + |w|^2          (kappa: noise of the reference over the sensor's)
+
+    de = (u^T dA d - w^T dT) / s - (e / s^2) w^T dw
+    w^T dw = w^T dA u + y^T dA d - y^T A dT,   y = (I - u u^T) A w / F
+
+Each coefficient is a polynomial in the positions of the masses. A row of the Jacobian is therefore
+``phi (x) g``, with g the derivative by the nine numbers (a_xx, a_yy, a_zz, a_xy, a_xz, a_yz, t_x, t_y, t_z).
+The module imports numpy only, because the live bridge uses it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+
+__all__ = [
+    "CHUNK_ROWS", "PAIRS", "Samples", "jacobian", "residuals", "residuals_of", "rms", "robust_scale",
+    "scales_and_offsets", "symmetric",
+]  # fmt: skip
+
+CHUNK_ROWS = 8192
+"""Rows of the Jacobian that are in memory at a time."""
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Row and column of each of the six entries of a symmetric matrix, in the order in which they are stored."""
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The samples that a fit compares with their reference."""
+
+    field: FloatArray
+    """(n, 3), nT, raw."""
+    reference: FloatArray
+    """(n,), nT, H_e."""
+    phi: FloatArray
+    """(n, m): Monomials of the positions."""
+    steps: FloatArray
+    """(n,): Sampling intervals since the previous sample; infinite where that belongs to another run."""
+    F_0: float
+    """nT, the total field that the coefficients of A refer to: ``A = I + a / F_0``."""
+    kappa: float = 0.0
+    """Noise of the reference divided by the sensor's."""
+
+    def part(self, rows: slice | BoolArray | IndexArray) -> Samples:
+        """Pick samples: an (n,) mask, places or a slice."""
+        return Samples(
+            self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.F_0, self.kappa
+        )
+
+
+def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the residual e (n,) in sensor nT, and its derivative by the nine coefficients (n, 9).
+
+    Parameters
+    ----------
+    samples : Samples
+        n of them, with m monomials.
+    coefficients : (9 m,) array
+        nT, monomial by monomial.
+    """
+    # A and T at the positions of every sample, then the corrected vector b and its direction u
+    theta = samples.phi @ coefficients.reshape(-1, 9)
+    A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)
+    d = samples.field - theta[:, 6:]
+    b = _times(A, d)
+    F = np.sqrt((b * b).sum(axis=1))
+    u = b / F[:, None]
+    # Sampson's weight: a channel's noise of 1 nT moves F by |A u| nT
+    w = _times(A, u)
+    s2 = samples.kappa**2 + (w * w).sum(axis=1)
+    s = np.sqrt(s2)
+    e = (F - samples.reference) / s
+    # the derivative of the weight, y, and of the residual: de = z^T dA d - (A z)^T dT - k w^T dA u
+    v = _times(A, w)
+    y = (v - u * (u * v).sum(axis=1)[:, None]) / F[:, None]
+    k = (e / s2)[:, None]
+    z = u / s[:, None] - k * y
+    g = np.empty((len(e), 9))
+    for slot, (i, j) in enumerate(PAIRS):
+        g[:, slot] = z[:, i] * d[:, j] - k[:, 0] * w[:, i] * u[:, j]
+        if i != j:
+            g[:, slot] += z[:, j] * d[:, i] - k[:, 0] * w[:, j] * u[:, i]
+    g[:, :6] /= samples.F_0
+    g[:, 6:] = -_times(A, z)
+    return e, g
+
+
+def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:
+    """(n, 9 m) derivatives by all coefficients, ``phi (x) g``, of monomials (n, m) and those by the nine."""
+    return np.asarray(phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
+
+
+def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
+    """Residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
+    pieces = [
+        residuals(samples.part(slice(start, start + CHUNK_ROWS)), coefficients)[0]
+        for start in range(0, len(samples.field), CHUNK_ROWS)
+    ]
+    return np.concatenate(pieces)
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square of the values (n,)."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def robust_scale(values: FloatArray) -> float:
+    """1-sigma of the bulk of values (n,) about zero, outliers or not: 1.48 times their median magnitude."""
+    return 1.4826 * float(np.median(np.abs(values)))
+
+
+def scales_and_offsets(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
+    theta = samples.phi @ coefficients.reshape(-1, 9)
+    A = np.eye(3) + symmetric(theta) / samples.F_0
+    return np.asarray(np.linalg.eigvalsh(A)), np.asarray(np.linalg.norm(theta[:, 6:], axis=1))
+
+
+def _times(A: FloatArray, x: FloatArray) -> FloatArray:
+    """(n, 3, 3) times (n, 3)."""
+    return np.asarray(np.matmul(A, x[:, :, None])[:, :, 0])
+
+
+def symmetric(entries: FloatArray) -> FloatArray:
+    """Return (n, 3, 3) symmetric matrices from their six entries (n, 6 or more), ordered as :data:`PAIRS`."""
+    return entries[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
