@@ -66,6 +66,8 @@ class Link(Table, frozen=True):
     """File of 32 bytes; packets are signed and unsigned ones refused."""
     max_other_peers_rate: NotNegative = 1000.0
     """kB/s that all peers but the autopilot's get together, on ``udpin`` and ``tcpin``."""
+    request_streams: bool = True
+    """Request from the autopilot the messages that the bridge needs, if they arrive too rarely."""
     parameters: Name | None = None
     """File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a
     configuration called ``bridge.toml``."""

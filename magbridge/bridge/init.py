@@ -9,6 +9,7 @@ from typing import Any
 
 from magbridge.calibration.model import Calibration
 from magbridge.correction import TEMPERATURE
+from magbridge.logs.telemetry_fields import FIELDS, Value
 from magbridge.sensors.options import options_of
 
 __all__ = ["Answers", "bridge_toml"]
@@ -119,14 +120,31 @@ def _telemetry(units: dict[str, str]) -> list[str]:
     for name, unit in units.items():
         lines += [
             f"[telemetry.{_key(name)}]    # any field of any MAVLink message; value = scale * field + offset",
-            'message = "NAMED_VALUE_FLOAT"',
-            f"match = {{name = {_text(name[:10])}}}    # at most 10 characters",
-            'field = "value"',
+            *_source(name, unit),
             f"unit = {_text(unit)}    # the calibration's",
             "max_age = 30.0    # s; an older value is stale",
             "",
         ]
     return lines
+
+
+def _source(name: str, unit: str) -> list[str]:
+    """Return the keys that say which message holds a parameter: an autopilot's own one where it is known.
+
+    The columns that magbridge reads from a telemetry log are named in
+    :mod:`magbridge.logs.telemetry_fields`; a calibration that was fitted to such a log has these names.
+    """
+    for message, columns in FIELDS.items():
+        if name in columns:
+            value = Value(name, message, columns[name])
+            if unit in ("", value.unit):
+                scale = [f"scale = {value.scale:g}"] if value.scale != 1.0 else []
+                return [f'message = "{message}"', f'field = "{columns[name]}"', *scale]
+    return [
+        'message = "NAMED_VALUE_FLOAT"',
+        f"match = {{name = {_text(name[:10])}}}    # at most 10 characters",
+        'field = "value"',
+    ]
 
 
 def _calibration(file: str | None) -> list[str]:

@@ -26,6 +26,7 @@ from magbridge.link.component import Component
 from magbridge.link.message_rates import check_publish
 from magbridge.link.parameters import alignment, file_rate, learning, telemetry_ages
 from magbridge.link.reports import Condition
+from magbridge.link.requests import needed_rates
 from magbridge.link.telemetry import TelemetryMap
 from magbridge.link.validity import is_possible
 from magbridge.mavlink import Message, Signing, Spec, spec
@@ -128,6 +129,7 @@ class Pipeline:
             kept=start.parameters,
             status=self._status,
             speaking=lambda: self.sensor.state == MAG_PORT_STATE.OK,
+            streams=self._streams() if config.link.request_streams else None,
         )
         own = config.link
         self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
@@ -149,6 +151,15 @@ class Pipeline:
         self.component.parameters.watch(self._tune)
         self._tune()
         self._begin(start, used, foreign=foreign)
+
+    def _streams(self) -> dict[str, tuple[float, float]]:
+        """Return the rates at which the bridge needs messages of the autopilot."""
+        config = self._config
+        return needed_rates(
+            attitude=self._direction is not None,
+            navigation=config.navigation is not None,
+            telemetry=tuple(wanted.message for wanted in config.telemetry.values()),
+        )
 
     @property
     def declarations(self) -> list[bytes]:

@@ -17,11 +17,13 @@ from magbridge.link.parameter_service import ParameterService
 from magbridge.link.parameters import Parameters, Tunable, rates
 from magbridge.link.publish import PUBLISHED, Publisher
 from magbridge.link.reports import Condition, Reports
+from magbridge.link.requests import StreamRequests
 from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
-from magbridge.mavlink import REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
+from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.mavlink.framing import is_signed
+from magbridge.mavlink.signing import NOT_SIGNED
 
 __all__ = ["TIMESYNC_US", "Component"]
 
@@ -87,6 +89,7 @@ class Component:
         kept: Mapping[str, float] | None = None,
         status: Callable[[], Condition] = Condition,
         speaking: Callable[[], bool] = bool,
+        streams: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         self._link = link
         self.codec = Codec(link.system, link.component, signing)
@@ -99,6 +102,10 @@ class Component:
         self._refusals_reported = 0
         self.announcer = Announcer(self.outbox, self.timers)
         self.vehicle = Vehicle(link.system, link.component, link.autopilot, self.announcer, self.timers)
+        self.streams = StreamRequests(
+            (link.system, link.autopilot), streams or {}, self.outbox, self.timers, self.announcer
+        )
+        self.vehicle.on_reboot = self.streams.rebooted
         self.parameters = Parameters([*rates({**DEFAULTS, **publish}, LIMITS), *tunables])
         for name in self.parameters.restore(kept or {}):
             self.announcer.send_statustext(
@@ -172,15 +179,19 @@ class Component:
         messages = self.codec.parse(data, whole=self._whole)
         self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
         self.received += self._frame_log.frames(messages, self.codec.pending)
+        self._report_clock()
         for message in messages:
             if not message.known:
                 if message.id == REFUSED:
                     self._report_refusals(message)
+                if message.id != BAD_DATA:
+                    self.vehicle.count(message, t_us)
                 continue
             handler = self._handlers.get(message.id)
             if handler:
                 handler(message)
             if self.vehicle.receive(message, t_us):
+                self.streams.receive(message, t_us)
                 ours.append(message)
         return ours
 
@@ -194,8 +205,16 @@ class Component:
         refusals = list(self.codec.signing.refusals.items())
         for why, (system, component) in refusals[self._refusals_reported :]:
             text = f"frames of {system}:{component} refused: {why}"
+            if why == NOT_SIGNED:
+                text += ", or a router has removed the signature"
             self.announcer.state(f"refused: {why}", text, MAV_SEVERITY.WARNING)
         self._refusals_reported = len(refusals)
+
+    def _report_clock(self) -> None:
+        """Report that our clock is days behind the autopilot's, which refuses our frames meanwhile."""
+        if self.codec.signing is not None and (days := self.codec.signing.followed_days) >= 1.0:
+            text = f"clock is {days:.0f} days behind the autopilot's: signatures follow its time"
+            self.announcer.state("signing clock", text, MAV_SEVERITY.WARNING)
 
     def _begin(self, t_us: int) -> None:
         self.codec.now_us = t_us

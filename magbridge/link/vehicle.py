@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 from magbridge.link.announcer import Announcer
@@ -42,6 +43,8 @@ class Vehicle:
         Reset when the autopilot reboots.
     reboots : int
         Number of restarts of the boot clock.
+    on_reboot : callable
+        Called at each restart.
     """
 
     def __init__(
@@ -50,6 +53,7 @@ class Vehicle:
         self.system, self.component, self.autopilot = system, component, autopilot
         self.clock = VehicleClock()
         self.reboots = 0
+        self.on_reboot: Callable[[], object] = int
         self.state = MAG_PORT_STATE.ABSENT
         self._announcer, self._timers = announcer, timers
         self._losses = Losses(system, announcer, timers)
@@ -80,6 +84,11 @@ class Vehicle:
             elif message.id == HEARTBEAT:
                 self._present(t_us)
         return True
+
+    def count(self, message: Message, t_us: int) -> None:
+        """Count a frame of our vehicle that is not read: its id is unknown, or its signature was refused."""
+        if message.system == self.system and message.component != self.component:
+            self._losses.count(message.component, message.sequence, t_us)
 
     def _other_sender(self, message: Message) -> None:
         """Announce another vehicle on the link; a ground station is not a vehicle."""
@@ -118,6 +127,7 @@ class Vehicle:
             self._behind = 0
             self.reboots += 1
             self.clock.reset()
+            self.on_reboot()
             self._stamps.clear()
             self._announcer.send_statustext(
                 f"autopilot {self.system}:{self.autopilot} rebooted", MAV_SEVERITY.WARNING

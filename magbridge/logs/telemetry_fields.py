@@ -16,7 +16,7 @@ from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import split_index
 
 __all__ = [
-    "IMUS", "POWER_CYCLE", "SOURCES", "TELEMETRY", "UNKNOWN_INT", "Columns", "Declared", "Value",
+    "FIELDS", "IMUS", "POWER_CYCLE", "SOURCES", "TELEMETRY", "UNKNOWN_INT", "Columns", "Declared", "Value",
     "correction", "sample",
 ]  # fmt: skip
 

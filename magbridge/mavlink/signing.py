@@ -40,6 +40,10 @@ SET = (1_672_531_200_000_000 - EPOCH_US) // 10
 LIMIT = (1 << 48) - 1
 STREAMS = 1024
 """Most floors that are kept; of more, those of the streams heard first are forgotten."""
+NOT_SIGNED = "not signed"
+"""Reason for the refusal of a frame without a signature."""
+FOLLOW_UNSET = 10 * 365 * 24 * 60 * MINUTE
+"""How far the autopilot's stamps may take ours in a run that has no stamp of an earlier run."""
 NEED_NO_SIGNATURE = frozenset({109})
 """RADIO_STATUS: radios put it on the link, and they have no key."""
 
@@ -93,6 +97,8 @@ class Signing(MAVLinkSigning):
     ----------
     last : int
         The last time stamp used in what we sent.
+    followed_days : float
+        By how many days the autopilot's last stamp was ahead of our clock.
     refused : int
         Frames that were unsigned, wrongly signed or old.
     refusals : dict of str to tuple of 2 int
@@ -105,6 +111,8 @@ class Signing(MAVLinkSigning):
         super().__init__()
         self.secret_key, self.sign_outgoing, self._key, self._follow = key, True, key, follow
         self.last = last
+        self.followed_days = 0.0
+        self._follow_limit = FOLLOW if last else FOLLOW_UNSET
         self.refused = 0
         self.refusals: dict[str, tuple[int, int]] = {}
         self._floors = {(link, system, sender, ahead): s for link, system, sender, ahead, s in streams}
@@ -133,7 +141,7 @@ class Signing(MAVLinkSigning):
 
     def accept(self, frame: bytes, stream: tuple[int, int], number: int, t_us: int) -> bool:
         """Say whether a frame of the `stream` (system, component) is genuine and new."""
-        why = "" if number in NEED_NO_SIGNATURE else "not signed"
+        why = "" if number in NEED_NO_SIGNATURE else NOT_SIGNED
         if is_signed(frame):
             why = self._doubt(frame, stream, t_us)
         if why:
@@ -155,6 +163,7 @@ class Signing(MAVLinkSigning):
         self._floors[key] = stamp
         if len(self._floors) > STREAMS:
             del self._floors[next(iter(self._floors))]
-        if stream == self._follow and stamp < (now + FOLLOW if now > SET else LIMIT // 2):
+        if stream == self._follow and stamp < (now + self._follow_limit if now > SET else LIMIT // 2):
             self.last = max(self.last, stamp)
+            self.followed_days = max(0.0, (stamp - now) / (24 * 60 * MINUTE))
         return ""

@@ -8,6 +8,7 @@ import pty
 import subprocess
 import sys
 import threading
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import reduce
@@ -18,6 +19,7 @@ import pytest
 from commands import Command
 
 from magbridge.bridge.check import findings
+from magbridge.bridge.init import Answers, bridge_toml
 from magbridge.bridge.ports import listen, recognise
 from magbridge.config import load
 from magbridge.mavlink import Codec
@@ -122,6 +124,14 @@ def test_init_writes_what_run_would_start_with(
     assert "would start" in command("run", "--check", "--config", "bridge.toml").out
     assert "is there already" in command.refuses("init", code=2)
     assert not (here / "logs").exists()
+
+
+def test_init_names_the_autopilots_own_message_of_a_parameter() -> None:
+    text = bridge_toml(Answers("hmr2300", "/dev/ttyUSB0", parameters=("battery_current [A]", "battpos [in]")))
+    telemetry = tomllib.loads(text)["telemetry"]
+    current, mass = telemetry["battery_current"], telemetry["battpos"]
+    assert (current["message"], current["field"], current["scale"]) == ("SYS_STATUS", "current_battery", 0.01)
+    assert (mass["message"], mass["match"]) == ("NAMED_VALUE_FLOAT", {"name": "battpos"})
 
 
 def test_init_says_what_is_left_to_fill_in(command: Command) -> None:

@@ -11,7 +11,7 @@ import pytest
 from line import Line
 
 from magbridge.link.clock import VehicleClock
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, spec
 
 START = 1_700_000_000_000_000
 
@@ -220,3 +220,17 @@ def test_a_clock_that_was_set_is_learned_anew_at_once(now: int) -> None:
     assert clock.offset_us(START + 10_000_000) == pytest.approx(now, abs=20_000)
     exchange(clock, rng, START + 11_000_000, now, slow=300_000.0)  # a slow one is no step
     assert clock.offset_us(START + 11_000_000) == pytest.approx(now, abs=20_000)
+
+
+def test_frames_of_unknown_messages_are_not_lost(link: Line) -> None:
+    """An autopilot sends messages that the dialect lacks; they count as received."""
+    autopilot = Codec(1, 1)
+    beat = spec("HEARTBEAT")
+    for second in range(40):
+        frames = [autopilot.frame(beat, beat.payload(type=1, autopilot=12)) for _ in range(19)]
+        unknown = bytearray(autopilot.frame(beat, beat.payload(type=1)))
+        unknown[7:10] = (59_000).to_bytes(3, "little")
+        for frame in (*frames[:9], bytes(unknown), *frames[9:]):
+            link.give(frame)
+        link.to(second + 1.0)
+    assert not any("frames missing" in text for _, text in link.component.announcer.texts)

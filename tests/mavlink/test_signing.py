@@ -178,7 +178,7 @@ def test_a_liar_with_the_key_harms_only_its_own_stream() -> None:
 def test_our_stamps_follow_the_autopilot_s_but_not_for_years() -> None:
     """A computer that was off for a day, without a clock of its own, is believed by a vehicle that knows."""
     day = 24 * HOUR
-    for ahead, follows in ((day, True), (10 * YEAR, False)):
+    for ahead, follows in ((day, True), (30 * day, True), (11 * YEAR, False)):
         bridge, autopilot = Codec(1, 191, Signing(KEY, follow=(1, 1))), codec(component=1)
         assert accepts(bridge, autopilot, NOW, ahead)
         text(bridge)

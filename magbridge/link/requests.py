@@ -1,0 +1,160 @@
+"""Request from the autopilot the messages that the bridge needs, at the rates that it needs."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from typing import Final
+
+from magbridge.link.announcer import Announcer
+from magbridge.link.outbox import Outbox
+from magbridge.link.timers import Timers
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
+
+__all__ = ["AIRCRAFT", "StreamRequests", "needed_rates"]
+
+AIRCRAFT: Final = frozenset((1, 2, 3, 4, 13, 14, 15, 19, 20, 21, 22, 23, 24, 25, 29, 35))
+"""MAV_TYPE of vehicles that turn by tens of degrees a second: fixed and rotary wings."""
+LOOK_US: Final = 10_000_000
+"""µs over which the bridge measures at which rate each message arrives."""
+ANSWER_US: Final = 2_000_000
+"""µs that the bridge waits for the answer to one request."""
+MIN_FRACTION: Final = 0.7
+"""Fraction of the needed rate below which the bridge requests it. A higher rate, which another client may
+have requested, stays as it is."""
+MAX_ATTEMPTS: Final = 3
+"""Requests of one message between two reboots of the autopilot."""
+UNREQUESTABLE: Final = frozenset(
+    ("NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "DEBUG", "DEBUG_VECT", "DEBUG_FLOAT_ARRAY", "HEARTBEAT")
+)
+"""Messages that several programs send, each on its own schedule."""
+
+
+def needed_rates(
+    *, attitude: bool, navigation: bool, telemetry: tuple[str, ...]
+) -> dict[str, tuple[float, float]]:
+    """Return the rates in Hz, of an aircraft and of any other vehicle, that each message is needed at.
+
+    Parameters
+    ----------
+    attitude : bool
+        The direction of the field is checked.
+    navigation : bool
+        The bridge navigates.
+    telemetry : tuple of str
+        Messages that hold parameters of the calibration.
+    """
+    rates = {name: (5.0, 2.0) for name in telemetry if name not in UNREQUESTABLE}
+    rates["GLOBAL_POSITION_INT"] = (2.0, 1.0)
+    if attitude or navigation:
+        rates["ATTITUDE"] = (10.0, 4.0)
+    if navigation:
+        rates |= {"VFR_HUD": (5.0, 2.0), "GPS_RAW_INT": (2.0, 1.0), "EKF_STATUS_REPORT": (1.0, 1.0)}
+    return rates
+
+
+class StreamRequests:
+    """Measures at which rate each needed message arrives, and requests those that arrive too rarely.
+
+    Parameters
+    ----------
+    peer : tuple of 2 int
+        System and component of the autopilot.
+    rates : mapping of str to tuple of 2 float
+        As :func:`needed_rates` returns them.
+    outbox, timers, announcer
+        Those of the link.
+    """
+
+    def __init__(
+        self,
+        peer: tuple[int, int],
+        rates: Mapping[str, tuple[float, float]],
+        outbox: Outbox,
+        timers: Timers,
+        announcer: Announcer,
+    ) -> None:
+        self._peer, self._outbox, self._timers, self._announcer = peer, outbox, timers, announcer
+        self._needed = {spec(name).id: pair for name, pair in rates.items()}
+        self._received: Counter[int] = Counter()
+        self._attempts: Counter[int] = Counter()
+        self._queue: deque[int] = deque()
+        self._asked: int | None = None
+        self._present = self._is_aircraft = False
+        self.measured: dict[str, float] = {}
+        """Rate in Hz at which each needed message arrived in the last :data:`LOOK_US`."""
+
+    def receive(self, message: Message, time_us: int) -> None:
+        """Count a message of the autopilot; handle the answer to a request."""
+        if message.component != self._peer[1]:
+            return
+        if message.id == HEARTBEAT:
+            self._is_aircraft = message["type"] in AIRCRAFT
+            if not self._present:
+                self._present = True
+                self._timers.every("streams", LOOK_US, self._look, time_us + LOOK_US)
+        elif message.id == ACK:
+            if message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL and self._asked is not None:
+                self._answered(message["result"])
+        elif message.id in self._needed:
+            self._received[message.id] += 1
+
+    def rebooted(self) -> None:
+        """Begin again: the autopilot has forgotten what was requested."""
+        self._attempts.clear()
+        self._received.clear()
+
+    def rate_of(self, number: int) -> float:
+        """Return the rate in Hz at which a message is needed."""
+        return self._needed[number][0 if self._is_aircraft else 1]
+
+    def _look(self, _: int) -> None:
+        """Queue requests for the messages that arrived too rarely since the last call."""
+        for number in self._needed:
+            rate = self._received[number] * 1e6 / LOOK_US
+            self.measured[spec(number).name] = rate
+            rare = rate < MIN_FRACTION * self.rate_of(number)
+            if rare and self._attempts[number] < MAX_ATTEMPTS and number not in self._queue:
+                self._queue.append(number)
+        self._received.clear()
+        if self._asked is None:
+            self._ask_next()
+
+    def _ask_next(self) -> None:
+        """Send the next request; one is under way at a time, because an answer does not name its message."""
+        self._asked = None
+        if not self._queue:
+            return
+        number = self._asked = self._queue.popleft()
+        self._attempts[number] += 1
+        system, component = self._peer
+        self._outbox.send(
+            "COMMAND_LONG",
+            target_system=system,
+            target_component=component,
+            command=int(MAV_CMD.SET_MESSAGE_INTERVAL),
+            param1=float(number),
+            param2=1e6 / self.rate_of(number),
+        )
+        deadline = self._outbox.codec.now_us + ANSWER_US
+        self._timers.at("stream request", deadline, lambda _: self._ask_next())
+
+    def _answered(self, result: int) -> None:
+        """Report a denial, and go on with the next request."""
+        assert self._asked is not None
+        name = spec(self._asked).name
+        if result not in (MAV_RESULT.ACCEPTED, MAV_RESULT.IN_PROGRESS):
+            self._attempts[self._asked] = MAX_ATTEMPTS
+            why = MAV_RESULT(result).name if result in MAV_RESULT.__members__.values() else str(result)
+            self._announcer.state(
+                f"stream {name}",
+                f"the autopilot does not send {name} at {self.rate_of(self._asked):g} Hz: {why}",
+                MAV_SEVERITY.WARNING,
+            )
+        self._timers.cancel("stream request")
+        self._ask_next()
+
+
+HEARTBEAT: Final = spec("HEARTBEAT").id
+ACK: Final = spec("COMMAND_ACK").id

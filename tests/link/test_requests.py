@@ -1,0 +1,94 @@
+"""The bridge requests the messages that it needs, and never lowers a rate."""
+
+from __future__ import annotations
+
+from magbridge.link.announcer import Announcer
+from magbridge.link.outbox import Outbox
+from magbridge.link.requests import StreamRequests, needed_rates
+from magbridge.link.timers import Timers
+from magbridge.mavlink import Codec, Message, spec
+from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_TYPE
+
+SECOND = 1_000_000
+NEEDED = {"ATTITUDE": (10.0, 4.0), "VFR_HUD": (5.0, 2.0)}
+
+
+class Bench:
+    """An autopilot that sends messages at given rates, and answers each request with one result."""
+
+    def __init__(self, kind: int, result: int = MAV_RESULT.ACCEPTED) -> None:
+        self.codec = Codec(1, 191)
+        self.outbox, self.timers = Outbox(self.codec), Timers()
+        self.announcer = Announcer(self.outbox, self.timers)
+        self.requests = StreamRequests((1, 1), NEEDED, self.outbox, self.timers, self.announcer)
+        self.autopilot, self._ear, self._kind, self._result = Codec(1, 1), Codec(0, 0), kind, result
+        self.asked: list[tuple[str, float]] = []
+        self.now_us = 0
+
+    def run(self, seconds: int, **rates: int) -> None:
+        for _ in range(seconds):
+            self._give("HEARTBEAT", type=self._kind)
+            for name, rate in rates.items():
+                for _ in range(rate):
+                    self._give(name)
+            self.now_us += SECOND
+            self.codec.now_us = self.now_us
+            self.timers.advance(self.now_us, lambda _: None)
+            self._answer()
+
+    def _give(self, name: str, **fields: object) -> None:
+        (message,) = self._ear.parse(self.autopilot.pack(name, **fields))
+        self.requests.receive(message, self.now_us)
+
+    def _answer(self) -> None:
+        while frames := self.outbox.drain():
+            for _, frame in frames:
+                (message,) = Codec(0, 0).parse(frame)
+                if message.name == "COMMAND_LONG":
+                    self._keep(message)
+
+    def _keep(self, message: Message) -> None:
+        assert message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL
+        assert (message["target_system"], message["target_component"]) == (1, 1)
+        self.asked.append((spec(int(message["param1"])).name, 1e6 / message["param2"]))
+        self._give("COMMAND_ACK", command=MAV_CMD.SET_MESSAGE_INTERVAL, result=self._result)
+
+
+def test_messages_that_arrive_too_rarely_are_requested_at_the_rates_of_the_vehicle() -> None:
+    plane, glider = Bench(1), Bench(int(MAV_TYPE.SUBMARINE))
+    for bench in (plane, glider):
+        bench.run(12, ATTITUDE=1, VFR_HUD=1)
+    assert plane.asked == [("ATTITUDE", 10.0), ("VFR_HUD", 5.0)]
+    assert glider.asked == [("ATTITUDE", 4.0), ("VFR_HUD", 2.0)]
+
+
+def test_a_rate_that_is_high_enough_stays_as_another_client_has_set_it() -> None:
+    bench = Bench(1)
+    bench.run(60, ATTITUDE=50, VFR_HUD=4)
+    assert bench.asked == []
+    assert bench.requests.measured["ATTITUDE"] == 50.0
+
+
+def test_a_request_is_repeated_a_few_times_and_again_after_a_reboot() -> None:
+    bench = Bench(1)
+    bench.run(120, ATTITUDE=1, VFR_HUD=5)
+    assert bench.asked == [("ATTITUDE", 10.0)] * 3
+    bench.requests.rebooted()
+    bench.run(12, ATTITUDE=1, VFR_HUD=5)
+    assert len(bench.asked) == 4
+
+
+def test_a_denial_is_reported_and_not_repeated() -> None:
+    bench = Bench(1, MAV_RESULT.DENIED)
+    bench.run(60, ATTITUDE=1, VFR_HUD=5)
+    assert bench.asked == [("ATTITUDE", 10.0)]
+    assert [text for _, text in bench.announcer.texts] == [
+        "the autopilot does not send ATTITUDE at 10 Hz: DENIED"
+    ]
+
+
+def test_what_is_needed_depends_on_the_task() -> None:
+    plain = needed_rates(attitude=False, navigation=False, telemetry=("NAMED_VALUE_FLOAT", "SYS_STATUS"))
+    assert sorted(plain) == ["GLOBAL_POSITION_INT", "SYS_STATUS"]
+    full = needed_rates(attitude=True, navigation=True, telemetry=())
+    assert {"ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "EKF_STATUS_REPORT"} < set(full)
