@@ -3,6 +3,7 @@
     python3 tools/dev.py bench                      everything: some minutes
     python3 tools/dev.py bench processor start      some of it
     python3 tools/dev.py bench --json               for machines, with details
+    python3 tools/dev.py bench --table FILE.md      also as a table in Markdown, with date, commit and load
 
 Repetitions of the program and of its floor alternate and medians are printed, so that a busy machine slows
 both alike. Processor time and ratios hold on a busy machine; latencies do not: the load average is printed
@@ -14,8 +15,10 @@ from __future__ import annotations
 import json
 import os
 import platform
+import subprocess
 import sys
 import tempfile
+from datetime import date
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,8 @@ from benchmarks.row import Row
 from rich.console import Console
 from rich.table import Table
 from studies import command_line, table
+
+from magbridge.version import __version__
 
 __all__ = ["BENCHMARKS"]
 
@@ -78,10 +83,35 @@ def show(results: list[dict[str, Any]]) -> Table:
     return shown
 
 
+def markdown(results: list[dict[str, Any]]) -> str:
+    """Return the table in Markdown, below date, commit, version and load."""
+    git = ["git", "rev-parse", "--short", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or "no commit"
+    loads = [load for result in results for load in result["load"]]
+    lines = [
+        f"Version {__version__}, commit {commit}, {date.today()}, load {min(loads):.1f} to {max(loads):.1f}.",
+        "",
+        "| quantity | magbridge | floor | target |",
+        "|---|---|---|---|",
+    ]
+    for row in (row for result in results for row in result["rows"]):
+        floor = f"{row.floor_is}: {row.floor:.3g} {row.unit}" if row.floor is not None else ""
+        target = (
+            f"at most {row.most:g}"
+            if row.most is not None
+            else f"at least {row.least:g}"
+            if row.least
+            else ""
+        )
+        lines.append(f"| {row.what} | {row.value:.3g} {row.unit} | {floor} | {target} |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> int:
     parser = command_line(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--table", type=Path, help="Markdown file to write the table to")
     parser.add_argument("--factor", type=float, default=1.0, help="multiplies the number of repetitions")
     chosen = parser.parse_args()
     if unknown := set(chosen.names) - set(BENCHMARKS):
@@ -90,6 +120,8 @@ def main() -> int:
     for name in chosen.names or BENCHMARKS:
         print(f"{name} ...", file=sys.stderr)
         results.append(measure(name, chosen.factor))
+    if chosen.table:
+        chosen.table.write_text(markdown(results), encoding="utf-8")
     if chosen.json:
         results = [
             {

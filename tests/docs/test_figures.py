@@ -27,17 +27,23 @@ def commands(text: str) -> list[tuple[Path, list[str]]]:
     ]
 
 
+def source_of(tool: Path) -> str:
+    """The text of a tool and of the tools that it imports or runs, whose options it has, too."""
+    text = tool.read_text(encoding="utf-8")
+    names = re.findall(r"^(?:from|import) (\w+)|tools/(\w+)\.py", text, re.MULTILINE)
+    parts = [ROOT / "tools" / f"{imported or called}.py" for imported, called in names]
+    return "".join([text, *(part.read_text(encoding="utf-8") for part in parts if part.is_file())])
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_a_tool_that_a_page_names_is_there_and_has_those_options(page: Path) -> None:
     for tool, options in commands(page.read_text(encoding="utf-8")):
         assert tool.exists(), tool.name
-        source = tool.read_text(encoding="utf-8")
-        if "from studies import" in source:
-            source += (ROOT / "tools" / "studies.py").read_text(encoding="utf-8")
+        source = source_of(tool)
         assert [one for one in options if f'"{one}"' not in source] == [], tool.name
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", sorted(ROOT.glob("docs/results/*.md")), ids=lambda page: page.name)
 def test_a_table_of_figures_stands_on_a_page_that_says_how_they_are_measured(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     if any(len(FIGURE.findall(one)) >= SOME for one in TABLE.findall(text)):
