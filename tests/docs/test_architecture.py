@@ -40,3 +40,12 @@ def test_every_central_type_is_in_its_module() -> None:
     assert len(table) > 4
     for name, module, _ in table:
         assert hasattr(importlib.import_module(f"magbridge.{module.strip('`')}"), name.strip("`")), name
+
+
+def test_every_module_that_the_method_names_exists() -> None:
+    """``magbridge.a.b`` and what follows it as ``.c`` are modules or packages."""
+    text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    names = re.findall(r"`(magbridge(?:\.\w+)+)`", text)
+    assert len(names) > 10
+    paths = [ROOT / name.replace(".", "/") for name in names]
+    assert not [path for path in paths if not path.is_dir() and not path.with_suffix(".py").is_file()]
