@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from math import cos, hypot, isfinite, nan, radians, sin, tan
+from typing import NamedTuple
 
 from magbridge.field.geodesy import offset, separation
 
-__all__ = ["GLIDE", "DeadReckoning"]
+__all__ = ["GLIDE", "DeadReckoning", "MotionNoise"]
 
 GLIDE = 8.0
 """deg, of pitch; a glider flatter than that is turning between dive and climb."""
@@ -16,6 +17,28 @@ FASTEST = 3.0
 """m/s, through the water; a higher speed comes from a jump in the depth."""
 LONGEST = 3600.0
 """s without telemetry, after which the motion is unknown."""
+MAX_REPORT_INTERVAL_S = 60.0
+"""s between two reports of the velocity, over which a change between them is averaged."""
+MIN_TURN_FRACTION = 0.25
+"""Fraction of the speed by which the velocity must have changed to count as a turn: noise is less."""
+
+
+class MotionNoise(NamedTuple):
+    """Uncertainty of the dead-reckoned motion since the start; it only grows.
+
+    The difference of two is the uncertainty of the motion between them.
+    """
+
+    nn: float = 0.0
+    ne: float = 0.0
+    ee: float = 0.0
+    """`nn`, `ne`, `ee`: covariance (m², north and east) of the motion between two reports of the velocity."""
+    turns: float = 0.0
+    """Sum of the squared changes of velocity in turns, (m/s)²."""
+
+    def since(self, earlier: MotionNoise) -> MotionNoise:
+        """Return the uncertainty of the motion since an earlier moment."""
+        return MotionNoise(*(a - b for a, b in zip(self, earlier, strict=True)))
 
 
 class DeadReckoning:
@@ -29,13 +52,16 @@ class DeadReckoning:
         m.
     travelled : float
         m through the water since the start.
+    noise : MotionNoise
+        Uncertainty of the motion since the start.
     """
 
     def __init__(self) -> None:
         self.latitude = self.longitude = nan
         self.depth, self.travelled = 0.0, 0.0
-        self._time = nan
-        self._velocity = (0.0, 0.0)
+        self.noise = MotionNoise()
+        self._time = self._reported = nan
+        self._velocity = self._steady = (0.0, 0.0)
         self._heading = self._pitch = self._speed = nan
         self._dive = (nan, nan)  # time and depth since when the rate of depth is taken
         self._rate = nan
@@ -48,8 +74,13 @@ class DeadReckoning:
 
     def forget(self) -> None:
         """Forget what the motion was computed from: other telemetry follows. It goes on until then."""
-        self._heading = self._pitch = self._speed = nan
+        self._heading = self._pitch = self._speed = self._reported = nan
         self._local = self._carrier = None
+
+    @property
+    def speed(self) -> float:
+        """Last known speed, m/s."""
+        return hypot(*self._velocity)
 
     def advance(self, time: float) -> None:
         """Move along the last known velocity up to `time` (s)."""
@@ -100,12 +131,40 @@ class DeadReckoning:
                 self._move(*separation(*self._carrier, *there))
             self._carrier, self._velocity = there, (0.0, 0.0)
         elif "velocity_north" in values and "velocity_east" in values:
-            self._velocity = values["velocity_north"], values["velocity_east"]
+            self._change_velocity(time, (values["velocity_north"], values["velocity_east"]), reported=True)
         elif self._local is None and self._carrier is None and isfinite(self._heading):
             speed = self._speed if isfinite(self._speed) else self._glide()
             if isfinite(speed):
                 along = radians(self._heading)
-                self._velocity = speed * cos(along), speed * sin(along)
+                velocity = speed * cos(along), speed * sin(along)
+                self._change_velocity(time, velocity, reported="heading" in values)
+
+    def _change_velocity(self, time: float, velocity: tuple[float, float], *, reported: bool) -> None:
+        """Follow a new velocity; `reported` with its direction.
+
+        Notes
+        -----
+        The velocity v₀ of the previous report, Δt ago, became v₁ at an unknown moment, uniformly distributed
+        over Δt. The motion in Δt then has the mean (v₀ + v₁) Δt/2 and the covariance
+        (v₁ - v₀)(v₁ - v₀)ᵀ Δt²/12. An error of heading or speed turns with the vehicle, so that a turn
+        changes what it does to the velocity in proportion to v₁ - v₀.
+        """
+        north, east = velocity[0] - self._velocity[0], velocity[1] - self._velocity[1]
+        elapsed = min(time - self._reported, MAX_REPORT_INTERVAL_S)
+        nn, ne, ee, turns = self.noise
+        if reported and elapsed > 0.0:
+            # the motion so far was v₀ Δt: add half of the change
+            self._shift(0.5 * north * elapsed, 0.5 * east * elapsed)
+            scale = elapsed * elapsed / 12.0
+            nn, ne, ee = nn + north * north * scale, ne + north * east * scale, ee + east * east * scale
+        change = hypot(velocity[0] - self._steady[0], velocity[1] - self._steady[1])
+        if change > MIN_TURN_FRACTION * hypot(*self._steady):
+            turns += change * change if self._steady != (0.0, 0.0) else 0.0
+            self._steady = velocity
+        self.noise = MotionNoise(nn, ne, ee, turns)
+        self._velocity = velocity
+        if reported:
+            self._reported = time
 
     def _sink(self, time: float) -> None:
         since, depth = self._dive
@@ -124,5 +183,8 @@ class DeadReckoning:
 
     def _move(self, north: float, east: float) -> None:
         self.travelled += hypot(north, east)
+        self._shift(north, east)
+
+    def _shift(self, north: float, east: float) -> None:
         if isfinite(self.latitude):
             self.latitude, self.longitude = offset(self.latitude, self.longitude, north, east)

@@ -11,7 +11,8 @@ from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
-from magbridge.navigate.model import Block, prior, resolution, transition
+from magbridge.navigate.deadreckoning import MotionNoise
+from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
 from magbridge.navigate.options import Options, any_level
 from magbridge.navigate.record import Jump, State
 from magbridge.navigate.tracker import Innovation, Tracker
@@ -54,6 +55,8 @@ class Estimate:
         F and Q of the last prediction, for a smoother.
     jumps : list of Jump
         Restarts of the estimate, across which a smoother must not look.
+    log_likelihoods : tuple of float
+        Of the last measurement on the map: by the filter, and by a field unrelated to the map.
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options) -> None:
@@ -63,7 +66,7 @@ class Estimate:
         self.valid = False
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
-        self.time_us, self._travelled = 0, 0.0
+        self.time_us, self._travelled, self._motion = 0, 0.0, NO_MOTION_NOISE
         self._filter: Tracker | Bank | None = None
         self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
@@ -75,6 +78,8 @@ class Estimate:
         self._searches = 0
         self._confirmed = False  # competing filters that began wider have come to the same place
         self._described = False  # the map has described the field
+        self._fixed = False  # the place is that of a fix
+        self.log_likelihoods = 0.0, 0.0
 
     @property
     def begun(self) -> bool:
@@ -99,10 +104,20 @@ class Estimate:
         self._confirmed = sigma >= self._reach()
         self.state = State.SEARCHING
 
-    def correct(self, there: FloatArray, sigma: float) -> None:
-        """Take in a fix (2,), m north and east of the dead-reckoned position; `sigma` m on each axis.
+    def correct(self, there: FloatArray, sigma: float, fused_sigma: float | None = None) -> None:
+        """Update with a fix that holds at the time of the last prediction.
 
-        It holds at the time of the last prediction.
+        The fix confirms the place, but does not end :attr:`State.LOST`: the map must describe the field
+        there first.
+
+        Parameters
+        ----------
+        there : ndarray, (2,)
+            m, north and east of the dead-reckoned position.
+        sigma : float
+            m, of the fix, each axis.
+        fused_sigma : float, optional
+            m, with which it is fused: larger than `sigma` if its error is that of the previous fix.
         """
         assert self._filter is not None
         self._read()
@@ -110,15 +125,37 @@ class Estimate:
             _, start = prior(self.options, sigma)
             start[2:, 2:] += self.P[2:, 2:]
             self._begin(np.concatenate([there, self.x[2:]]), start, "a fix contradicts the filter")
+            self._described, self._nowhere = self._described and not self._lost, 0.0
         else:
-            self._filter.update_position(float(there[0]), float(there[1]), sigma)
+            self._filter.update_position(float(there[0]), float(there[1]), fused_sigma or sigma)
             self._read()
-        self._monitor, self._lost = None, False
+        self._confirmed = self._fixed = True
         self._alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
-    def update(self, block: Block, travelled: float) -> Innovation:
-        """Take in a measurement, `travelled` m after the start; return its innovation, NaN off the map."""
-        seconds, metres = self.predict(block.time_us, travelled)
+    def widen(self, metres: float) -> None:
+        """Add `metres` (1-sigma, each axis) to the position: a fix that was fused was wrong by as much."""
+        if self._filter is None:
+            return
+        Q = np.zeros_like(self.P)
+        Q[0, 0] = Q[1, 1] = metres**2
+        Q[2, 2] = Q[3, 3] = 0.25 * self.options.current_sigma**2
+        self._filter.predict(np.eye(len(Q)), Q)
+        self._alone += Q[:4, :4]
+        self._read()
+
+    def update(self, block: Block, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> Innovation:
+        """Update with a measurement and return its innovation, NaN off the map.
+
+        Parameters
+        ----------
+        block : Block
+        travelled : float
+            m through the water since the start.
+        motion : MotionNoise
+            Uncertainty of the dead-reckoned motion since the start.
+        """
+        before = self._motion
+        seconds, metres = self.predict(block.time_us, travelled, motion)
         finer = resolution(self.grid, self.options, block.variance)
         if finer < FINER * self._resolution:  # never coarser: a first block may have been a poor one
             self._resolution = finer
@@ -132,18 +169,20 @@ class Estimate:
         if on_the_map:
             if widest(self._alone) < self._resolution:
                 self._level = float(self.P[4, 4]), block.time_us
-            self._judge(block, seconds, metres, seen.log_likelihood)
+            self._judge(block, seconds, metres, motion.since(before), seen.log_likelihood)
         self._choose(on_the_map)
         proven = self._confirmed and self._described
         doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
         self.valid = self.state is State.TRACKING and proven and not doubted
         return seen
 
-    def predict(self, time_us: int, travelled: float) -> tuple[float, float]:
+    def predict(
+        self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE
+    ) -> tuple[float, float]:
         """Propagate to `time_us`, `travelled` m after the start; return the seconds and metres passed."""
         seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self._travelled
-        self.time_us, self._travelled = time_us, travelled
-        F, Q = transition(self.options, seconds, metres)
+        F, Q = transition(self.options, seconds, metres, motion.since(self._motion))
+        self.time_us, self._travelled, self._motion = time_us, travelled, motion
         self._alone = F[:4, :4] @ self._alone @ F[:4, :4].T + Q[:4, :4]
         self.moved = F, Q
         if self._filter is None:
@@ -197,17 +236,22 @@ class Estimate:
     def _jump(self, x: FloatArray, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
         self.jumps.append(Jump(self.time_us, north, east, widest(self._alone), cause))
-        self._monitor, self._confirmed = None, False
+        self._monitor, self._confirmed, self._fixed = None, False, False
 
-    def _judge(self, block: Block, seconds: float, metres: float, likelihood: float) -> None:
+    def _judge(
+        self, block: Block, seconds: float, metres: float, motion: MotionNoise, likelihood: float
+    ) -> None:
         """Compare the filter with competing ones, and replace it if one of them has won."""
         assert self._filter is not None
         unmapped = self._unmapped.update(block, seconds, metres, self._filter.curvature_variance)
+        self.log_likelihoods = likelihood, unmapped
         self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
         if self._nowhere > log(self.options.doubt):
             self._search_anew()
             return
         self._described |= self._nowhere <= -log(self.options.doubt)
+        if self._described and self._fixed and self._confirmed:
+            self._lost, self._searches = False, 0
         if not self._compact(widest(self.P)):
             return
         if self._monitor is None:
@@ -223,7 +267,7 @@ class Estimate:
                 self._levels(),
             )
             return
-        verdict = self._monitor.step(block, metres, self.x, self.P)
+        verdict = self._monitor.step(block, metres, motion, self.x, self.P)
         if verdict is Verdict.ELSEWHERE:
             self._filter, self._lost = self._monitor.surrender(block.time_us), True
             self._jump(self._filter.moments()[0], verdict.value)
@@ -270,6 +314,11 @@ class Estimate:
         length = self.grid.correlation_length * (0.5 if self._confirmed else 1.0)
         return max(REACH, widest(self._alone), min(length, 5.0 * REACH))
 
+    def _near_fix(self) -> bool:
+        """Return True if a fix, and dead reckoning since, give the place as well as the map could."""
+        limit = min(0.25 * self.grid.correlation_length, self.options.sigma_limit)
+        return self._fixed and self._described and widest(self._alone) <= limit
+
     def _choose(self, on_the_map: bool) -> None:
         """Change between a bank and one tracker if the width demands it; set the state."""
         width = widest(self.P)
@@ -282,6 +331,8 @@ class Estimate:
             self.state = State.LOST
         elif not self._compact(width):
             self.state = State.SEARCHING
+        elif self._near_fix():
+            self.state = State.TRACKING
         elif not on_the_map or width > UNINFORMED * widest(self._alone):
             self.state = State.DEAD_RECKONING
         else:

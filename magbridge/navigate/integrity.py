@@ -20,7 +20,8 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.model import Block, average, block_length, transition
+from magbridge.navigate.deadreckoning import MotionNoise
+from magbridge.navigate.model import NO_MOTION_NOISE, Block, average, block_length, transition
 from magbridge.navigate.options import Options
 
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
@@ -136,24 +137,30 @@ class IntegrityMonitor:
         self._threshold = log(options.doubt)
         self._waiting: list[Block] = []
         self._metres, self._step = 0.0, STRIDES * block_length(grid)
+        self._motion = NO_MOTION_NOISE
         self.here = Bank(grid, x, P, resolution, options.gate)
         self.elsewhere = Bank(grid, x, wide, resolution, options.gate, doubted)
         self.odds = 0.0
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
-    def step(self, block: Block, metres: float, x: FloatArray, P: FloatArray) -> Verdict:
-        """Take in a block `metres` after the previous one.
+    def step(
+        self, block: Block, metres: float, motion: MotionNoise, x: FloatArray, P: FloatArray
+    ) -> Verdict:
+        """Update both banks with a block `metres` after the previous one, and compare them.
 
-        It is compared with the filter's estimate after that block: `x` (6,) and its covariance `P` (6, 6).
+        They are compared with the filter's estimate after that block: `x` (6,) and its covariance `P`
+        (6, 6). `motion` is the uncertainty of the motion since the previous block.
         """
         self._waiting.append(block)
         self._metres += metres
+        self._motion = MotionNoise(*(a + b for a, b in zip(self._motion, motion, strict=True)))
         first = self._waiting[0]
         if block.time_us - first.time_us < PATIENCE_US and self._metres < self._step:
             return Verdict.OPEN
         together = average(self._waiting)
-        F, Q = transition(self._options, (together.time_us - self._time_us) * 1e-6, self._metres)
-        self._time_us, self._metres = together.time_us, 0.0
+        seconds = (together.time_us - self._time_us) * 1e-6
+        F, Q = transition(self._options, seconds, self._metres, self._motion)
+        self._time_us, self._metres, self._motion = together.time_us, 0.0, NO_MOTION_NOISE
         self._waiting.clear()
         self.here.predict(F, Q)
         self.elsewhere.predict(F, Q)

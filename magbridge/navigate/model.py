@@ -24,6 +24,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.deadreckoning import MotionNoise
 from magbridge.navigate.options import Options
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
 ]  # fmt: skip
 
 N_STATES = 6
+NO_MOTION_NOISE = MotionNoise()
 FINE = 0.35
 """Share of the spread that one measurement allows: errors of successive ones are alike and add up."""
 
@@ -77,8 +79,18 @@ def prior(options: Options, position_sigma: float | None = None) -> tuple[FloatA
     return np.zeros(N_STATES), np.diag(np.square(sigmas))
 
 
-def transition(options: Options, seconds: float, metres: float) -> tuple[FloatArray, FloatArray]:
+def transition(
+    options: Options, seconds: float, metres: float, motion: MotionNoise = NO_MOTION_NOISE
+) -> tuple[FloatArray, FloatArray]:
     """Return F and Q (6, 6) over a time and a distance through the water.
+
+    Parameters
+    ----------
+    options : Options
+    seconds, metres : float
+        Time, and distance through the water.
+    motion : MotionNoise, optional
+        Uncertainty of the dead-reckoned motion in that time, in addition to ``options.drift``.
 
     Notes
     -----
@@ -93,7 +105,8 @@ def transition(options: Options, seconds: float, metres: float) -> tuple[FloatAr
         f[p, c], f[c, c] = seconds * (1.0 + kept) / 2.0, kept
         q[p, p] = o.drift**2 * seconds + gained * seconds * seconds / 3.0
         q[p, c] = q[c, p] = gained * seconds / 2.0
-        q[c, c] = gained
+        q[c, c] = gained + 0.5 * o.motion_error**2 * motion.turns
+    q[:2, :2] += [[motion.nn, motion.ne], [motion.ne, motion.ee]]
     slow = (4, o.bias_sigma, seconds / o.bias_time), (5, o.map_sigma, metres / o.map_length)
     for i, sigma, decay in slow:
         f[i, i] = exp(-decay)

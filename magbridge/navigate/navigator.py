@@ -80,7 +80,7 @@ class Navigator:
             return None
         record = self.finish()
         where = self._reckoning
-        self.estimate.predict(time_us, where.travelled)
+        self.estimate.predict(time_us, where.travelled, where.noise)
         self.estimate.correct(
             np.array(separation(where.latitude, where.longitude, latitude, longitude)), sigma
         )
@@ -146,7 +146,7 @@ class Navigator:
 
     def _update(self, block: Block) -> Record:
         now = self.estimate
-        seen = now.update(block, self._reckoning.travelled)
+        seen = now.update(block, self._reckoning.travelled, self._reckoning.noise)
         north, east, current_north, current_east, bias, map_error = now.x.tolist()
         latitude, longitude = offset(block.latitude, block.longitude, north, east)
         (nn, ne), (_, ee) = now.P[:2, :2].tolist()

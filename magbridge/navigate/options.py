@@ -29,6 +29,9 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """`current_sigma`, `current_time`: m/s and s: the current, and its correlation time."""
     drift: NotNegative = 0.2
     """m/sqrt(s), random walk of the dead reckoning."""
+    motion_error: NotNegative = 0.02
+    """Relative error of speed, and of heading in rad: what a turn adds to the uncertainty of the current, as
+    a fraction of the change of velocity."""
     bias_sigma: NotNegative = 5.0
     bias_time: Positive = 21_600.0
     """`bias_sigma`, `bias_time`: nT and s: the error that the calibration leaves, and its correlation time.
