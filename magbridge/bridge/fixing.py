@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import hypot, inf
 
 from magbridge.bridge.frame import Frame
+from magbridge.field.geodesy import separation
 from magbridge.link.component import Component
 from magbridge.link.fixes import Fix, Kind, widened
 from magbridge.mavlink import Message, by_id, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from magbridge.navigate.gnss import GnssMonitor, GnssState
 from magbridge.navigate.record import Reckoned
 
 __all__ = ["FIX_3D", "Fixing", "Gps"]
@@ -22,6 +24,13 @@ HELD_US = 60_000_000
 ASK_US = 5_000_000
 """µs between two requests for the origin of the local frame."""
 OVERRATED = "ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
+UNUSED_US = 45_000_000
+"""µs for which the autopilot's position must differ from the fixes until that is reported."""
+MIN_DIFFERENCE_M, DIFFERENCE_SIGMA = 40.0, 4.0
+"""m, and 1-sigmas of the fix: a smaller difference from the autopilot's position is none."""
+PX4_KEEPS_CLAIM = 1, 16
+"""Version of PX4 up to which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's own uncertainty; a later one
+fuses it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""
 UNANSWERED = 3
 """Commands in a row without an answer before that is told."""
 HINTS = {
@@ -38,9 +47,9 @@ class Gps:
         self._last_us = self._since_us = -LONGEST_US
         self._allowed_us = 0
 
-    def receive(self, message: Message, time_us: int) -> bool:
-        """Take in a GPS_RAW_INT; return whether it holds a position."""
-        good: bool = message["fix_type"] >= FIX_3D
+    def receive(self, message: Message, time_us: int, *, used: bool = True) -> bool:
+        """Process a GPS_RAW_INT; return whether it has a position that is used."""
+        good: bool = message["fix_type"] >= FIX_3D and used
         if not good:
             self._allowed_us = 0
             return False
@@ -70,6 +79,8 @@ class Fixing:
     component : Component
     frame : Frame
         Has heard each message before.
+    gnss : GnssMonitor
+        Has tested each GPS position before.
 
     Attributes
     ----------
@@ -80,14 +91,23 @@ class Fixing:
         Number of fixes, and of answers.
     """
 
-    def __init__(self, kind: Kind, component: Component, frame: Frame) -> None:
+    def __init__(self, kind: Kind, component: Component, frame: Frame, gnss: GnssMonitor) -> None:
         self.gps, self.stack = Gps(), int(MAV_AUTOPILOT.GENERIC)
         self.sent = self.accepted = self.refused = 0
         self._kind, self._component, self._frame = kind, component, frame
+        self._gnss = gnss
+        self._position_us = -LONGEST_US  # when the receiver last sent a position, used or not
+        self._reported_unused = False
+        self._version: tuple[int, int] | None = None  # of the autopilot's firmware
+        self._last: Fix | None = None
+        self._agreed_us = 0  # when the autopilot's position was last that of our fixes
         self._before_us: int | None = None
         self._waiting = 0
         self._reboots = component.vehicle.reboots
-        self._handlers = by_id(COMMAND_ACK=self._answer, GPS_RAW_INT=self._gps, HEARTBEAT=self._heartbeat)
+        self._handlers = by_id(
+            AUTOPILOT_VERSION=self._read_version, COMMAND_ACK=self._answer,
+            GLOBAL_POSITION_INT=self._compare, GPS_RAW_INT=self._gps, HEARTBEAT=self._heartbeat,
+        )  # fmt: skip
         if kind.local:
             component.timers.every("origin", ASK_US, self._ask_origin, component.codec.now_us)
 
@@ -96,8 +116,14 @@ class Fixing:
         """Whether a fix leaves the autopilot's velocity alone: ArduPilot's setLatLng does, PX4 does not."""
         return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4
 
+    @property
+    def is_fused(self) -> bool:
+        """Return True if the autopilot fuses a fix with what it knows, so that it must be widened."""
+        replaced = self._version is not None and self._version <= PX4_KEEPS_CLAIM
+        return self._kind.fused or (self.stack == MAV_AUTOPILOT.PX4 and not replaced)
+
     def receive(self, message: Message, time_us: int) -> None:
-        """Take in a message of the autopilot."""
+        """Process a message of the autopilot."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 
@@ -106,28 +132,29 @@ class Fixing:
         now_us = self._component.codec.now_us
         fix = self._fix(at, resets, now_us)
         if isinstance(fix, str):
-            self._before_us = None
+            self._before_us = self._last = None
             self._report_none(fix)
             return False
-        if self._kind.fused:
+        if self._last is None:
+            self._agreed_us = now_us
+        self._last = fix
+        if self.is_fused:
             since_us = inf if self._before_us is None else now_us - self._before_us
             fix = widened(fix, since_us * 1e-6)
         self._before_us = now_us
         self._kind.send(self._component.outbox, fix, *self._component.peer)
         self.sent += 1
-        self._state("fixes go to the autopilot: GPS is lost")
+        rejected = self._gnss.state is GnssState.REJECTED and self._has_gps(now_us)
+        self._state(f"fixes go to the autopilot: GPS is {'rejected' if rejected else 'lost'}")
         if not self._kind.fused:
             self._await_answer()
         return True
 
     def _fix(self, at: Reckoned | None, resets: int, now_us: int) -> Fix | str:
         """Return the fix, or the reason why there is none."""
-        if self.stack in self._kind.refused_by:
-            return self._kind.refused_by[self.stack]
-        if self.gps.good(now_us):
-            return "GPS is good"
-        if at is None:
-            return "no valid position"
+        unwanted = self._unwanted(now_us)
+        if unwanted or at is None:
+            return unwanted or "no valid position"
         pose = self._frame.pose(now_us, at.latitude, at.longitude) if self._kind.local else None
         if isinstance(pose, str):
             return pose
@@ -145,6 +172,15 @@ class Fixing:
         if self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._kind.overrated(fix):
             return OVERRATED
         return fix
+
+    def _unwanted(self, now_us: int) -> str:
+        """Return the reason why the autopilot needs or takes no fix; empty if it does."""
+        if self.stack in self._kind.refused_by:
+            return self._kind.refused_by[self.stack]
+        if self.gps.good(now_us):
+            return "GPS is good"
+        suspect = self._gnss.state is GnssState.SUSPECT and self._has_gps(now_us)
+        return "GPS is suspect" if suspect else ""
 
     def _await_answer(self) -> None:
         """Count a fix that the autopilot has not yet answered; tell where it answers none."""
@@ -167,12 +203,42 @@ class Fixing:
         text = f"the autopilot refuses fixes: {name}{HINTS.get(result, '')}"
         self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
 
+    def _compare(self, message: Message, time_us: int) -> None:
+        """Compare the autopilot's position with the last fix, and report if they differ for long."""
+        if self._last is None or self._before_us is None:
+            return
+        own = message["lat"] * 1e-7, message["lon"] * 1e-7
+        distance = hypot(*separation(self._last.latitude, self._last.longitude, *own))
+        if distance < MIN_DIFFERENCE_M + DIFFERENCE_SIGMA * self._last.sigma:
+            self._agreed_us = time_us
+            self._component.announcer.forget("use")
+        elif time_us - self._agreed_us > UNUSED_US:
+            text = f"the autopilot does not use the fixes: its position is {distance:.0f} m off"
+            # one text for one state, whatever the distance is
+            if not self._reported_unused:
+                self._component.announcer.state("use", text, MAV_SEVERITY.WARNING)
+        self._reported_unused = distance >= MIN_DIFFERENCE_M and time_us - self._agreed_us > UNUSED_US
+
+    def _read_version(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
+        version = message["flight_sw_version"]
+        if version:
+            self._version = version >> 24, version >> 16 & 0xFF
+
+    def _has_gps(self, time_us: int) -> bool:
+        """Return True if the receiver sends positions, used or not."""
+        return time_us - self._position_us < LONGEST_US
+
     def _gps(self, message: Message, time_us: int) -> None:
-        if self.gps.receive(message, time_us) and self._before_us is not None:
-            self._before_us = None
+        if message["fix_type"] >= FIX_3D:
+            self._position_us = time_us
+        used = self._gnss.state in (GnssState.NONE, GnssState.GOOD)
+        if self.gps.receive(message, time_us, used=used) and self._before_us is not None:
+            self._before_us = self._last = None
             self._report_none("GPS is good")
 
-    def _heartbeat(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
+    def _heartbeat(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
+        if self.stack != message["autopilot"] and self._version is None:
+            self._request("AUTOPILOT_VERSION")
         self.stack = message["autopilot"]
 
     def _ask_origin(self, time_us: int) -> None:  # noqa: ARG002 - a timer's action
@@ -180,14 +246,18 @@ class Fixing:
         if component.vehicle.reboots != self._reboots:
             self._reboots, self._frame.origin = component.vehicle.reboots, None
         if self._frame.origin is None:
-            system, autopilot = component.peer
-            component.outbox.send(
-                "COMMAND_LONG",
-                command=MAV_CMD.REQUEST_MESSAGE,
-                param1=float(spec("GPS_GLOBAL_ORIGIN").id),
-                target_system=system,
-                target_component=autopilot,
-            )
+            self._request("GPS_GLOBAL_ORIGIN")
+
+    def _request(self, name: str) -> None:
+        """Ask the autopilot for one message."""
+        system, autopilot = self._component.peer
+        self._component.outbox.send(
+            "COMMAND_LONG",
+            command=MAV_CMD.REQUEST_MESSAGE,
+            param1=float(spec(name).id),
+            target_system=system,
+            target_component=autopilot,
+        )
 
     def _report_none(self, reason: str) -> None:
         wanted = "GPS" not in reason

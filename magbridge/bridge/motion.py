@@ -28,6 +28,13 @@ GLIDING_US = 600_000_000
 """µs since the vehicle was last steep, for which it counts as a glider."""
 LEARNING = 0.1
 """Share of each new speed in the mean that is kept for when nothing else is known."""
+EQUAL_M_S = 0.011
+"""m/s: an airspeed this near to the speed over ground is that speed (``GCS_Common.cpp``, vfr_hud_airspeed, of
+a vehicle without an airspeed sensor). GPS_RAW_INT has steps of 0.01 m/s."""
+MIN_EQUAL = 5
+"""Number of such speeds in a row until that is reported."""
+VELOCITY_HORIZ, CONST_POS_MODE = 2, 128
+"""Flags of EKF_STATUS_REPORT, and of ESTIMATOR_STATUS: the velocity holds; the position is only held."""
 JUMP = 10.0
 """m: a step in a position that its own velocity does not explain by more than that is a reset."""
 
@@ -65,23 +72,28 @@ class Motion:
     source : Source
     fed_back : bool
         Our fixes are in the autopilot's position.
+    gps_trusted : bool
+        No GPS position that was rejected is in the autopilot's position.
     """
 
     def __init__(
         self, navigator: Navigator, component: Component, frame: Frame, velocity_stays: Callable[[], bool]
     ) -> None:
-        self.source, self.fed_back = Source.NONE, False
+        self.source, self.fed_back, self.gps_trusted = Source.NONE, False, True
         self._navigator, self._component, self._frame = navigator, component, frame
         self._velocity_stays = velocity_stays
         self._received_us = 0
         self._heading = self._pitch = self._last = nan
         self._steep_us = -GLIDING_US
+        self._ground_speed, self._equal = nan, 0  # m/s, by GPS; airspeeds in a row that were equal to it
+        self._unvouched_us = -FRESH_US  # when the autopilot last reported that its velocity does not hold
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
         self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
         self._jumps = 0.0, 0.0
         self._measured: set[tuple[int, int]] = set()  # streams with a velocity that is not always zero
         self._handlers = by_id(
-            ATTITUDE=self._attitude, GLOBAL_POSITION_INT=self._global, LOCAL_POSITION_NED=self._local,
+            ATTITUDE=self._attitude, EKF_STATUS_REPORT=self._vouch, ESTIMATOR_STATUS=self._vouch,
+            GLOBAL_POSITION_INT=self._global, GPS_RAW_INT=self._gps, LOCAL_POSITION_NED=self._local,
             ODOMETRY=self._odometry, VFR_HUD=self._speed,
         )  # fmt: skip
 
@@ -116,10 +128,29 @@ class Motion:
 
     def _speed(self, message: Message, time_us: int) -> None:
         speed = message["airspeed"]  # 0 of a vehicle that does not measure it
-        if speed > 0.0 and isfinite(self._heading):
+        is_ground = min(abs(speed - message["groundspeed"]), abs(speed - self._ground_speed)) < EQUAL_M_S
+        if is_ground and speed > 0.0:
+            text = "VFR_HUD.airspeed is the speed over ground: not used"
+            self._equal += 1
+            if self._equal >= MIN_EQUAL:
+                self._component.announcer.state("airspeed", text, MAV_SEVERITY.WARNING)
+        elif speed > 0.0 and isfinite(self._heading):
+            self._equal = 0
             self._last = speed
+            # a source that is followed already has the heading, from the time of its report
+            heading = nan if self.source is Source.SPEED else self._heading
             if self._use(Source.SPEED, time_us, "heading and speed through the water or air"):
-                self._pass(time_us, heading=self._heading, pitch=self._pitch, speed=speed)
+                self._pass(time_us, heading=heading, pitch=self._pitch, speed=speed)
+
+    def _gps(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
+        self._ground_speed = message["vel"] * 1e-2
+
+    def _vouch(self, message: Message, time_us: int) -> None:
+        """Use the autopilot's report on whether its velocity holds."""
+        if message.component == self._component.peer[1]:
+            flags = message["flags"]
+            holds = flags & VELOCITY_HORIZ and not flags & CONST_POS_MODE
+            self._unvouched_us = -FRESH_US if holds else time_us
 
     def _global(self, message: Message, time_us: int) -> None:
         self._pass(time_us, depth=self._frame.depth(time_us))
@@ -146,6 +177,8 @@ class Motion:
     ) -> None:
         """Take in an estimate of position (m, north and east) and velocity (m/s)."""
         stream, own = (message.component, message.id), message.component == self._component.peer[1]
+        if own and (not self.gps_trusted or time_us - self._unvouched_us < FRESH_US):
+            return
         if isfinite(hypot(*velocity)) and velocity != (0.0, 0.0):
             self._measured.add(stream)
             if own and not self.fed_back:

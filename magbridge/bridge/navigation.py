@@ -23,13 +23,14 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.navigate import Navigator, Options, Record, State
 from magbridge.navigate.depth import at_depth
+from magbridge.navigate.gnss import GnssReason, GnssState
 from magbridge.navigate.options import informed
 from magbridge.records import Corrected
 from magbridge.toml import convert
 
 __all__ = ["Navigation", "open_navigation"]
 
-GPS = spec("GPS_RAW_INT").id
+GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
 WORDS = {
     State.OFF: "waiting for a first position",
     State.SEARCHING: "searching",
@@ -38,6 +39,15 @@ WORDS = {
     State.LOST: "lost: the field and the map disagree",
 }
 
+GPS_REASONS = {
+    GnssReason.SPOOFING: "the receiver reports spoofing",
+    GnssReason.JAMMING: "the receiver reports jamming",
+    GnssReason.FROZEN: "its position stays the same while the vehicle moves",
+    GnssReason.JUMP: "its position jumps",
+    GnssReason.POSITION: "it differs from the navigator's position",
+    GnssReason.DRIFT: "it drifts away from the navigator's position",
+    GnssReason.FIELD: "the map does not describe the field at its position",
+}
 
 ALIKE = (
     *("covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate"),
@@ -62,8 +72,9 @@ class Navigation:
         self.navigator = Navigator(grid, options)
         self._component = component
         self._frame = Frame()
-        self.fixing = Fixing(fix, component, self._frame)
+        self.fixing = Fixing(fix, component, self._frame, self.navigator.gnss)
         self.motion = Motion(self.navigator, component, self._frame, lambda: self.fixing.velocity_stays)
+        self._gnss_state = GnssState.GOOD
         self._with_updates = fix.rate == 0.0
         if not self._with_updates:
             now_us = component.codec.now_us
@@ -73,12 +84,17 @@ class Navigation:
 
     def receive(self, message: Message, time_us: int) -> None:
         """Pass on the vehicle's motion, or its position at the surface, from a message to the navigator."""
+        if message.id == INTEGRITY:
+            states = message["jamming_state"], message["spoofing_state"]
+            self.navigator.gnss.receive_integrity(time_us, *states)
+        elif message.id == GPS:
+            self._gps(message, time_us)
         if message.component == self._component.peer[1]:
             self._frame.receive(message, time_us)
             self.fixing.receive(message, time_us)
         self.motion.receive(message, time_us)
-        if message.id == GPS:
-            self._gps(message, time_us)
+        if message.id == GPS and self._with_updates and not self.fixing.gps.good(time_us):
+            self._send()  # the first fix does not wait for the next update
 
     def sample(self, time_us: int, corrected: Corrected) -> None:
         """Take a corrected sample."""
@@ -86,13 +102,23 @@ class Navigation:
         self._notify(self.navigator.sample(time_us, corrected))
 
     def _gps(self, message: Message, time_us: int) -> None:
-        if message["fix_type"] < FIX_3D:
+        if message["fix_type"] < FIX_3D or not (message["lat"] or message["lon"]):
             return
-        if self.fixing.gps.held(time_us):
-            self.motion.gps_held()
         latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
         accuracy = message["h_acc"] * 1e-3
-        self._notify(self.navigator.fix(time_us, latitude, longitude, accuracy if accuracy > 0.0 else None))
+        sigma = accuracy if accuracy > 0.0 else None
+        self._notify(self.navigator.gnss_position(time_us, latitude, longitude, sigma))
+        gnss = self.navigator.gnss
+        if gnss.state is GnssState.GOOD and self.fixing.gps.held(time_us):
+            self.motion.gps_held()
+        self.motion.gps_trusted = gnss.state is GnssState.GOOD
+        if gnss.state is not self._gnss_state:
+            self._gnss_state = gnss.state
+            text, severity = "GPS good", MAV_SEVERITY.INFO
+            if gnss.state is not GnssState.GOOD:
+                word = gnss.state.name.lower()
+                text, severity = f"GPS {word}: {GPS_REASONS[gnss.reason]}", MAV_SEVERITY.WARNING
+            self._component.announcer.state("gps", text, severity)
 
     def _notify(self, record: Record | None) -> None:
         """Send an update; and a fix, if fixes have no rate of their own."""
@@ -113,6 +139,8 @@ class Navigation:
                 **{name: getattr(record, name) for name in ALIKE},
                 state=int(record.state),
                 accepted=int(record.accepted),
+                gps_state=int(self.navigator.gnss.state),
+                gps_reason=int(self.navigator.gnss.reason),
             )
         if self._with_updates:
             self._send()

@@ -454,6 +454,42 @@ enums["MAG_NAVIGATION_STATE"][4] = EnumEntry("MAG_NAVIGATION_STATE_LOST", """The
 MAG_NAVIGATION_STATE_ENUM_END = 5
 enums["MAG_NAVIGATION_STATE"][5] = EnumEntry("MAG_NAVIGATION_STATE_ENUM_END", """""")
 
+# MAG_GPS_STATE
+enums["MAG_GPS_STATE"] = Enum()
+enums["MAG_GPS_STATE"].bitmask = False
+MAG_GPS_STATE_NONE = 0
+enums["MAG_GPS_STATE"][0] = EnumEntry("MAG_GPS_STATE_NONE", """No position yet.""")
+MAG_GPS_STATE_GOOD = 1
+enums["MAG_GPS_STATE"][1] = EnumEntry("MAG_GPS_STATE_GOOD", """They are used.""")
+MAG_GPS_STATE_SUSPECT = 2
+enums["MAG_GPS_STATE"][2] = EnumEntry("MAG_GPS_STATE_SUSPECT", """They are not used, but could be right.""")
+MAG_GPS_STATE_REJECTED = 3
+enums["MAG_GPS_STATE"][3] = EnumEntry("MAG_GPS_STATE_REJECTED", """They are wrong and not used.""")
+MAG_GPS_STATE_ENUM_END = 4
+enums["MAG_GPS_STATE"][4] = EnumEntry("MAG_GPS_STATE_ENUM_END", """""")
+
+# MAG_GPS_REASON
+enums["MAG_GPS_REASON"] = Enum()
+enums["MAG_GPS_REASON"].bitmask = False
+MAG_GPS_REASON_NONE = 0
+enums["MAG_GPS_REASON"][0] = EnumEntry("MAG_GPS_REASON_NONE", """They are used.""")
+MAG_GPS_REASON_SPOOFING = 1
+enums["MAG_GPS_REASON"][1] = EnumEntry("MAG_GPS_REASON_SPOOFING", """The receiver reports spoofing.""")
+MAG_GPS_REASON_JAMMING = 2
+enums["MAG_GPS_REASON"][2] = EnumEntry("MAG_GPS_REASON_JAMMING", """The receiver reports jamming.""")
+MAG_GPS_REASON_FROZEN = 3
+enums["MAG_GPS_REASON"][3] = EnumEntry("MAG_GPS_REASON_FROZEN", """The position stays the same while the vehicle moves.""")
+MAG_GPS_REASON_JUMP = 4
+enums["MAG_GPS_REASON"][4] = EnumEntry("MAG_GPS_REASON_JUMP", """The position jumps.""")
+MAG_GPS_REASON_POSITION = 5
+enums["MAG_GPS_REASON"][5] = EnumEntry("MAG_GPS_REASON_POSITION", """It differs from the position of the filter.""")
+MAG_GPS_REASON_DRIFT = 6
+enums["MAG_GPS_REASON"][6] = EnumEntry("MAG_GPS_REASON_DRIFT", """It drifts away from the position of the filter.""")
+MAG_GPS_REASON_FIELD = 7
+enums["MAG_GPS_REASON"][7] = EnumEntry("MAG_GPS_REASON_FIELD", """The map does not describe the field at the position.""")
+MAG_GPS_REASON_ENUM_END = 8
+enums["MAG_GPS_REASON"][8] = EnumEntry("MAG_GPS_REASON_ENUM_END", """""")
+
 # MAG_LEARNING_STATE
 enums["MAG_LEARNING_STATE"] = Enum()
 enums["MAG_LEARNING_STATE"].bitmask = False
@@ -686,22 +722,22 @@ class MAVLink_mag_navigation_message(MAVLink_message):
 
     id = MAVLINK_MSG_ID_MAG_NAVIGATION
     msgname = "MAG_NAVIGATION"
-    fieldnames = ["time_usec", "lat", "lon", "covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate", "bias", "bias_sigma", "current_north", "current_east", "state", "accepted"]
-    ordered_fieldnames = ["time_usec", "lat", "lon", "covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate", "bias", "bias_sigma", "current_north", "current_east", "state", "accepted"]
-    fieldtypes = ["uint64_t", "int32_t", "int32_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint8_t", "uint8_t"]
+    fieldnames = ["time_usec", "lat", "lon", "covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate", "bias", "bias_sigma", "current_north", "current_east", "state", "accepted", "gps_state", "gps_reason"]
+    ordered_fieldnames = ["time_usec", "lat", "lon", "covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate", "bias", "bias_sigma", "current_north", "current_east", "state", "accepted", "gps_state", "gps_reason"]
+    fieldtypes = ["uint64_t", "int32_t", "int32_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint8_t", "uint8_t", "uint8_t", "uint8_t"]
     fielddisplays_by_name: Dict[str, str] = {}
-    fieldenums_by_name: Dict[str, str] = {"state": "MAG_NAVIGATION_STATE"}
+    fieldenums_by_name: Dict[str, str] = {"state": "MAG_NAVIGATION_STATE", "gps_state": "MAG_GPS_STATE", "gps_reason": "MAG_GPS_REASON"}
     fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "lat": "degE7", "lon": "degE7", "covariance_nn": "m^2", "covariance_ne": "m^2", "covariance_ee": "m^2", "innovation": "nT", "innovation_variance": "nT^2", "bias": "nT", "bias_sigma": "nT", "current_north": "m/s", "current_east": "m/s"}
-    native_format = bytearray(b"<QiiffffffffffBB")
-    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14]
-    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]
-    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]
-    crc_extra = 253
-    unpacker = struct.Struct("<QiiffffffffffBB")
+    native_format = bytearray(b"<QiiffffffffffBBBB")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]
+    crc_extra = 3
+    unpacker = struct.Struct("<QiiffffffffffBBBB")
     instance_field = None
     instance_offset = -1
 
-    def __init__(self, time_usec: int, lat: int, lon: int, covariance_nn: float, covariance_ne: float, covariance_ee: float, innovation: float, innovation_variance: float, gate: float, bias: float, bias_sigma: float, current_north: float, current_east: float, state: int, accepted: int):
+    def __init__(self, time_usec: int, lat: int, lon: int, covariance_nn: float, covariance_ne: float, covariance_ee: float, innovation: float, innovation_variance: float, gate: float, bias: float, bias_sigma: float, current_north: float, current_east: float, state: int, accepted: int, gps_state: int, gps_reason: int):
         MAVLink_message.__init__(self, MAVLink_mag_navigation_message.id, MAVLink_mag_navigation_message.msgname)
         self._fieldnames = MAVLink_mag_navigation_message.fieldnames
         self._instance_field = MAVLink_mag_navigation_message.instance_field
@@ -721,9 +757,11 @@ class MAVLink_mag_navigation_message(MAVLink_message):
         self.current_east = current_east
         self.state = state
         self.accepted = accepted
+        self.gps_state = gps_state
+        self.gps_reason = gps_reason
 
     def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
-        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.lat, self.lon, self.covariance_nn, self.covariance_ne, self.covariance_ee, self.innovation, self.innovation_variance, self.gate, self.bias, self.bias_sigma, self.current_north, self.current_east, self.state, self.accepted), force_mavlink1=force_mavlink1)
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.lat, self.lon, self.covariance_nn, self.covariance_ne, self.covariance_ee, self.innovation, self.innovation_variance, self.gate, self.bias, self.bias_sigma, self.current_north, self.current_east, self.state, self.accepted, self.gps_state, self.gps_reason), force_mavlink1=force_mavlink1)
 
 
 # Define name on the class for backwards compatibility (it is now msgname).
@@ -1877,7 +1915,7 @@ class MAVLink(object):
         """
         self.send(self.mag_status_encode(time_usec, vehicle_clock_offset, uptime, calibration_id, samples, samples_lost, sensor_bytes_skipped, sensor_frames_bad, link_frames, link_frames_lost, link_bytes_skipped, link_refused, log_records, log_lost, telemetry_stale, sample_rate, sensor_clock_drift, vehicle_clock_sigma, vehicle_clock_drift, vehicle_reboots, sensor_state, autopilot_state, log_state), force_mavlink1=force_mavlink1)
 
-    def mag_navigation_encode(self, time_usec: int, lat: int, lon: int, covariance_nn: float, covariance_ne: float, covariance_ee: float, innovation: float, innovation_variance: float, gate: float, bias: float, bias_sigma: float, current_north: float, current_east: float, state: int, accepted: int) -> MAVLink_mag_navigation_message:
+    def mag_navigation_encode(self, time_usec: int, lat: int, lon: int, covariance_nn: float, covariance_ne: float, covariance_ee: float, innovation: float, innovation_variance: float, gate: float, bias: float, bias_sigma: float, current_north: float, current_east: float, state: int, accepted: int, gps_state: int, gps_reason: int) -> MAVLink_mag_navigation_message:
         """
         One update of the position filter that compares the corrected field
         with an anomaly map.
@@ -1897,11 +1935,13 @@ class MAVLink(object):
         current_east              : Drift east, estimated. [m/s] (type:float)
         state                     : What the filter says of itself. (type:uint8_t, values:MAG_NAVIGATION_STATE)
         accepted                  : 1: the innovation was within the gate and taken in. (type:uint8_t)
+        gps_state                 : Whether the positions of the GPS receiver are used. (type:uint8_t, values:MAG_GPS_STATE)
+        gps_reason                : Why they are not used. (type:uint8_t, values:MAG_GPS_REASON)
 
         """
-        return MAVLink_mag_navigation_message(time_usec, lat, lon, covariance_nn, covariance_ne, covariance_ee, innovation, innovation_variance, gate, bias, bias_sigma, current_north, current_east, state, accepted)
+        return MAVLink_mag_navigation_message(time_usec, lat, lon, covariance_nn, covariance_ne, covariance_ee, innovation, innovation_variance, gate, bias, bias_sigma, current_north, current_east, state, accepted, gps_state, gps_reason)
 
-    def mag_navigation_send(self, time_usec: int, lat: int, lon: int, covariance_nn: float, covariance_ne: float, covariance_ee: float, innovation: float, innovation_variance: float, gate: float, bias: float, bias_sigma: float, current_north: float, current_east: float, state: int, accepted: int, force_mavlink1: bool = False) -> None:
+    def mag_navigation_send(self, time_usec: int, lat: int, lon: int, covariance_nn: float, covariance_ne: float, covariance_ee: float, innovation: float, innovation_variance: float, gate: float, bias: float, bias_sigma: float, current_north: float, current_east: float, state: int, accepted: int, gps_state: int, gps_reason: int, force_mavlink1: bool = False) -> None:
         """
         One update of the position filter that compares the corrected field
         with an anomaly map.
@@ -1921,9 +1961,11 @@ class MAVLink(object):
         current_east              : Drift east, estimated. [m/s] (type:float)
         state                     : What the filter says of itself. (type:uint8_t, values:MAG_NAVIGATION_STATE)
         accepted                  : 1: the innovation was within the gate and taken in. (type:uint8_t)
+        gps_state                 : Whether the positions of the GPS receiver are used. (type:uint8_t, values:MAG_GPS_STATE)
+        gps_reason                : Why they are not used. (type:uint8_t, values:MAG_GPS_REASON)
 
         """
-        self.send(self.mag_navigation_encode(time_usec, lat, lon, covariance_nn, covariance_ne, covariance_ee, innovation, innovation_variance, gate, bias, bias_sigma, current_north, current_east, state, accepted), force_mavlink1=force_mavlink1)
+        self.send(self.mag_navigation_encode(time_usec, lat, lon, covariance_nn, covariance_ne, covariance_ee, innovation, innovation_variance, gate, bias, bias_sigma, current_north, current_east, state, accepted, gps_state, gps_reason), force_mavlink1=force_mavlink1)
 
     def mag_sensor_bytes_encode(self, sensor_id: int, length: int, data: Sequence[int]) -> MAVLink_mag_sensor_bytes_message:
         """

@@ -10,8 +10,8 @@ from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.deadreckoning import MotionNoise
+from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
 from magbridge.navigate.options import Options, any_level
 from magbridge.navigate.record import Jump, State
@@ -55,8 +55,12 @@ class Estimate:
         F and Q of the last prediction, for a smoother.
     jumps : list of Jump
         Restarts of the estimate, across which a smoother must not look.
-    log_likelihoods : tuple of float
-        Of the last measurement on the map: by the filter, and by a field unrelated to the map.
+    alone : ndarray, (4, 4)
+        Covariance of position and current by dead reckoning alone, since the start or the last fix.
+    travelled : float
+        m through the water until `time_us`.
+    motion : MotionNoise
+        Uncertainty of the dead-reckoned motion until then.
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options) -> None:
@@ -66,20 +70,19 @@ class Estimate:
         self.valid = False
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
-        self.time_us, self._travelled, self._motion = 0, 0.0, NO_MOTION_NOISE
+        self.time_us, self.travelled, self.motion = 0, 0.0, NO_MOTION_NOISE
         self._filter: Tracker | Bank | None = None
         self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
         self._nowhere = 0.0
         self._resolution = inf
-        self._alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
+        self.alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
         self._level: tuple[float, int] | None = None  # nT², the bias's variance at a known place; µs, then
         self._lost = False
         self._searches = 0
         self._confirmed = False  # competing filters that began wider have come to the same place
         self._described = False  # the map has described the field
         self._fixed = False  # the place is that of a fix
-        self.log_likelihoods = 0.0, 0.0
 
     @property
     def begun(self) -> bool:
@@ -100,7 +103,7 @@ class Estimate:
         """Begin at the dead-reckoned position, known to `sigma` m on each axis."""
         self.time_us = time_us
         self.x, self.P = prior(self.options, sigma)
-        self._alone = self.P[:4, :4].copy()
+        self.alone = self.P[:4, :4].copy()
         self._confirmed = sigma >= self._reach()
         self.state = State.SEARCHING
 
@@ -130,7 +133,7 @@ class Estimate:
             self._filter.update_position(float(there[0]), float(there[1]), fused_sigma or sigma)
             self._read()
         self._confirmed = self._fixed = True
-        self._alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
+        self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def widen(self, metres: float) -> None:
         """Add `metres` (1-sigma, each axis) to the position: a fix that was fused was wrong by as much."""
@@ -140,7 +143,7 @@ class Estimate:
         Q[0, 0] = Q[1, 1] = metres**2
         Q[2, 2] = Q[3, 3] = 0.25 * self.options.current_sigma**2
         self._filter.predict(np.eye(len(Q)), Q)
-        self._alone += Q[:4, :4]
+        self.alone += Q[:4, :4]
         self._read()
 
     def update(self, block: Block, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> Innovation:
@@ -149,12 +152,13 @@ class Estimate:
         Parameters
         ----------
         block : Block
+            Samples averaged to one measurement.
         travelled : float
             m through the water since the start.
         motion : MotionNoise
             Uncertainty of the dead-reckoned motion since the start.
         """
-        before = self._motion
+        before = self.motion
         seconds, metres = self.predict(block.time_us, travelled, motion)
         finer = resolution(self.grid, self.options, block.variance)
         if finer < FINER * self._resolution:  # never coarser: a first block may have been a poor one
@@ -167,7 +171,7 @@ class Estimate:
         self._read()
         on_the_map = isfinite(seen.anomaly)
         if on_the_map:
-            if widest(self._alone) < self._resolution:
+            if widest(self.alone) < self._resolution:
                 self._level = float(self.P[4, 4]), block.time_us
             self._judge(block, seconds, metres, motion.since(before), seen.log_likelihood)
         self._choose(on_the_map)
@@ -180,10 +184,10 @@ class Estimate:
         self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE
     ) -> tuple[float, float]:
         """Propagate to `time_us`, `travelled` m after the start; return the seconds and metres passed."""
-        seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self._travelled
-        F, Q = transition(self.options, seconds, metres, motion.since(self._motion))
-        self.time_us, self._travelled, self._motion = time_us, travelled, motion
-        self._alone = F[:4, :4] @ self._alone @ F[:4, :4].T + Q[:4, :4]
+        seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self.travelled
+        F, Q = transition(self.options, seconds, metres, motion.since(self.motion))
+        self.time_us, self.travelled, self.motion = time_us, travelled, motion
+        self.alone = F[:4, :4] @ self.alone @ F[:4, :4].T + Q[:4, :4]
         self.moved = F, Q
         if self._filter is None:
             self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
@@ -200,7 +204,7 @@ class Estimate:
         Q[2, 2] = Q[3, 3] = self.options.current_sigma**2
         for one in (self._filter, *banks):
             one.predict(np.eye(len(Q)), Q)
-        self._alone += Q[:4, :4]
+        self.alone += Q[:4, :4]
         self._read()
 
     def _take_in(self, block: Block) -> Innovation:
@@ -235,7 +239,7 @@ class Estimate:
 
     def _jump(self, x: FloatArray, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
-        self.jumps.append(Jump(self.time_us, north, east, widest(self._alone), cause))
+        self.jumps.append(Jump(self.time_us, north, east, widest(self.alone), cause))
         self._monitor, self._confirmed, self._fixed = None, False, False
 
     def _judge(
@@ -244,7 +248,6 @@ class Estimate:
         """Compare the filter with competing ones, and replace it if one of them has won."""
         assert self._filter is not None
         unmapped = self._unmapped.update(block, seconds, metres, self._filter.curvature_variance)
-        self.log_likelihoods = likelihood, unmapped
         self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
         if self._nowhere > log(self.options.doubt):
             self._search_anew()
@@ -297,7 +300,7 @@ class Estimate:
         self.options = any_level(self.options, self.grid)
         self._unmapped = Unmapped(self.grid, self.options)
         x, P = prior(self._claimed)
-        P[:4, :4] = self._alone
+        P[:4, :4] = self.alone
         P[:2, :2] += (self._reach() * SPREADS[self._searches % len(SPREADS)]) ** 2 * np.eye(2)
         self._searches += 1
         self._jump(x, Verdict.NOWHERE.value)
@@ -312,12 +315,17 @@ class Estimate:
     def _reach(self) -> float:
         """Return the 1-sigma (m) of the places around the filter that competing filters start from."""
         length = self.grid.correlation_length * (0.5 if self._confirmed else 1.0)
-        return max(REACH, widest(self._alone), min(length, 5.0 * REACH))
+        return max(REACH, widest(self.alone), min(length, 5.0 * REACH))
+
+    @property
+    def informed(self) -> bool:
+        """Whether the field has improved the position of dead reckoning alone."""
+        return widest(self.P) <= UNINFORMED * widest(self.alone)
 
     def _near_fix(self) -> bool:
         """Return True if a fix, and dead reckoning since, give the place as well as the map could."""
         limit = min(0.25 * self.grid.correlation_length, self.options.sigma_limit)
-        return self._fixed and self._described and widest(self._alone) <= limit
+        return self._fixed and self._described and widest(self.alone) <= limit
 
     def _choose(self, on_the_map: bool) -> None:
         """Change between a bank and one tracker if the width demands it; set the state."""
@@ -333,7 +341,7 @@ class Estimate:
             self.state = State.SEARCHING
         elif self._near_fix():
             self.state = State.TRACKING
-        elif not on_the_map or width > UNINFORMED * widest(self._alone):
+        elif not on_the_map or not self.informed:
             self.state = State.DEAD_RECKONING
         else:
             self.state = State.TRACKING

@@ -143,9 +143,7 @@ class IntegrityMonitor:
         self.odds = 0.0
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
-    def step(
-        self, block: Block, metres: float, motion: MotionNoise, x: FloatArray, P: FloatArray
-    ) -> Verdict:
+    def step(self, block: Block, metres: float, motion: MotionNoise, x: FloatArray, P: FloatArray) -> Verdict:
         """Update both banks with a block `metres` after the previous one, and compare them.
 
         They are compared with the filter's estimate after that block: `x` (6,) and its covariance `P`

@@ -87,6 +87,7 @@ def transition(
     Parameters
     ----------
     options : Options
+        Of the navigator.
     seconds, metres : float
         Time, and distance through the water.
     motion : MotionNoise, optional

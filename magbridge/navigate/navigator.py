@@ -22,6 +22,7 @@ from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.depth import lasting_errors
 from magbridge.navigate.estimate import Estimate
+from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
 from magbridge.navigate.model import Block, block_length, transition
 from magbridge.navigate.options import Options
 from magbridge.navigate.record import Reckoned, Record, State
@@ -41,6 +42,8 @@ class Navigator:
     ----------
     estimate : Estimate
         The position around the dead-reckoned track, and whether to trust it.
+    gnss : GnssMonitor
+        Whether the positions of the receiver are used.
     dropped : int
         Number of samples that were dropped because they came out of time order.
     utc_offset_us : int
@@ -50,6 +53,7 @@ class Navigator:
     def __init__(self, grid: AnomalyGrid, options: Options | None = None) -> None:
         grid, options = lasting_errors(grid, options or Options())
         self.estimate = Estimate(grid, options)
+        self.gnss = GnssMonitor(grid, options)
         self.dropped = self.utc_offset_us = 0
         self._reckoning = DeadReckoning()
         self._collector = Collector(options, block_length(grid))
@@ -69,21 +73,65 @@ class Navigator:
         sigma : float, optional
             m, each axis; default ``options.start_sigma``.
         """
+        return self._correct(time_us, (latitude, longitude), sigma, None)
+
+    def gnss_position(
+        self, time_us: int, latitude: float, longitude: float, sigma: float | None = None
+    ) -> Record | None:
+        """Test a position of a GNSS receiver, use it if it is good; return the update that it completes.
+
+        Parameters as in :meth:`fix`; :attr:`gnss` has the result of the test.
+        """
         if not (isfinite(latitude) and isfinite(longitude)):
             return None
-        sigma = self.estimate.options.start_sigma if sigma is None else sigma
+        place, monitor, estimate = (latitude, longitude), self.gnss, self.estimate
+        known = estimate.options.start_sigma if sigma is None else sigma
         self._reckoning.advance(time_us * 1e-6)
+        if not estimate.begun:
+            # nothing to compare with: only the receiver's own report counts
+            nothing = Prediction(
+                np.zeros(2), np.eye(2) * 1e12, np.eye(2) * 1e12, 0.0, 0.0, lost=False, informed=False
+            )
+            state = monitor.check(time_us, place, (0.0, 0.0), known, nothing)
+        else:
+            where = self._reckoning
+            away = separation(where.latitude, where.longitude, latitude, longitude)
+            was_good = monitor.state is GnssState.GOOD
+            state = monitor.check(time_us, place, away, known, self._prediction(time_us))
+            if was_good and state is not GnssState.GOOD:
+                estimate.widen(monitor.drift)
+        if state is not GnssState.GOOD:
+            return None
+        return self._correct(time_us, place, sigma, monitor.fused_sigma(time_us, known))
+
+    def _prediction(self, time_us: int) -> Prediction:
+        """Return what is known of the position at a time from the last update on."""
+        now, where = self.estimate, self._reckoning
+        F, Q = transition(now.options, max((time_us - now.time_us) * 1e-6, 0.0), 0.0)
+        P = (F @ now.P @ F.T + Q)[:2, :2]
+        alone = (F[:4, :4] @ now.alone @ F[:4, :4].T + Q[:4, :4])[:2, :2]
+        return Prediction(
+            (F @ now.x)[:2], P, alone, where.travelled, where.speed, now.state is State.LOST, now.informed
+        )
+
+    def _correct(
+        self, time_us: int, place: tuple[float, float], sigma: float | None, fused_sigma: float | None
+    ) -> Record | None:
+        """Use a position, deg; return the update that it completes."""
+        if not (isfinite(place[0]) and isfinite(place[1])):
+            return None
+        sigma = self.estimate.options.start_sigma if sigma is None else sigma
+        where = self._reckoning
+        where.advance(time_us * 1e-6)
         if not self.estimate.begun:
-            self._reckoning.place(latitude, longitude)
+            where.place(*place)
             self._collector.flush()  # drops samples that were taken at another place
             self.estimate.start(time_us, sigma)
             return None
         record = self.finish()
-        where = self._reckoning
         self.estimate.predict(time_us, where.travelled, where.noise)
-        self.estimate.correct(
-            np.array(separation(where.latitude, where.longitude, latitude, longitude)), sigma
-        )
+        there = np.array(separation(where.latitude, where.longitude, *place))
+        self.estimate.correct(there, sigma, fused_sigma)
         return record
 
     def telemetry(self, time_us: int, **values: float) -> None:
@@ -145,8 +193,12 @@ class Navigator:
         return self._reckoning.ahead(time_us * 1e-6)
 
     def _update(self, block: Block) -> Record:
-        now = self.estimate
-        seen = now.update(block, self._reckoning.travelled, self._reckoning.noise)
+        now, where = self.estimate, self._reckoning
+        before_us, travelled, noise = now.time_us, now.travelled, now.motion
+        seen = now.update(block, where.travelled, where.noise)
+        if isfinite(seen.anomaly):
+            seconds, metres = (block.time_us - before_us) * 1e-6, where.travelled - travelled
+            self.gnss.observe(block, seconds, metres, where.noise.since(noise), seen.log_likelihood)
         north, east, current_north, current_east, bias, map_error = now.x.tolist()
         latitude, longitude = offset(block.latitude, block.longitude, north, east)
         (nn, ne), (_, ee) = now.P[:2, :2].tolist()

@@ -105,7 +105,7 @@ def test_rivals_of_a_filter_that_was_confirmed_begin_half_as_far_away(
                 break
         assert estimate._monitor is not None
         spread = float(estimate._monitor.elsewhere.moments()[1][0, 0]) ** 0.5
-        alone = float(estimate._alone[0, 0]) ** 0.5
+        alone = float(estimate.alone[0, 0]) ** 0.5
         reach = max(alone, 0.5 * length) if confirmed else max(alone, length)
         assert spread == pytest.approx(hypot(reach, float(estimate.P[0, 0]) ** 0.5), rel=0.2)
 

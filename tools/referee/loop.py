@@ -42,6 +42,8 @@ class Passage(NamedTuple):
         m.
     gps : callable
         Of s since the start: whether there is reception.
+    deception : callable
+        Of s since the start: m, north and east, by which the receiver's position is wrong.
     """
 
     time: FloatArray
@@ -52,6 +54,7 @@ class Passage(NamedTuple):
     sigma: FloatArray
     depth: float
     gps: Callable[[float], bool]
+    deception: Callable[[float], tuple[float, float]] = lambda _: (0.0, 0.0)
 
 
 class Run(NamedTuple):
@@ -69,6 +72,12 @@ class Run(NamedTuple):
         m, the autopilot's 1-sigma on each axis.
     sent : ndarray, (n,)
         Number of fixes until then.
+    state : ndarray, (n,)
+        State of the bridge's navigator.
+    sigma : ndarray, (n,)
+        m, 1-sigma of its position, root mean square of both axes.
+    gnss : ndarray, (n,)
+        State of the receiver's positions by the bridge.
     texts : list of (float, str)
         s since the start, and what was announced.
     """
@@ -78,6 +87,9 @@ class Run(NamedTuple):
     autopilot: FloatArray
     claimed: FloatArray
     sent: FloatArray
+    state: FloatArray
+    sigma: FloatArray
+    gnss: FloatArray
     texts: list[tuple[float, str]]
 
 
@@ -116,10 +128,13 @@ def sail(
         component.announcer.texts.clear()
         off = separation(*truth.place, *autopilot.place)
         own, claimed = own_error(navigation, now_us, truth), autopilot.filter.sigma
-        rows.append((seconds, own, *off, claimed, navigation.fixing.sent))
+        navigator = navigation.navigator
+        sigma = float(np.sqrt(0.5 * np.trace(navigator.estimate.P[:2, :2])))
+        states = navigator.estimate.state, sigma, navigator.gnss.state
+        rows.append((seconds, own, *off, claimed, navigation.fixing.sent, *states))
     table = np.array(rows)
-    seconds, error, _, _, claimed, sent = table.T
-    return Run(seconds, error, table[:, 2:4], claimed, sent, texts), autopilot, navigation
+    seconds, error, _, _, claimed, sent, *states = table.T
+    return Run(seconds, error, table[:, 2:4], claimed, sent, *states, texts), autopilot, navigation
 
 
 def exchange(component: Component, autopilot: Autopilot) -> bytes:
@@ -149,5 +164,6 @@ def truths(passage: Passage, seed: int) -> Iterator[tuple[float, Truth]]:
     for k, second in enumerate(seconds.tolist()):
         place = float(latitude[k]), float(longitude[k])
         i = int(second / every)
-        gps = offset(*place, *noise[k].tolist()) if passage.gps(second) else None
+        wrong = noise[k] + passage.deception(second)
+        gps = offset(*place, *wrong.tolist()) if passage.gps(second) else None
         yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, passage.depth, gps)

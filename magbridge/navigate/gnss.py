@@ -1,0 +1,386 @@
+"""Integrity of GNSS positions: each is tested before the navigator uses it.
+
+A receiver that is jammed or spoofed goes on to report a 3-D fix with a small error. Its positions are tested
+against what else is known:
+
+=========== ============================================================================================
+jump        two positions differ by more than dead reckoning and its errors allow between them
+frozen      the position stays the same while the vehicle moves
+position    it differs from the navigator's position by more than both claim
+drift       the mean of that difference over 20 s is larger than the errors of both
+field       the map does not describe the measured field at the position
+spoofing,   the receiver reports it (GNSS_INTEGRITY)
+jamming
+=========== ============================================================================================
+
+All positions are relative to the dead-reckoned position, so that a difference of two positions is the error
+of dead reckoning between them, whatever the vehicle did.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import IntEnum
+from math import exp, hypot, inf, log, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.deadreckoning import MotionNoise
+from magbridge.navigate.integrity import Unmapped, squared_mahalanobis
+from magbridge.navigate.model import Block, prior, transition
+from magbridge.navigate.options import Options, any_level
+from magbridge.navigate.tracker import Tracker
+
+__all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
+
+MAX_DEVIATION_SIGMA = 5.0
+"""Deviation from a prediction on which a position is rejected: by chance in 4e-6, two degrees of freedom."""
+MIN_SIGMA_M = 1.5
+"""m: a smaller sigma of a receiver is not used, since its error changes slowly."""
+WINDOW_US = 30_000_000
+"""µs over which the motion by GNSS is compared with dead reckoning."""
+MEAN_TIME_S = 20.0
+"""s, time constant of the mean deviation from the navigator."""
+LASTING_FRACTION = 0.5
+"""Part of the receiver's sigma that a mean over MEAN_TIME_S does not reduce."""
+HOLD_US, LONG_HOLD_US = 20_000_000, 45_000_000
+"""µs for which positions must agree with each other until they are used again: if the navigator or the field
+agrees, and if neither can tell."""
+MIN_POSITIONS = 3
+"""Number of positions in that time."""
+OUTAGE_US = 60_000_000
+"""µs without a position, after which dead reckoning may be off by more than ``current_sigma`` says."""
+OUTAGE_SPEED_FRACTION = 0.1
+"""1-sigma of the velocity error after an outage, as a fraction of the speed."""
+MIN_FROZEN_M = 10.0
+"""m, that the vehicle must have moved until a constant position is frozen."""
+FRESH_US = 10_000_000
+"""µs for which a position, or a report of the receiver's, holds."""
+CORRELATION_TIME_S = 30.0
+"""s over which the errors of successive positions are alike."""
+OK_STATE, DETECTED_STATE = 1, 3
+"""GPS_JAMMING_STATE and GPS_SPOOFING_STATE: nothing found; found and not mitigated."""
+
+
+class GnssState(IntEnum):
+    """Whether the positions of the receiver are used; the values are those sent over the link."""
+
+    NONE = 0
+    """No position yet."""
+    GOOD = 1
+    """They are used."""
+    SUSPECT = 2
+    """They are not used, but could be right."""
+    REJECTED = 3
+    """They are wrong."""
+
+
+class GnssReason(IntEnum):
+    """Why positions are not used; the values are those sent over the link."""
+
+    NONE = 0
+    SPOOFING = 1
+    JAMMING = 2
+    FROZEN = 3
+    JUMP = 4
+    POSITION = 5
+    DRIFT = 6
+    FIELD = 7
+
+
+class Prediction(NamedTuple):
+    """What the navigator predicts at the time of a GNSS position, relative to dead reckoning.
+
+    Attributes
+    ----------
+    position : ndarray, (2,)
+        m, north and east.
+    covariance, alone : ndarray, (2, 2)
+        m²: of the position, and of dead reckoning since the last position that was used.
+    travelled, speed : float
+        m since the start, m/s.
+    lost, informed : bool
+        The navigator is lost; the field has improved its position.
+    """
+
+    position: FloatArray
+    covariance: FloatArray
+    alone: FloatArray
+    travelled: float
+    speed: float
+    lost: bool
+    informed: bool
+
+
+class GnssMonitor:
+    """Tests GNSS positions, in order of time.
+
+    Parameters
+    ----------
+    grid : AnomalyGrid
+    options : Options
+        Of the navigator.
+
+    Attributes
+    ----------
+    state : GnssState
+    reason : GnssReason
+        Why the positions are not used.
+    deviation : float
+        m, of the last position from the navigator's.
+    drift : float
+        m, mean deviation over the last 20 s.
+    """
+
+    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+        self.state, self.reason = GnssState.NONE, GnssReason.NONE
+        self.deviation = self.drift = 0.0
+        self._grid, self._options = grid, options
+        self._history: deque[tuple[int, float, float]] = deque()  # µs; m north and east of dead reckoning
+        self._place: tuple[float, float] | None = None
+        self._frozen_from = 0.0  # m travelled when the position was first the present one
+        self._since_us = 0  # since when the positions agree with each other
+        self._count = 0  # positions since then
+        self._chained = True  # no jump since the last position that was used
+        self._mean = np.zeros(2)
+        self._reported = GnssReason.NONE
+        self._reported_us = -FRESH_US
+        self._field = _FieldTest(grid, options)
+
+    def receive_integrity(self, time_us: int, jamming: int, spoofing: int) -> None:
+        """Use the receiver's own report, GNSS_INTEGRITY's jamming_state and spoofing_state."""
+        self._reported_us = time_us
+        if spoofing == DETECTED_STATE:
+            self._reported = GnssReason.SPOOFING
+        else:
+            self._reported = GnssReason.JAMMING if jamming == DETECTED_STATE else GnssReason.NONE
+
+    def fused_sigma(self, time_us: int, sigma: float) -> float:
+        """Return the sigma (m) with which a position is fused, given the time since the previous one.
+
+        Notes
+        -----
+        Errors of one variance σ² that are alike over τ, each Δt, count as independent ones of the variance
+        σ² (1 + τ/Δt).
+        """
+        if len(self._history) < 2:
+            return sigma
+        seconds = (time_us - self._history[-2][0]) * 1e-6
+        return sigma * sqrt(1.0 + CORRELATION_TIME_S / max(seconds, 0.05))
+
+    def check(
+        self,
+        time_us: int,
+        place: tuple[float, float],
+        offset_m: tuple[float, float],
+        sigma: float,
+        prediction: Prediction,
+    ) -> GnssState:
+        """Test a position and return the state.
+
+        Parameters
+        ----------
+        time_us : int
+            µs of event time.
+        place : tuple of float
+            Latitude and longitude, deg.
+        offset_m : tuple of float
+            m, north and east of the dead-reckoned position.
+        sigma : float
+            m, 1-sigma on each axis.
+        prediction : Prediction
+            Of the navigator, at this time.
+        """
+        sigma = max(sigma, MIN_SIGMA_M)
+        jumped = self._jumps(time_us, offset_m, sigma, prediction.speed)
+        frozen = self._frozen(place, sigma, prediction.travelled)
+        self._field.move(time_us, offset_m, sigma, restart=jumped)
+        away = np.array(offset_m) - prediction.position
+        self.deviation = hypot(*away.tolist())
+        agrees = self._agrees(away, sigma, prediction)
+        drifts = self._drifts(time_us, away, sigma, prediction)
+        if self.state is GnssState.NONE:
+            self.state = GnssState.GOOD
+        if reported := self._receiver_reports(time_us):
+            spoofed = reported is GnssReason.SPOOFING
+            self._set(GnssState.REJECTED if spoofed else GnssState.SUSPECT, reported, time_us)
+        elif frozen:
+            self._set(GnssState.REJECTED, GnssReason.FROZEN, time_us)
+        elif jumped:
+            self._set(GnssState.REJECTED, GnssReason.JUMP, time_us)
+        elif self.state is GnssState.GOOD:
+            self._leave_good(time_us, agrees=agrees, drifts=drifts, lost=prediction.lost)
+        elif self._returns(time_us, agrees, prediction):
+            self.state, self.reason, self._chained = GnssState.GOOD, GnssReason.NONE, True
+            self._mean, self.drift = np.zeros(2), 0.0
+        elif not agrees and prediction.informed:
+            self.state = GnssState.REJECTED
+        return self.state
+
+    def observe(
+        self, block: Block, seconds: float, metres: float, motion: MotionNoise, filter_likelihood: float
+    ) -> None:
+        """Compare a measurement of the field with the map at the last position.
+
+        Parameters
+        ----------
+        block : Block
+            Samples averaged to one measurement.
+        seconds, metres : float
+            Since the previous one.
+        motion : MotionNoise
+            Of that time.
+        filter_likelihood : float
+            Log-likelihood by the navigator's filter.
+        """
+        self._field.update(block, seconds, metres, motion, filter_likelihood)
+
+    # ---- single tests --------------------------------------------------------------------------------
+
+    def _jumps(self, time_us: int, offset_m: tuple[float, float], sigma: float, speed: float) -> bool:
+        """Compare with the previous position, and with that of WINDOW_US ago."""
+        history = self._history
+        while len(history) > 1 and time_us - history[0][0] > WINDOW_US:
+            history.popleft()
+        o = self._options
+        jumped = False
+        for then_us, north, east in (history[-1], history[0]) if history else ():
+            seconds = (time_us - then_us) * 1e-6
+            velocity_error = hypot(o.current_sigma, o.motion_error * speed)
+            if time_us - then_us > OUTAGE_US:
+                velocity_error = max(velocity_error, OUTAGE_SPEED_FRACTION * speed)
+            error = hypot(sqrt(2.0) * sigma, velocity_error * seconds, o.drift * sqrt(max(seconds, 0.0)))
+            distance = hypot(offset_m[0] - north, offset_m[1] - east)
+            jumped |= distance > MAX_DEVIATION_SIGMA * error
+        if jumped:
+            history.clear()
+            self._since_us, self._count, self._chained = time_us, 0, False
+        history.append((time_us, *offset_m))
+        self._count += 1
+        return jumped
+
+    def _frozen(self, place: tuple[float, float], sigma: float, travelled: float) -> bool:
+        if place != self._place:
+            self._place, self._frozen_from = place, travelled
+        return travelled - self._frozen_from > max(MIN_FROZEN_M, 4.0 * sigma)
+
+    def _agrees(self, away: FloatArray, sigma: float, prediction: Prediction) -> bool:
+        """Return True if a deviation (2,) from the navigator is within both errors."""
+        P = prediction.alone if prediction.lost else prediction.covariance
+        return squared_mahalanobis(away, P + sigma**2 * np.eye(2)) <= MAX_DEVIATION_SIGMA**2
+
+    def _drifts(self, time_us: int, away: FloatArray, sigma: float, prediction: Prediction) -> bool:
+        """Return True if the mean deviation from the navigator is larger than the errors allow."""
+        seconds = (time_us - self._history[-2][0]) * 1e-6 if len(self._history) > 1 else inf
+        kept = exp(-seconds / MEAN_TIME_S)
+        if self.state is not GnssState.GOOD or seconds > MEAN_TIME_S:
+            self._mean, kept = np.zeros(2), 1.0  # starts again after a pause
+        self._mean = kept * self._mean + (1.0 - kept) * away
+        self.drift = hypot(*self._mean.tolist())
+        P = prediction.covariance + (LASTING_FRACTION * sigma) ** 2 * np.eye(2)
+        return squared_mahalanobis(self._mean, P) > MAX_DEVIATION_SIGMA**2
+
+    def _receiver_reports(self, time_us: int) -> GnssReason:
+        return self._reported if time_us - self._reported_us < FRESH_US else GnssReason.NONE
+
+    # ---- changes of state ----------------------------------------------------------------------------
+
+    def _leave_good(self, time_us: int, *, agrees: bool, drifts: bool, lost: bool) -> None:
+        if not agrees:
+            self._set(GnssState.REJECTED, GnssReason.POSITION, time_us)
+        elif drifts:
+            self._set(GnssState.REJECTED, GnssReason.DRIFT, time_us)
+        elif self._field.contradicts or (lost and self._field.log_odds_of_map < 0.0):
+            self._set(GnssState.SUSPECT, GnssReason.FIELD, time_us)
+
+    def _set(self, state: GnssState, reason: GnssReason, time_us: int) -> None:
+        if self.state is GnssState.GOOD:
+            self._since_us, self._count = time_us, 0
+        self.state, self.reason = state, reason
+
+    def _returns(self, time_us: int, agrees: bool, prediction: Prediction) -> bool:
+        """Return True if positions that were not used are right again."""
+        held_us = time_us - self._since_us
+        if held_us < HOLD_US or self._count < MIN_POSITIONS:
+            return False
+        field = self._field
+        if field.confirms or (field.favours and not prediction.lost):
+            return True
+        if field.contradicts:
+            return False
+        if prediction.lost:
+            return agrees and self._chained and held_us >= LONG_HOLD_US and field.log_odds_of_map > 0.0
+        undecided = not prediction.informed and field.log_odds_of_position > -0.5 * field.limit
+        return agrees or (self._chained and undecided and held_us >= LONG_HOLD_US)
+
+
+class _FieldTest:
+    """Compares the field with the map at the GNSS position, with an unrelated field, and with the navigator.
+
+    Each difference of log-likelihoods is summed, within ± the logarithm of ``options.doubt``.
+
+    Attributes
+    ----------
+    limit : float
+        Largest log odds.
+    log_odds_of_map : float
+        Of the map at the position against a field unrelated to it.
+    log_odds_of_position : float
+        Of the map at the position against the map at the navigator's.
+    """
+
+    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+        self.limit = log(options.doubt)
+        self.log_odds_of_map = self.log_odds_of_position = 0.0
+        self._grid, self._options = grid, any_level(options, grid)
+        self._unmapped = Unmapped(grid, self._options)
+        self._tracker: Tracker | None = None
+        self._offset, self._sigma, self._time_us = (0.0, 0.0), inf, -FRESH_US
+
+    @property
+    def contradicts(self) -> bool:
+        """The map does not describe the field at the position."""
+        return self.log_odds_of_map <= -self.limit
+
+    @property
+    def confirms(self) -> bool:
+        """The map describes the field at the position, and not worse than at the navigator's."""
+        return self.log_odds_of_map >= self.limit and self.log_odds_of_position >= 0.0
+
+    @property
+    def favours(self) -> bool:
+        """The map describes the field at the position better than at the navigator's."""
+        return self.log_odds_of_position >= self.limit
+
+    def move(self, time_us: int, offset_m: tuple[float, float], sigma: float, *, restart: bool) -> None:
+        """Continue at a position (m, north and east of dead reckoning) with its 1-sigma (m)."""
+        if restart or time_us - self._time_us > FRESH_US:
+            self._tracker, self.log_odds_of_map, self.log_odds_of_position = None, 0.0, 0.0
+            self._unmapped = Unmapped(self._grid, self._options)
+        self._offset, self._sigma, self._time_us = offset_m, sigma, time_us
+
+    def update(
+        self, block: Block, seconds: float, metres: float, motion: MotionNoise, filter_likelihood: float
+    ) -> None:
+        """Add a measurement, `seconds` and `metres` after the previous one."""
+        if abs(block.time_us - self._time_us) > FRESH_US:
+            return
+        if self._tracker is None:
+            self._tracker = Tracker(self._grid, *prior(self._options, self._sigma), self._options.gate)
+        tracker = self._tracker
+        tracker.predict(*transition(self._options, seconds, metres, motion))
+        # the position is the receiver's, whatever the field says; bias and map error are estimated
+        x, P = tracker.x, tracker.P
+        x[:2] = self._offset
+        P[:2], P[:, :2] = 0.0, 0.0
+        P[0, 0] = P[1, 1] = self._sigma**2
+        seen = tracker.update(block)
+        unmapped = self._unmapped.update(block, seconds, metres, tracker.curvature_variance)
+        if not seen.variance > 0.0:  # off the map
+            return
+        for name, other in (("log_odds_of_map", unmapped), ("log_odds_of_position", filter_likelihood)):
+            total = getattr(self, name) + seen.log_likelihood - other
+            setattr(self, name, min(max(total, -self.limit), self.limit))
