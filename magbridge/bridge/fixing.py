@@ -24,6 +24,8 @@ HELD_US = 60_000_000
 ASK_US = 5_000_000
 """µs between two requests for the origin of the local frame."""
 OVERRATED = "ArduPilot would claim to know it better: use EXTERNAL_POSITION_ESTIMATE"
+ANSWER_PAUSE_US = 20_000_000
+"""µs between two reports that the autopilot begins or ceases to accept fixes."""
 UNUSED_US = 45_000_000
 """µs for which the autopilot's position must differ from the fixes until that is reported."""
 MIN_DIFFERENCE_M, DIFFERENCE_SIGMA = 40.0, 4.0
@@ -103,6 +105,7 @@ class Fixing:
         self._agreed_us = 0  # when the autopilot's position was last that of our fixes
         self._before_us: int | None = None
         self._waiting = 0
+        self._result, self._report_us = -1, 0  # the answer that was reported; when another may be
         self._reboots = component.vehicle.reboots
         self._handlers = by_id(
             AUTOPILOT_VERSION=self._read_version, COMMAND_ACK=self._answer,
@@ -189,15 +192,20 @@ class Fixing:
             text = "the autopilot does not answer fixes"
             self._component.announcer.state("answer", text, MAV_SEVERITY.WARNING)
 
-    def _answer(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - a handler like the others
+    def _answer(self, message: Message, time_us: int) -> None:
         if message["command"] != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self.sent:
             return
         self._waiting, result = 0, message["result"]
-        if result == MAV_RESULT.ACCEPTED:
-            self.accepted += 1
+        accepted = result == MAV_RESULT.ACCEPTED
+        self.accepted += accepted
+        self.refused += not accepted
+        if time_us < self._report_us and result != self._result:
+            return
+        if result != self._result:
+            self._result, self._report_us = result, time_us + ANSWER_PAUSE_US
+        if accepted:
             self._component.announcer.state("answer", "the autopilot takes fixes")
             return
-        self.refused += 1
         known = result in set(MAV_RESULT)
         name = MAV_RESULT(result).name if known else f"result {result}"
         text = f"the autopilot refuses fixes: {name}{HINTS.get(result, '')}"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from magbridge.field.geodesy import offset, separation
 
-__all__ = ["GLIDE", "DeadReckoning", "MotionNoise"]
+__all__ = ["GLIDE", "DeadReckoning", "MotionNoise", "Step"]
 
 GLIDE = 8.0
 """deg, of pitch; a glider flatter than that is turning between dive and climb."""
@@ -39,6 +39,20 @@ class MotionNoise(NamedTuple):
     def since(self, earlier: MotionNoise) -> MotionNoise:
         """Return the uncertainty of the motion since an earlier moment."""
         return MotionNoise(*(a - b for a, b in zip(self, earlier, strict=True)))
+
+
+class Step(NamedTuple):
+    """Motion between two measurements; steps add up."""
+
+    seconds: float = 0.0
+    metres: float = 0.0
+    """`seconds`, `metres`: time, and distance through the water."""
+    noise: MotionNoise = MotionNoise()
+
+    def joined(self, later: Step) -> Step:
+        """Return this step and a later one as one step."""
+        noise = MotionNoise(*(a + b for a, b in zip(self.noise, later.noise, strict=True)))
+        return Step(self.seconds + later.seconds, self.metres + later.metres, noise)
 
 
 class DeadReckoning:

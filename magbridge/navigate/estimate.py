@@ -10,7 +10,7 @@ from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.deadreckoning import MotionNoise
+from magbridge.navigate.deadreckoning import MotionNoise, Step
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
 from magbridge.navigate.options import Options, any_level
@@ -61,6 +61,8 @@ class Estimate:
         m through the water until `time_us`.
     motion : MotionNoise
         Uncertainty of the dead-reckoned motion until then.
+    step : Step
+        Motion between the last two measurements on the map.
     """
 
     def __init__(self, grid: AnomalyGrid, options: Options) -> None:
@@ -71,6 +73,8 @@ class Estimate:
         self.moved = np.eye(6), np.zeros((6, 6))
         self.jumps: list[Jump] = []
         self.time_us, self.travelled, self.motion = 0, 0.0, NO_MOTION_NOISE
+        self.step = Step()
+        self._measured = 0, 0.0, NO_MOTION_NOISE  # µs, m, noise of the motion at the last measurement
         self._filter: Tracker | Bank | None = None
         self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
@@ -102,6 +106,7 @@ class Estimate:
     def start(self, time_us: int, sigma: float) -> None:
         """Begin at the dead-reckoned position, known to `sigma` m on each axis."""
         self.time_us = time_us
+        self._measured = time_us, self.travelled, self.motion
         self.x, self.P = prior(self.options, sigma)
         self.alone = self.P[:4, :4].copy()
         self._confirmed = sigma >= self._reach()
@@ -132,16 +137,15 @@ class Estimate:
         else:
             self._filter.update_position(float(there[0]), float(there[1]), fused_sigma or sigma)
             self._read()
-        self._confirmed = self._fixed = True
+        self._monitor, self._confirmed, self._fixed = None, True, True
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def widen(self, metres: float) -> None:
-        """Add `metres` (1-sigma, each axis) to the position: a fix that was fused was wrong by as much."""
+        """Add an error of `metres` (1-sigma, each axis) to the position: fixes that were fused were wrong."""
         if self._filter is None:
             return
         Q = np.zeros_like(self.P)
         Q[0, 0] = Q[1, 1] = metres**2
-        Q[2, 2] = Q[3, 3] = 0.25 * self.options.current_sigma**2
         self._filter.predict(np.eye(len(Q)), Q)
         self.alone += Q[:4, :4]
         self._read()
@@ -158,8 +162,7 @@ class Estimate:
         motion : MotionNoise
             Uncertainty of the dead-reckoned motion since the start.
         """
-        before = self.motion
-        seconds, metres = self.predict(block.time_us, travelled, motion)
+        self.predict(block.time_us, travelled, motion)
         finer = resolution(self.grid, self.options, block.variance)
         if finer < FINER * self._resolution:  # never coarser: a first block may have been a poor one
             self._resolution = finer
@@ -173,17 +176,19 @@ class Estimate:
         if on_the_map:
             if widest(self.alone) < self._resolution:
                 self._level = float(self.P[4, 4]), block.time_us
-            self._judge(block, seconds, metres, motion.since(before), seen.log_likelihood)
+            then_us, before, earlier = self._measured
+            seconds = (block.time_us - then_us) * 1e-6
+            self.step = Step(seconds, travelled - before, motion.since(earlier))
+            self._measured = block.time_us, travelled, motion
+            self._judge(block, seen.log_likelihood)
         self._choose(on_the_map)
         proven = self._confirmed and self._described
         doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
         self.valid = self.state is State.TRACKING and proven and not doubted
         return seen
 
-    def predict(
-        self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE
-    ) -> tuple[float, float]:
-        """Propagate to `time_us`, `travelled` m after the start; return the seconds and metres passed."""
+    def predict(self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> None:
+        """Propagate to `time_us`, `travelled` m after the start."""
         seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self.travelled
         F, Q = transition(self.options, seconds, metres, motion.since(self.motion))
         self.time_us, self.travelled, self.motion = time_us, travelled, motion
@@ -193,7 +198,6 @@ class Estimate:
             self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
         else:
             self._filter.predict(F, Q)
-        return seconds, metres
 
     def other_motion(self) -> None:
         """From now on dead reckoning follows other telemetry: what it misses, the current, is another."""
@@ -242,12 +246,10 @@ class Estimate:
         self.jumps.append(Jump(self.time_us, north, east, widest(self.alone), cause))
         self._monitor, self._confirmed, self._fixed = None, False, False
 
-    def _judge(
-        self, block: Block, seconds: float, metres: float, motion: MotionNoise, likelihood: float
-    ) -> None:
+    def _judge(self, block: Block, likelihood: float) -> None:
         """Compare the filter with competing ones, and replace it if one of them has won."""
         assert self._filter is not None
-        unmapped = self._unmapped.update(block, seconds, metres, self._filter.curvature_variance)
+        unmapped = self._unmapped.update(block, self.step, self._filter.curvature_variance)
         self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
         if self._nowhere > log(self.options.doubt):
             self._search_anew()
@@ -270,7 +272,7 @@ class Estimate:
                 self._levels(),
             )
             return
-        verdict = self._monitor.step(block, metres, motion, self.x, self.P)
+        verdict = self._monitor.step(block, self.step, self.x, self.P)
         if verdict is Verdict.ELSEWHERE:
             self._filter, self._lost = self._monitor.surrender(block.time_us), True
             self._jump(self._filter.moments()[0], verdict.value)

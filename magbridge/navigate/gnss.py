@@ -28,7 +28,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.deadreckoning import MotionNoise
+from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.integrity import Unmapped, squared_mahalanobis
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import Options, any_level
@@ -36,8 +36,8 @@ from magbridge.navigate.tracker import Tracker
 
 __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 
-MAX_DEVIATION_SIGMA = 5.0
-"""Deviation from a prediction on which a position is rejected: by chance in 4e-6, two degrees of freedom."""
+MAX_DEVIATION_SIGMA = 4.5
+"""Deviation from a prediction on which a position is rejected: by chance in 4e-5, two degrees of freedom."""
 MIN_SIGMA_M = 1.5
 """m: a smaller sigma of a receiver is not used, since its error changes slowly."""
 WINDOW_US = 30_000_000
@@ -49,6 +49,8 @@ LASTING_FRACTION = 0.5
 HOLD_US, LONG_HOLD_US = 20_000_000, 45_000_000
 """µs for which positions must agree with each other until they are used again: if the navigator or the field
 agrees, and if neither can tell."""
+MAX_SIGMA_RATIO = 3.0
+"""Largest sigma of a position over the smallest in WINDOW_US: a jammed receiver claims now 2 m, now 200 m."""
 MIN_POSITIONS = 3
 """Number of positions in that time."""
 OUTAGE_US = 60_000_000
@@ -57,6 +59,9 @@ OUTAGE_SPEED_FRACTION = 0.1
 """1-sigma of the velocity error after an outage, as a fraction of the speed."""
 MIN_FROZEN_M = 10.0
 """m, that the vehicle must have moved until a constant position is frozen."""
+FIELD_STEP = 0.1
+"""Correlation lengths of the map between two measurements of the field that are compared: between closer ones
+an unrelated smooth field predicts as well as the map."""
 FRESH_US = 10_000_000
 """µs for which a position, or a report of the receiver's, holds."""
 CORRELATION_TIME_S = 30.0
@@ -100,8 +105,12 @@ class Prediction(NamedTuple):
         m, north and east.
     covariance, alone : ndarray, (2, 2)
         m²: of the position, and of dead reckoning since the last position that was used.
-    travelled, speed : float
-        m since the start, m/s.
+    current : ndarray, (2,)
+        m/s, by which dead reckoning is wrong.
+    current_sigma : float
+        m/s, 1-sigma on each axis.
+    travelled, speed, turns : float
+        m since the start, m/s, and :attr:`MotionNoise.turns` since the start.
     lost, informed : bool
         The navigator is lost; the field has improved its position.
     """
@@ -109,10 +118,26 @@ class Prediction(NamedTuple):
     position: FloatArray
     covariance: FloatArray
     alone: FloatArray
+    current: FloatArray
+    current_sigma: float
     travelled: float
     speed: float
+    turns: float
     lost: bool
     informed: bool
+
+
+class _Position(NamedTuple):
+    """A position that was tested: µs; m relative to dead reckoning; m; the current known then, m/s; turns."""
+
+    time_us: int
+    north: float
+    east: float
+    sigma: float
+    current_north: float
+    current_east: float
+    current_sigma: float
+    turns: float
 
 
 class GnssMonitor:
@@ -139,16 +164,23 @@ class GnssMonitor:
         self.state, self.reason = GnssState.NONE, GnssReason.NONE
         self.deviation = self.drift = 0.0
         self._grid, self._options = grid, options
-        self._history: deque[tuple[int, float, float]] = deque()  # µs; m north and east of dead reckoning
+        self._history: deque[_Position] = deque()
         self._place: tuple[float, float] | None = None
         self._frozen_from = 0.0  # m travelled when the position was first the present one
         self._since_us = 0  # since when the positions agree with each other
         self._count = 0  # positions since then
         self._chained = True  # no jump since the last position that was used
+        self._trusted: _Position | None = None  # the first of the window when positions ceased to be used
         self._mean = np.zeros(2)
         self._reported = GnssReason.NONE
         self._reported_us = -FRESH_US
         self._field = _FieldTest(grid, options)
+
+    @property
+    def possible_error(self) -> float:
+        """m, by which positions that were used may have been wrong when they ceased to be."""
+        unseen = FIELD_STEP * self._grid.correlation_length if self.reason is GnssReason.FIELD else 0.0
+        return hypot(self.drift, unseen)
 
     def receive_integrity(self, time_us: int, jamming: int, spoofing: int) -> None:
         """Use the receiver's own report, GNSS_INTEGRITY's jamming_state and spoofing_state."""
@@ -168,7 +200,7 @@ class GnssMonitor:
         """
         if len(self._history) < 2:
             return sigma
-        seconds = (time_us - self._history[-2][0]) * 1e-6
+        seconds = (time_us - self._history[-2].time_us) * 1e-6
         return sigma * sqrt(1.0 + CORRELATION_TIME_S / max(seconds, 0.05))
 
     def check(
@@ -195,7 +227,9 @@ class GnssMonitor:
             Of the navigator, at this time.
         """
         sigma = max(sigma, MIN_SIGMA_M)
-        jumped = self._jumps(time_us, offset_m, sigma, prediction.speed)
+        smallest = min((row.sigma for row in self._history), default=sigma)
+        sigma = min(sigma, MAX_SIGMA_RATIO * smallest)
+        jumped = self._jumps(time_us, offset_m, sigma, prediction)
         frozen = self._frozen(place, sigma, prediction.travelled)
         self._field.move(time_us, offset_m, sigma, restart=jumped)
         away = np.array(offset_m) - prediction.position
@@ -215,50 +249,66 @@ class GnssMonitor:
             self._leave_good(time_us, agrees=agrees, drifts=drifts, lost=prediction.lost)
         elif self._returns(time_us, agrees, prediction):
             self.state, self.reason, self._chained = GnssState.GOOD, GnssReason.NONE, True
+            self._trusted = None
             self._mean, self.drift = np.zeros(2), 0.0
         elif not agrees and prediction.informed:
             self.state = GnssState.REJECTED
         return self.state
 
-    def observe(
-        self, block: Block, seconds: float, metres: float, motion: MotionNoise, filter_likelihood: float
-    ) -> None:
+    def observe(self, block: Block, step: Step, filter_likelihood: float) -> None:
         """Compare a measurement of the field with the map at the last position.
 
         Parameters
         ----------
         block : Block
             Samples averaged to one measurement.
-        seconds, metres : float
-            Since the previous one.
-        motion : MotionNoise
-            Of that time.
+        step : Step
+            Motion since the previous one.
         filter_likelihood : float
             Log-likelihood by the navigator's filter.
         """
-        self._field.update(block, seconds, metres, motion, filter_likelihood)
+        self._field.update(block, step, filter_likelihood)
 
     # ---- single tests --------------------------------------------------------------------------------
 
-    def _jumps(self, time_us: int, offset_m: tuple[float, float], sigma: float, speed: float) -> bool:
-        """Compare with the previous position, and with that of WINDOW_US ago."""
-        history = self._history
-        while len(history) > 1 and time_us - history[0][0] > WINDOW_US:
+    def _jumps(
+        self, time_us: int, offset_m: tuple[float, float], sigma: float, prediction: Prediction
+    ) -> bool:
+        """Compare with the previous position, that of WINDOW_US ago, and one between them.
+
+        Notes
+        -----
+        In a time Δ, dead reckoning errs by the current c that was known at its start, with the variance
+        (σ_c² + 2 σ² Δ/τ) Δ² of a Gauss-Markov current (σ, τ), and by its own random walk.
+        """
+        history, o = self._history, self._options
+        while len(history) > 1 and time_us - history[0].time_us > WINDOW_US:
             history.popleft()
-        o = self._options
         jumped = False
-        for then_us, north, east in (history[-1], history[0]) if history else ():
-            seconds = (time_us - then_us) * 1e-6
-            velocity_error = hypot(o.current_sigma, o.motion_error * speed)
-            if time_us - then_us > OUTAGE_US:
-                velocity_error = max(velocity_error, OUTAGE_SPEED_FRACTION * speed)
-            error = hypot(sqrt(2.0) * sigma, velocity_error * seconds, o.drift * sqrt(max(seconds, 0.0)))
-            distance = hypot(offset_m[0] - north, offset_m[1] - east)
+        for then in (history[-1], history[2 * len(history) // 3], history[0]) if history else ():
+            seconds = max((time_us - then.time_us) * 1e-6, 0.0)
+            # what was known of the current before the positions were wrong
+            known = then if self._trusted is None else self._trusted
+            age = max((time_us - known.time_us) * 1e-6, 0.0)
+            changed = o.current_sigma * sqrt(min(2.0 * age / o.current_time, 1.0))
+            turned = o.motion_error * sqrt(prediction.turns - known.turns)
+            velocity_error = hypot(known.current_sigma, changed, turned)
+            if seconds * 1e6 > OUTAGE_US:
+                velocity_error = max(velocity_error, OUTAGE_SPEED_FRACTION * prediction.speed)
+            error = hypot(sqrt(2.0) * sigma, velocity_error * seconds, o.drift * sqrt(seconds))
+            distance = hypot(
+                offset_m[0] - then.north - known.current_north * seconds,
+                offset_m[1] - then.east - known.current_east * seconds,
+            )
             jumped |= distance > MAX_DEVIATION_SIGMA * error
         if jumped:
+            self._trusted = self._trusted or history[0]
             history.clear()
             self._since_us, self._count, self._chained = time_us, 0, False
-        history.append((time_us, *offset_m))
+        north, east = prediction.current.tolist()
+        history.append(
+            _Position(time_us, *offset_m, sigma, north, east, prediction.current_sigma, prediction.turns)
+        )
         self._count += 1
         return jumped
 
@@ -274,7 +324,7 @@ class GnssMonitor:
 
     def _drifts(self, time_us: int, away: FloatArray, sigma: float, prediction: Prediction) -> bool:
         """Return True if the mean deviation from the navigator is larger than the errors allow."""
-        seconds = (time_us - self._history[-2][0]) * 1e-6 if len(self._history) > 1 else inf
+        seconds = (time_us - self._history[-2].time_us) * 1e-6 if len(self._history) > 1 else inf
         kept = exp(-seconds / MEAN_TIME_S)
         if self.state is not GnssState.GOOD or seconds > MEAN_TIME_S:
             self._mean, kept = np.zeros(2), 1.0  # starts again after a pause
@@ -299,6 +349,7 @@ class GnssMonitor:
     def _set(self, state: GnssState, reason: GnssReason, time_us: int) -> None:
         if self.state is GnssState.GOOD:
             self._since_us, self._count = time_us, 0
+            self._trusted = self._trusted or self._history[0]
         self.state, self.reason = state, reason
 
     def _returns(self, time_us: int, agrees: bool, prediction: Prediction) -> bool:
@@ -309,7 +360,7 @@ class GnssMonitor:
         field = self._field
         if field.confirms or (field.favours and not prediction.lost):
             return True
-        if field.contradicts:
+        if field.contradicts or self.reason is GnssReason.FIELD:
             return False
         if prediction.lost:
             return agrees and self._chained and held_us >= LONG_HOLD_US and field.log_odds_of_map > 0.0
@@ -335,15 +386,17 @@ class _FieldTest:
     def __init__(self, grid: AnomalyGrid, options: Options) -> None:
         self.limit = log(options.doubt)
         self.log_odds_of_map = self.log_odds_of_position = 0.0
+        self._against = 0.0  # cumulative sum of the odds against the map, never negative (Page 1954)
         self._grid, self._options = grid, any_level(options, grid)
         self._unmapped = Unmapped(grid, self._options)
         self._tracker: Tracker | None = None
         self._offset, self._sigma, self._time_us = (0.0, 0.0), inf, -FRESH_US
+        self._step = Step()  # since the last measurement that was used
 
     @property
     def contradicts(self) -> bool:
         """The map does not describe the field at the position."""
-        return self.log_odds_of_map <= -self.limit
+        return self._against >= self.limit
 
     @property
     def confirms(self) -> bool:
@@ -359,28 +412,31 @@ class _FieldTest:
         """Continue at a position (m, north and east of dead reckoning) with its 1-sigma (m)."""
         if restart or time_us - self._time_us > FRESH_US:
             self._tracker, self.log_odds_of_map, self.log_odds_of_position = None, 0.0, 0.0
+            self._against = 0.0
             self._unmapped = Unmapped(self._grid, self._options)
         self._offset, self._sigma, self._time_us = offset_m, sigma, time_us
 
-    def update(
-        self, block: Block, seconds: float, metres: float, motion: MotionNoise, filter_likelihood: float
-    ) -> None:
-        """Add a measurement, `seconds` and `metres` after the previous one."""
-        if abs(block.time_us - self._time_us) > FRESH_US:
+    def update(self, block: Block, step: Step, filter_likelihood: float) -> None:
+        """Add a measurement, one `step` after the previous one."""
+        self._step = self._step.joined(step)
+        far = self._step.metres >= FIELD_STEP * self._grid.correlation_length
+        if abs(block.time_us - self._time_us) > FRESH_US or not far:
             return
+        whole, self._step = self._step, Step()
         if self._tracker is None:
             self._tracker = Tracker(self._grid, *prior(self._options, self._sigma), self._options.gate)
         tracker = self._tracker
-        tracker.predict(*transition(self._options, seconds, metres, motion))
+        tracker.predict(*transition(self._options, *whole))
         # the position is the receiver's, whatever the field says; bias and map error are estimated
         x, P = tracker.x, tracker.P
         x[:2] = self._offset
         P[:2], P[:, :2] = 0.0, 0.0
         P[0, 0] = P[1, 1] = self._sigma**2
         seen = tracker.update(block)
-        unmapped = self._unmapped.update(block, seconds, metres, tracker.curvature_variance)
+        unmapped = self._unmapped.update(block, whole, tracker.curvature_variance)
         if not seen.variance > 0.0:  # off the map
             return
+        self._against = min(max(self._against - seen.log_likelihood + unmapped, 0.0), self.limit)
         for name, other in (("log_odds_of_map", unmapped), ("log_odds_of_position", filter_likelihood)):
             total = getattr(self, name) + seen.log_likelihood - other
             setattr(self, name, min(max(total, -self.limit), self.limit))

@@ -20,8 +20,8 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
-from magbridge.navigate.deadreckoning import MotionNoise
-from magbridge.navigate.model import NO_MOTION_NOISE, Block, average, block_length, transition
+from magbridge.navigate.deadreckoning import Step
+from magbridge.navigate.model import Block, average, block_length, transition
 from magbridge.navigate.options import Options
 
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
@@ -67,14 +67,15 @@ class Unmapped:
         self._x = 0.0, 0.0
         self._p = self._value, 0.0, self._slope
 
-    def update(self, block: Block, seconds: float, metres: float, curvature_variance: float) -> float:
-        """Take in a measurement, `seconds` and `metres` after the previous one; return its log-likelihood.
+    def update(self, block: Block, step: Step, curvature_variance: float) -> float:
+        """Update with a measurement, one `step` after the previous one; return its log-likelihood.
 
         `curvature_variance` (nT²) is what the filter adds to the measurement's variance for the map's
         curvature. It is added here too; else a filter that is still searching would lose by its larger
         variance alone.
         """
         o, rate = self._options, self._rate
+        seconds, metres, _ = step
         kept = exp(-rate * metres)
         a, b = kept * (1.0 + rate * metres), kept * metres
         c, d = -kept * rate * rate * metres, kept * (1.0 - rate * metres)
@@ -136,29 +137,27 @@ class IntegrityMonitor:
         self._options, self._time_us = options, time_us
         self._threshold = log(options.doubt)
         self._waiting: list[Block] = []
-        self._metres, self._step = 0.0, STRIDES * block_length(grid)
-        self._motion = NO_MOTION_NOISE
+        self._since, self._step = Step(), STRIDES * block_length(grid)
         self.here = Bank(grid, x, P, resolution, options.gate)
         self.elsewhere = Bank(grid, x, wide, resolution, options.gate, doubted)
         self.odds = 0.0
         """Natural logarithm of the odds of *elsewhere* against *here*."""
 
-    def step(self, block: Block, metres: float, motion: MotionNoise, x: FloatArray, P: FloatArray) -> Verdict:
-        """Update both banks with a block `metres` after the previous one, and compare them.
+    def step(self, block: Block, step: Step, x: FloatArray, P: FloatArray) -> Verdict:
+        """Update both banks with a block, one `step` after the previous one, and compare them.
 
         They are compared with the filter's estimate after that block: `x` (6,) and its covariance `P`
-        (6, 6). `motion` is the uncertainty of the motion since the previous block.
+        (6, 6).
         """
         self._waiting.append(block)
-        self._metres += metres
-        self._motion = MotionNoise(*(a + b for a, b in zip(self._motion, motion, strict=True)))
+        self._since = self._since.joined(step)
         first = self._waiting[0]
-        if block.time_us - first.time_us < PATIENCE_US and self._metres < self._step:
+        if block.time_us - first.time_us < PATIENCE_US and self._since.metres < self._step:
             return Verdict.OPEN
         together = average(self._waiting)
         seconds = (together.time_us - self._time_us) * 1e-6
-        F, Q = transition(self._options, seconds, self._metres, self._motion)
-        self._time_us, self._metres, self._motion = together.time_us, 0.0, NO_MOTION_NOISE
+        F, Q = transition(self._options, seconds, self._since.metres, self._since.noise)
+        self._time_us, self._since = together.time_us, Step()
         self._waiting.clear()
         self.here.predict(F, Q)
         self.elsewhere.predict(F, Q)

@@ -15,7 +15,7 @@ from math import isfinite, sqrt
 
 import numpy as np
 
-from magbridge.field.geodesy import offset, separation
+from magbridge.field.geodesy import offset, separation, worse_axis
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import widest
 from magbridge.navigate.collect import Collector
@@ -89,8 +89,9 @@ class Navigator:
         self._reckoning.advance(time_us * 1e-6)
         if not estimate.begun:
             # nothing to compare with: only the receiver's own report counts
+            wide, zero, o = np.eye(2) * 1e12, np.zeros(2), estimate.options
             nothing = Prediction(
-                np.zeros(2), np.eye(2) * 1e12, np.eye(2) * 1e12, 0.0, 0.0, lost=False, informed=False
+                zero, wide, wide, zero, o.current_sigma, 0.0, 0.0, 0.0, lost=False, informed=False
             )
             state = monitor.check(time_us, place, (0.0, 0.0), known, nothing)
         else:
@@ -99,7 +100,7 @@ class Navigator:
             was_good = monitor.state is GnssState.GOOD
             state = monitor.check(time_us, place, away, known, self._prediction(time_us))
             if was_good and state is not GnssState.GOOD:
-                estimate.widen(monitor.drift)
+                estimate.widen(monitor.possible_error)
         if state is not GnssState.GOOD:
             return None
         return self._correct(time_us, place, sigma, monitor.fused_sigma(time_us, known))
@@ -108,11 +109,13 @@ class Navigator:
         """Return what is known of the position at a time from the last update on."""
         now, where = self.estimate, self._reckoning
         F, Q = transition(now.options, max((time_us - now.time_us) * 1e-6, 0.0), 0.0)
-        P = (F @ now.P @ F.T + Q)[:2, :2]
+        x, P = F @ now.x, F @ now.P @ F.T + Q
+        current_sigma = worse_axis(P[2, 2], P[2, 3], P[3, 3])
         alone = (F[:4, :4] @ now.alone @ F[:4, :4].T + Q[:4, :4])[:2, :2]
         return Prediction(
-            (F @ now.x)[:2], P, alone, where.travelled, where.speed, now.state is State.LOST, now.informed
-        )
+            x[:2], P[:2, :2], alone, x[2:4], float(current_sigma), where.travelled, where.speed,
+            where.noise.turns, now.state is State.LOST, now.informed,
+        )  # fmt: skip
 
     def _correct(
         self, time_us: int, place: tuple[float, float], sigma: float | None, fused_sigma: float | None
@@ -194,11 +197,9 @@ class Navigator:
 
     def _update(self, block: Block) -> Record:
         now, where = self.estimate, self._reckoning
-        before_us, travelled, noise = now.time_us, now.travelled, now.motion
         seen = now.update(block, where.travelled, where.noise)
         if isfinite(seen.anomaly):
-            seconds, metres = (block.time_us - before_us) * 1e-6, where.travelled - travelled
-            self.gnss.observe(block, seconds, metres, where.noise.since(noise), seen.log_likelihood)
+            self.gnss.observe(block, now.step, seen.log_likelihood)
         north, east, current_north, current_east, bias, map_error = now.x.tolist()
         latitude, longitude = offset(block.latitude, block.longitude, north, east)
         (nn, ne), (_, ee) = now.P[:2, :2].tolist()

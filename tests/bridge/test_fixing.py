@@ -122,7 +122,7 @@ def test_a_refusal_is_told_once_and_so_is_its_end() -> None:
     bench.fix()
     bench.receive("COMMAND_ACK", **ACK, result=4)
     assert "FAILED (it still uses GPS, has no origin, or nothing" in bench.texts_with("refuses")[0]
-    bench.to(210)
+    bench.to(221)
     bench.receive("COMMAND_ACK", **ACK, result=77)
     assert bench.texts_with("refuses") == ["the autopilot refuses fixes: result 77"]
 

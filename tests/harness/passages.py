@@ -5,7 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from navigation_studies.simulated import Map, synthetic
 from referee.loop import Passage
+from referee.receiver import Receiver, honest
 
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
@@ -16,6 +18,10 @@ PLACE = (49.5, -57.9)
 START = 1_780_000_000.0
 LOST, BACK, LAST = 60.0, 840.0, 900.0
 """s: GPS is lost, and comes back; the end."""
+AIRCRAFT = Options(
+    start_sigma=50.0, current_sigma=4.0, current_time=3600.0, bias_sigma=2.0, map_sigma=2.0, interval=5.0
+)
+"""Of a plane: a wind of 4 m/s."""
 OPTIONS = Options(start_sigma=200.0, current_sigma=0.1, bias_sigma=1.0, map_sigma=0.5, interval=4.0)
 
 
@@ -49,3 +55,42 @@ def passage(seed: int = 1, current: float = 0.1) -> Passage:
     return Passage(
         time, latitude, longitude, velocity, noisy, np.ones(time.size), 2.0, lambda s: s < LOST or s > BACK
     )
+
+
+@cache
+def steep_map(seed: int = 1) -> AnomalyGrid:
+    """Return a map of 120 nT RMS and 1 km correlation length, 16 km to each side."""
+    return synthetic(Map(120.0, 1000.0), seed)
+
+
+def flight(
+    minutes: float,
+    lost: float,
+    back: float,
+    receiver: Receiver = honest,
+    seed: int = 1,
+    turn_every: float = 300.0,
+) -> Passage:
+    """Return a plane's flight at 22 m/s in a wind of 4 m/s, with a turn of 90 degrees every 5 minutes.
+
+    A turn takes 6 s. There is no GPS between `lost` and `back`, s.
+    """
+    rng = np.random.default_rng(seed)
+    time = START + np.arange(0.0, 60.0 * minutes + 1.0)
+    seconds = time - START
+    heading = (
+        30.0 + 90.0 * np.cumsum(np.clip((seconds % turn_every) - turn_every + 6.0, 0.0, None) > 0.0) / 12.0
+    )
+    radians = np.radians(heading)
+    velocity = 22.0 * np.column_stack([np.cos(radians), np.sin(radians)])
+    wind = np.array([3.0, -2.6])
+    away = np.vstack([[0.0, 0.0], np.cumsum(velocity + wind, axis=0)[:-1]])
+    away -= 0.5 * (away.min(axis=0) + away.max(axis=0))  # keep it on the map
+    latitude, longitude = np.array([offset(*PLACE, *row) for row in away.tolist()]).T
+    anomaly = steep_map().evaluate(longitude, latitude).anomaly
+    assert np.isfinite(anomaly).all()
+    field = total_field(longitude, latitude, 0.0, time) + anomaly + rng.normal(size=time.size)
+    return Passage(
+        time, latitude, longitude, velocity, field, np.ones(time.size), 0.0,
+        lambda s: s < lost or s >= back, receiver,
+    )  # fmt: skip

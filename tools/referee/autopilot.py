@@ -35,6 +35,8 @@ class Truth(NamedTuple):
         m below the sea.
     gps : tuple of float or None
         deg, what the receiver measures; None without reception.
+    accuracy : float
+        m, what the receiver claims.
     """
 
     place: Place
@@ -43,6 +45,7 @@ class Truth(NamedTuple):
     pitch: float
     depth: float
     gps: Place | None
+    accuracy: float = GPS_SIGMA
 
 
 class Autopilot:
@@ -196,7 +199,7 @@ class Autopilot:
         data += pack("ATTITUDE", time_boot_ms=boot_ms, yaw=yaw, pitch=pitch)
         gps = {"fix_type": NO_FIX}
         if truth.gps is not None:
-            gps = {"fix_type": FIX_3D, "h_acc": round(GPS_SIGMA * 1e3)}
+            gps = {"fix_type": FIX_3D, "h_acc": round(truth.accuracy * 1e3)}
             gps |= {"lat": round(truth.gps[0] * 1e7), "lon": east_e7(truth.gps[1])}
         data += pack("GPS_RAW_INT", time_usec=self._now_us, **gps)
         latitude, longitude = self.place

@@ -19,6 +19,7 @@ from magbridge.link.fixes import FIXES
 from magbridge.navigate import Options
 from magbridge.records import Corrected
 from referee.autopilot import GPS_SIGMA, Autopilot, Truth
+from referee.receiver import Receiver, honest
 
 __all__ = ["Passage", "Run", "sail"]
 
@@ -42,8 +43,9 @@ class Passage(NamedTuple):
         m.
     gps : callable
         Of s since the start: whether there is reception.
-    deception : callable
-        Of s since the start: m, north and east, by which the receiver's position is wrong.
+    receiver : callable
+        Of s since the start and the true position (deg): the position that the receiver measures and the
+        accuracy (m) that it claims; None without a fix. See :mod:`referee.receiver`.
     """
 
     time: FloatArray
@@ -54,7 +56,7 @@ class Passage(NamedTuple):
     sigma: FloatArray
     depth: float
     gps: Callable[[float], bool]
-    deception: Callable[[float], tuple[float, float]] = lambda _: (0.0, 0.0)
+    receiver: Receiver = honest
 
 
 class Run(NamedTuple):
@@ -114,15 +116,15 @@ def sail(
     samples = deque(zip(*columns, strict=True))
     for seconds, truth in truths(passage, seed):
         now_us = start_us + round(seconds * SECOND_US)
+        for when_us, corrected in due(samples, now_us - 1):
+            navigation.sample(when_us, corrected)
         component.advance(now_us)
         answers += exchange(component, autopilot)
         for message in component.receive(answers + autopilot.step(now_us, truth), now_us):
             navigation.receive(message, now_us)
         component.received.clear()
-        while samples and samples[0][0] * 1e6 <= now_us:
-            when, field, sigma = samples.popleft()
-            corrected = Corrected(field, sigma, (field, 0.0, 0.0), (sigma, sigma, sigma), 0)
-            navigation.sample(round(when * 1e6), corrected)
+        for when_us, corrected in due(samples, now_us):
+            navigation.sample(when_us, corrected)
         answers = exchange(component, autopilot)
         texts += [(seconds, text) for _, text in component.announcer.texts]
         component.announcer.texts.clear()
@@ -130,11 +132,19 @@ def sail(
         own, claimed = own_error(navigation, now_us, truth), autopilot.filter.sigma
         navigator = navigation.navigator
         sigma = float(np.sqrt(0.5 * np.trace(navigator.estimate.P[:2, :2])))
-        states = navigator.estimate.state, sigma, navigator.gnss.state
+        states = float(navigator.estimate.state), sigma, float(navigator.gnss.state)
         rows.append((seconds, own, *off, claimed, navigation.fixing.sent, *states))
     table = np.array(rows)
-    seconds, error, _, _, claimed, sent, *states = table.T
-    return Run(seconds, error, table[:, 2:4], claimed, sent, *states, texts), autopilot, navigation
+    seconds, error, _, _, claimed, sent, state, sigma, gnss = table.T
+    run = Run(seconds, error, table[:, 2:4], claimed, sent, state, sigma, gnss, texts)
+    return run, autopilot, navigation
+
+
+def due(samples: deque[tuple[float, float, float]], until_us: int) -> Iterator[tuple[int, Corrected]]:
+    """Remove the samples (s, nT, nT) until a time, and yield them."""
+    while samples and samples[0][0] * 1e6 <= until_us:
+        when, field, sigma = samples.popleft()
+        yield round(when * 1e6), Corrected(field, sigma, (field, 0.0, 0.0), (sigma, sigma, sigma), 0)
 
 
 def exchange(component: Component, autopilot: Autopilot) -> bytes:
@@ -164,6 +174,7 @@ def truths(passage: Passage, seed: int) -> Iterator[tuple[float, Truth]]:
     for k, second in enumerate(seconds.tolist()):
         place = float(latitude[k]), float(longitude[k])
         i = int(second / every)
-        wrong = noise[k] + passage.deception(second)
-        gps = offset(*place, *wrong.tolist()) if passage.gps(second) else None
-        yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, passage.depth, gps)
+        measured = passage.receiver(second, place) if passage.gps(second) else None
+        gps = offset(*measured[0], *noise[k].tolist()) if measured else None
+        accuracy = measured[1] if measured else GPS_SIGMA
+        yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, passage.depth, gps, accuracy)
