@@ -122,6 +122,8 @@ _SPELLINGS = {
 _SAME = {other: unit for unit, others in _SPELLINGS.items() for other in others}
 
 
+MAX_NAMES = 60
+"""Largest number of columns that a message names."""
 YEAR_1980 = 315_532_800.0
 """s since 1970: no log of a magnetometer with a computer is older, but a clock that nobody set is."""
 
@@ -165,8 +167,9 @@ def may_be(unit: str, other: str) -> bool:
 
 
 def absent(name: str, there: Iterable[str]) -> str:
-    """Say that a column is not there, what is, and how to tell which of those it is."""
-    headings = " ".join(repr(one) if " " in one else one for one in there)
+    """Return the message that a column is missing, which there are, and how to declare it."""
+    names = [repr(name) if " " in name else name for name in there]
+    headings = " ".join(names[:MAX_NAMES]) + f" and {len(names) - MAX_NAMES} more" * (len(names) > MAX_NAMES)
     return f'expected this column; there are: {headings}; if one is it: --column {name}="THEIRS [unit]"'
 
 

@@ -15,6 +15,12 @@ from magbridge.errors import ConfigError
 __all__ = ["Table", "check_entries", "convert", "load_toml"]
 
 T = TypeVar("T")
+MAX_SIZE = 10_000_000
+"""Largest TOML file that is read, bytes."""
+MAX_DEPTH = 100
+"""Deepest nesting of arrays, tables and keys that is read: the parser is recursive, or quadratic, in it."""
+NESTED = re.compile(rf"[\w\"' -]+(?:\.[\w\"' -]+){{{MAX_DEPTH},}}")
+"""A dotted key that is nested too deeply."""
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -23,8 +29,16 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 def load_toml(path: str | Path) -> dict[str, Any]:
     """Read a TOML file; raise :class:`ConfigError` where it is missing or not TOML."""
+    too_deep = f"expected keys, arrays and tables at most {MAX_DEPTH} deep"
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+        if Path(path).stat().st_size > MAX_SIZE:
+            raise ConfigError(path, "", f"expected a TOML file of at most {MAX_SIZE // 10**6} MB")
+        text = Path(path).read_text(encoding="utf-8-sig")
+        if any(line.count(".") > MAX_DEPTH and NESTED.match(line.lstrip(" [")) for line in text.splitlines()):
+            raise ConfigError(path, "", too_deep)
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ConfigError(path, "", too_deep) from None
     except OSError as error:
         raise ConfigError(path, "", error.strerror or str(error)) from error
     except UnicodeDecodeError as error:

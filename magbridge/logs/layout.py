@@ -31,6 +31,8 @@ __all__ = ["BLANKS", "HEADER", "Layout", "cells", "is_remark", "layout_of"]
 
 HEADER = 200
 """Lines at the start of a file by which its layout is found."""
+MAX_COLUMNS = 4_096
+"""Largest number of columns that is read."""
 ATTRIBUTE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
 is_remark = re.compile(r"[#%/]|\s*(?:line|tie)[\s:]*[\w.:]+\s*$", re.IGNORECASE).match
 """Whether a line is no row: a comment, or what Geosoft and others write between the lines of a survey."""
@@ -90,6 +92,8 @@ def cells(line: str, separator: str) -> list[str]:
     """Return the fields of a line, without the blanks around them."""
     if separator == BLANKS:
         return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.rstrip("\r\n").split(separator)] if line.strip("\r\n") else []
     return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
 
 
@@ -113,6 +117,8 @@ def layout_of(
     if not body or not lines[comments].strip():
         raise FormatError(path, "expected a header row, the file is empty", row=comments + 1)
     found.separator = declared.separator or _separator(body)
+    if (width := _count(body[0], found.separator)) > MAX_COLUMNS:
+        raise FormatError(path, f"expected at most {MAX_COLUMNS} columns, got {width}", row=comments + 1)
     start = comments + _preamble(lines[comments:], found)
     headings = cells(lines[start].lstrip("#% "), found.separator)
     found.first = start + 1

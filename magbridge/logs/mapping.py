@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import msgspec
 
@@ -55,6 +56,14 @@ class Declared(Table, frozen=True):
     """`separator`, `decimal`: Of a text file; found by looking where they are not given."""
     zone: str | None = None
     """Time zone (``Europe/Berlin``) of times of day that do not say theirs; UTC if not given."""
+
+    def __post_init__(self) -> None:
+        if self.separator is not None and (len(self.separator) != 1 or self.separator in '"\r\n'):
+            raise ValueError(f"separator: expected one character, got {self.separator!r}")
+        try:
+            ZoneInfo(self.zone or "UTC")
+        except (ZoneInfoNotFoundError, ValueError, OSError):
+            raise ValueError(f"zone: expected a time zone as Europe/Berlin, got {self.zone!r}") from None
 
 
 def declared(column: Sequence[str], file: Path | None) -> Declared:

@@ -30,6 +30,9 @@ except ImportError:
 
 __all__ = ["FileWriter", "chunks"]
 
+MAX_EXPANDED, MAX_EXPANSION = 100_000_000, 200
+"""Bytes of values that are always read, and per byte of a larger file: times alone take one byte a row."""
+
 
 def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the file as deployments of at most `rows` rows, each with their numbers.
@@ -52,6 +55,12 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
     attrs = json.loads(_text(schema.metadata, b"magbridge") or "{}")
     if not file.metadata.num_rows:
         raise FormatError(path, "expected rows, there are none")
+    size = file.metadata.num_rows * file.metadata.num_columns * 8
+    if size > max(MAX_EXPANDED, MAX_EXPANSION * path.stat().st_size):
+        claimed = f"{file.metadata.num_rows} rows of {file.metadata.num_columns} columns"
+        raise FormatError(
+            path, f"{claimed} in {path.stat().st_size} bytes: expected a file that is not damaged"
+        )
     layout, clock = _layout(path, file, foreign=b"magbridge" not in (schema.metadata or {}))
     row = 1
     for batch in file.iter_batches(batch_size=min(rows, 1 << 20)):

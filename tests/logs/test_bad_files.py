@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.columns import CHANNELS
-from magbridge.errors import FormatError
+from magbridge.errors import ConfigError, FormatError
+from magbridge.logs import Options
 from magbridge.logs.deployment import deployment, named_losses, passed_over
 
 SUFFIXES = (".csv", ".nc", ".parquet", ".tlog", ".bin", ".ulg", ".dbd", ".tbd")
@@ -275,3 +276,38 @@ def test_parquet_of_other_metadata(output: bytes, tmp_path: Path) -> None:
     path = tmp_path / "log.parquet"
     parquet.write_table(pa.table({"time": [1.0, 2.0]}).replace_schema_metadata({"magbridge": output}), path)
     assert refused(path).startswith("expected a whole Parquet file")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('separator = "1e5"', "separator: expected one character"),
+        ('zone = "Nowhere"', "zone: expected a time zone"),
+        pytest.param(f"a = {'[' * 50_000}", "at most 100 deep", id="nested arrays"),
+        pytest.param(f"{'.'.join('a' * 50_000)} = 1", "at most 100 deep", id="nested keys"),
+    ],
+)
+def test_a_mapping_file_that_cannot_be_used(text: str, expected: str, tmp_path: Path) -> None:
+    (tmp_path / "columns.toml").write_text(text)
+    (tmp_path / "log.csv").write_text("time,mag_x\n1,2\n")
+    with pytest.raises(ConfigError, match=expected):
+        logs.read(tmp_path / "log.csv", options=Options(columns=tmp_path / "columns.toml"))
+
+
+def test_more_columns_than_any_log_has(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text(",".join(f"c{k}" for k in range(100_000)) + "\n" + ",".join("1" * 100_000) + "\n")
+    with pytest.raises(FormatError, match="expected at most 4096 columns, got 100000"):
+        logs.read(path)
+    path.write_text(",".join(f"c{k}" for k in range(200_000)) + "\n" + ",".join("1" * 200_000) + "\n")
+    with pytest.raises(FormatError, match="expected"):
+        logs.read(path)
+
+
+def test_a_parquet_file_that_expands_beyond_measure(tmp_path: Path) -> None:
+    pq, pa = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
+    zeros = pa.array(np.zeros(4_000_000))
+    table = pa.table({"time": zeros, **{f"c{k}": zeros for k in range(8)}})
+    pq.write_table(table, tmp_path / "bomb.parquet")
+    with pytest.raises(FormatError, match="4000000 rows of 9 columns in"):
+        logs.read(tmp_path / "bomb.parquet")

@@ -12,8 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
+from magbridge import logs
+from magbridge.logs import Options
+from magbridge.logs.compasses import compasses_in
 from magbridge.logs.dataflash import Flash, read_binary
 from magbridge.logs.dataflash_text import read_text
+from magbridge.logs.deployment import noted
 
 EVERYTHING = {name: set(fields.split(",")) for name, (_, _, fields) in KINDS.items()}
 
@@ -171,3 +175,40 @@ def test_a_description_that_contradicts_itself_is_not_believed(tmp_path: Path) -
     log, path = flight(), tmp_path / "log.bin"
     path.write_bytes(described(14, 9, "MAG", "Q", "TimeUS") + log.data)
     assert len(read_binary(path, EVERYTHING).records["MAG"].at) == 40
+
+
+def test_survey_magnetometers_are_further_compasses(tmp_path: Path) -> None:
+    kinds = {**KINDS, "MAGH": (30, "QBBBfff", "TimeUS,Node,Sensor,Bus,Mx,My,Mz")}
+    for has_compass in (True, False):
+        log = Log(kinds)
+        for k in range(20):
+            us = 100_000 * k
+            log.fix(us, 1.7e9 + us * 1e-6)
+            if has_compass:
+                log.mag(us, 0, [200, 100, -400])
+            for node in (70, 71):
+                log.write_message("MAGH", us + 1000, node, 0, 0, 0.19, 0.001 * node, 0.44)
+        path = tmp_path / f"{has_compass}.bin"
+        path.write_bytes(log.data)
+        first = logs.read(path)
+        assert [compass.number for compass in compasses_in(first)] == list(range(2 + has_compass))
+        chosen = logs.read(path, options=Options(compass="MAGH 71:0:0"))
+        np.testing.assert_allclose(chosen["mag_y"], 7_100.0, rtol=1e-6)
+        by_number = logs.read(path, options=Options(compass=str(int(has_compass))))
+        np.testing.assert_allclose(by_number["mag_y"], 7_000.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1, 100])
+def test_powers_in_hundredths_are_known_by_the_voltage(factor: int, tmp_path: Path) -> None:
+    log = Log({**KINDS, "CURR": (31, "Qhh", "TimeUS,Volt,Curr")})
+    for k in range(20):
+        us = 100_000 * k
+        log.fix(us, 1.7e9 + us * 1e-6)
+        log.mag(us, 0, [200, 100, -400])
+        log.write_message("CURR", us, 16 * factor, 27 * factor)
+    path = tmp_path / "log.bin"
+    path.write_bytes(log.data)
+    back = logs.read(path)
+    assert set(back["battery_current"].to_numpy()) == {27.0}
+    assert set(back["battery_voltage"].to_numpy()) == {16.0}
+    assert any("hundredths" in note for note in noted(back.attrs)) == (factor == 100)

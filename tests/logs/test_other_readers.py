@@ -89,7 +89,7 @@ def _px4() -> bytes:
     topics = {
         "sensor_mag": (f"uint64_t timestamp;uint32_t device_id;{axes}", "<QI3f"),
         "vehicle_attitude": ("uint64_t timestamp;float[4] q;", "<Q4f"),
-        "vehicle_global_position": ("uint64_t timestamp;double lat;double lon;", "<Q2d"),
+        "vehicle_global_position": ("uint64_t timestamp;double lat;double lon;float alt;", "<Q2df"),
         "vehicle_local_position": (f"uint64_t timestamp;{axes}", "<Q3f"),
         "battery_status": ("uint64_t timestamp;float voltage_v;float current_a;", "<Q2f"),
         "vehicle_air_data": ("uint64_t timestamp;float baro_pressure_pa;", "<Qf"),
@@ -107,7 +107,7 @@ def _px4() -> bytes:
             output.append(("vehicle_local_position", 0, (us - 5, 1.0, 2.0, -0.1 * k)))
             output += [("battery_status", n, (us + 3, 16.0 - n, -1.0 if k == 6 else k + n)) for n in range(2)]
         if k % 5 == 1:
-            output.append(("vehicle_global_position", 0, (us, 47.0 + 1e-5 * k, 8.0)))
+            output.append(("vehicle_global_position", 0, (us, 47.0 + 1e-5 * k, 8.0, 500.0 + k)))
             output.append(("vehicle_air_data", 0, (us, 1e5 + k)))
             output.append(("vehicle_attitude", 0, (us, 1.0, 0.0, 0.0, 0.0)))
     return ulog_of(topics, {"CAL_MAG0_ID": 11}, output)
@@ -131,7 +131,7 @@ def test_every_column_of_px4_is_as_pyulog_reads_it(tmp_path: Path) -> None:
         **{f"mag_{axis}": series("sensor_mag", axis, scale=1e5) for axis in "xyz"},
         "latitude": series("vehicle_global_position", "lat"),
         "longitude": series("vehicle_global_position", "lon"),
-        "depth": series("vehicle_local_position", "z"),
+        "depth": series("vehicle_global_position", "alt", scale=-1.0),  # above the sea, not the start
         "pressure": series("vehicle_air_data", "baro_pressure_pa", scale=0.01),
         "battery_voltage": series("battery_status", "voltage_v"),
         "battery_current": series("battery_status", "current_a"),

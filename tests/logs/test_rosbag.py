@@ -253,6 +253,23 @@ def test_an_imu_that_knows_no_orientation_gives_none(tmp_path: Path) -> None:
         np.testing.assert_allclose(back[name], values, atol=1e-6, err_msg=name)
 
 
+def test_a_constant_identity_is_not_an_attitude(tmp_path: Path) -> None:
+    """Drivers without an estimator publish the orientation 0 0 0 1, also without covariance."""
+
+    def other(write_message: Any, types: Any, header: Any, k: int, _: str) -> None:
+        vector, nine = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 9.8), np.zeros(9)
+        write_message(
+            "/a_raw", "sensor_msgs/msg/Imu", k, header=header(k, "imu"),
+            orientation=types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+            orientation_covariance=nine, angular_velocity=vector, angular_velocity_covariance=nine,
+            linear_acceleration=vector, linear_acceleration_covariance=nine,
+        )  # fmt: skip
+
+    back = logs.read(bag(tmp_path / "log", more=other))
+    for name, values in zip(("roll", "pitch", "heading"), ANGLES.T, strict=True):
+        np.testing.assert_allclose(back[name], values, atol=1e-6, err_msg=name)
+
+
 @pytest.mark.parametrize("kept", [0.3, 0.9])
 def test_a_bag_that_breaks_off_is_one_line(kept: float, tmp_path: Path) -> None:
     path = bag(tmp_path / "log.bag", "ros1")
