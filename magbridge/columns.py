@@ -9,6 +9,8 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from magbridge.errors import FormatError
 
 if TYPE_CHECKING:
@@ -16,7 +18,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "NT_PER_UNIT", "Column",
-    "absent", "counts_from_boot", "factor", "may_be", "require", "require_units", "usual",
+    "absent", "counts_from_boot", "decoded", "factor", "in_seconds", "may_be", "require",
+    "require_units", "usual",
 ]  # fmt: skip
 
 
@@ -136,6 +139,52 @@ def counts_from_boot(deployment: xr.Dataset) -> bool:
     time = deployment["time"].values
     reference = deployment.attrs.get("time_reference")
     return reference == "boot" or bool(time.size and reference is None and time[-1] < YEAR_1980)
+
+
+def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
+    """Return a deployment with its times in s since 1970-01-01 UTC, which may be datetime64.
+
+    Times that are neither numbers nor datetime64 are a :class:`~magbridge.errors.FormatError`.
+    """
+    if "time" not in deployment.coords and "time" in deployment:
+        deployment = deployment.set_coords("time")
+    times = {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
+    for name, time in times.items():
+        if time.dtype.kind == "M":
+            unknown = time.isnull()
+            seconds = (time.values - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
+            described = {**time.attrs, **COLUMNS[name]._asdict()}
+            values = (time.dims, np.where(unknown, np.nan, seconds), described)
+            deployment = (
+                deployment.assign_coords(time=values) if name == "time" else deployment.assign({name: values})
+            )
+        elif time.dtype.kind not in "iuf":
+            source = deployment.attrs.get("source", "the deployment")
+            raise FormatError(
+                source, f"expected times as numbers or datetime64, got {time.dtype}", column=name
+            )
+    return deployment
+
+
+def decoded(deployment: xr.Dataset) -> xr.Dataset:
+    """Return a deployment with datetime64 times (UTC, ns), as xarray decodes them.
+
+    Times that count from a boot are counted from 1970.
+    """
+    for name in ("time", *CHANNEL_TIMES):
+        if name in deployment.variables and deployment[name].dtype.kind != "M":
+            time = deployment[name]
+            seconds = np.where(np.isfinite(time.values), time.values, 0.0)
+            whole = np.floor(seconds)
+            moments = whole.astype("datetime64[s]").astype("datetime64[ns]")
+            moments = moments + np.rint((seconds - whole) * 1e9).astype("timedelta64[ns]")
+            moments[~np.isfinite(time.values)] = np.datetime64("NaT")
+            described = {key: value for key, value in time.attrs.items() if key != "units"}
+            values = (time.dims, moments, described)
+            deployment = (
+                deployment.assign_coords(time=values) if name == "time" else deployment.assign({name: values})
+            )
+    return deployment
 
 
 def factor(unit: str, column: str) -> float | None:

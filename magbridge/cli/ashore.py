@@ -60,7 +60,7 @@ def convert(
     from magbridge.logs import Writer, read_chunks
 
     rows, pieces = 0, []
-    with Writer(output, _og(metadata) if metadata else None) as writer:
+    with Writer(output, _og(metadata), og1=True) if metadata else Writer(output) as writer:
         for part in track(read_chunks(files, options=reading.options), "reading"):
             pieces.append(part.attrs)
             if heading_reference:

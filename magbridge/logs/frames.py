@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 import xarray as xr
 
+from magbridge.columns import in_seconds
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import deployment
 from magbridge.logs.headings import split
@@ -50,6 +51,7 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
 
 def to_frame(log: xr.Dataset) -> pd.DataFrame:
     """Return a deployment as a data frame, indexed by moments in UTC; units are in ``frame.attrs``."""
+    log = in_seconds(log)
     frame = log.to_dataframe()
     frame.index = pd.to_datetime(log["time"].to_numpy(), unit="s", utc=True).rename("time")
     frame.attrs = {str(name): log[name].attrs.get("units", "") for name in log}

@@ -9,7 +9,7 @@ import xarray as xr
 from msgspec import to_builtins
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_boot
+from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_boot, in_seconds
 from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
@@ -65,6 +65,7 @@ def info(log: xr.Dataset) -> dict[str, Any]:
         ``losses`` (which name it), ``notes``, ``compasses``, ``columns`` (name, unit, meaning, share known,
         lowest, highest, interval of its changes), ``uses`` (command -> what it lacks) and ``hints``.
     """
+    log = in_seconds(log)
     time = log["time"].to_numpy().astype(float)
     steps = np.diff(time)
     interval = float(np.median(steps)) if len(steps) else None

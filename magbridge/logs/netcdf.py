@@ -1,9 +1,10 @@
-"""netCDF in and out: trajectories, written in the shape of OceanGliders OG1.0.
+"""netCDF in and out: one trajectory.
 
-Written is one trajectory along ``N_MEASUREMENTS``, names in capitals. ``TIME LATITUDE LONGITUDE DEPTH ROLL
-PITCH HEADING TEMP PRES`` are OG1.0's own names; the others are ours in capitals (``MAG_X``), and the
-attribute ``column`` keeps the exact name. What OG1.0 also demands about people, platform and quality control
-we do not know, so a file does not claim to comply. Read is any trajectory, by
+A file is written along the dimension ``time`` with the documented names of the columns, so that
+``xarray.open_dataset`` gives the same names as :func:`magbridge.logs.read`. With the vocabulary of
+OceanGliders OG1.0 it is written along ``N_MEASUREMENTS`` in capitals instead: ``TIME LATITUDE LONGITUDE DEPTH
+ROLL PITCH HEADING TEMP PRES`` are names of OG1.0, the others the documented names in capitals (``MAG_X``).
+The attribute ``column`` keeps the documented name in both. Any trajectory is read, by
 :mod:`magbridge.logs.trajectory`; a basestation's Seaglider file is recognised by its dimensions and read by
 :mod:`magbridge.logs.seaglider`.
 
@@ -38,8 +39,8 @@ except ImportError:
 
 __all__ = ["FileWriter", "chunks"]
 
-DIMENSION = "N_MEASUREMENTS"
-NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
+OG1_DIMENSION = "N_MEASUREMENTS"
+OG1_NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
 """Columns whose OG1.0 name is not simply our name in capitals."""
 ATTRIBUTES: dict[str, dict[str, Any]] = {
     "time": {"standard_name": "time", "calendar": "gregorian", "units": EPOCH},
@@ -80,10 +81,19 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
 
 
 class FileWriter:
-    """Writes deployments one after the other; the columns are those of the first."""
+    """Writes deployments one after the other; the columns are those of the first.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    Parameters
+    ----------
+    path : Path
+        The file to write.
+    og1 : bool
+        The names are those of OG1.0, instead of the documented ones.
+    """
+
+    def __init__(self, path: Path, *, og1: bool = False) -> None:
+        self._path, self._og1 = path, og1
+        self._dimension = OG1_DIMENSION if og1 else "time"
         with systems_reason(path):
             self._file = netCDF4.Dataset(path, "w", format="NETCDF4")
         self._variables: dict[str, Any] = {}
@@ -107,7 +117,7 @@ class FileWriter:
     def _define(self, dataset: xr.Dataset) -> None:
         file = self._file
         file.set_auto_mask(False)
-        file.createDimension(DIMENSION, None)
+        file.createDimension(self._dimension, None)
         first = float(dataset["time"][0]) if dataset.sizes["time"] else 0.0
         file.setncatts(
             {
@@ -124,23 +134,23 @@ class FileWriter:
                 "history": _history(str(dataset.attrs.get("history", ""))),
             }
         )
-        trajectory = file.createVariable("TRAJECTORY", str)
+        trajectory = file.createVariable(self._written("trajectory"), str)
         trajectory.setncatts({"cf_role": "trajectory_id", "long_name": "trajectory name"})
         trajectory[...] = str(dataset.attrs.get("source", ""))
         there = [name for name in COORDINATES if name == "time" or name in dataset]
-        coordinates = " ".join(name.upper() for name in there)
-        taken = {"TRAJECTORY"}
+        coordinates = " ".join(self._written(name) for name in there)
+        taken = {self._written("trajectory")}
         for name in ("time", *(str(name) for name in dataset.data_vars)):
-            capitals = NAMES.get(name, name.upper()).replace("/", "_")
-            while capitals in taken:
-                capitals += "_"
-            taken.add(capitals)
+            written = self._written(name)
+            while written in taken:
+                written += "_"
+            taken.add(written)
             attrs = dict(dataset[name].attrs) | ATTRIBUTES.get(name, {})
             flags = name == "quality"  # CF: flags have the type of their masks
             # a coordinate of CF has no fill value: a time is never missing
             fill = {"time": None, "quality": NO_FLAGS}.get(name, np.nan)
             variable = file.createVariable(
-                capitals, "i4" if flags else "f8", (DIMENSION,), fill_value=fill, zlib=True, complevel=1,
+                written, "i4" if flags else "f8", (self._dimension,), fill_value=fill, zlib=True, complevel=1,
                 chunksizes=(CHUNK,),
             )  # fmt: skip
             if flags:
@@ -155,6 +165,10 @@ class FileWriter:
             variable.setncatts(attrs)
             variable.setncatts({"column": name})
             self._variables[name] = variable
+
+    def _written(self, name: str) -> str:
+        """Return the name of a column's variable; netCDF forbids slashes in it."""
+        return (OG1_NAMES.get(name, name.upper()) if self._og1 else name).replace("/", "_")
 
     def close(self) -> None:
         """Write everything to the file and close it."""

@@ -14,7 +14,7 @@ from itertools import accumulate, chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.columns import CHANNEL_TIMES, counts_from_boot, require
+from magbridge.columns import CHANNEL_TIMES, counts_from_boot, decoded, require
 from magbridge.errors import FormatError
 from magbridge.files import existing
 from magbridge.guard import Guarded, Job, guarded
@@ -35,7 +35,13 @@ SMALL = 4_000_000
 DEFAULTS = Options()
 
 
-def read(paths: Paths, *, required: Iterable[str] = (), options: Options = DEFAULTS) -> xr.Dataset:
+def read(
+    paths: Paths,
+    *,
+    required: Iterable[str] = (),
+    options: Options = DEFAULTS,
+    decode_times: bool = False,
+) -> xr.Dataset:
     """Return one deployment from one file or several, sorted in time.
 
     Parameters
@@ -46,6 +52,8 @@ def read(paths: Paths, *, required: Iterable[str] = (), options: Options = DEFAU
         Columns that the result must have, as :data:`magbridge.columns.CHANNELS`.
     options : Options
         What the user says about the logs.
+    decode_times : bool
+        Times are datetime64 (UTC), as xarray decodes them, and not s since 1970.
 
     Returns
     -------
@@ -67,7 +75,7 @@ def read(paths: Paths, *, required: Iterable[str] = (), options: Options = DEFAU
 
     dataset = join(read_each(paths, options=options))
     require(dataset, required)
-    return dataset
+    return decoded(dataset) if decode_times else dataset
 
 
 def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:

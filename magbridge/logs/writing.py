@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from magbridge.columns import in_seconds
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
 from magbridge.logs.registry import format_of, metadata_path
@@ -25,7 +27,7 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
     Parameters
     ----------
     dataset : Dataset (time)
-        With columns as :func:`read` returns them.
+        With columns as :func:`read` returns them; times in s since 1970, or datetime64.
     path : path
         Its suffix chooses the format.
 
@@ -44,16 +46,19 @@ class Writer:
     """A file that grows by deployments, one after the other in time, and appears when it is complete.
 
     The columns are those of the first deployment; a later one that lacks a column has NaN there. When the
-    block raises, nothing is left behind. `finish` may add to the file once all rows are in it.
+    block raises, nothing is left behind. `finish` may add to the file once all rows are in it; `options` are
+    the format's own, as ``og1=True`` of netCDF. Times may be datetime64.
 
     >>> with Writer("out.nc") as writer:  # doctest: +SKIP
     ...     for dataset in read_chunks("in.tlog"):
     ...         writer.append(dataset)
     """
 
-    def __init__(self, path: str | os.PathLike[str], finish: Callable[[Path], None] | None = None) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], finish: Callable[[Path], None] | None = None, **options: Any
+    ) -> None:
         self._path, self._finish = Path(path), finish
-        self._open = format_of(self._path, write=True).load().FileWriter
+        self._open = partial(format_of(self._path, write=True).load().FileWriter, **options)
         self._columns: dict[str, dict[str, Any]] = {}
 
     def __enter__(self) -> Self:
@@ -81,6 +86,7 @@ class Writer:
         from magbridge.logs.checks import increasing  # noqa: PLC0415 - xarray is for ashore
         from magbridge.logs.deployment import same_columns, uncounted  # noqa: PLC0415
 
+        dataset = in_seconds(dataset)
         first = not self._columns
         if first:
             self._columns = {str(name): dict(dataset[name].attrs) for name in dataset.data_vars}

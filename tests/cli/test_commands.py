@@ -123,14 +123,14 @@ def test_what_correct_writes_is_netcdf_that_others_read(
     command("correct", deployment, "--calibration", "cal.json", "-o", "corrected.nc", "--plot", "c.png")
     assert Path("c.png").read_bytes().startswith(b"\x89PNG")
     with xr.open_dataset("corrected.nc") as theirs:
-        assert theirs["TIME"].dtype.kind == "M"
-        assert {"TIME", "LATITUDE", "LONGITUDE", "DEPTH"} == set(theirs.coords)
-        quality = theirs["QUALITY"]
+        assert theirs["time"].dtype.kind == "M"
+        assert {"time", "latitude", "longitude", "depth"} == set(theirs.coords)
+        quality = theirs["quality"]
         assert len(quality.attrs["flag_masks"]) == len(quality.attrs["flag_meanings"].split())
         assert quality.attrs["flag_masks"].dtype == np.int32
         assert f"calibration {theirs.attrs['calibration_id']}" in theirs.attrs["history"]
         assert "written by magbridge" in theirs.attrs["history"]
-        np.testing.assert_array_equal(theirs["LATITUDE"], read(deployment)["latitude"])
+        np.testing.assert_array_equal(theirs["latitude"], read(deployment)["latitude"])
     flags = read("corrected.nc")["quality"]
     np.testing.assert_array_equal(flags % 1, 0.0)
 

@@ -71,10 +71,10 @@ def test_a_scientist_with_a_slocum(walk: Walk, here: Path) -> None:
     walk("magbridge convert *.dbd *.ebd -o deployment.nc")
     walk("magbridge info deployment.nc")
     with xr.open_dataset("deployment.nc") as log:
-        assert np.issubdtype(log["TIME"].dtype, np.datetime64)
-        assert float(log["LATITUDE"].max()) == pytest.approx(45.0, abs=0.1)
-        assert log["BATTPOS"].attrs["units"] == "in"
-        assert log["TIME"].size >= 118
+        assert np.issubdtype(log["time"].dtype, np.datetime64)
+        assert float(log["latitude"].max()) == pytest.approx(45.0, abs=0.1)
+        assert log["battpos"].attrs["units"] == "in"
+        assert log["time"].size >= 118
 
 
 def test_a_pilot_with_ardupilots_log(walk: Walk, here: Path) -> None:

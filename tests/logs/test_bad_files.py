@@ -181,7 +181,7 @@ def test_time_goes_back(suffix: str, tmp_path: Path) -> None:
     logs.write(dataset, path)
     if suffix == ".nc":
         with netCDF4.Dataset(path, "a") as file:
-            file["TIME"][3] = 2.5
+            file["time"][3] = 2.5
     else:
         import pyarrow as pa  # noqa: PLC0415 - not for the other format
         from pyarrow import parquet  # noqa: PLC0415

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import netCDF4
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 from magbridge import logs
 from magbridge.errors import FormatError
@@ -60,19 +62,45 @@ def test_csv_says_which_number_stands_for_none(rows: int, tmp_path: Path) -> Non
     assert "fill_value" not in read.attrs
 
 
-def test_netcdf_has_the_shape_of_og1(tmp_path: Path) -> None:
-    columns = {name: np.ones(5) for name in ("latitude", "longitude", "depth", "mag_x", "battpos")}
-    logs.write(deployment("made", 1_466_705_388.0 + np.arange(5.0), columns), tmp_path / "a.nc")
+@pytest.mark.parametrize("og1", [False, True])
+def test_netcdf_has_the_documented_names_or_those_of_og1(og1: bool, tmp_path: Path) -> None:
+    names = ("latitude", "longitude", "depth", "mag_x", "battpos")
+    log = deployment("made", 1_466_705_388.25 + np.arange(5.0), dict.fromkeys(names, np.ones(5)))
+    options: Any = {"og1": True} if og1 else {}
+    with logs.Writer(tmp_path / "a.nc", None, **options) as writer:
+        writer.append(log)
+
+    def written(name: str) -> str:
+        return name.upper() if og1 else name
+
     with netCDF4.Dataset(tmp_path / "a.nc") as file:
-        assert file.dimensions["N_MEASUREMENTS"].isunlimited()
-        assert {"TIME", "LATITUDE", "LONGITUDE", "DEPTH", "MAG_X", "BATTPOS", "TRAJECTORY"} <= set(
-            file.variables
-        )
-        assert file["TIME"].units == "seconds since 1970-01-01T00:00:00Z"
-        assert file["TRAJECTORY"].cf_role == "trajectory_id"
+        assert file.dimensions["N_MEASUREMENTS" if og1 else "time"].isunlimited()
+        assert set(map(written, (*names, "time", "trajectory"))) == set(file.variables)
+        assert file[written("time")].units == "seconds since 1970-01-01T00:00:00Z"
+        assert file[written("trajectory")].cf_role == "trajectory_id"
         assert file.featureType == "trajectory"
         assert file.time_coverage_start == "20160623T180948"
-        assert file["LATITUDE"].standard_name == "latitude"
+        assert file[written("latitude")].standard_name == "latitude"
+    assert set(logs.read(tmp_path / "a.nc").data_vars) == set(names)
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".csv", ".tlog", ".parquet"])
+def test_a_deployment_with_decoded_times_is_written_as_one_with_seconds(suffix: str, tmp_path: Path) -> None:
+    time = 1_466_705_388.0 + 0.25 * np.arange(5.0)
+    log = deployment("made", time, {"mag_x": np.ones(5), "mag_time_x": time + 0.125})
+    logs.write(log, tmp_path / "seconds.nc")
+    with xr.open_dataset(tmp_path / "seconds.nc") as theirs:
+        decoded = theirs.drop_vars("trajectory").load()
+    assert decoded["time"].dtype.kind == "M"
+    ours = logs.read(tmp_path / "seconds.nc", decode_times=True)
+    apart = np.abs(ours["time"].to_numpy() - decoded["time"].to_numpy())
+    assert apart.max() < np.timedelta64(1, "us")  # xarray computes in float64
+    assert ours["mag_time_x"].dtype.kind == "M"
+    for dataset in (decoded, ours):
+        logs.write(dataset, tmp_path / f"out{suffix}")
+        back = logs.read(tmp_path / f"out{suffix}")
+        np.testing.assert_allclose(back["time"], time, atol=1e-6)
+        np.testing.assert_allclose(back["mag_time_x"], time + 0.125, atol=1e-6)
 
 
 @pytest.mark.parametrize(
