@@ -1,11 +1,11 @@
-"""What an unfriendly network costs the autopilot: a running bridge, attacked, and a table of what was lost.
+"""What an unfriendly network costs the autopilot: a running bridge, attacked, and a table of the losses.
 
     .venv/bin/python tools/attacks.py              all: some minutes
     .venv/bin/python tools/attacks.py header       some, by a part of their names
 
 The bridge runs as a process between an emulated sensor and an emulated autopilot, which sends 200 frames a
 second. *In*: the autopilot's frames that the bridge missed, by their numbers, or refused where an attacker
-speaks as the autopilot and has numbers of its own. *Out*: the samples of MAG_FIELD that the autopilot missed.
+sends as the autopilot and has numbers of its own. *Out*: the samples of MAG_FIELD that the autopilot missed.
 Attackers without a key may send whatever they like from where they like.
 """
 
@@ -66,7 +66,7 @@ class Attacker:
 
 
 class Attack(NamedTuple):
-    """One: on which link, by how many, and what is done at every frame of the autopilot."""
+    """One: on which link, by how many, and the action at every frame of the autopilot."""
 
     name: str
     link: str
@@ -136,11 +136,11 @@ ATTACKS = (
     Attack("frames signed with another key", "signed", 1,
            lambda a, _: a.emit(Codec(1, 1, Signing(bytes(32))).pack("HEARTBEAT", type=12)), "another key"),
     Attack("genuine frames, recorded and sent again", "signed", 1, recorded_frames, "an old time stamp"),
-    Attack("a liar with the key, ten years ahead, as 1:25", "signed", 1,
+    Attack("a sender with the key, ten years ahead, as 1:25", "signed", 1,
            lambda a, _: a.emit(signed(25, YEARS_US))),
-    Attack("a liar with the key, ten years ahead, as the autopilot", "signed", 1,
+    Attack("a sender with the key, ten years ahead, as the autopilot", "signed", 1,
            lambda a, _: a.emit(signed(1, YEARS_US)), "several addresses", spoofs=True),
-    Attack("a liar with the key, an hour behind, as 1:25", "signed", 1,
+    Attack("a sender with the key, an hour behind, as 1:25", "signed", 1,
            lambda a, _: a.emit(signed(25, -3_600_000_000)), "a time stamp behind our clock"),
     Attack("a new key, unasked (SETUP_SIGNING)", "signed", 1,
            lambda a, _: a.emit(frame(255, 190, "SETUP_SIGNING", **to_us(secret_key=KEY[::-1]))),
@@ -162,7 +162,7 @@ ATTACKS = (
            lambda a, k: a.emit(frame(200 + k % 50, 1 + k % 200, "HEARTBEAT", type=6, autopilot=8))),
     Attack("files opened without end, and one outside", "udpin", 1,
            lambda a, k: a.emit(ftp(Opcode.OPEN_READ, (b"general.json", b"../key.bin")[k % 2], k)), "refused"),
-    Attack("answers to TIMESYNC that nobody asked for", "udpin", 1,
+    Attack("answers to TIMESYNC without a request", "udpin", 1,
            lambda a, k: a.emit(frame(1, 1, "TIMESYNC", tc1=1 + k, ts1=k)), "several addresses", spoofs=True),
     Attack("bursts of a file by 7 at once", "udpin, others", 7,
            lambda a, k: a.emit(ftp(Opcode.OPEN_READ if k < 2 else Opcode.BURST, b"parameter.json", k, 239))),
@@ -186,7 +186,7 @@ ATTACKS = (
 
 
 def run(rig: Rig, attack: Attack, seconds: float = SECONDS) -> tuple[float, float, int, str]:
-    """Attack; return the shares lost in and out, bytes that the strangers got, and what was told."""
+    """Attack; return the shares lost in and out, bytes that the strangers got, and the reports."""
     rig.until_well()
     before, mark, sent, texts = rig.fresh_status(), rig.mark, [0], set(rig.texts())
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""How fast it is, each figure beside its floor in the same run.
+"""Measure speed and memory, each figure with its floor in the same run.
 
     python3 tools/dev.py bench                      everything: some minutes
     python3 tools/dev.py bench processor start      some of it
@@ -6,7 +6,7 @@
     python3 tools/dev.py bench --table FILE.md      also as a table in Markdown, with date, commit and load
 
 Repetitions of the program and of its floor alternate and medians are printed, so that a busy machine slows
-both alike. Processor time and ratios hold on a busy machine; latencies do not: the load average is printed
+both. Processor time and ratios hold on a busy machine; latencies do not: the load average is printed
 with them, and the floor's own tail shows how far they can be trusted.
 """
 

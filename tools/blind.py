@@ -3,7 +3,7 @@
 Run it as ``python tools/blind.py --cases 800 --out study``; an interrupted study continues where it
 stopped, and a longer one contains the shorter. ``--part null,named`` runs some of its parts.
 ``--scheduler ADDRESS`` uses an existing dask cluster, ``--workers N`` processes of this machine. Tables go
-to ``table.md``, figures beside.
+to ``table.md``, figures next to it.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def main() -> None:
         "--cases", type=int, default=800, help="cases of the whole study, shared among its parts"
     )
     parser.add_argument("--part", default=",".join(PARTS), help=f"parts to run, of {', '.join(PARTS)}")
-    parser.add_argument("--seed", type=int, default=0, help="draws other vehicles, and everything else anew")
+    parser.add_argument("--seed", type=int, default=0, help="draws other vehicles, and everything else again")
     parser.add_argument("--out", type=Path, default=Path("study"))
     add_engine(parser)
     options = parser.parse_args()

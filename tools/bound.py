@@ -48,7 +48,7 @@ class BestFit:
     at_sigma : float
         m, how well the masses' positions are known beforehand.
     widths : (k,) array, optional
-        1-sigma of what is known beforehand instead: soft iron (9), hard iron (3, nT), and of each mass moment
+        1-sigma of the prior instead: soft iron (9), hard iron (3, nT), and of each mass moment
         (3, A m²), volume (3, m³) and place (3, m).
 
     Attributes
@@ -107,7 +107,7 @@ class BestFit:
         return np.asarray(after - self._h @ off)
 
     def _whitened(self, values: FloatArray) -> FloatArray:
-        """Whiten columns (m, j), nT, on the calibration's samples; each run begins anew."""
+        """Whiten columns (m, j), nT, on the calibration's samples; each run begins independently."""
         values = values / self._learned_floor[:, None]
         follows = (np.diff(self._calibration["run"].to_numpy(), prepend=np.nan) == 0)[:, None]
         innovations = (values - self._phi * np.roll(values, 1, axis=0)) / np.sqrt(1 - self._phi**2)
@@ -122,17 +122,17 @@ class SurveyBound:
     vehicle : Vehicle
         The truth, as for :class:`BestFit`.
     survey : Dataset (time)
-        From which vehicle and rock are learned, of n samples.
+        From which vehicle and crustal field are estimated, of n samples.
     place : (n, 2) array
         m, of its samples.
-    rock : tuple of 2 float
+    crust : tuple of 2 float
         nT and m, of a Gaussian field with a Gaussian covariance, which is known.
     noise : tuple of 2 float
         nT of a channel, and its memory in samples.
 
     Notes
     -----
-    As :class:`BestFit`, with rock and level in the covariance K of the magnitudes:
+    As :class:`BestFit`, with crustal field and bias in the covariance K of the magnitudes:
     :math:`P = (I + G^T K^{-1} G)^{-1}`. The map is the posterior of a Gaussian field whose data have the
     covariance :math:`K + G G^T`. Neighbouring samples are averaged until :data:`DENSE` are left.
     """
@@ -142,10 +142,10 @@ class SurveyBound:
         vehicle: Vehicle,
         survey: xr.Dataset,
         place: FloatArray,
-        rock: tuple[float, float],
+        crust: tuple[float, float],
         noise: tuple[float, float],
     ) -> None:
-        self._vehicle, self._sigma, self._rock = vehicle, noise[0], rock
+        self._vehicle, self._sigma, self._crust = vehicle, noise[0], crust
         self._scale, memory = _widths(vehicle, 0.05), noise[1]
         g, floor = _sensitivity(vehicle, survey, self._sigma)
         step = -(-len(g) // DENSE)
@@ -171,13 +171,13 @@ class SurveyBound:
         return float(np.sqrt(1.0 + np.einsum("ni,ij,nj->", H, P, H) / (floor**2).sum()))
 
     def data_covariance(self, *, vehicle_known: bool) -> FloatArray:
-        """Return the covariance (n, n), nT², of the magnitudes: rock, level, noise, vehicle."""
+        """Return the covariance (n, n), nT², of the magnitudes: crustal field, bias, noise, vehicle."""
         return np.asarray(self._K if vehicle_known else self._K + self._G @ self._G.T)
 
     def of_map(self, at: FloatArray, apart_from: int, *, vehicle_known: bool) -> FloatArray:
         """Return the least error (m,), nT, of the map at places (m, 2), m.
 
-        It is apart from the mean error at the first `apart_from` of them.
+        It excludes the mean error at the first `apart_from` of them.
         """
         K = self.data_covariance(vehicle_known=vehicle_known)
         C = self._alike(at, self._place)
@@ -186,8 +186,8 @@ class SurveyBound:
         return np.asarray(np.sqrt(np.diag(S) - 2.0 * level + level[:apart_from].mean()))
 
     def _alike(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """Return the rock's covariance (n, m), nT², between places (n, 2) and (m, 2), m."""
-        size, length = self._rock
+        """Return the crustal field's covariance (n, m), nT², between places (n, 2) and (m, 2), m."""
+        size, length = self._crust
         return np.asarray(size**2 * np.exp(-0.5 * cdist(a, b, "sqeuclidean") / length**2))
 
 

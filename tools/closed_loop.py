@@ -12,10 +12,10 @@ ignoring m    with the one that does not
 ratio         the former over the latter
 autopilot m   error of the autopilot's own position
 alone m       that of the one that ignores fixes
-claims m      what it claims (1-sigma, an axis), root mean square
-standardised  its error an axis over what it claims, root mean square: 1 is honest
+claims m      its claim (1-sigma, an axis), root mean square
+standardised  its error an axis over its claimed sigma, root mean square: 1 is consistent
 back s        from the return of GPS until the autopilot is within 3 sigma of it
-taken         of what was sent
+taken         of the sent fixes
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def one(case: Case) -> list[str]:
     without, _ = run(False)
     lost = (with_us.seconds > LOST) & (with_us.seconds < case.hours * HOUR - BACK)
     fed = lost & (with_us.sent > 0)
-    fed &= np.cumsum(fed) > LOST  # once it has settled
+    fed &= np.cumsum(fed) > LOST  # once it has converged
     if not fed.any():  # none was sent
         fed = lost
     obeying, ignoring = rms(with_us.error[lost]), rms(without.error[lost])

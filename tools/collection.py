@@ -3,8 +3,8 @@
     python tools/collection.py
 
 pytest-xdist's workers collect independently; where an identifier depends on the time, on random numbers or on
-the order of a set, the run ends before the first test. The two collections are some seconds apart and hash
-strings differently.
+the order of a set, the run ends before the first test. The two collections are separated by some seconds
+and hash strings differently.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ UPSTREAM = """<?xml version="1.0"?>
 
 
 def collect(path: Path, seen: dict[Path, Any]) -> dict[Path, Any]:
-    """Parse `path` and what it includes, each file once."""
+    """Parse `path` and its includes, each file once."""
     if path not in seen:
         seen[path] = parsed = mavparse.MAVXML(str(path), mavparse.PROTOCOL_2_0)
         for name in parsed.include:

@@ -3,9 +3,10 @@
 Each vehicle of a simulated fleet is drawn at random and flies several deployments: ten runs, then a survey on
 another day. From one refit to the next its fixed iron, its masses' places and moments change (`--refit
 battery`: the battery pack is another one, with a moment of its own), from one power-up to the next the
-sensor's offsets. The fleet learns from all deployments but each vehicle's last. That one is calibrated with
-some of its runs, with the fleet's prior and without, and scored on its survey as tools/accuracy.py does. The
-bound assumes that the vehicle before its last refit and the widths of all changes are known exactly.
+sensor's offsets. The fleet learns from all deployments but each vehicle's last. The last one is calibrated
+with some of its runs, with the fleet's prior and without, and scored on its survey as tools/accuracy.py
+does. The bound assumes that the vehicle before its last refit and the widths of all changes are known
+exactly.
 
     python tools/fleet.py --vehicles 12 --deployments 8 --runs 0 2 10
 """
@@ -86,7 +87,7 @@ class Flight(NamedTuple):
         return at_rest(parts["calibration"], MASSES), at_rest(parts["survey"], MASSES), vehicle
 
     def widths(self) -> FloatArray:
-        """Return how far its vehicle may be from what it was before: after a refit, or a power-up alone."""
+        """Return how far its vehicle may be from its state before: after a refit, or a power-up alone."""
         refitted = self.number % self.every == 0
         nothing = 1e-9  # the bound divides by it
         widths = [*[REFITTED["soft iron"] if refitted else nothing] * 9]

@@ -1,7 +1,7 @@
 """Damaged inputs for every parser and reader: a result, or one of our own errors; anything else is kept.
 
 Seeds are what our own writers write. Each is damaged at random (bits, bytes, numbers, pieces moved, doubled,
-cut off), and read as a user's file or line would be. The same seed damages the same way; a run goes on where
+cut off), and read as a user's file or line would be. A seed damages in one way; a run goes on where
 the last of its folder stopped. With atheris (pip install atheris) ``--guided`` lets coverage choose.
 
     python tools/fuzz.py mavlink digitizer -n 1000000 -o fuzz
@@ -178,7 +178,7 @@ def damaged(seeds: list[bytes], rng: random.Random) -> bytes:
 
 
 class Session:
-    """One target's folder: how many inputs were tried with what outcome, and what was found."""
+    """One target's folder: how many inputs were tried with what outcome, and the findings."""
 
     def __init__(self, name: str, folder: Path, seed: int) -> None:
         self.name, self.folder = name, folder / name
@@ -205,7 +205,7 @@ class Session:
             self.state["read"] += 1
         except MagbridgeError as error:
             self.state["refused"] += 1
-            if "\n" in str(error) or "cannot be read, damaged?" in str(error):  # nobody foresaw it
+            if "\n" in str(error) or "cannot be read, damaged?" in str(error):  # it was not foreseen
                 problem = f"{error}\n" + "\n".join(getattr(error, "__notes__", []))
         except Exception:  # noqa: BLE001 - that is what we look for
             problem = traceback.format_exc()
@@ -249,10 +249,10 @@ def blind(session: Session, read: Read, seeds: list[bytes], count: int, seconds:
 
 
 def guided(session: Session, name: str, folder: Path, count: int) -> None:
-    """Let atheris choose by coverage; what it finds useful stays in the target's folder ``corpus``."""
+    """Use coverage by atheris; useful inputs stays in the target's folder ``corpus``."""
     import atheris  # type: ignore[import-not-found,import-untyped,unused-ignore]  # optional, for this alone
 
-    # what is imported here is watched: also that which the first reading imports
+    # imports here are watched: also that which the first reading imports
     with atheris.instrument_imports(include=["magbridge"]), contextlib.suppress(MagbridgeError):
         read = TARGETS[name].open(folder)
         read(b"")
@@ -303,7 +303,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", type=Path, default=Path("fuzz"), help="folder of states and findings")
     parser.add_argument("--guided", action="store_true", help="by coverage (atheris); one target")
-    parser.add_argument("--report", action="store_true", help="print what was tried, and stop")
+    parser.add_argument("--report", action="store_true", help="print the inputs tried, and stop")
     chosen = parser.parse_args()
     if chosen.report:
         report(chosen.o)

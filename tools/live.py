@@ -1,17 +1,17 @@
 """What a bridge that learns in flight makes of a calibration that no longer fits, on simulated gliders.
 
-Each glider flies the paper's Table 1 and is calibrated; then it surveys rock of 60 nT on another day, with
-one thing changed, and the bridge has nothing but the IGRF to compare with. A sample's telemetry is two
-seconds old: a mass's motion begins before it is reported. Samples in a motion are left out. Printed for each
-change, the median of the gliders where nothing else is said:
+Each glider flies the paper's Table 1 and is calibrated; then it surveys a crustal field of 60 nT on another
+day, with one thing changed, and the bridge has nothing but the IGRF to compare with. A sample's telemetry
+is two seconds old: a mass's motion begins before it is reported. Samples in a motion are left out. Printed
+for each change, the median of the gliders unless stated otherwise:
 
 - fixed, MagNav, bound, published (and the 95th percentile): RMS error about its mean after the first three
   hours, over the noise floor, of the fixed field, the field by MagNav.jl's online filter
   (:mod:`magnav_online`), by one that knows the cause and its onset (:mod:`live_bound`) and the published one;
-- sigma: standardised error of what is published, from the alarm on;
+- sigma: normalised error of the published field, from the alarm on;
 - beyond: how many samples are off by more than three sigmas, over those that the optimal detector needs,
-  which knows cause, direction, size and calibration, but the rock no better than the bridge does (95th
-  percentile);
+  which knows cause, direction, size and calibration, but the crustal field no better than the bridge does
+  (95th percentile);
 - delay: samples until the alarm, over the same;
 - among, alone: how often the cause is among those named, and the only one;
 - false: alarms without a cause;
@@ -212,7 +212,7 @@ def main() -> None:
     parser.add_argument("--hours", type=float, default=12.0, help="of the survey")
     parser.add_argument("--size", type=float, default=20.0, help="nT of a change, in times its kind's unit")
     parser.add_argument("--changes", nargs="+", default=list(CHANGES), choices=list(CHANGES))
-    parser.add_argument("-v", action="store_true", help="print what is announced")
+    parser.add_argument("-v", action="store_true", help="print the notices")
     add_engine(parser)
     asked = parser.parse_args()
     shown = table(

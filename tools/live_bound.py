@@ -1,6 +1,6 @@
 """What the best could make of a change, for :mod:`live`: filters that know the cause, its onset and the rest.
 
-But they know the rock no better than the bridge does.
+But they know the crustal field no better than the bridge does.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def transitions(nuisance: Nuisance, log: xr.Dataset) -> list[tuple[FloatArray, F
 def best_delay(
     effect: FloatArray, log: xr.Dataset, rest: BoolArray, calibration: Calibration, since: int
 ) -> int:
-    """Return how many samples `rest` until a known `effect` (n,) on the total field, nT, is beyond chance.
+    """Return how many samples `rest` until a known `effect` (n,) on the total field, nT, is significant.
 
-    It begins with the sample `since`; what the rock is there is known from those before.
+    It begins with the sample `since`; the crustal field there follows from those before.
 
-    That is where the log-likelihood ratio of a signal known in noise and rock is expected to reach the
-    bridge's own threshold: half the energy of the signal, whitened as the bridge whitens.
+    That is where the log-likelihood ratio of a signal known in noise and crustal field is expected to reach
+    the bridge's own threshold: half the energy of the signal, whitened as the bridge whitens.
     """
     nuisance = Nuisance(calibration.noise, Align().reference_sigma)
     P, m, h = nuisance.initial.copy(), np.zeros(STATES), -nuisance.row(1.0)

@@ -11,7 +11,7 @@ __all__ = ["CHANGES", "MASSES", "hours"]
 
 MASSES = ("battpos", "ballast")
 Change = Callable[[xr.Dataset, np.random.Generator, float], np.ndarray]
-"""The log, a generator, and how many times the noise: what is added to the channels (n, 3), nT."""
+"""The log, a generator, and how many times the noise: the field added to the channels (n, 3), nT."""
 
 
 def direction(rng: np.random.Generator) -> np.ndarray:
@@ -82,4 +82,4 @@ CHANGES: dict[str, tuple[Change, str, float]] = {
     "map": (sheet, "map_error", 0.4),
     "straight over rock": (nothing, "", 0.0),
 }
-"""Name -> what is changed, its cause, and from which share of the survey on."""
+"""Name -> the change, its cause, and from which share of the survey on."""

@@ -1,9 +1,9 @@
 """How good a bridge gets that begins without a calibration: error and sigma against hours, and the figure.
 
-Random gliders survey rock of 60 nT in a criss-cross, with the IGRF as the only reference and no calibration
-run. Printed and drawn: the RMS error about its mean of the published field over the noise floor, in each
-stretch of the survey, and its claimed sigma, with and without the error of the level, which nobody sees;
-and the standardised error of its samples, level and all.
+Random gliders survey a crustal field of 60 nT in a criss-cross, with the IGRF as the only reference and no
+calibration run. Printed and drawn: the RMS error about its mean of the published field over the noise
+floor, in each stretch of the survey, and its claimed sigma, with and without the error of the level, which
+is not observable; and the standardised error of its samples, level and all.
 
     python tools/live_nothing.py --seeds 4 --hours 24 -o docs/figures/learning.png
 """
@@ -26,7 +26,7 @@ from magbridge.learning import Learner
 from magbridge.learning.start import class_prior
 
 EDGES = (0.05, 0.1, 0.2, 0.35, 0.6, 1.0, 1.5, 2.25, 3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0)
-"""h."""
+"""Ends of the stretches, h."""
 FLOOR = 1.0
 """nT, the noise of the simulated sensor's channels."""
 

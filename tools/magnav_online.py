@@ -1,9 +1,9 @@
 """The peer of learning in flight: MagNav.jl's online filter, the linear one, on our samples.
 
 There (``ekf_online`` in MagNav.jl; Canciani 2022, IEEE Trans. Aerospace and Electronic Systems 58:420) the 18
-coefficients of Tolles and Lawson are states beside a first-order Gauss-Markov field: permanent, induced and
+coefficients of Tolles and Lawson are states next to a first-order Gauss-Markov field: permanent, induced and
 eddy-current terms, which are products of the direction cosines, their squares and their rates. It has no
-terms for masses that move, so it gets the field corrected by the fixed calibration, and learns what is left.
+terms for masses that move, so it gets the field corrected by the fixed calibration, and learns the rest.
 """
 
 from __future__ import annotations

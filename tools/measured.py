@@ -63,7 +63,7 @@ SEAGLIDER_CHOICES: tuple[tuple[str, tuple[str, ...], int], ...] = (
 FLIGHT_MIDNIGHT_S = 1592611200.0
 """Seconds since 1970 at the start of the flight's day (2020-06-20)."""
 FLIGHT_ROWS = 5
-"""Of the flight's rows (10 Hz), every fifth is used: an aircraft turns no faster."""
+"""Every fifth row of the flight (10 Hz) is used: an aircraft turns no faster."""
 HELD_OUT_PARTS = 8
 MAX_LINE_DISTANCE_M = 60.0
 """Half a step between a line's samples, about."""
@@ -312,7 +312,7 @@ def calibrate_and_diagnose(vehicle: Vehicle) -> tuple[Fit, Diagnosis]:
 
 
 def show_diagnoses(data: Path, console: Console) -> None:
-    """Print what is found in each vehicle's log, and the independent check."""
+    """Print the findings in each vehicle's log, and the independent check."""
     shown = table(
         "Measured logs, nT RMS",
         "log", "scales", "verdict", "found", "before", "held out", "95 %", "about mean", "+ 9 terms",

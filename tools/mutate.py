@@ -5,9 +5,9 @@
     python3 tools/mutate.py --seed 2 -n 5            others
 
 A comparison is turned, an operator exchanged, a number changed, a statement left out; then the tests of the
-module's own room run, until the first that fails. What lives is printed with its line: either nothing tests
-that, or the change changes nothing that matters, which only a reader can tell. Nothing is written: the change
-is made as the module is imported, in a fork of a process that has imported the libraries.
+module's own package run, until the first that fails. What lives is printed with its line: either nothing
+tests that, or the change changes nothing that matters, which only a reader can tell. Nothing is written:
+the change is made as the module is imported, in a fork of a process that has imported the libraries.
 """
 
 from __future__ import annotations
@@ -117,10 +117,10 @@ def _is_for_types(node: ast.AST) -> bool:
 
 
 def change(tree: ast.Module, number: int, rng: random.Random) -> tuple[int, str]:
-    """Make the change of that number in a tree; return its line, and what was changed."""
+    """Make the change of that number in a tree; return its line, and the change."""
     node, how = list(changes(tree))[number]
     before = ast.unparse(node).splitlines()[0]
-    new: Any = node  # of any kind: what is set below exists there
+    new: Any = node  # of any kind: the attributes set below exist there
     match node, how:
         case ast.Compare(), _:
             new.ops[0] = OTHER[type(node.ops[0])]()

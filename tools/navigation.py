@@ -1,4 +1,4 @@
-"""How well the navigator holds a position: simulated gliders and maps, beside the bound and beside peers.
+"""How well the navigator holds a position: simulated gliders and maps, with the bound and with peers.
 
     python tools/navigation.py [--runs 100] [--part accuracy] ... [--keep DIR] [--peers PYTHON] [--data DIR]
 
@@ -7,7 +7,7 @@ accuracy      error over the posterior Cramér-Rao bound, lost runs, consistency
 nominal       the same, with the remaining errors of a nominal calibration
 watch         how long a wrong position counts as valid
 misinformed   whether a position counts as valid when the level is wrong, or half of the map is
-unmapped      surveys without a map: a glider's of 6 and 12 h, an aircraft's of 100 minutes, beside the bound
+unmapped      surveys without a map: a glider's of 6 and 12 h, an aircraft's of 100 minutes, with the bound
 smoothed      the same flights on a rough map and on that map without its short waves
 dived         gliders that dive under a map flown 90 m above the sea, without and with its continuation
 calibrations  simulated gliders, each calibrated by nominal, cubic and auto, that fly the same survey
@@ -175,15 +175,15 @@ def calibrations(runs: Runs, _asked: argparse.Namespace) -> None:
             show(table)
 
 
-# ---- whether a lost filter says so -------------------------------------------------------------------------
+# ---- whether a lost filter reports it
 
 
 def watch(runs: Runs, _asked: argparse.Namespace) -> None:
     """How soon a wrong position no longer counts as valid."""
     print(
         "\n"
-        f"## A lost filter says so: {runs.number} runs of 6 h a row. Lost: the truth is outside the 99.99 % "
-        "ellipse, and a quarter of\n"
+        f"## A lost filter reports it: {runs.number} runs of 6 h a row. Lost: the truth is outside the "
+        "99.99 % ellipse, and a quarter of\n"
         "a correlation length away or more. Flagged: its position is no longer valid\n"
     )
     table: Table = [("how, map", "lost %", "flagged in 30 min %", "95 % within min", "found in 2 h %")]
@@ -225,10 +225,11 @@ def misinformed(runs: Runs, _asked: argparse.Namespace) -> None:
 
 
 def dives(runs: Runs, _asked: argparse.Namespace) -> None:
-    """What it costs to use a map at its own altitude for the field below it."""
+    """Measure the cost of using a map at its own altitude for the field below it."""
     print(
         "\n"
-        f"## Under a map from 90 m up: {runs.number} worlds, 4 h, dives of 140 m, 54 nT of rock 350 m down\n"
+        f"## Under a map from 90 m up: {runs.number} worlds, 4 h, dives of 140 m, a crustal field "
+        "of 54 nT from 350 m down\n"
     )
     found = np.array(runs(partial(dived)))
     table: Table = [("map", "error m: median", "90 %", "worst", "NEES/2", "valid %")]
@@ -253,7 +254,7 @@ def on_smoothed_maps(runs: Runs, asked: argparse.Namespace) -> None:
 
 
 def unmapped(runs: Runs, asked: argparse.Namespace) -> None:
-    """Localise surveys in their own field, beside the bound of localisation and mapping at once."""
+    """Localise surveys in their own field, with the bound of localisation and mapping at once."""
     print(
         "\n"
         f"## Without a map: {runs.number} surveys a row (aircraft: a quarter), RMS in m over track and runs;"

@@ -1,10 +1,10 @@
-"""How fast logs are read, beside the libraries that others read them with.
+"""Measure how fast logs are read, compared with the usual libraries.
 
     python tools/readers.py [--times 3] LOG...
 
 Each reader has a process of its own, its start and its imports included; Slocum's segments are read together.
 Printed are processor seconds (of all processes; the least of several runs), their ratio, and the largest
-memory. A peer reads the same as far as it can be told to: pymavlink and rosbags are asked for the messages
+memory. A peer reads the same as far as its options allow: pymavlink and rosbags are asked for the messages
 that magbridge reads, pyulog for its topics, dbdreader for its sensors; xarray loads all.
 """
 

@@ -180,7 +180,12 @@ def _entry(name: str) -> str:
 def messages() -> Iterator[str]:
     """Yield the lines of the page of messages and enumerations."""
     dialect = parse(ROOT / "magbridge/mavlink/magbridge.xml").getroot()
-    yield from ("# MAVLink messages", "", "What the bridge sends beside the standard messages.", "")
+    yield from (
+        "# MAVLink messages",
+        "",
+        "Messages that the bridge sends in addition to the standard ones.",
+        "",
+    )
     for message in dialect.iterfind("messages/message"):
         yield from (f"## {message.get('name')} ({message.get('id')})", "", _text(message), "")
         yield from ("| field | type | unit | |", "|---|---|---|---|")

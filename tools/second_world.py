@@ -2,9 +2,9 @@
 
 Run it as ``python tools/second_world.py --cases 40``. It shares with the simulator neither the forward model
 (dipoles with an induced part, eddy currents of a plate with a time constant, currents in a loop), nor the
-mission, nor the noise, and nothing was tuned on it. A name is *right* if what was hidden is named, *alone* if
-nothing else is; a *second* is any further name; *foreign* effects are no cause of the table, and any name is
-wrong for them.
+mission, nor the noise, and nothing was tuned on it. A name is *right* if the hidden cause is named, *alone*
+if nothing else is; a *second* is any further name; *foreign* effects are not in the table of causes, and
+any name is wrong for them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from magbridge.diagnose.run import diagnose
 
 STEP, HOURS, EPOCH = 5.0, 4.0, 1.75e9
 EARTH = np.array([17_000.0, -4_600.0, 46_500.0])
-"""nT, north, east, down."""
+"""Main field in nT: north, east, down."""
 UNITS = {
     "mag_x": "nT", "mag_y": "nT", "mag_z": "nT", "reference_field": "nT", "roll": "deg", "pitch": "deg",
     "heading": "deg", "latitude": "deg", "longitude": "deg", "depth": "m", "battpos": "mm", "vbd": "cc",
@@ -132,7 +132,7 @@ class Glider:
 
 
 Case = Callable[[int, str, float], dict[str, Any]]
-"""Number, name of what is hidden, S/N -> what is named."""
+"""Number, name of the hidden effect, S/N -> the names given."""
 Effect = Callable[[Log, np.random.Generator], FloatArray]
 
 
@@ -244,7 +244,7 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
 
 
 def reported(name: str, found: Diagnosis) -> dict[str, Any]:
-    """Return what was hidden, what is named, and what remains possible."""
+    """Return the hidden, the named and the possible causes."""
     named = one_of(one.candidate.cause for one in found.findings)
     named |= {"outliers"} if found.wrong is not None else set()
     sets = named | one_of(r.candidate.cause for one in found.findings for r in one.competing)
@@ -252,7 +252,7 @@ def reported(name: str, found: Diagnosis) -> dict[str, Any]:
 
 
 def study(run: Case, names: Sequence[str], own: Container[str], doc: str | None) -> None:
-    """Run cases, each hiding one of `names` (nothing, where empty) in turn, and count what is named."""
+    """Run cases, each hiding one of `names` (nothing, where empty) in turn, and count the names."""
     parser = command_line(doc)
     parser.add_argument("--cases", type=int, default=2 * len(names))
     parser.add_argument("--first", type=int, default=0, help="number of the first case")

@@ -25,7 +25,7 @@ def count(folder: Path) -> tuple[int, int]:
 
 
 def parts(groups: dict[str, list[str]]) -> dict[str, tuple[int, int]]:
-    """Return lines and modules of each part; what no part names under ``magbridge`` is in the top level."""
+    """Return lines and modules of each part; the rest of ``magbridge`` is in the top level."""
     counts = {
         name: tuple(map(sum, zip(*(count(ROOT / folder) for folder in folders), strict=True)))
         for name, folders in groups.items()

@@ -5,8 +5,8 @@
 
 Bytes of an emulated digitizer and of an autopilot go straight into the bridge's pipeline. In the end,
 readings made = samples + lost, as MAG_STATUS tells; of the samples without a flag at most 0.3 % lie beyond
-three of their sigmas, as of a Gaussian error; and the most memory that the process ever held is what it
-was at half time. Each hour of the instrument's time has its line.
+three of their sigmas, as of a Gaussian error; and the most memory that the process ever held equals that at
+half time. Each hour of the instrument's time has its line.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ file = "cal.json"
 """
 BEGIN_US = 1_780_000_000_000_000
 TRUTH = np.array([20_000.0, 1_000.0, 40_000.0])
-"""nT."""
+"""True field in sensor axes, nT."""
 SLOPE = np.array([300.0, -200.0, 100.0])
 """nT that the mass adds from 0 to 1."""
 FAULTS = ("unplugged", "damaged", "twice", "standstill", "spike", "moves")
@@ -63,7 +63,7 @@ HOUR = 3_600_000
 
 
 def calibration() -> Calibration:
-    """Return what is right for a mass whose field is `SLOPE` times its position."""
+    """Return the right value for a mass whose field is `SLOPE` times its position."""
     return Calibration(
         parameters=(Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0),),
         terms=(Polynomial(exponents=((0,), (1,))),),
@@ -77,7 +77,7 @@ def calibration() -> Calibration:
 
 
 class Soak:
-    """A bridge, its instrument and autopilot, and the account of what was made."""
+    """A bridge, its instrument and autopilot, and the account of all readings."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         save(calibration(), folder / "cal.json")
@@ -94,14 +94,14 @@ class Soak:
         self._ear, self._autopilot = Codec(0, 0), Codec(1, 1)
 
     def reading(self, extra: float = 0.0) -> bytes:
-        """Return the bytes of the next reading, whether anybody hears them or not."""
+        """Return the bytes of the next reading, whether a receiver exists or not."""
         self.made += 1
         field = TRUTH + SLOPE * self.position + self.rng.normal(0.0, 1.0, 3) + [0.0, 0.0, extra]
         x, y, z = field.tolist()
         return self.encoder.encode(Reading((x, y, z), device_time=self.made * 1e-3 % 4294.967296, supply=3.7))
 
     def feed(self, channel: Channel, data: bytes) -> None:
-        """Let the bridge have bytes now, and look at what it says of them."""
+        """Send bytes to the bridge now, and check its messages."""
         event = Event(BEGIN_US + self.made * 1000 + 400 + self.later_us, channel, data)
         for _, frame in self.pipeline.feed(event):
             for message in self._ear.parse(frame):
@@ -177,7 +177,7 @@ def main() -> int:
             if soak.made >= told + HOUR:
                 told = soak.made
                 print(f"{told / HOUR:.1f} h: {soak.account()}, {peak()} kB", flush=True)
-            if not half and soak.made > last // 2:  # what it caches is full by now
+            if not half and soak.made > last // 2:  # its caches are full by now
                 half = peak()
         for _ in range(3):
             soak.feed(Channel.SENSOR, soak.reading())

@@ -1,9 +1,9 @@
-"""Install the programs that the interoperability tests talk to, into ``.peers``, apart from magbridge.
+"""Install the programs that the interoperability tests talk to, into ``.peers``, separate from magbridge.
 
     python3 tools/stations.py
 
 MAVProxy, MAVSDK and pymavlink's tools (Python, ``.peers/python``), node-mavlink (npm, ``.peers/node``).
-Versions are pinned; what is there already in the right version stays. MAVProxy's maps and plots (1 GB) are
+Versions are pinned; programs of the right version stay. MAVProxy's maps and plots (1 GB) are
 left out: the modules that the tests load do without.
 """
 

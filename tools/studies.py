@@ -1,7 +1,7 @@
 """What the studies share: running cases in parallel, keeping their rows, and the tables of the results.
 
-A study is a function that runs one case and returns its rows, the columns that tell the lines of its table
-apart, and a summary for each further column. ``--out FILE.parquet`` keeps the rows; cases that the file has
+A study is a function that runs one case and returns its rows, the columns that distinguish the lines of its
+table, and a summary for each further column. ``--out FILE.parquet`` keeps the rows; cases that the file has
 are not run again.
 """
 
@@ -29,7 +29,7 @@ __all__ = ["Column", "Study", "add_engine", "as_done", "command_line", "in_order
 Row = dict[str, Any]
 Statistic = Callable[[np.ndarray], float]
 REPORT_EVERY = 10
-"""Cases between two lines of progress where there is no terminal."""
+"""Cases between two lines of progress without a terminal."""
 
 
 def command_line(doc: str | None) -> argparse.ArgumentParser:
@@ -120,7 +120,7 @@ class Study:
         Takes the parts of a case and returns its rows, each a dictionary. A row whose ``failed`` is not
         empty is counted and left out of the statistics.
     by : tuple of str
-        Columns of the rows that tell the lines of the table apart.
+        Columns of the rows that distinguish the lines of the table.
     columns : mapping of str to Column
         Further columns of the table by heading.
     """

@@ -2,8 +2,8 @@
 
 Run it as ``python tools/third_world.py --cases 22``. A lawn-mower of yo-yos near the equator; masses are bars
 with two poles, noise is flicker noise, and effects are laws that neither the detector nor the other worlds
-know (Bouc and Wen's hysteresis, a damped filter of second order, a soft clip). Nothing was tuned on it. What
-is counted is what :mod:`second_world` counts; where nothing is hidden, any name is false.
+know (Bouc and Wen's hysteresis, a damped filter of second order, a soft clip). Nothing was tuned on it. The
+counts are those of :mod:`second_world` counts; where nothing is hidden, any name is false.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from magbridge.diagnose.run import diagnose
 
 HOURS, EPOCH = 4.0, 1.76e9
 EARTH = np.array([27_500.0, 1_900.0, -18_200.0])
-"""nT, north, east, down."""
+"""Main field in nT: north, east, down."""
 POLES = 20.0
 """nT m² a pole of a mass gives, 1-sigma."""
 
@@ -86,7 +86,7 @@ class Vehicle:
 
 
 Effect = Callable[[Vehicle, Log, np.random.Generator], FloatArray]
-"""What is added to the reading (n, 3), up to a factor."""
+"""The field added to the reading (n, 3), up to a factor."""
 
 
 def _along(x: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -160,7 +160,7 @@ def _escort(log: Log, rng: np.random.Generator) -> FloatArray:
 
 
 def _heater(log: Log, rng: np.random.Generator) -> FloatArray:
-    """A thermostat's current that nobody logs: on while it is cold, for ever longer."""
+    """A thermostat's current that is not logged: on while it is cold, for ever longer."""
     cycle = np.cumsum(1.0 / (300.0 + 400.0 * _hours(log) / HOURS)) * STEP
     return ((cycle + rng.random()) % 1.0 < 0.3).astype(float)
 

@@ -1,7 +1,7 @@
-"""A cause of one's own for ``magbridge diagnose``: something that is switched on and off has a field.
+"""A third-party cause for ``magbridge diagnose``: something that is switched on and off has a field.
 
 A cause is one row, `HEATER_FIELD`, and the function in it, which lists hypotheses. Each is an effect that the
-live correction knows too (here a `ChannelEffect`), so what is found can be flown.
+live correction knows too (here a `ChannelEffect`), so the finding can be corrected live.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from magbridge.sensors import Driver
 __all__ = ["Counts", "CountsOptions"]
 
 LONGEST = 64
-"""Bytes of the longest line; what is longer is no line."""
+"""Maximum number of bytes of a line."""
 
 
 class CountsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -57,7 +57,7 @@ class Counts(Driver):
         return ()
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Take bytes as they came; return the readings that they complete."""
+        """Parse bytes in any pieces; return the readings that they complete."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST:  # noise without an end of a line
             self._skipped += len(self._rest)

@@ -43,7 +43,6 @@ def test_every_central_type_is_in_its_module() -> None:
 
 
 def test_every_module_that_the_method_names_exists() -> None:
-    """``magbridge.a.b`` and what follows it as ``.c`` are modules or packages."""
     text = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
     names = re.findall(r"`(magbridge(?:\.\w+)+)`", text)
     assert len(names) > 10

@@ -1,4 +1,4 @@
-"""Every figure that a page shows was measured by a command beside it, which is there with its options."""
+"""Every figure that a page shows was measured by a command on the page, which exists with its options."""
 
 from __future__ import annotations
 

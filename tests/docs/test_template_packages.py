@@ -46,7 +46,7 @@ def install(template: Path, folder: Path) -> None:
 
 
 def magbridge(folder: Path, *arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run the program with what is in `folder` installed beside it."""
+    """Run the program with the contents of `folder` installed."""
     done = subprocess.run(
         [sys.executable, "-m", "magbridge", *map(str, arguments)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])},

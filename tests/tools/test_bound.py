@@ -68,7 +68,7 @@ def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: p
 
 
 def test_a_best_map_s_error_is_its_bound(flight: tuple[Vehicle, xr.Dataset, xr.Dataset]) -> None:
-    """On average over rocks, vehicles and noise; who knows the vehicle has less."""
+    """On average over crustal fields, vehicles and noise; it is less if the vehicle is known."""
     vehicle, _, survey = flight
     few, rng = survey.isel(time=slice(0, None, 9)), np.random.default_rng(2)
     place = np.cumsum(rng.normal(0.0, 60.0, (few.sizes["time"], 2)), axis=0)

@@ -179,7 +179,7 @@ def test_an_autopilot_that_obeys_leads_nobody_astray(kind: str, stack: str, stre
 
 
 def test_ardupilot_is_not_made_to_believe_odometry_too_much() -> None:
-    """Its EKF would claim 1 m where the field gives 100: none is sent, and it is told why."""
+    """Its EKF would claim 1 m where the field gives 100: none is sent, and the reason is reported."""
     run, autopilot = sailed("ODOMETRY", "ArduPilot", "ODOMETRY")
     assert not autopilot.taken
     assert any("ArduPilot would claim to know it better" in text for _, text in run.texts)

@@ -1,4 +1,4 @@
-"""Fitting and correcting: beside scipy with finite differences, and beside the bare matrix product."""
+"""Time fitting and correcting, compared with scipy and with the bare matrix product."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
         compared("correct, sigmas and all, positions new with every sample", "bare", bare, least=0.5),
         compared("the same, the product in pieces that stay in the cache", "pieces", "as above, in pieces"),
         compared(
-            "the same, beside all three products that it contains",
+            "the same, against all three products that it contains",
             "contained",
             "coarse and fine parts, in pieces",
         ),
@@ -131,7 +131,7 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
 def _jobs(
     calibration: Calibration, data: Observations
 ) -> tuple[dict[str, tuple[Callable[[], object], int]], tuple[int, int]]:
-    """Return what is timed, each with its number of samples; and the shape of the calibration's table."""
+    """Return the timed jobs, each with its number of samples; and the shape of the calibration's table."""
     rng = np.random.default_rng(1)
     n, few = 200_000, 2000
     field = data.field[rng.integers(0, len(data), n)]

@@ -24,7 +24,7 @@ LIBRARIES = "import numpy, cyclopts, pandas, xarray, scipy.linalg, scipy.optimiz
 
 
 def commands(folder: Path, repetitions: int) -> list[Row]:
-    """Time commands beside an interpreter that only imports the libraries they stand on."""
+    """Time commands and an interpreter that only imports the libraries they stand on."""
     write(simulate(load("demo"), 1).isel(time=slice(ROWS)), folder / "runs.csv")
     asked = ("--parameter", "battpos", "--parameter", "ballast", "-o", str(folder / "cal.json"))
     measured: dict[str, tuple[list[str], str, float]] = {

@@ -21,7 +21,7 @@ from sitl.mission import CrissCross
 __all__ = ["diagnosing", "long_survey", "survey_in"]
 
 NIGHT, MONTH = 12.0, 720.0
-"""h."""
+"""Durations of the logs, h."""
 NIGHTLY, MONTHLY = 10.0, 1.0
 """nT/degC, in a night and in a month: either makes a signal-to-noise ratio of 30 to 45."""
 

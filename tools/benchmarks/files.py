@@ -66,7 +66,7 @@ class Download:
 
 
 def files(folder: Path, repetitions: int) -> list[Row]:
-    """Measure without a download, beside a whole one at eight times the usual rate, and without again."""
+    """Measure without a download, during a whole one at eight times the usual rate, and without again."""
     logs = folder / "logs"
     logs.mkdir()
     with (logs / NAME).open("wb") as file:
@@ -88,7 +88,7 @@ def files(folder: Path, repetitions: int) -> list[Row]:
     rows = []
     for name, q, most in (("p50", 50.0, None), ("p99", 99.0, 2.0)):
         with_it, without = late(downloading, q), late(alone, q)
-        what = f"latency beside a download, {name}"
+        what = f"latency during a download, {name}"
         rows.append(Row(what, with_it, "ms", without, "without", with_it / without, most=most))
     samples = sum(len(run.latency) for run in downloading)
     lost = sum(int(np.isnan(run.latency).sum()) for run in downloading)

@@ -66,7 +66,7 @@ class Running(NamedTuple):
     """That datagram."""
 
     def write(self, frame: bytes) -> None:
-        """Let the fluxgate send `frame`."""
+        """Send `frame` as the fluxgate."""
         os.write(self.master, frame)
 
 
@@ -150,9 +150,9 @@ def play(
     sequences: Callable[[bytes], list[int]],
     station: Callable[[bytes], bytes] = lambda _: b"",
 ) -> Sent:
-    """Send readings and telemetry for a while; match what comes back by sequence number.
+    """Send readings and telemetry for a while; match the answers by sequence number.
 
-    A `station` is shown every datagram, and what it returns is sent.
+    A `station` receives every datagram, and its answer is sent.
     """
     clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
     received: list[tuple[float, bytes]] = []

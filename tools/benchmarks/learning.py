@@ -30,7 +30,7 @@ LIVE = 6.0
 
 
 def learning(folder: Path, repetitions: int) -> list[Row]:
-    """Measure a bridge that learns beside one that does not."""
+    """Measure a bridge that learns and one that does not."""
     return [*_processor(folder, repetitions), *_running(folder, repetitions)]
 
 

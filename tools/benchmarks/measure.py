@@ -14,7 +14,7 @@ __all__ = ["in_own_process", "processor_time"]
 
 
 def in_own_process(script: str, *arguments: object) -> Any:
-    """Run a script, which finds the arguments in ``sys.argv``; return what it prints as JSON, if anything."""
+    """Run a script, which finds the arguments in ``sys.argv``; return its output as JSON, if anything."""
     command = [sys.executable, "-c", script, *map(str, arguments)]
     place = Path(__file__).parents[1]
     done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)

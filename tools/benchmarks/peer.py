@@ -1,4 +1,4 @@
-"""The same MAVLink messages by the classes that pymavlink generates from our XML: floor of the benchmarks."""
+"""MAVLink messages by the classes that pymavlink generates from our XML: floor of the benchmarks."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Processor time of the whole live path for one sample, beside that of pymavlink's codec alone.
+"""Processor time of the whole live path for one sample, compared with pymavlink's codec alone.
 
-Two floors: decoding what comes over the link and encoding what goes out over it; and, because the log's
+Two floors: decoding the received frames and encoding the sent ones; and, because the log's
 frames are outputs too, that and encoding the message in which the log keeps the sensor's bytes.
 """
 
@@ -82,7 +82,7 @@ def _measure(folder: Path, repetitions: int, *, moving: bool) -> list[Row]:
 
 
 def _times(folder: Path, repetitions: int, *, moving: bool) -> tuple[dict[str, list[float]], float]:
-    """Return the µs that a sample takes in each repetition, by what is done; and the messages it sends."""
+    """Return the µs that a sample takes in each repetition, by kind of work; and the messages it sends."""
     pipeline = set_up(load(write_config(folder)), Start(BEGIN_US))
     feed, peer, log = Feed(moving=moving), Peer(), TlogWriter(folder / "logs")
     samples, messages = SECONDS * HERTZ, 0

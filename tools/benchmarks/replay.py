@@ -88,7 +88,7 @@ def _measure(folder: Path, repetitions: int, name: str, step: float, rows: int) 
 
 
 def _play(folder: Path, config: Path, log: xr.Dataset) -> tuple[float, float, bytes]:
-    """Return wall clock (s) of the replay, processor time (s) of the bridge, and what it published."""
+    """Return wall clock (s) of the replay, processor time (s) of the bridge, and its output."""
     listener, published = Listener(), bytearray()
 
     def receive(data: bytes) -> None:

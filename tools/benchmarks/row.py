@@ -10,7 +10,7 @@ __all__ = ["Row"]
 
 
 class Row(NamedTuple):
-    """A measured figure, beside its floor in the same run and its target.
+    """A measured figure, with its floor in the same run and its target.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
     @property
     def holds(self) -> bool | None:
-        """Whether the target is met; None without one."""
+        """True if the target is met; None without a target."""
         judged = self.value if self.ratio is None else self.ratio
         if self.most is not None:
             return judged <= self.most

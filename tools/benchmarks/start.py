@@ -1,4 +1,4 @@
-"""From ``magbridge run`` to its first heartbeat, what it imports, and the memory that it takes."""
+"""From ``magbridge run`` to its first heartbeat, its imports, and the memory that it takes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HERTZ = 100
 
 
 def start(folder: Path, repetitions: int) -> list[Row]:
-    """Start the bridge again and again, beside an interpreter that only imports what any bridge needs."""
+    """Start the bridge repeatedly, and an interpreter with the necessary imports."""
     bridge, bare, used = [], [], []
     memory: dict[str, float] = {}
     for _ in range(repetitions):

@@ -27,7 +27,7 @@ __all__ = ["BEGIN_US", "CONFIG", "Feed", "calibration", "write_config"]
 BEGIN_US = 1_750_000_000_000_000
 TELEMETRY_HZ = 20
 TELEMETRY = ("battpos",) * 8 + ("ballast",) * 8 + ("ATTITUDE",) * 3 + ("GLOBAL_POSITION_INT",)
-"""Messages of one second, beside the autopilot's heartbeat."""
+"""Messages of one second, in addition to the autopilot's heartbeat."""
 HORIZONTAL, VERTICAL, NOISE = 19_000.0, 48_640.0, 0.5
 """nT: the Earth's field at 49.5 N, 57.8 W, and the noise of an axis."""
 DECLINATION = -0.32
