@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import commits
@@ -83,3 +84,9 @@ def test_the_parts_of_the_package_add_up() -> None:
     assert files > 0
     named = counts["fleet, monitor, cli, top level"][0]
     assert named == counts["package"][0] - counts["logs"][0] >= files + sum(lines for lines, _ in top)
+
+
+def test_every_part_has_its_folders_and_its_budget() -> None:
+    limits = tomllib.loads(size.LIMITS.read_text("utf-8"))["size"]
+    assert {*limits["folders"], "package"} == set(limits["budget"])
+    assert set(size.parts(limits["folders"])) == set(limits["budget"])
