@@ -37,6 +37,6 @@ def heater_field(problem: Problem) -> list[Candidate]:
 HEATER_FIELD = Cause(
     candidates=heater_field,
     needs="a series that is on or off",
-    separated_by="switch it by hand at one attitude",
+    disambiguation="switch it by hand at one attitude",
     meaning="something that is switched on and off makes a field",
 )

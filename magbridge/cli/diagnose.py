@@ -118,22 +118,18 @@ def summary(facts: dict[str, Any], parts: str) -> str:
     from magbridge.diagnose.words import number
 
     before, after = (number(facts[f"rms_{when}_nT"]) for when in ("before", "after"))
-    low, high = facts["improvement"]["interval"]
-    if any(one["cause"] != "outliers" for one in facts["findings"]):
-        rms = f"{before} -> {after} nT RMS, "
-        rms += f"on {parts} left out of the fit" if parts else "not held out"
-        rms += f" ({low:.2f} to {high:.2f} times, 95 %)" + ": no gain is shown" * (high >= 1.0)
-    else:
+    use, improvement = facts["assessment"], facts["improvement"]
+    low, high = improvement["interval"]
+    if use["reason"] == "nothing_added":
         rms = f"{before} nT RMS" + ", not held out" * (not parts) + "; nothing is added to the calibration"
-    use = facts["assessment"]
-    if facts["findings"] and (refitted := use["rms_nT"]["refitted"]) is not None:
-        rms += f"; {number(refitted)} nT by fitting the calibration's own numbers anew"
-    verdict = "nothing needs explaining" if use["fit_for_use"] == "not_needed" else facts["verdict"]
-    fit = f"fit for use: {use['fit_for_use'].replace('_', ' ')}. {use['answer']}"
-    # that a cause shows no gain stands in its own line
-    against = [one["text"] for one in use["reasons_against"] if one["code"] != "no_improvement"]
-    doubts = [f"  {text}" for text in against] * (use["fit_for_use"] not in ("yes", "not_needed"))
-    return "\n  ".join([f"{verdict}: {rms}", fit, *doubts, *causes_of(facts)])
+    else:
+        rms = f"error of the corrected field {before} -> {after} nT RMS, "
+        rms += f"on {parts} left out of the fit" if parts else "not held out"
+        rms += f" ({low:.2f} to {high:.2f} times, 95 %)" + ": no improvement is shown" * (high >= 1.0)
+        rms += f"; {number(improvement['refit_nT'])} nT by a refit of the calibration alone"
+    verdict = "nothing needs explaining" if use["reason"] == "not_needed" else facts["verdict"]
+    fit = f"fit for use: {use['fit_for_use']}. {use['summary']}"
+    return "\n  ".join([f"{verdict}: {rms}", fit, *causes_of(facts)])
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
@@ -148,7 +144,7 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
         walks = ["noise that wanders"] * ("random_walk" in codes)
         others = " or ".join([*map(_plain, one["alternatives"]), *walks])
         lines = f"{_plain(one)}, S/N {one['signal_to_noise']:.1f}{_followed(one['follows'])}"
-        lines += "; no gain is shown" * ("no_improvement" in codes)
+        lines += "; no improvement is shown" * ("no_improvement" in codes)
         causes.append(lines + f"; or {others}" * bool(others))
     if rest := facts["unexplained"]:
         lines = f"left without a name: {rest['kind']}, S/N {rest['signal_to_noise']:.1f}"

@@ -108,10 +108,20 @@ class Diagnosis:
     """At the extended calibration."""
     before: FloatArray
     after: FloatArray
-    """`before`, `after` (n,): nT, residuals with the calibration as it was given, and with the extended one,
-    held out."""
+    """`before`, `after` (n,): corrected field less reference, nT, with the calibration as given, and held out
+    with the extended one, the named errors of the reference taken out."""
     total: Improvement
-    """Of all findings together."""
+    """Improvement by all findings together, with the named errors of the reference taken out."""
+    improvement: Improvement
+    """Improvement of the corrected field over the calibration as given, against the reference as given."""
+    over_refit: Improvement
+    """Improvement of the corrected field over a refit of the calibration alone."""
+    other_day: Improvement | None
+    """Improvement of the corrected field on whole days left out of the fit; None for a log of one day."""
+    refused: str
+    """Code of the reason why the extension was refused; empty where it stands."""
+    refusal_values: tuple[float, float]
+    """Allowed and found value behind a refusal, nT."""
     isolability: Isolability
     beyond: Improvement
     """Of all findings together, over the calibration's own numbers fitted anew, held out."""

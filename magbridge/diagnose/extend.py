@@ -4,30 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import accumulate
 
 import msgspec
 import numpy as np
 
-from magbridge.arrays import IndexArray
+from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
+from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.prior import isotropic
-from magbridge.diagnose.compare.problem import Problem, samples_of
+from magbridge.diagnose.compare.problem import Problem, linearised, samples_of
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.inference.design import normal
+from magbridge.diagnose.inference.design import Design, normal
 from magbridge.diagnose.inference.evidence import IDEAL
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.estimation.residual import residuals, residuals_of, robust_scale
+from magbridge.estimation.residual import residuals_of, robust_scale
 from magbridge.version import __version__
 
-__all__ = ["extend", "flyable", "relinearised", "with_map_error", "with_misfit"]
+__all__ = ["extend", "flyable", "relinearised", "with_map_error", "with_misfit", "without_effects_at"]
 
-STEPS = 4
-"""Linearisations at most; a second one is rarely needed."""
+MAX_STEPS = 12
+"""Most Gauss-Newton steps; a second one is rarely needed."""
+MAX_HALVINGS = 6
+"""Most halvings of one step."""
+MAX_MISMATCH = 0.1
+"""Convergence: RMS difference of linear prediction and nonlinear residual, as a fraction of the noise."""
 MODES = 64
 """Directions among which the misfit of an idealised regressor is spread; measured in the blind study."""
 
@@ -73,35 +80,43 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     )
 
 
-def flyable(survey: Survey, calibration: Calibration) -> Calibration:
-    """Return the calibration without those rates of change that make the live correction worse.
+def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list[int]]:
+    """Drop the rates of change that make the live correction worse.
 
-    On the vehicle the next sample is not known yet, so a rate is a backward difference, which is mostly noise
-    if the vehicle sways from sample to sample.
+    In flight the next sample is not known yet, so a rate is a backward difference, which is mostly noise if
+    the vehicle sways from sample to sample.
+
+    Returns
+    -------
+    Calibration, list of int
+        The calibration without those effects, and their places among the effects that it was given with.
     """
-    place = 0
-    for effect in calibration.effects:
-        without = _without(calibration, place)
-        if isinstance(effect, RateEffect) and _power(survey, without) < _power(survey, calibration):
-            calibration = without
-        else:
-            place += 1
-    return calibration
+    dropped: list[int] = []
+    for place, effect in enumerate(calibration.effects):
+        if not isinstance(effect, RateEffect):
+            continue
+        kept, without = (without_effects_at(calibration, some) for some in (dropped, [*dropped, place]))
+        if _power(survey, without) < _power(survey, kept):
+            dropped.append(place)
+    return without_effects_at(calibration, dropped), dropped
 
 
 def _power(survey: Survey, calibration: Calibration) -> float:
-    """nT², mean square of the residual over the new samples, corrected as the bridge would."""
+    """Return the mean square of the residual over the new samples, nT², corrected as the bridge would."""
     return float(np.mean(residuals_of(*samples_of(survey, calibration))[~survey.learned] ** 2))
 
 
-def _without(calibration: Calibration, place: int) -> Calibration:
-    """Return the calibration without the effect at a place; other places may hold an equal one."""
-    before, (effect, *after) = calibration.effects[:place], calibration.effects[place:]
-    at = sum(term.size for term in (*calibration.terms, *before))
-    own = np.arange(at, at + effect.size)
+def without_effects_at(calibration: Calibration, places: Sequence[int]) -> Calibration:
+    """Return the calibration without the effects at some places; other places may hold equal ones."""
+    if not places:
+        return calibration
+    first = sum(term.size for term in calibration.terms)
+    starts = list(accumulate((effect.size for effect in calibration.effects), initial=first))
+    own = np.concatenate([np.arange(starts[place], starts[place + 1]) for place in places])
+    kept = [effect for place, effect in enumerate(calibration.effects) if place not in places]
     return replace(
         calibration,
-        effects=(*before, *after),
+        effects=tuple(kept),
         coefficients=np.delete(calibration.coefficients, own),
         covariance=np.delete(np.delete(calibration.covariance, own, 0), own, 1),
     )
@@ -135,24 +150,57 @@ def with_map_error(
 def relinearised(
     problem: Problem, model: Sequence[Candidate], fit: Joint
 ) -> tuple[Problem, list[Columns], Joint]:
-    """Linearise anew about the extended calibration, and fit again.
+    """Fit again about the extended calibration until the linear model predicts the nonlinear residual.
 
-    The magnitude is not linear in a large effect. A model with a delay or a rate of change is left as the
-    search had it: the live effects' backward differences contain the sample's own noise.
+    Gauss-Newton steps with step halving. Rates of change keep the central differences of the search, because
+    the backward differences of the live effects contain the noise of their own sample.
+
+    Parameters
+    ----------
+    problem : Problem
+        Comparison, linearised about the calibration as given.
+    model : sequence of Candidate
+        Causes that extend the calibration; without any, the calibration's own coefficients are refitted.
+    fit : Joint
+        Fit of the model in this problem.
+
+    Returns
+    -------
+    Problem, list of Columns, Joint
+        The problem linearised at the last point, the columns of the model's pieces there, and the fit.
     """
-    columns = [candidate.columns for candidate in model]
-    if not model or any(isinstance(effect, (RateEffect, ClockEffect)) for c in model for effect in c.effects):
-        return problem, columns, fit
-    settled = problem
-    for _ in range(STEPS):
-        before, noise, c = fit.log_likelihood, fit.noise, np.append(fit.z, fit.coefficients)
-        ridge, columns = fit.prior[len(fit.z) :], []
-        settled.let_go()  # one problem's columns at a time
-        settled, columns = _about(problem, model, fit)
-        fit = fit_joint(settled, columns, noise.past.order, c, blocks=noise.uneven, ridge=ridge)
-        if abs(fit.log_likelihood - before) < 0.5:
+    ridge, order, blocks = fit.prior[len(fit.z) :], fit.noise.past.order, fit.noise.uneven
+    # The calibration as given is the point that a step which overshoots is halved towards
+    origin = replace(fit, z=np.zeros_like(fit.z), coefficients=np.zeros_like(fit.coefficients))
+    last, last_cost = origin, _cost(problem.residual, origin, problem)
+    for _ in range(MAX_STEPS):
+        for _ in range(MAX_HALVINGS):
+            settled, columns = _about(problem, model, fit)
+            actual = settled.residual - Design(settled, columns).times(np.append(fit.z, fit.coefficients))
+            cost = _cost(actual, fit, problem)
+            if cost <= last_cost:
+                break
+            fit = replace(
+                fit, z=0.5 * (fit.z + last.z), coefficients=0.5 * (fit.coefficients + last.coefficients)
+            )
+            settled.let_go()
+        missed = float(np.sqrt(np.mean((actual - fit.residual) ** 2)))
+        if missed < MAX_MISMATCH * float(np.median(fit.noise.scale)) and cost <= last_cost:
             break
+        last, last_cost = fit, cost
+        start = np.append(fit.z, fit.coefficients)
+        fit = fit_joint(settled, columns, order, start, blocks=blocks, ridge=ridge)
+        settled.let_go()
     return settled, columns, fit
+
+
+def _cost(residual: FloatArray, fit: Joint, problem: Problem) -> float:
+    """Return the negative log posterior of a nonlinear residual (n,), nT, under the noise of `fit`."""
+    noise, c = fit.noise, np.append(fit.z, fit.coefficients)
+    centre = np.append(problem.centre, np.zeros(len(c) - len(problem.centre)))
+    x2 = noise.whiten(residual) ** 2 / noise.kappa
+    likelihood = 0.5 * (noise.nu + 1.0) * float(np.log1p(x2 / noise.nu).sum())
+    return likelihood + 0.5 * float(fit.prior @ (c - centre) ** 2)
 
 
 def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
@@ -177,31 +225,50 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
 
 
 def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:
-    """Return problem and columns of the model, linearised about the calibration that `fit` extends."""
+    """Return the problem and a column block for each piece of the model, linearised at `fit`."""
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
-    samples.phi[np.ix_(problem.survey.learned, _since(extended, model))] = 0.0
-    e, g = residuals(samples, coefficients)
+    pieces = [piece for candidate in model for piece in candidate.pieces]
+    first = samples.phi.shape[1] - sum(_counts(extended))
+    added = sum(_counts(extended)[len(problem.calibration.effects) :])
+    smooth = [_central(problem, effect) for piece in pieces for effect in piece.effects]
+    places = accumulate(_counts(extended), initial=first)
+    for place, rates in zip(list(places)[len(problem.calibration.effects) :], smooth, strict=False):
+        if rates is not None:
+            samples.phi[:, place : place + len(rates)] = rates.T
+    absent = [np.full(sum(_counts_of(piece.effects, extended)), piece.since) for piece in pieces]
+    late = samples.phi.shape[1] - added + np.flatnonzero(np.concatenate([np.empty(0, bool), *absent]))
+    samples.phi[np.ix_(problem.survey.learned, late)] = 0.0
+    e, g, reference_jacobian, _ = linearised(samples, coefficients)
     selector = np.eye(extended.coefficients.size)[:, problem.calibration.coefficients.size :]
     effects, at, columns = derivatives(extended, samples, g, -selector), 0, []
-    rebuilt = replace(problem, residual=e, jacobian=g)
-    # the residual at the first point, extrapolated linearly from this one; errors of the reference, slow
-    # noise and the axes' delays are in both, as `extended` corrects none
+    rebuilt = replace(problem, residual=e, jacobian=g, reference_jacobian=reference_jacobian)
+    # The residual at the calibration as given, extrapolated linearly from this point. Errors of the
+    # reference, slow noise and the axes' delays are in both, because `extended` corrects none of them
     rebuilt.residual[:] += rebuilt.calibration_jacobian[:, problem.known] @ fit.z[problem.known]
-    for candidate, place in zip(model, slices(model), strict=True):
-        if not candidate.effects:
-            columns.append(candidate.columns)
-        else:
-            block = effects[:, at : at + candidate.size] * candidate.width
-            rebuilt.residual[:] += block @ fit.coefficients[place]
-            columns.append(block.__getitem__)
-            at += candidate.size
+    for piece, place in zip(pieces, slices(pieces), strict=True):
+        if not piece.effects:
+            columns.append(piece.columns)
+            continue
+        block = effects[:, at : at + piece.size] * piece.width
+        rebuilt.residual[:] += block @ fit.coefficients[place]
+        columns.append(block.__getitem__)
+        at += piece.size
     return rebuilt, columns
 
 
-def _since(extended: Calibration, model: Sequence[Candidate]) -> IndexArray:
-    """Return the places of the regressors of causes that have appeared since the calibration."""
-    late = {id(e) for c in model for piece in c.pieces if piece.since for e in piece.effects}
-    counts = [effect.columns(extended.reference.field).shape[1] for effect in extended.effects]
-    marks = np.repeat([id(effect) in late for effect in extended.effects], counts)
-    return len(extended.kernel.weights) - len(marks) + np.flatnonzero(marks)
+def _central(problem: Problem, effect: Effect) -> FloatArray | None:
+    """Return the regressors (r, n) of a rate of change by central differences; None for other effects."""
+    if isinstance(effect, RateEffect):
+        return field_rates(problem)
+    return mass_rates(problem) if isinstance(effect, ClockEffect) else None
+
+
+def _counts(calibration: Calibration) -> list[int]:
+    """Return the number of regressors of each effect of a calibration."""
+    return _counts_of(calibration.effects, calibration)
+
+
+def _counts_of(effects: Sequence[Effect], calibration: Calibration) -> list[int]:
+    """Return the number of regressors of each of the effects."""
+    return [effect.columns(calibration.reference.field).shape[1] for effect in effects]

@@ -10,25 +10,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from magbridge.arrays import BoolArray, FloatArray
+from magbridge.arrays import BoolArray
+from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.accept import odds_over_random_walk, settle
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.causes.time_dependent import interference_tone
+from magbridge.diagnose.compare.dives import days_of
 from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.diagnosis import WORTH, Diagnosis, Finding, counted, small, verdict_of
-from magbridge.diagnose.extend import extend, flyable, relinearised, with_map_error, with_misfit
+from magbridge.diagnose.improvement import Extension, check_written, corrected, error_without, extension_of
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
 from magbridge.diagnose.inference.hypothesis import Hypothesis
 from magbridge.diagnose.inference.isolability import isolability
-from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.left_out import held_out, paired
-from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
+from magbridge.diagnose.inference.left_out import paired
 from magbridge.diagnose.inference.outliers import Outliers, outliers
 from magbridge.diagnose.inference.search import Outcome
 from magbridge.diagnose.seen import memory
@@ -94,6 +94,11 @@ def diagnose(
         # matplotlib only where a report is wanted
         from magbridge.diagnose.report.page import write  # noqa: PLC0415
 
+        progress("checking the written calibration")
+        if diagnosis.calibration is not calibration:
+            worse = check_written(encode_calibration(diagnosis.calibration), calibration, datasets, grid)
+            if worse and not any(candidate.about != "vehicle" for candidate in diagnosis.named):
+                diagnosis = _refused(diagnosis, worse)
         progress("writing the report")
         write(diagnosis, out_dir, causes, remarks)
     return diagnosis
@@ -122,34 +127,55 @@ def _examine(
         rest, named, competing, fit = switched, (), (), outcome.null
     model = [h.candidate for h in named]
     wrong = off if off is not None and off.isolated else None
-    progress("extending the calibration")
-    settled, columns, fit = relinearised(problem, model, fit)
-    fit = with_misfit(model, loosened(settled, model, columns, fit, candidates))
-    extended = calibration
-    if model:
-        extended = with_map_error(settled, model, fit, flyable(problem.survey, extend(settled, model, fit)))
-    progress("measuring the gain")
     counts = counted(problem, wrong)
-    before = after = problem.straight(outcome.null.z)
-    alone = held_out(problem, [], outcome.null)
+    progress("refitting the calibration alone")
+    refit = extension_of(problem, [], outcome.null, counts)
+    refit.problem.let_go()
+    progress("extending the calibration")
+    extension = refit
     if model:
-        after, score = held_out(settled, columns, fit)
-        settled.let_go()
-        if score < alone.score - ODDS:
-            # the dives left out speak 20:1 against these names
-            named, competing, model, fit, after, extended = (), (), [], outcome.null, before, calibration
+        extension = extension_of(problem, model, fit, counts, candidates)
+        extension.problem.let_go()
+        if extension.score < refit.score - ODDS:
+            # The dives left out speak 20:1 against these names
+            named, competing, model, extension = (), (), [], refit
             rest = leftover(problem, [], outcome.null, tone)
-    rest = rest or unlisted(problem, fit, named, off, after, counts)
-    total, beyond = (paired(since, after, problem.survey.dive, counts) for since in (before, alone.residual))
+    progress("measuring the improvement")
+    fit = extension.fit if model else outcome.null
+    before = corrected(problem.survey, calibration).total - problem.survey.reference
+    after = extension.error - extension.reference_error if model else before
+    rest = rest or unlisted(problem, fit, named, off, after * problem.reference_jacobian, counts)
+    dive, stands = problem.survey.dive, bool(model) and not extension.refused
+    total, beyond = (paired(since, after, dive, counts) for since in (before, refit.error))
+    day = days_of(problem.survey.time, problem.survey.learned)
+    other_day = None
+    if stands and day is not None and extension.day_error is not None:
+        other_day = paired(before, extension.day_error, day, counts)
     negligible = bool(named) and wrong is None and beyond.ratio > 1.0 - WORTH
     return Diagnosis(
         problem=problem, outcome=outcome,
-        findings=_findings(problem, named, competing, fit, after, counts, outcome),
-        wrong=wrong, unexplained=rest and rest._replace(fitted=()), calibration=extended, fit=fit,
+        findings=_findings(problem, named, competing, extension, refit, counts, outcome),
+        wrong=wrong, unexplained=rest and rest._replace(fitted=()),
+        calibration=extension.calibration if stands else calibration, fit=fit,
+        refused=extension.refused if model else "",
+        refusal_values=extension.details, other_day=other_day,
         before=before, after=after, total=total,
+        improvement=paired(before, extension.error if stands else before, dive, counts),
+        over_refit=paired(refit.error, extension.error if stands else before, dive, counts),
         isolability=isolability(candidates, outcome.info, outcome.look_elsewhere, len(causes), untestable),
         beyond=beyond, verdict=verdict_of(named, wrong, rest, total), causes=causes,
-        negligible=negligible and small(problem, alone.residual, rest),
+        negligible=negligible and small(problem, refit.error * problem.reference_jacobian, rest),
+    )  # fmt: skip
+
+
+def _refused(diagnosis: Diagnosis, values: tuple[float, float]) -> Diagnosis:
+    """Return the diagnosis with its extension refused, because the written file corrects the log worse."""
+    problem, counts = diagnosis.problem, diagnosis.counts
+    unchanged = paired(diagnosis.before, diagnosis.before, problem.survey.dive, counts)
+    return replace(
+        diagnosis, calibration=problem.calibration, refused="written_file", refusal_values=values,
+        improvement=unchanged, over_refit=replace(diagnosis.over_refit, after=unchanged.after),
+        other_day=None,
     )  # fmt: skip
 
 
@@ -206,19 +232,16 @@ def _findings(
     problem: Problem,
     named: Sequence[Hypothesis],
     competing: Sequence[tuple[CompetingHypothesis, ...]],
-    fit: Joint,
-    after: FloatArray,
+    extension: Extension,
+    refit: Extension,
     counts: BoolArray,
     outcome: Outcome,
 ) -> tuple[Finding, ...]:
-    """Collect each cause's results; its gain is that over a fit of the others without it."""
-    found, q = [], len(fit.z)
-    places = slices([h.candidate for h in named])
-    for k, (own, hypothesis, others) in enumerate(zip(places, named, competing, strict=True)):
-        columns = [h.candidate.columns for i, h in enumerate(named) if i != k]
-        kept = np.delete(fit.prior, slice(q + own.start, q + own.stop))
-        alone = replace(fit, coefficients=np.delete(fit.coefficients, own), prior=kept)
-        without = held_out(problem, columns, alone).residual
+    """Collect the results of each cause; its improvement is that over an extension by the others alone."""
+    found, fit, model = [], extension.fit, [h.candidate for h in named]
+    after = extension.error - extension.reference_error
+    for own, hypothesis, others in zip(slices(model), named, competing, strict=True):
+        without = error_without(problem, model, own, outcome.fit) if len(model) > 1 else refit.error
         improvement = paired(without, after, problem.survey.dive, counts)
         covariance = fit.effects_covariance[own, own]
         odds = odds_over_random_walk(outcome, hypothesis) if _is_slow(problem, hypothesis) else np.inf

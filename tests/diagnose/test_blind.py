@@ -174,14 +174,15 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
         "rms_before_nT",
         "rms_after_nT",
         "improvement",
-        "gain",
         "findings",
         "unexplained",
         "remarks",
     }
     assert set(found) == {*keys, "format", "assessment"}
     assert found["findings"][0]["cause"] == "current_field"
-    assert found["gain"]["interval"][0] <= found["gain"]["rms_ratio"] <= found["gain"]["interval"][1] < 1.0
+    improvement = found["improvement"]
+    assert improvement["interval"][0] <= improvement["rms_ratio"] <= improvement["interval"][1] < 1.0
+    assert improvement["after_nT"] < improvement["refit_nT"] <= 1.02 * improvement["before_nT"]
     assert set(found["findings"][0]["parameters"]["x"]) == {"value", "sigma", "unit"}
     extended = load(tmp_path / "out" / "calibration.json")
     error = corrected(ds, extended).total - ds["reference_field"].to_numpy()

@@ -48,7 +48,7 @@ def test_a_cause_takes_one_row_and_one_function() -> None:
         places = [path for path in ROOM.glob("*.py") if path != table and name in strings(path)]
         assert len(places) <= 1, (name, places)
         assert row.candidates.__module__.startswith("magbridge.diagnose.causes.")
-        assert all((row.needs, row.separated_by, row.meaning))
+        assert all((row.needs, row.disambiguation, row.meaning))
 
 
 @pytest.mark.parametrize("name", CAUSES)

@@ -130,13 +130,14 @@ def skewed(whole: Problem, period: float) -> tuple[Survey, Calibration]:
 
 def test_a_rate_is_flown_with_where_a_difference_backwards_tells_it() -> None:
     survey, calibration = skewed(right(300), 200.0)
-    assert flyable(survey, calibration) is calibration
+    assert flyable(survey, calibration) == (calibration, [])
 
 
 def test_a_rate_that_is_noise_live_is_left_out() -> None:
     """A sway of two and a half samples."""
     survey, calibration = skewed(right(300), 10.0)
-    calm = flyable(survey, calibration)
+    calm, dropped = flyable(survey, calibration)
+    assert dropped == [0]
     assert [effect.kind for effect in calm.effects] == ["time"]
     np.testing.assert_array_equal(calm.coefficients[-3:], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [4.0, 5.0, 6.0])
@@ -198,7 +199,8 @@ def test_a_rate_that_is_there_twice_is_left_out_twice() -> None:
         coefficients=np.append(plain, [0.0, 0.3, 0.0, 0.0, 0.3, 0.0, 1.0, 2.0, 3.0]),
         covariance=np.diag(np.append(np.diag(calibration.covariance)[:-6], np.arange(1.0, 10.0))),
     )
-    calm = flyable(survey, twice)
+    calm, dropped = flyable(survey, twice)
+    assert dropped == [0, 1]
     assert calm.effects == (step,)
     np.testing.assert_array_equal(calm.coefficients, [*plain, 1.0, 2.0, 3.0])
     np.testing.assert_array_equal(np.diag(calm.covariance)[-3:], [7.0, 8.0, 9.0])

@@ -64,22 +64,22 @@ def test_the_report_says_what_the_assessment_holds(clear: Diagnosis, name: str) 
     facts = json.loads(findings_json(diagnosis, CAUSES))["assessment"]
     page = unescape(report_html(diagnosis, CAUSES)).replace("\N{NO-BREAK SPACE}", " ")
     first = page.partition("<h2")[0]
-    assert facts["answer"] in first
+    assert facts["summary"] in first
     for note in (*facts["reasons_for"], *facts["reasons_against"]):
         assert note["text"] in first
     for note in (note for some in facts["warnings"] for note in some):
         assert note["text"] in page
     if name == "contested":
-        assert facts["fit_for_use"] == "once_settled"
-        assert facts["manoeuvres"] == [CAUSES["current_field"].separated_by]
-        assert {"contested", "implausible_size"} <= {note["code"] for note in facts["reasons_against"]}
+        assert facts["fit_for_use"] == "conditional"
+        assert facts["manoeuvres"] == [CAUSES["current_field"].disambiguation]
+        assert {"contested", "implausible_amplitude"} <= {note["code"] for note in facts["reasons_against"]}
 
 
 def test_what_is_seen_stands_apart_from_what_it_may_be(clear: Diagnosis) -> None:
     (one,) = json.loads(findings_json(clear, CAUSES))["findings"]
     assert one["cause"] == "current_field"
     assert one["follows"]["channel"] == one["channel"]
-    assert one["follows"]["size_nT"] > 1.0
+    assert one["follows"]["amplitude_nT"] > 1.0
 
 
 def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
@@ -88,5 +88,5 @@ def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
     assert "Nothing else" not in page
     assert re.search(r"What is left, [\d.]+\xa0nT RMS, looks like noise", page)
     assert ("remembers" in page) == last.lasts
-    assert clear.total.after < clear.beyond.before <= 1.01 * clear.total.before
-    assert f"fitted anew would leave {number(clear.beyond.before)}\xa0nT" in page
+    assert clear.improvement.after < clear.over_refit.before <= 1.01 * clear.improvement.before
+    assert f"A refit of the calibration alone leaves {number(clear.over_refit.before)}\xa0nT" in page

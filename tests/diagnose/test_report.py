@@ -107,8 +107,8 @@ def test_the_command_names_every_cause_that_may_be_it_on_a_line_of_its_own() -> 
     assert causes_of(nameless | {"unexplained": None, "verdict": "nothing_found"}) == ["no cause"]
 
 
-def test_the_command_says_what_the_gain_was_measured_on() -> None:
-    """And tells no gain where nothing was added: 1.14 -> 1.14 nT would read as one that failed."""
+def test_the_command_reports_what_the_improvement_was_measured_on() -> None:
+    """And no improvement where nothing was added: 1.14 -> 1.14 nT would read as one that failed."""
     one = {
         "cause": "clock_offset",
         "channel": None,
@@ -116,29 +116,29 @@ def test_the_command_says_what_the_gain_was_measured_on() -> None:
         "alternatives": [],
         "follows": None,
     }
-    facts = {"verdict": "explained", "findings": [one], "unexplained": None, "rms_before_nT": 117.42}
-    facts |= {"rms_after_nT": 74.42, "improvement": {"interval": [0.486, 0.84]}}
-    settled: dict[str, Any] = {"fit_for_use": "once_settled", "answer": "Only once these doubts are settled."}
-    settled["reasons_against"] = [{"code": "contested", "text": "Not told apart: this from that."}]
-    settled["reasons_against"] += [{"code": "no_improvement", "text": "No gain."}]
-    facts |= {
-        "assessment": settled | {"warnings": [[{"code": "no_improvement"}]], "rms_nT": {"refitted": 101.2}}
+    facts: dict[str, Any] = {"verdict": "explained", "findings": [one], "unexplained": None}
+    facts |= {"rms_before_nT": 117.42, "rms_after_nT": 74.42}
+    facts |= {"improvement": {"interval": [0.486, 0.84], "refit_nT": 101.2}}
+    use = {
+        "fit_for_use": "conditional",
+        "reason": "one_condition",
+        "summary": "Fit for use on one condition: x.",
     }
-    first, use, doubt, second = summary(facts, "dives").splitlines()
+    facts |= {"assessment": use | {"warnings": [[{"code": "no_improvement"}]]}}
+    first, second, third = summary(facts, "dives").splitlines()
     assert first == (
-        "explained: 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to 0.84 times, 95 %); 101 nT by "
-        "fitting the calibration's own numbers anew"
+        "explained: error of the corrected field 117 -> 74.4 nT RMS, on dives left out of the fit (0.49 to "
+        "0.84 times, 95 %); 101 nT by a refit of the calibration alone"
     )
-    none = {
-        "assessment": settled | {"warnings": [[]], "rms_nT": {"refitted": 74.9}, "fit_for_use": "not_needed"}
-    }
-    assert summary(facts | none, "dives").startswith("nothing needs explaining: 117 -> ")
-    assert use == "  fit for use: once settled. Only once these doubts are settled."
-    assert doubt == "    Not told apart: this from that."
-    assert second == "  clock_offset, S/N 9.0; no gain is shown"
+    assert second == "  fit for use: conditional. Fit for use on one condition: x."
+    assert third == "  clock_offset, S/N 9.0; no improvement is shown"
+    none = {"assessment": facts["assessment"] | {"reason": "not_needed"}}
+    assert summary(facts | none, "dives").startswith("nothing needs explaining: error")
     assert "nT RMS, not held out (0.49" in summary(facts, "")
-    assert "95 %): no gain is shown" in summary(facts | {"improvement": {"interval": [0.9, 1.02]}}, "dives")
+    weak = facts | {"improvement": {"interval": [0.9, 1.02], "refit_nT": 101.2}}
+    assert "95 %): no improvement is shown" in summary(weak, "dives")
     plain = facts | {"verdict": "nothing_found", "findings": []}
+    plain |= {"assessment": facts["assessment"] | {"reason": "nothing_added"}}
     assert summary(plain, "dives").startswith(
         "nothing_found: 117 nT RMS; nothing is added to the calibration"
     )
@@ -180,11 +180,11 @@ def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
         Improvement(117.0, 75.8, 0.65, (0.48, 0.83)),
     )
     assert improved(none, "").startswith(
-        "On the log that the calibration was fitted to, 588 nT RMS became 587"
+        "On the log that the calibration was fitted to, the error of the corrected field, 588 nT RMS, became"
     )
     assert improved(none, "eighths of the log") == (
-        "On eighths of the log left out of the fit, 588 nT RMS became 587 nT (ratio 1.00, 95 % interval "
-        "0.86 to 1.02: no improvement is shown)."
+        "On eighths of the log left out of the fit, the error of the corrected field, 588 nT RMS, became 587 "
+        "nT (ratio 1.00, 95 % interval 0.86 to 1.02: no improvement is shown)."
     )
     assert improved(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
     assert (none.shown, much.shown) == (False, True)
@@ -273,7 +273,7 @@ def test_names_that_something_unexplained_keeps_are_told() -> None:
     rest = Leftover("drift", 9.0, 1e-9, 12.0, None, None, within=(drift, current))
     output = nameless(rest, CAUSES)
     assert "It resembles: offset drift, current field (motor&lt;1&gt;)." in output
-    assert CAUSES["offset_drift"].separated_by in output
+    assert CAUSES["offset_drift"].disambiguation in output
     assert nameless(rest._replace(within=()), CAUSES) == "It fits no known cause, so it has no name."
 
 
@@ -298,7 +298,7 @@ def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     for output in (alone, channels):
         assert "none comes within odds of 20:1" in output
     assert "cannot tell it from temperature offset (water) or offset drift (" in causes
-    assert cause.separated_by in causes
+    assert cause.disambiguation in causes
 
 
 def test_of_many_channels_the_difference_s_own_are_drawn(

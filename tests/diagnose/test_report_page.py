@@ -7,12 +7,11 @@ from base64 import b64decode
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from posed import candidate
 
 from magbridge.diagnose.assessment.weigh import OWN, Assessment
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.diagnosis import Diagnosis, Finding
+from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.left_out import Improvement
 from magbridge.diagnose.inference.outliers import Outliers
@@ -36,86 +35,88 @@ def with_(diagnosis: Diagnosis, **more: object) -> Diagnosis:
     return replace(diagnosis, findings=(replace(diagnosis.findings[0], **more),))  # type: ignore[arg-type]
 
 
-def test_nothing_speaks_against_a_clear_case(clear: Diagnosis) -> None:
-    """But that what was left out is of the same log is said even then."""
+IDLE = Improvement(1.0, 1.0, 1.0, (0.9, 1.1))
+
+
+def test_a_clear_case_is_fit_for_use_on_one_condition(clear: Diagnosis) -> None:
+    """The parts left out are of the same log, so a log of another day is the condition."""
     found = answer(clear)
-    assert (found.answer, found.fit_for_use) == ("Nothing in this log speaks against it.", "yes")
+    assert (found.fit_for_use, found.reason) == ("conditional", "one_condition")
+    assert "another day" in found.condition
     assert "corrects for what belongs to the vehicle" in reasons(found)[0]
-    assert "parts of the same log" in reasons(found)[-1]
-    assert len(reasons(found)) == 2
+    assert [note.code for note in found.reasons_against] == ["domain", "same_log"]
 
 
-def test_without_a_gain_it_does_not_fly(clear: Diagnosis) -> None:
-    found = answer(replace(clear, total=Improvement(1.0, 1.0, 1.0, (0.9, 1.1))))
-    assert (found.answer, found.fit_for_use) == ("Not on the evidence of this log.", "no")
+def test_only_another_day_makes_it_an_unconditional_yes(clear: Diagnosis) -> None:
+    shown = Improvement(2.0, 1.0, 0.5, (0.4, 0.6))
+    assert answer(replace(clear, other_day=shown)).fit_for_use == "yes"
+    assert answer(replace(clear, other_day=IDLE)).fit_for_use == "conditional"
+
+
+def test_without_an_improvement_of_the_corrected_field_it_is_not_fit_for_use(clear: Diagnosis) -> None:
+    found = answer(replace(clear, improvement=IDLE))
+    assert (found.fit_for_use, found.reason) == ("no", "no_improvement")
     assert "do not use it" in reasons(found)[0]
+    assert answer(replace(clear, over_refit=IDLE)).reason == "refit_as_good"
+    refused = answer(replace(clear, refused="not_linear", refusal_values=(22.1, 954.0)))
+    assert (refused.fit_for_use, refused.reason) == ("no", "refused")
+    assert "predicts an error of 22.1 nT RMS, and the corrector leaves 954 nT" in refused.summary
 
 
 def test_what_makes_no_difference_needs_no_extension(clear: Diagnosis) -> None:
-    """And a calibration whose own data do not support it is a doubt of every extension."""
+    """And a calibration whose own data do not support it sets the condition."""
     small = replace(clear, negligible=True)
-    assert answer(small).fit_for_use == "not_needed"
+    assert answer(small).reason == "not_needed"
     assert "Nothing needs explaining: what was found makes" in report_html(small, CAUSES).partition("<h2")[0]
     given = replace(clear.problem.calibration, warnings=("all headings lie within 20 degrees",))
     found = answer(replace(clear, problem=replace(clear.problem, calibration=given)))
-    assert found.fit_for_use == "once_settled"
+    assert found.fit_for_use == "conditional"
     assert "own data do not support it: all headings lie within 20 degrees." in "".join(reasons(found))
+    assert "calibrate again" in found.condition
 
 
-def test_another_possible_cause_is_a_doubt_that_a_manoeuvre_settles(clear: Diagnosis) -> None:
-    """Another channel of the same cause is none: the name holds."""
+def test_another_possible_cause_sets_a_condition_that_a_manoeuvre_removes(clear: Diagnosis) -> None:
+    """Another channel of the same cause does not: the name holds."""
     other = CompetingHypothesis(candidate("offset_drift", np.ones(1)), 1.0)
     twin = CompetingHypothesis(candidate("current_field", np.ones(1), channel="amps_c"), 1.0)
     found = answer(with_(clear, competing=(other,)))
-    assert (found.answer, found.fit_for_use) == ("Only once these doubts are settled.", "once_settled")
-    assert CAUSES["current_field"].separated_by in reasons(found)[1]
-    assert answer(with_(clear, competing=(twin,))).fit_for_use == "yes"
+    assert found.fit_for_use == "conditional"
+    assert CAUSES["current_field"].disambiguation in found.condition
+    assert "another day" in answer(with_(clear, competing=(twin,))).condition
 
 
-def test_causes_that_cancel_are_a_doubt(clear: Diagnosis) -> None:
+def test_causes_that_cancel_set_a_condition(clear: Diagnosis) -> None:
     first = clear.findings[0]
     against = replace(first, coefficients=-0.9 * first.coefficients)
     found = answer(replace(clear, findings=(first, against)))
-    assert found.fit_for_use == "once_settled"
+    assert "largely cancel" in found.condition
     assert sum("largely cancel each other" in reason for reason in reasons(found)) == 1
-    assert answer(replace(clear, findings=(first, first))).fit_for_use == "yes"
+    assert "another day" in answer(replace(clear, findings=(first, first))).condition
 
 
-def test_each_other_doubt_is_told(clear: Diagnosis) -> None:
-    idle, large = Improvement(1.0, 1.0, 1.0, (0.9, 1.1)), 10.0 * np.ones(3)
+def test_each_other_objection_is_reported(clear: Diagnosis) -> None:
+    large = 10.0 * np.ones(3)
     survey = clear.problem.survey
     own = replace(clear.problem, survey=replace(survey, fitted=np.ones(len(survey), bool)))
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
     doubtful = {
-        "shows no improvement on what was left out": with_(clear, improvement=idle),
+        "shows no improvement on what was left out": with_(clear, improvement=IDLE),
         "10 times the usual size": with_(clear, coefficients=large),
         OWN: replace(clear, problem=own),
         "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),
     }
     for text, diagnosis in doubtful.items():
         found = answer(diagnosis)
-        assert found.fit_for_use == "once_settled"
+        assert found.fit_for_use == "conditional"
         assert any(text in reason for reason in reasons(found)), text
 
 
 def test_where_nothing_was_added_there_is_nothing_to_fly(clear: Diagnosis) -> None:
     plain = replace(clear, findings=(), verdict="nothing_found")
     assert reasons(answer(plain)) == []
-    assert "it holds" in answer(plain).answer
+    assert "it holds" in answer(plain).summary
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
-    assert "expect errors like the" in answer(replace(plain, unexplained=rest)).answer
-
-
-def test_what_stays_in_the_field_is_reckoned_with(clear: Diagnosis) -> None:
-    """The RMS of the verdict has removed an error of the reference, which the calibration cannot."""
-    sun = replace(clear.findings[0].candidate, cause="diurnal_variation", channel=None, effects=())
-    named = replace(clear.findings[0].hypothesis, candidate=sun)
-    both: tuple[Finding, ...] = (clear.findings[0], replace(clear.findings[0], hypothesis=named))
-    found = answer(replace(clear, findings=both))
-    (output,) = [reason for reason in reasons(found) if reason.startswith("By itself it takes")]
-    before, after = (float(x) for x in re.findall(r"from ([\d.]+) to ([\d.]+) nT RMS", output)[0])
-    assert before == pytest.approx(clear.total.before, rel=0.01)
-    assert after < before
+    assert "expect errors like the" in answer(replace(plain, unexplained=rest)).summary
 
 
 def test_every_cause_has_a_meaning() -> None:
@@ -167,7 +168,7 @@ def test_the_page_is_whole(clear: Diagnosis) -> None:
     """Every figure has a caption, and no line ends between a number and its unit."""
     page = report_html(clear, CAUSES)
     assert page.count("<figure>") == page.count("<figcaption>") == page.count('alt="')
-    assert page.index('class="box good"') < page.index("<h2")
+    assert page.index('class="box doubt"') < page.index("<h2")
     assert not re.search(r"\d (nT|%)", re.sub(r"base64,[^\"]*|<style>.*?</style>", "", page, flags=re.DOTALL))
 
 

@@ -54,7 +54,7 @@ def test_only_returns_at_several_times_tell_place_from_time() -> None:
     )  # what bends about the turning point is the same on both ways
     assert "cannot be told apart" in back.text
     assert fro.separable > 0.5
-    assert fro.apart
+    assert fro.distinguishable
     assert "can be told apart" in fro.text
 
 
@@ -122,8 +122,8 @@ def test_one_hidden_cause_gets_one_name_and_a_doubt_where_the_track_cannot_tell(
     (one,) = facts["findings"]
     others = [other["cause"] for other in one["alternatives"]] if track == "away" else []
     assert hidden in [one["cause"], *others]
-    output = facts["assessment"]["place_or_time"]
-    assert output["told_apart"] == (track == "to and fro, eight times")
+    output = facts["assessment"]["spatial_temporal"]
+    assert output["distinguishable"] == (track == "to and fro, eight times")
     codes = [one["code"] for one in facts["assessment"]["reasons_against"]]
-    assert ("place_or_time" in codes) == (hidden == "diurnal_variation" and track == "away")
+    assert ("spatial_temporal" in codes) == (hidden == "diurnal_variation" and track == "away")
     assert any(output["text"] in part for part in visible(found))

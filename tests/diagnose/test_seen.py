@@ -136,7 +136,7 @@ def test_a_residual_far_from_white_is_never_nothing() -> None:
     assert residual["white_nT"] == pytest.approx(np.std(np.diff(slow)) / np.sqrt(2.0), rel=0.2)
     assert 60.0 < rest["correlation_time_s"] < 250.0
     assert rest["follows"]["channel"] is rest["best_channel"] is None
-    assert "does not describe all" in facts["assessment"]["answer"]
+    assert "does not describe all" in facts["assessment"]["summary"]
     output = "\n".join(causes_of(facts))
     assert f"{residual['rms_nT']:.1f} nT RMS, lasts {rest['correlation_time_s']:.3g} s" in output
     assert 0.5 * residual["rms_nT"] < rest["rms_nT"] <= residual["rms_nT"]

@@ -20,7 +20,7 @@ __all__ = ["DOUBTS", "IMPLAUSIBLE", "Note", "contested", "not_separated", "notes
 
 IMPLAUSIBLE = 5.0
 """Multiple of its plausible size above which a cause is doubted."""
-DOUBTS = ("contested", "random_walk", "implausible_size", "no_improvement")
+DOUBTS = ("contested", "random_walk", "implausible_amplitude", "no_improvement")
 """Codes of notes that speak against the use of an extended calibration."""
 
 
@@ -62,7 +62,7 @@ def _of_numbers(finding: Finding) -> Iterator[Note]:
     times = times_usual(candidate, finding.coefficients)
     if times >= IMPLAUSIBLE:
         yield Note(
-            "implausible_size",
+            "implausible_amplitude",
             f"This is {number(times, 2)} times the usual size of such a cause. Two causes that cancel each "
             "other can grow this large: check the extended calibration against another reference before it "
             "is used.",
@@ -137,5 +137,5 @@ def not_separated(
             "contested",
             f"The data cannot tell it from {names_of(competing, ' or ')} (odds below 20:1), and a correction "
             "under a wrong name may fit this log and fail on the next. To tell them apart: "
-            f"{cause.separated_by}.",
+            f"{cause.disambiguation}.",
         )

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
 __all__ = [
-    "Alone", "Budget", "Delays", "Level", "Motion", "alone", "budget", "cancelling", "delays", "level",
+    "Budget", "Delays", "Level", "Motion", "budget", "cancelling", "delays", "level",
     "motion", "slow_share", "stays", "times_usual",
 ]  # fmt: skip
 
@@ -61,15 +61,6 @@ class Budget(NamedTuple):
     refitted: float | None
     after: float | None
     fitted: float
-
-
-class Alone(NamedTuple):
-    """RMS, and scatter about the mean, nT: the calibration as given, and the extended one by itself."""
-
-    before: float
-    after: float
-    scatter_before: float
-    scatter_after: float
 
 
 def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration) -> Level | None:
@@ -145,19 +136,9 @@ def cancelling(diagnosis: Diagnosis) -> list[tuple[Finding, Finding, float, floa
     ]
 
 
-def alone(diagnosis: Diagnosis) -> Alone:
-    """Return what the extended calibration does by itself, on the log that it was fitted to."""
-    survey = diagnosis.problem.survey
-    before, after = (
-        residuals_of(*samples_of(survey, calibration))[~survey.learned]
-        for calibration in (diagnosis.problem.calibration, diagnosis.calibration)
-    )
-    return Alone(rms(before), rms(after), float(np.std(before)), float(np.std(after)))
-
-
 def budget(diagnosis: Diagnosis) -> Budget:
     """Compare the residual that the calibration predicts with those that were found."""
     counts, total = diagnosis.counts, diagnosis.total
     predicted = float(np.sqrt(np.mean(diagnosis.problem.stated[counts])))
-    refitted, after = (diagnosis.beyond.before, total.after) if diagnosis.findings else (None, None)
+    refitted, after = (diagnosis.over_refit.before, total.after) if diagnosis.findings else (None, None)
     return Budget(predicted, total.before, refitted, after, rms(diagnosis.residual[counts]))

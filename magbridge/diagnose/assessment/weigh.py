@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from magbridge.arrays import FloatArray
 from magbridge.diagnose.assessment.notes import DOUBTS, Note, contested, notes
 from magbridge.diagnose.assessment.numbers import (
     Budget,
     Delays,
     Level,
-    alone,
     budget,
     cancelling,
     delays,
@@ -27,27 +29,56 @@ if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
-__all__ = ["OWN", "Assessment", "Fitness", "assess", "useful"]
+__all__ = ["OWN", "Assessment", "Fitness", "Reason", "assess", "useful"]
 
-Fitness = Literal["yes", "once_settled", "no", "not_needed", "nothing_added", "reference_only"]
+Fitness = Literal["yes", "conditional", "no"]
+Reason = Literal[
+    "held_out_and_other_day", "one_condition", "nothing_added", "not_needed", "reference_only", "refused",
+    "no_improvement", "refit_as_good",
+]  # fmt: skip
+"""Code of the reason for the answer."""
 OWN = (
     "The calibration was fitted to this very log and has absorbed part of what is wrong: the improvement is "
     "no test."
 )
-REPEATS = (
-    "What was left out of the fit are parts of the same log. Compare one more log, of another day, before "
-    "you rely on it."
-)
+REPEATS = "All parts left out of the fit belong to this log: a log of another day may differ."
 SLOWLY = 0.9
 """Share of its power that a trend and a bend over the log explain, of what is called slow."""
-ANSWERS: dict[Fitness, str] = {
-    "yes": "Nothing in this log speaks against it.",
-    "once_settled": "Only once these doubts are settled.",
-    "no": "Not on the evidence of this log.",
-    "not_needed": "There is no need for it: the calibration's own numbers fitted anew do as well.",
+SUMMARIES: dict[Reason, str] = {
+    "held_out_and_other_day": "The corrected field improves on parts and on days left out of the fit.",
+    "not_needed": "There is no need for it: the calibration's own coefficients, refitted, do as well.",
     "reference_only": "It has no new term: what was found belongs to the reference, not to the vehicle. Its "
-    "coefficients are fitted anew with that taken out.",
+    "coefficients are refitted with that taken out.",
+    "no_improvement": "The corrected field does not improve on what was left out of the fit.",
+    "refit_as_good": "A refit of the calibration alone corrects as well: calibrate again instead.",
 }
+REFUSALS = {
+    "not_linear": "On parts left out of the fit the linear model predicts an error of {0} nT RMS, and the "
+    "corrector leaves {1} nT",
+    "outside_prior": "It would move the corrected field by {1} nT where this log does not determine it and "
+    "the calibration allows {0} nT",
+    "worse": "On parts left out of the fit it would leave {1} nT RMS, and the calibration as given leaves "
+    "{0} nT",
+    "written_file": "The written file, read back, corrects this log with an error of {1} nT RMS, and the "
+    "calibration as given with one of {0} nT",
+}
+"""Why an extension is refused, with its two values."""
+CONDITIONS = {
+    "own_log": "compare a log that the calibration was not fitted to.",
+    "unsupported": "calibrate again from runs that support the calibration ({0}).",
+    "contested": "find out first which of the possible causes it is: {0}.",
+    "random_walk": "log the sensor at rest for as long as this log, to exclude a drifting offset.",
+    "implausible_amplitude": "compare the corrected field with another reference, because the effect is "
+    "implausibly large.",
+    "reference_shift": "compare the corrected field with another reference, because all of it is shifted.",
+    "cancelling": "compare the corrected field with another reference, because two causes largely cancel.",
+    "unexplained": "find the cause of what is left without a name.",
+    "spatial_temporal": "cross the track again at another time, to distinguish a map's error from a change "
+    "with time.",
+    "no_improvement": "compare another log, because one of the causes shows no improvement of its own.",
+    "same_log": "the improvement must show in a log of another day as well.",
+}
+"""The condition that removes each objection, the weightiest first."""
 
 
 @dataclass(frozen=True)
@@ -55,17 +86,20 @@ class Assessment:
     """All that a reader gets beside the findings themselves."""
 
     fit_for_use: Fitness
-    """``yes``, ``once_settled``, ``no``, ``not_needed``, ``nothing_added`` or ``reference_only`` (no new
-    term)."""
-    answer: str
-    """The same as a sentence."""
+    """Whether the written calibration may be used in place of the one as given."""
+    reason: Reason
+    """Code of the reason for that."""
+    condition: str
+    """The one condition of a conditional answer; empty otherwise."""
+    summary: str
+    """The answer as a sentence."""
     reasons_for: tuple[Note, ...]
     reasons_against: tuple[Note, ...]
     manoeuvres: tuple[str, ...]
     """What to fly to settle the doubts."""
     notes: tuple[tuple[Note, ...], ...]
     """What to know before believing each finding."""
-    level: Level | None
+    reference_shift: Level | None
     """Shift of the whole corrected field that may be the reference's."""
     delays: Delays | None
     """Of the sensor's axes, where they look interpolated."""
@@ -87,16 +121,25 @@ def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
     noted = tuple(tuple(notes(diagnosis, one, causes[one.candidate.cause])) for one in diagnosis.findings)
     against = _against(diagnosis, noted, shift, track) if diagnosis.named else []
     use = useful(diagnosis)
-    fitness = _fitness(diagnosis, use, against)
-    good = [Note("use", use), *_alone(diagnosis)] if use else []
+    if use:
+        against = [*against, *_domain(diagnosis)]
+    fitness, reason = _fitness(diagnosis, use, against)
+    manoeuvres = tuple(dict.fromkeys(_manoeuvres(diagnosis, causes)))
+    condition = _condition(diagnosis, against, manoeuvres) if fitness == "conditional" else ""
+    good = [Note("use", use)] if use else []
     return Assessment(
         fit_for_use=fitness,
-        answer=ANSWERS.get(fitness) or _as_given(diagnosis),
+        reason=reason,
+        condition=condition,
+        summary=f"Fit for use on one condition: {condition}" if condition else _summary(diagnosis, reason),
         reasons_for=tuple(good),
-        reasons_against=(*against, *([Note("same_log", REPEATS)] if use else [])),
-        manoeuvres=tuple(dict.fromkeys(_manoeuvres(diagnosis, causes))),
+        reasons_against=(
+            *against,
+            *([Note("same_log", REPEATS)] if use and diagnosis.other_day is None else []),
+        ),
+        manoeuvres=manoeuvres,
         notes=noted,
-        level=shift,
+        reference_shift=shift,
         delays=delays(problem, diagnosis.fit),
         budget=budget(diagnosis),
         residual=memory(problem, residual),
@@ -105,16 +148,69 @@ def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
     )
 
 
-def _fitness(diagnosis: Diagnosis, use: str, against: Sequence[Note]) -> Fitness:
-    if not diagnosis.named:
-        return "nothing_added"
-    if diagnosis.negligible:
-        return "not_needed"
-    if not use:
-        return "reference_only"
-    if not diagnosis.total.shown:
-        return "no"
-    return "once_settled" if against else "yes"
+def _fitness(diagnosis: Diagnosis, use: str, against: Sequence[Note]) -> tuple[Fitness, Reason]:
+    """Return whether the written calibration is fit for use, and the code of the reason."""
+    objections: dict[Reason, bool] = {
+        "nothing_added": not diagnosis.named,
+        "refused": bool(diagnosis.refused),
+        "not_needed": diagnosis.negligible,
+        "reference_only": not use,
+        "no_improvement": not diagnosis.improvement.shown,
+        "refit_as_good": not diagnosis.over_refit.shown,
+    }
+    reason = next((code for code, applies in objections.items() if applies), None)
+    if reason is not None:
+        return "no", reason
+    other_day = diagnosis.other_day is not None and diagnosis.other_day.shown
+    if other_day and not any(note.code in CONDITIONS for note in against):
+        return "yes", "held_out_and_other_day"
+    return "conditional", "one_condition"
+
+
+def _condition(diagnosis: Diagnosis, against: Sequence[Note], manoeuvres: Sequence[str]) -> str:
+    """Return the condition that removes the weightiest objection, else that of a log of another day."""
+    codes = [note.code for note in against if note.code in CONDITIONS]
+    code = min(codes, key=list(CONDITIONS).index, default="same_log")
+    if code == "unsupported":
+        return CONDITIONS[code].format("; ".join(diagnosis.problem.calibration.warnings))
+    return CONDITIONS[code].format("; ".join(manoeuvres))
+
+
+def _summary(diagnosis: Diagnosis, reason: Reason) -> str:
+    """Return the answer as a sentence."""
+    if reason == "refused":
+        values = [number(value) for value in diagnosis.refusal_values]
+        why = REFUSALS[diagnosis.refused].format(*values)
+        return f"The extension is refused. {why}. calibration.json is the calibration as it was given."
+    return SUMMARIES.get(reason) or _as_given(diagnosis)
+
+
+def _domain(diagnosis: Diagnosis) -> list[Note]:
+    """List the ranges of attitude, depth and telemetry in which the improvement was measured."""
+    survey, known = diagnosis.problem.survey, diagnosis.problem.calibration
+    fresh = ~survey.learned
+    ranges: dict[str, tuple[float, float, str]] = {}
+    if survey.attitude is not None:
+        for k, name in enumerate(("roll", "pitch")):
+            ranges[name] = (*_extremes(survey.attitude[fresh, k]), "deg")
+    names = [parameter.name for parameter in known.parameters]
+    names += [name for name in diagnosis.calibration.channels if name not in names]
+    for name in names:
+        ranges[name] = (*_extremes(survey.channels[name].values[fresh]), survey.channels[name].unit)
+    if not ranges:
+        return []
+    texts = [f"{n} {number(a)} to {number(b)} {unit}".rstrip() for n, (a, b, unit) in ranges.items()]
+    values = {f"{n}_{end}": x for n, (a, b, _) in ranges.items() for end, x in (("min", a), ("max", b))}
+    return [
+        Note(
+            "domain", f"The improvement was measured at {', '.join(texts)}; nothing is known outside.", values
+        )
+    ]
+
+
+def _extremes(values: FloatArray) -> tuple[float, float]:
+    """Return the smallest and the largest of values (n,)."""
+    return float(np.min(values)), float(np.max(values))
 
 
 def _as_given(diagnosis: Diagnosis) -> str:
@@ -131,29 +227,18 @@ def _as_given(diagnosis: Diagnosis) -> str:
 def useful(diagnosis: Diagnosis) -> str:
     """Say what the extended calibration corrects for and what not; nothing where nothing was added to it."""
     added = diagnosis.calibration.effects
+    if diagnosis.refused:
+        return ""
     if all(c.about != "vehicle" or (c.effects and set(added).isdisjoint(c.effects)) for c in diagnosis.named):
         return ""
     others = ", ".join(label(*candidate.group) for candidate in stays(diagnosis))
     but = f" It leaves {others} in the field, which the RMS above has removed." if others else ""
     verdict = (
         "corrects for what belongs to the vehicle and its sensor"
-        if diagnosis.total.shown
+        if diagnosis.improvement.shown
         else "shows no improvement on what it was not fitted to: do not use it before another log does"
     )
     return f"The extended calibration, calibration.json beside this page, {verdict}.{but}"
-
-
-def _alone(diagnosis: Diagnosis) -> list[Note]:
-    """Say what the extended calibration does by itself, where some of what was found stays in the field."""
-    if not stays(diagnosis):
-        return []
-    found = alone(diagnosis)
-    text = (
-        f"By itself it takes the difference from the reference from {number(found.before)} to "
-        f"{number(found.after)} nT RMS, and about its mean from {number(found.scatter_before)} to "
-        f"{number(found.scatter_after)} nT, on this log, to which it was fitted."
-    )
-    return [Note("by_itself", text, found._asdict())]
 
 
 def _against(
@@ -171,14 +256,14 @@ def _against(
             "constant belongs to the vehicle or to the reference: check the extended field against another "
             "reference before using it."
         )
-        found.append(Note("level", text, shift._asdict()))
+        found.append(Note("reference_shift", text, shift._asdict()))
     found += [
         Note(note.code, f"{_name(one)}: {note.text}", note.numbers)
         for one, some in zip(diagnosis.findings, noted, strict=True)
         for note in some
         if note.code in DOUBTS
     ]
-    found += _place_or_time(diagnosis, track)
+    found += _spatial_temporal(diagnosis, track)
     for one, other, a, b, both in cancelling(diagnosis):
         text = (
             f"{_name(one)} and {_name(other)} largely cancel each other ({number(a)} and {number(b)} nT RMS, "
@@ -191,22 +276,22 @@ def _against(
     return found
 
 
-def _place_or_time(diagnosis: Diagnosis, track: Returns | None) -> list[Note]:
+def _spatial_temporal(diagnosis: Diagnosis, track: Returns | None) -> list[Note]:
     """Say so where an error of the reference is slow, and the track does not tell place from time."""
-    if track is None or track.apart:
+    if track is None or track.distinguishable:
         return []
     about = [one for one in diagnosis.findings if one.candidate.about in ("place", "time")]
     slow = [_name(one) for one in about if slow_share(diagnosis.problem, one) >= SLOWLY]
     text = f"{track.text} Only their usual shapes speak for: {', '.join(slow)}."
-    return [Note("place_or_time", text, track._asdict())] if slow else []
+    return [Note("spatial_temporal", text, track._asdict())] if slow else []
 
 
 def _manoeuvres(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     """List what would tell the possible causes apart."""
-    found = [causes[one.candidate.cause].separated_by for one in diagnosis.findings if contested(one)]
+    found = [causes[one.candidate.cause].disambiguation for one in diagnosis.findings if contested(one)]
     rest = diagnosis.unexplained
     if rest is not None and rest.within:
-        found.append(causes[rest.within[0].candidate.cause].separated_by)
+        found.append(causes[rest.within[0].candidate.cause].disambiguation)
     return found
 
 

@@ -38,7 +38,7 @@ class Cause(NamedTuple):
     """``Problem -> list of Candidate``."""
     needs: str
     """What a log must contain for it to be tested."""
-    separated_by: str
+    disambiguation: str
     """The manoeuvre that tells it from its competing hypotheses."""
     meaning: str = ""
     """What it means, as a clause."""

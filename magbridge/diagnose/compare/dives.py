@@ -6,7 +6,12 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IntArray
 
-__all__ = ["dives_of", "eighths", "held"]
+__all__ = ["days_of", "dives_of", "eighths", "held"]
+
+DAY_S, NIGHT_S = 86400.0, 21600.0
+"""Longest day, and the gap after which another day begins, s."""
+MIN_SAMPLES_A_DAY = 100
+"""Fewest samples of a day that is left out by itself."""
 
 Table = dict[str, FloatArray]
 """Columns (n,) in order of time, each with a value somewhere; ``learned`` is 1 where it was learned from."""
@@ -31,6 +36,37 @@ def dives_of(table: Table) -> IntArray:
         if 4 <= start.sum() <= 0.05 * len(depth):
             return np.cumsum(start)
     return eighths(len(table["time"]))
+
+
+def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
+    """Return the number of each sample's day, or None where the diagnosed log is of fewer than two days.
+
+    Parameters
+    ----------
+    time : (n,) array
+        Times of the samples, s.
+    learned : (n,) bool array
+        Samples that serve only as a comparison; they have the number -1.
+
+    Notes
+    -----
+    A day begins with the first sample, after :data:`DAY_S`, and after a gap of :data:`NIGHT_S`. Days of fewer
+    than :data:`MIN_SAMPLES_A_DAY` samples count to the day before.
+    """
+    day, number, start, last = np.full(len(time), -1), -1, -np.inf, -np.inf
+    fresh = np.flatnonzero(~learned)
+    t = time[fresh]
+    bounds = []
+    for k, moment in enumerate(t.tolist()):
+        if moment - start >= DAY_S or moment - last > NIGHT_S:
+            start = moment
+            bounds.append(k)
+        last = moment
+    for first, end in zip(bounds, [*bounds[1:], len(t)], strict=True):
+        if end - first >= MIN_SAMPLES_A_DAY or number < 0:
+            number += 1
+        day[fresh[first:end]] = number
+    return day if number > 0 else None
 
 
 def held(values: FloatArray) -> FloatArray:

@@ -46,7 +46,7 @@ from magbridge.diagnose.compare.slow_noise import slow_columns, waves
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.estimation.residual import Samples, residuals
 
-__all__ = ["DELAY", "DELAYS", "Problem", "once", "pose", "samples_of", "with_slow_noise"]
+__all__ = ["DELAY", "DELAYS", "Problem", "linearised", "once", "pose", "samples_of", "with_slow_noise"]
 
 T = TypeVar("T")
 
@@ -166,20 +166,44 @@ def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, Float
     return Samples(survey.field, survey.reference, phi.T, survey.steps.astype(float), unit, kappa), W.ravel()
 
 
-def pose(survey: Survey, calibration: Calibration) -> Problem:
-    """Linearise the comparison about `calibration`."""
-    samples, coefficients = samples_of(survey, calibration)
-    n = len(survey)
+def linearised(
+    samples: Samples, coefficients: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Compute the residual and its derivatives at readings that are moved until the residual vanishes.
+
+    Parameters
+    ----------
+    samples : Samples
+        n samples, with m regressors.
+    coefficients : (9 m,) array
+        Coefficients of all regressors, nT.
+
+    Returns
+    -------
+    (n,), (n, 9), (n,), (n, 3) array
+        Residual (sensor nT), its derivative by the nine coefficients, its derivative by the true field, and
+        the moved readings (nT).
+    """
+    n = len(samples.field)
     e, g, reference_jacobian, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))
     for start in range(0, n, CHUNK):
         rows = slice(start, start + CHUNK)
         part = samples.part(rows)
         e[rows], slope = residuals(part, coefficients)
+        # Errors in variables: move the reading along its own gradient until the residual vanishes
         away = slope[:, 6:]
         reading[rows] = part.field + (e[rows] / (away * away).sum(axis=1))[:, None] * away
         _, g[rows] = residuals(replace(part, field=reading[rows]), coefficients)
         above, _ = residuals(replace(part, reference=part.reference + 1.0), coefficients)
         reference_jacobian[rows] = e[rows] - above
+    return e, g, reference_jacobian, reading
+
+
+def pose(survey: Survey, calibration: Calibration) -> Problem:
+    """Linearise the comparison about `calibration`."""
+    samples, coefficients = samples_of(survey, calibration)
+    n = len(survey)
+    e, g, reference_jacobian, reading = linearised(samples, coefficients)
     L, centre = prior(survey, calibration, samples, e, g)
     seen = np.zeros((L.shape[1],) * 2)
     for start in range(0, n, CHUNK):

@@ -1,4 +1,4 @@
-r"""Whether a track tells what changes with the place from what changes with time.
+r"""Whether a track distinguishes what changes with the place from what changes with time.
 
 Notes
 -----
@@ -26,7 +26,7 @@ CELL = 250.0
 AWAY = 900.0
 """s after which passing a place again is a return."""
 SEPARABLE = 0.1
-"""Least share from which place and time are told apart: at S/N 10 that is worth 5 nats, odds of 150:1."""
+"""Least share from which place and time are distinguished: at S/N 10 that is worth 5 nats, odds of 150:1."""
 
 
 class Returns(NamedTuple):
@@ -40,8 +40,8 @@ class Returns(NamedTuple):
     """Least share of the power of a slow change with time that no function of the place imitates."""
 
     @property
-    def apart(self) -> bool:
-        """Whether the log tells place from time."""
+    def distinguishable(self) -> bool:
+        """Return True if the log distinguishes place from time."""
         return self.separable >= SEPARABLE
 
     @property
@@ -49,15 +49,15 @@ class Returns(NamedTuple):
         """The same in words."""
         both = "an error of the map and a slow change with time (a daily variation)"
         if not self.share:
-            return f"The track never returns to a place: {both} cannot be told apart."
+            return f"The track never returns to a place: {both} cannot be distinguished."
         again = (
             f"The track passes {100.0 * self.share:.0f} % of its places again, up to "
             f"{self.longest / 3600.0:.1f} h later"
         )
-        if self.apart:
-            return f"{again}: {both} can be told apart."
+        if self.distinguishable:
+            return f"{again}: {both} can be distinguished."
         like = f"imitates {100.0 * (1.0 - self.separable):.0f} % of the other's power"
-        return f"{again}, but at times at which one {like}: {both} cannot be told apart."
+        return f"{again}, but at times at which one {like}: {both} cannot be distinguished."
 
 
 def returns(survey: Survey) -> Returns | None:

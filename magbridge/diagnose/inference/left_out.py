@@ -44,26 +44,37 @@ LEVEL = QUANTILES[1] - QUANTILES[0]
 
 
 class HeldOut(NamedTuple):
-    """(n,) residual, nT, of every sample under a fit that never saw its dive; and the model's score."""
+    """Result of leaving out dives, fold by fold."""
 
     residual: FloatArray
+    """Residual (n,) of every sample under the fit without its fold, by the linear model, nT of the sensor."""
     score: float
+    """Log predictive density of all folds."""
+    fold: IntArray
+    """Number (n,) of the fold that each sample belongs to."""
+    coefficients: FloatArray
+    """Coefficients (f, q + k) of calibration and effects, fitted without each fold."""
 
 
 def held_out(
-    problem: Problem, columns: Sequence[Columns], fit: Joint, *, interleaved: bool = False
+    problem: Problem,
+    columns: Sequence[Columns],
+    fit: Joint,
+    *,
+    interleaved: bool = False,
+    groups: IntArray | None = None,
 ) -> HeldOut:
     """Leave out dives, fold by fold.
 
     Nonlinear parameters and noise are those of the fit to all dives; every coefficient is fitted anew without
     the fold. Folds are stretches of dives, so that a slow change must be foretold; or, `interleaved`, every
-    eighth dive, so that it need only be filled in.
+    eighth dive, so that it need only be filled in. `groups` (n,) takes the place of the dives' numbers.
     """
     X, noise, prior = Design(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
     c = np.append(fit.z, fit.coefficients)
     y = noise.response(problem.residual - X.times(c))
-    dive = np.unique(problem.survey.dive, return_inverse=True)[1]
+    dive = np.unique(problem.survey.dive if groups is None else groups, return_inverse=True)[1]
     count, dives = min(FOLDS, int(dive.max()) + 1), int(dive.max()) + 1
     ends = np.cumsum([len(some) for some in np.array_split(np.arange(dives), count)])
     of = dive % count if interleaved else np.searchsorted(ends, dive, side="right")
@@ -85,7 +96,7 @@ def held_out(
     price = np.einsum("fi,fij,fj->", away, others, away)
     price += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
     price += prior[: len(fit.z)] @ (fit.z - problem.centre) ** 2
-    return HeldOut(residual, noise.log_likelihood - 0.5 * float(price))
+    return HeldOut(residual, noise.log_likelihood - 0.5 * float(price), of, without)
 
 
 @dataclass(frozen=True)

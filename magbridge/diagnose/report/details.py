@@ -110,9 +110,9 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
     budget, parts = diagnosis.assessment.budget, diagnosis.problem.survey.parts
     rows = {
         "predicted by the calibration as given: noise and its own uncertainty": budget.predicted,
-        "found with the calibration as given": budget.before,
-        f"found with its own numbers fitted anew, on {parts} left out": budget.refitted,
-        f"found with the extended calibration, on {parts} left out": budget.after,
+        "with the calibration as given": budget.before,
+        f"with its own coefficients refitted, on {parts} left out": budget.refitted,
+        f"extended, without the named errors of the reference, on {parts} left out": budget.after,
         "left in the fit to the whole log": budget.fitted,
     }
     lines = (
@@ -155,7 +155,7 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
         return "It fits no known cause, so it has no name."
     return (
         "No name is asserted: a description without a cause does as well. It resembles: "
-        f"{listed(rest.within)}. To tell: {escape(causes[rest.within[0].candidate.cause].separated_by)}."
+        f"{listed(rest.within)}. To tell: {escape(causes[rest.within[0].candidate.cause].disambiguation)}."
     )
 
 

@@ -21,7 +21,7 @@ from magbridge.diagnose.seen import Seen
 
 __all__ = ["FORMAT", "findings", "findings_json", "parameters"]
 
-FORMAT = 2
+FORMAT = 3
 """Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""
 
 
@@ -36,10 +36,9 @@ def findings(
     return {
         "format": FORMAT,
         "verdict": diagnosis.verdict,
-        "rms_before_nT": _round(diagnosis.total.before),
-        "rms_after_nT": _round(diagnosis.total.after),
-        "improvement": _improvement(diagnosis.total, diagnosis),
-        "gain": _improvement(diagnosis.total, diagnosis),
+        "rms_before_nT": _round(diagnosis.improvement.before),
+        "rms_after_nT": _round(diagnosis.improvement.after),
+        "improvement": _corrected(diagnosis),
         "findings": listed,
         "unexplained": None
         if rest is None
@@ -77,7 +76,7 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
         "signal_to_noise": _round(finding.signal_to_noise),
         "p_value": _round(finding.hypothesis.p_value),
         "alternatives": alternatives(competing),
-        "separated_by": causes[candidate.cause].separated_by if competing else None,
+        "disambiguation": causes[candidate.cause].disambiguation if competing else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
         "improvement": _improvement(finding.improvement, diagnosis),
     }
@@ -144,13 +143,15 @@ def assessment(found: Assessment) -> dict[str, Any]:
     delays, budget, residual, track = found.delays, found.budget, found.residual, found.returns
     return {
         "fit_for_use": found.fit_for_use,
-        "answer": found.answer,
+        "reason": found.reason,
+        "condition": found.condition or None,
+        "summary": found.summary,
         "reasons_for": _notes(found.reasons_for),
         "reasons_against": _notes(found.reasons_against),
         "manoeuvres": list(found.manoeuvres),
         "warnings": [_notes(some) for some in found.notes],
-        "level": found.level and {
-            "shift_nT": _round(found.level.shift), "sigma_nT": _round(found.level.sigma),
+        "reference_shift": found.reference_shift and {
+            "shift_nT": _round(found.reference_shift.shift), "sigma_nT": _round(found.reference_shift.sigma),
         },
         "channel_delays": delays and {
             "y_s": _round(delays.later[0]), "z_s": _round(delays.later[1]),
@@ -160,12 +161,12 @@ def assessment(found: Assessment) -> dict[str, Any]:
         "rms_nT": {name: None if x is None else _round(x) for name, x in budget._asdict().items()},
         "residual": {
             "rms_nT": _round(residual.rms), "white_nT": _round(residual.white),
-            "correlation_time_s": _round(residual.correlation_time), "slow_share": _round(residual.slow),
+            "correlation_time_s": _round(residual.correlation_time), "slow_fraction": _round(residual.slow),
             "follows": follows(found.follows),
         },
-        "place_or_time": track and {
-            "told_apart": track.apart, "least_share": _round(track.separable),
-            "returning_share": _round(track.share), "longest_s": _round(track.longest), "text": track.text,
+        "spatial_temporal": track and {
+            "distinguishable": track.distinguishable, "least_fraction": _round(track.separable),
+            "returning_fraction": _round(track.share), "longest_s": _round(track.longest), "text": track.text,
         },
     }  # fmt: skip
 
@@ -184,8 +185,8 @@ def follows(what: Seen) -> dict[str, Any]:
         "channel": what.channel,
         "lag_s": what.lag,
         "axis": what.axis,
-        "size_nT": _round(what.size),
-        "share": _round(what.share),
+        "amplitude_nT": _round(what.size),
+        "fraction": _round(what.share),
     }
 
 
@@ -200,10 +201,10 @@ def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
         "signal_to_noise": _round(float(np.sqrt(wrong.ratio))),
         "p_value": _round(wrong.p_value),
         "alternatives": [],
-        "separated_by": None,
+        "disambiguation": None,
         "parameters": {
             "count": {"value": int(wrong.rows.size), "sigma": None, "unit": "1"},
-            "median_size": {"value": _round(float(np.median(size))), "sigma": None, "unit": "nT"},
+            "median_amplitude": {"value": _round(float(np.median(size))), "sigma": None, "unit": "nT"},
         },
         "improvement": None,
     }
@@ -215,6 +216,20 @@ def _improvement(improvement: Improvement, diagnosis: Diagnosis) -> dict[str, An
         "interval": [_round(improvement.interval[0]), _round(improvement.interval[1])],
         "level": LEVEL,
         "held_out": diagnosis.problem.survey.parts,
+    }
+
+
+def _corrected(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the improvement of the corrected field, beside a refit of the calibration alone."""
+    found, over = diagnosis.improvement, diagnosis.over_refit
+    day = diagnosis.other_day
+    return _improvement(found, diagnosis) | {
+        "before_nT": _round(found.before),
+        "after_nT": _round(found.after),
+        "refit_nT": _round(over.before),
+        "ratio_to_refit": _round(over.ratio),
+        "interval_to_refit": [_round(over.interval[0]), _round(over.interval[1])],
+        "other_day": None if day is None else _improvement(day, diagnosis) | {"held_out": "days"},
     }
 
 

@@ -28,10 +28,7 @@ from magbridge.files import atomic_path, new_folder
 __all__ = ["improved", "late", "report_html", "write"]
 
 STYLE = Path(__file__).with_name("style.css")
-MARKS: dict[Fitness, str] = {
-    "yes": "good", "once_settled": "doubt", "no": "bad", "not_needed": "none", "nothing_added": "none",
-    "reference_only": "none",
-}  # fmt: skip
+MARKS: dict[Fitness, str] = {"yes": "good", "conditional": "doubt", "no": "none"}
 """How an answer is marked."""
 LONG = 7200.0
 """s, from which on a length is given in hours."""
@@ -123,11 +120,11 @@ def _sentence(diagnosis: Diagnosis) -> str:
         names.append(f"<b>outliers</b> ({diagnosis.wrong.rows.size} wrong samples)")
     worth = f"Without them, {before} nT RMS; nothing is added to the calibration."
     if diagnosis.findings:
-        survey, refitted = diagnosis.problem.survey, number(diagnosis.beyond.before)
+        survey, refitted = diagnosis.problem.survey, number(diagnosis.over_refit.before)
         own = (survey.fitted & ~survey.learned).any()  # the calibration was fitted to what is diagnosed
         worth = (
-            f"{improved(total, '' if own else survey.parts)} The calibration's own numbers fitted anew would "
-            f"leave {refitted} nT.{allowed}"
+            f"{improved(diagnosis.improvement, '' if own else survey.parts)} A refit of the calibration "
+            f"alone leaves {refitted} nT.{_reference_part(diagnosis)}{allowed}"
         )
     louder = rest and all(rest.signal_to_noise > one.signal_to_noise for one in diagnosis.findings)
     other = f"Something {'stronger' if louder else 'else'} is left that no known cause explains."
@@ -140,19 +137,27 @@ def _sentence(diagnosis: Diagnosis) -> str:
     return f"{start * diagnosis.negligible}Found: {'; '.join(names)}. {worth} {other}"
 
 
+def _reference_part(diagnosis: Diagnosis) -> str:
+    """Return what is left with the named errors of the reference taken out; empty where none is named."""
+    if all(candidate.about == "vehicle" for candidate in diagnosis.named):
+        return ""
+    left = number(diagnosis.total.after)
+    return f" With the named errors of the reference taken out of the comparison, {left} nT are left."
+
+
 def _or(competing: Sequence[CompetingHypothesis]) -> str:
     return f" <span class=faint>or {listed(competing, ' or ')}</span>" * bool(competing)
 
 
 def improved(improvement: Improvement, parts: str) -> str:
-    """Say what all findings together improve on what was left out, or that nothing shows.
+    """Return by how much the corrected field improves on what was left out, or that it does not.
 
     `parts` is what was left out in turn; empty where the calibration was fitted to the log itself.
     """
     low, high = improvement.interval
     where = f"On {parts} left out of the fit" if parts else "On the log that the calibration was fitted to"
     return (
-        f"{where}, {number(improvement.before)} nT RMS became "
+        f"{where}, the error of the corrected field, {number(improvement.before)} nT RMS, became "
         f"{number(improvement.after)} nT (ratio {improvement.ratio:.2f}, 95 % interval {low:.2f} to "
         f"{high:.2f}{'' if improvement.shown else ': no improvement is shown'})."
     )
@@ -161,14 +166,20 @@ def improved(improvement: Improvement, parts: str) -> str:
 def _fitness(found: Assessment) -> str:
     """Return whether the extended calibration is fit for use, with the reasons, as a box."""
     mark = MARKS[found.fit_for_use]
-    if found.fit_for_use == "reference_only" and found.reasons_against:
-        mark = "doubt"
+    if found.reason in ("refused", "no_improvement", "refit_as_good"):
+        mark = "bad"
     reasons = [*found.reasons_for, *found.reasons_against]
     items = "".join(f"<li>{escape(reason.text)}</li>" for reason in reasons)
     return (
-        f'<div class="box {mark}"><p><b>Is the extended calibration fit for use?</b> {escape(found.answer)}'
+        f'<div class="box {mark}"><p><b>Is the extended calibration fit for use?</b> {escape(_answer(found))}'
         f"</p>{f'<ul>{items}</ul>' if items else ''}</div>"
     )
+
+
+def _answer(found: Assessment) -> str:
+    """Return the answer in words."""
+    word = {"yes": "Yes. ", "conditional": "", "no": "No. "}[found.fit_for_use]
+    return word + found.summary
 
 
 def _overview(diagnosis: Diagnosis) -> str:

@@ -1,0 +1,369 @@
+r"""The improvement of an extended calibration: the corrector's own output on samples outside the fit.
+
+Notes
+-----
+The log is divided into folds of whole dives, runs or eighths. The coefficients of each fold's calibration are
+fitted to the other folds, about the converged fit to all of them, and that calibration corrects its own fold
+with :func:`magbridge.calibration.correct.correct`. No figure of improvement comes from the linear model. The
+calibration as given, refitted in the same way without any cause, is the comparison: what a refit alone gains
+is not credited to a cause.
+
+The linear model is only a check. An extension is refused where its held-out prediction and the corrected
+field differ by more than the noise, where it moves the corrected field beyond what the calibration's
+covariance allows and the log does not determine, and where the held-out field does not improve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.correct import CorrectedArrays, correct
+from magbridge.calibration.file import decode_calibration
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import Samples, residuals, rms
+from magbridge.correction import Correction
+from magbridge.diagnose.causes.candidates import Candidate, slices
+from magbridge.diagnose.compare.derivatives import derivatives
+from magbridge.diagnose.compare.design_columns import Columns
+from magbridge.diagnose.compare.dives import days_of
+from magbridge.diagnose.compare.prior import floor, isotropic
+from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
+from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.extend import (
+    extend,
+    flyable,
+    relinearised,
+    with_map_error,
+    with_misfit,
+    without_effects_at,
+)
+from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.inference.left_out import HeldOut, held_out
+from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.reference import reference_field
+from magbridge.rows import correct_rows
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["Extension", "check_written", "corrected", "error_without", "extension_of", "tightened"]
+
+TIGHTENING = (1.0, 0.3, 0.1)
+"""Factors on the prior sigma of the calibration's coefficients that are tried until an extension passes."""
+MAX_DEPARTURE_SIGMA = 4.0
+"""Most that a corrected sample may move, in sigmas of the calibration as given, where the log does not
+determine the move."""
+DETERMINED = 0.25
+"""Fraction of a sample's prior variance below which the log determines that sample's corrected field."""
+DOMAIN_TURN_DEG = 10.0
+"""Angle by which the attitudes of the log are turned to probe the calibration's domain, degrees."""
+MAX_DOMAIN_SAMPLES = 1500
+"""Most samples at which the domain is probed."""
+MAX_FRACTION_OUTSIDE = 0.01
+"""Fraction of the probes that may exceed the limit."""
+MAX_CHECKED_ROWS = 20_000
+"""Most rows of a log that are corrected with the written file."""
+MAX_PROMISE_RATIO = 1.1
+"""Ratio of the corrected field's held-out RMS to the linear prediction from which the two disagree."""
+
+
+@dataclass(frozen=True, eq=False)
+class Extension:
+    """An extended calibration with the errors of the fields that it corrects."""
+
+    calibration: Calibration
+    """Extended calibration, or the one as given where the extension is refused."""
+    problem: Problem
+    """Comparison, linearised at the extended calibration."""
+    columns: tuple[Columns, ...]
+    """Columns of the causes in that problem."""
+    fit: Joint
+    """Joint fit at the extended calibration."""
+    error: FloatArray
+    """Corrected field less reference (n,), nT, each sample by a calibration that was not fitted to it."""
+    reference_error: FloatArray
+    """What the named errors of the reference predict (n,), nT, fitted without the sample."""
+    sigma: FloatArray
+    """Stated sigma (n,) of the corrected field, nT."""
+    score: float
+    """Log predictive density of the folds."""
+    day_error: FloatArray | None = None
+    """Like `error`, with whole days left out; None for a log of one day."""
+    refused: str = ""
+    """Code of the reason for a refusal; empty where the extension stands."""
+    details: tuple[float, float] = (0.0, 0.0)
+    """Expected and found value behind the refusal, nT."""
+
+
+def corrected(survey: Survey, calibration: Calibration) -> CorrectedArrays:
+    """Return the samples of a survey, corrected as ``magbridge correct`` does."""
+    return correct(calibration, survey.field, survey.values(calibration.channels), survey.time)
+
+
+def extension_of(
+    problem: Problem,
+    model: Sequence[Candidate],
+    fit: Joint,
+    counts: BoolArray,
+    grid: Sequence[Candidate] = (),
+) -> Extension:
+    """Extend the calibration by the causes of a model; refuse an extension that its corrected field belies.
+
+    Parameters
+    ----------
+    problem : Problem
+        Comparison, linearised about the calibration as given.
+    model : sequence of Candidate
+        Named causes; without any, the calibration's own coefficients are refitted.
+    fit : Joint
+        Fit of the model in this problem.
+    counts : (n,) bool array
+        Samples by which the improvement is measured.
+    grid : sequence of Candidate
+        All candidates that were searched, for the uncertainty of nonlinear parameters.
+
+    Returns
+    -------
+    Extension
+        The first of the attempts, each with a tighter prior than the one before, that passes all checks; the
+        first attempt with its reason for refusal where none passes.
+    """
+    first = None
+    for factor in TIGHTENING:
+        attempt = _attempt(problem, model, fit, counts, grid, factor)
+        if not attempt.refused:
+            return attempt
+        first = first or attempt
+        attempt.problem.let_go()
+    assert first is not None
+    return replace(first, calibration=problem.calibration)
+
+
+def _attempt(
+    problem: Problem,
+    model: Sequence[Candidate],
+    fit: Joint,
+    counts: BoolArray,
+    grid: Sequence[Candidate],
+    factor: float,
+) -> Extension:
+    """Extend the calibration with its prior sigma multiplied by `factor`, and check the result."""
+    if factor < 1.0:
+        ridge, start = fit.prior[len(fit.z) :], np.append(factor * fit.z, fit.coefficients)
+        problem = tightened(problem, factor)
+        columns, noise = [candidate.columns for candidate in model], fit.noise
+        fit = fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
+    settled, blocks, fit = relinearised(problem, model, fit)
+    out = held_out(settled, blocks, fit)
+    fit = with_misfit(model, loosened(settled, model, blocks, fit, grid))
+    whole = extend(problem, model, fit)
+    calibration, dropped = flyable(problem.survey, whole)
+    error, reference_error = _held_out_error(problem, model, fit, out, dropped)
+    day_error, day = None, days_of(problem.survey.time, problem.survey.learned)
+    if day is not None and model:
+        day_error, _ = _held_out_error(
+            problem, model, fit, held_out(settled, blocks, fit, groups=day), dropped
+        )
+    calibration = with_map_error(settled, model, fit, calibration)
+    calibration = _covering(problem, calibration, error, [counts, counts & (out.fold == out.fold.max())])
+    extension = Extension(
+        calibration, settled, tuple(blocks), fit, error, reference_error,
+        corrected(problem.survey, calibration).sigma, out.score, day_error,
+    )  # fmt: skip
+    if not model:
+        return extension
+    reason, details = _refusal(problem, extension, out, counts, bool(dropped))
+    return replace(extension, refused=reason, details=details)
+
+
+def _held_out_error(
+    problem: Problem, model: Sequence[Candidate], fit: Joint, out: HeldOut, dropped: Sequence[int]
+) -> tuple[FloatArray, FloatArray]:
+    """Return held-out errors (n,), nT: of the corrected field, and as predicted for the reference."""
+    q, survey = len(fit.z), problem.survey
+    error, reference_error = np.zeros(len(problem)), np.zeros(len(problem))
+    wrong = [(c, place) for c, place in zip(model, slices(model), strict=True) if c.about != "vehicle"]
+    for k, c in enumerate(out.coefficients):
+        fold = out.fold == k
+        part = replace(fit, z=c[:q], coefficients=c[q:])
+        calibration = without_effects_at(extend(problem, model, part), dropped)
+        error[fold] = (corrected(survey, calibration).total - survey.reference)[fold]
+        for candidate, place in wrong:
+            added = np.asarray(candidate.columns(slice(0, len(problem)))[fold] @ part.coefficients[place])
+            reference_error[fold] += added / problem.reference_jacobian[fold]
+    return error, reference_error
+
+
+def _refusal(
+    problem: Problem, extension: Extension, out: HeldOut, counts: BoolArray, dropped: bool
+) -> tuple[str, tuple[float, float]]:
+    """Return the code of the reason why an extension is refused, empty if it is not, and the two values."""
+    noise = float(np.median(extension.fit.noise.scale))
+    # The corrector cannot undo the axes' delays, which the linear model takes out
+    linear = out.residual + extension.problem.delay_jacobian @ extension.fit.z[DELAYS]
+    promised = rms((linear / problem.reference_jacobian)[counts])
+    found = rms((extension.error - extension.reference_error)[counts])
+    # A rate of change that was dropped is in the linear prediction alone
+    if not dropped and found > max(MAX_PROMISE_RATIO * promised, float(np.hypot(promised, noise))):
+        return "not_linear", (promised, found)
+    allowed, moved = _departure(problem, extension)
+    if moved > allowed:
+        return "outside_prior", (allowed, moved)
+    before = (corrected(problem.survey, problem.calibration).total - problem.survey.reference)[counts]
+    if not extension.reference_error.any() and rms(extension.error[counts]) > rms(before):
+        return "worse", (rms(before), rms(extension.error[counts]))
+    return "", (0.0, 0.0)
+
+
+def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
+    """Return the limit and the value of the largest undetermined move of the corrected field, nT.
+
+    Probed are the log's own attitudes and those turned by :data:`DOMAIN_TURN_DEG` about each axis, with the
+    calibration's own coefficients alone: the effects of the causes are not limited.
+    """
+    calibration = problem.calibration
+    K = calibration.coefficients.size
+    own = replace(
+        calibration,
+        coefficients=extension.calibration.coefficients[:K],
+        covariance=extension.calibration.covariance[:K, :K],
+    )
+    step = max(1, len(problem) // (MAX_DOMAIN_SAMPLES // 7))
+    samples, coefficients = samples_of(problem.survey, calibration)
+    _, moved_coefficients = samples_of(problem.survey, own)
+    few = samples.part(slice(None, None, step))
+    probes = _turned(few)
+    e, g = residuals(probes, coefficients)
+    shift = np.abs(residuals(probes, moved_coefficients)[0] - e)
+    J = derivatives(calibration, probes, g, np.eye(K))
+    before = np.einsum("ij,jk,ik->i", J, calibration.covariance + floor(calibration), J)
+    after = np.einsum("ij,jk,ik->i", J, own.covariance, J)
+    limit = MAX_DEPARTURE_SIGMA * np.sqrt(before + problem.calibration.noise.sensor**2)
+    excess = np.where(after < DETERMINED * before, 0.0, shift / limit)
+    worst = int(np.argsort(excess)[int((1.0 - MAX_FRACTION_OUTSIDE) * (len(excess) - 1))])
+    return float(limit[worst]), float(excess[worst] * limit[worst])
+
+
+def _turned(samples: Samples) -> Samples:
+    """Return samples with their readings, and these turned both ways about each axis of the sensor."""
+    angle, readings = np.radians(DOMAIN_TURN_DEG), [samples.field]
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        for a in (angle, -angle):
+            R = np.eye(3)
+            R[i, i] = R[j, j] = np.cos(a)
+            R[i, j], R[j, i] = -np.sin(a), np.sin(a)
+            readings.append(samples.field @ R.T)
+    count = len(readings)
+    return replace(
+        samples,
+        field=np.concatenate(readings),
+        reference=np.tile(samples.reference, count),
+        phi=np.tile(samples.phi, (count, 1)),
+        steps=np.tile(samples.steps, count),
+    )
+
+
+def check_written(
+    content: bytes, given: Calibration, datasets: Sequence[xr.Dataset], grid: AnomalyGrid | None
+) -> tuple[float, float] | None:
+    """Read a written calibration back and correct the logs with it as ``magbridge correct`` does.
+
+    Parameters
+    ----------
+    content : bytes
+        Content of ``calibration.json``.
+    given : Calibration
+        Calibration before the extension.
+    datasets : sequence of Dataset
+        Logs that were diagnosed; of a long log the first :data:`MAX_CHECKED_ROWS` rows are corrected.
+    grid : AnomalyGrid, optional
+        Added to the main field where a log has no reference of its own.
+
+    Returns
+    -------
+    tuple of 2 float or None
+        RMS error with the calibration as given and with the written one, nT, if the latter is larger by more
+        than the noise; None where the file holds what was promised.
+    """
+    written = decode_calibration(content, "calibration.json")
+    errors: dict[bool, list[FloatArray]] = {False: [], True: []}
+    for ds in datasets:
+        part = ds.isel(time=slice(MAX_CHECKED_ROWS))
+        reference = reference_field(part, grid, given.reference.bias)
+        for extended, calibration in ((False, given), (True, written)):
+            total = correct_rows(Correction(calibration), part)["total_field"].to_numpy()
+            errors[extended].append(total - reference)
+    before, after = (np.concatenate(errors[key]) for key in (False, True))
+    both = np.isfinite(before) & np.isfinite(after)
+    if not both.any():
+        return None
+    found = rms(before[both]), rms(after[both])
+    return found if found[1] > np.hypot(found[0], given.noise.sensor) else None
+
+
+def tightened(problem: Problem, factor: float) -> Problem:
+    """Return the problem with the prior sigma of the calibration's coefficients multiplied by `factor`.
+
+    The variance that the prior loses is kept as variance of what these data cannot determine.
+    """
+    known = problem.known
+    directions, centre = problem.directions.copy(), problem.centre.copy()
+    D = directions[:, known]
+    unseen = problem.unseen + (1.0 - factor**2) * D @ D.T
+    directions[:, known] *= factor
+    centre[known] /= factor
+    return replace(problem, directions=directions, centre=centre, unseen=unseen)
+
+
+def _covering(
+    problem: Problem, calibration: Calibration, error: FloatArray, parts: Sequence[BoolArray]
+) -> Calibration:
+    r"""Return the calibration with a covariance that covers its held-out error (n,), nT, in some parts.
+
+    Notes
+    -----
+    The error of a model is not noise, and the covariance of a fit counts noise alone. The excess of the mean
+    square held-out error over the stated variance is added to the covariance, with s the coefficients that
+    raise the corrected field by 1 nT at any attitude:
+
+    .. math:: C \leftarrow C + \max(0, \overline{e^2} - \overline{\sigma^2})\, s s^T
+    """
+    sigma, s = corrected(problem.survey, calibration).sigma, isotropic(calibration)
+    excess = max(float(np.mean(error[rows] ** 2 - sigma[rows] ** 2)) for rows in parts if rows.any())
+    if excess <= 0.0 or not s.any():
+        return calibration
+    return replace(calibration, covariance=calibration.covariance + excess * np.outer(s, s))
+
+
+def error_without(problem: Problem, model: Sequence[Candidate], own: slice, fit: Joint) -> FloatArray:
+    """Return the held-out error (n,), nT, of an extension by all causes of a model except one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Comparison, linearised about the calibration as given.
+    model : sequence of Candidate
+        All named causes.
+    own : slice
+        Places of the coefficients of the cause that is left out.
+    fit : Joint
+        Fit of the whole model in this problem.
+    """
+    others = [c for c, place in zip(model, slices(model), strict=True) if place != own]
+    kept = np.delete(np.arange(fit.coefficients.size), own)
+    ridge, start = fit.prior[len(fit.z) + kept], np.append(fit.z, fit.coefficients[kept])
+    columns, noise = [candidate.columns for candidate in others], fit.noise
+    alone = fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
+    settled, blocks, alone = relinearised(problem, others, alone)
+    out = held_out(settled, blocks, alone)
+    settled.let_go()
+    _, dropped = flyable(problem.survey, extend(problem, others, alone))
+    error, reference_error = _held_out_error(problem, others, alone, out, dropped)
+    return error - reference_error
