@@ -58,6 +58,8 @@ class Finding:
     over_random_walk: float = np.inf
     """Log odds over a sensor whose offsets wander (:mod:`.accept`); infinite for a cause that
     is not slow."""
+    further: tuple[Candidate, ...] = ()
+    """Further causes of the same family that the fit contains: alternatives, not findings of their own."""
 
     @property
     def candidate(self) -> Candidate:
@@ -149,8 +151,8 @@ class Diagnosis:
 
     @property
     def named(self) -> list[Candidate]:
-        """The causes of the findings."""
-        return [one.candidate for one in self.findings]
+        """The causes of the findings, with all of each family."""
+        return [candidate for one in self.findings for candidate in (one.candidate, *one.further)]
 
     @property
     def possible(self) -> list[Candidate]:

@@ -11,11 +11,9 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
-from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.compare.prior import isotropic
@@ -231,11 +229,12 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     pieces = [piece for candidate in model for piece in candidate.pieces]
     first = samples.phi.shape[1] - sum(_counts(extended))
     added = sum(_counts(extended)[len(problem.calibration.effects) :])
-    smooth = [_central(problem, effect) for piece in pieces for effect in piece.effects]
+    smooth = [piece.regressors for piece in pieces for _ in piece.effects]
     places = accumulate(_counts(extended), initial=first)
     for place, rates in zip(list(places)[len(problem.calibration.effects) :], smooth, strict=False):
         if rates is not None:
-            samples.phi[:, place : place + len(rates)] = rates.T
+            central = rates(slice(0, len(problem)))
+            samples.phi[:, place : place + len(central)] = central.T
     absent = [np.full(sum(_counts_of(piece.effects, extended)), piece.since) for piece in pieces]
     late = samples.phi.shape[1] - added + np.flatnonzero(np.concatenate([np.empty(0, bool), *absent]))
     samples.phi[np.ix_(problem.survey.learned, late)] = 0.0
@@ -255,13 +254,6 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
         columns.append(block.__getitem__)
         at += piece.size
     return rebuilt, columns
-
-
-def _central(problem: Problem, effect: Effect) -> FloatArray | None:
-    """Return the regressors (r, n) of a rate of change by central differences; None for other effects."""
-    if isinstance(effect, RateEffect):
-        return field_rates(problem)
-    return mass_rates(problem) if isinstance(effect, ClockEffect) else None
 
 
 def _counts(calibration: Calibration) -> list[int]:

@@ -342,8 +342,10 @@ def _covering(
     return replace(calibration, covariance=calibration.covariance + excess * np.outer(s, s))
 
 
-def error_without(problem: Problem, model: Sequence[Candidate], own: slice, fit: Joint) -> FloatArray:
-    """Return the held-out error (n,), nT, of an extension by all causes of a model except one.
+def error_without(
+    problem: Problem, model: Sequence[Candidate], left_out: Sequence[slice], fit: Joint
+) -> FloatArray:
+    """Return the held-out error (n,), nT, of an extension by a model without some of its causes.
 
     Parameters
     ----------
@@ -351,13 +353,13 @@ def error_without(problem: Problem, model: Sequence[Candidate], own: slice, fit:
         Comparison, linearised about the calibration as given.
     model : sequence of Candidate
         All named causes.
-    own : slice
-        Places of the coefficients of the cause that is left out.
+    left_out : sequence of slice
+        Places of the coefficients of the causes that are left out.
     fit : Joint
         Fit of the whole model in this problem.
     """
-    others = [c for c, place in zip(model, slices(model), strict=True) if place != own]
-    kept = np.delete(np.arange(fit.coefficients.size), own)
+    others = [c for c, place in zip(model, slices(model), strict=True) if place not in left_out]
+    kept = np.delete(np.arange(fit.coefficients.size), np.r_[*left_out])
     ridge, start = fit.prior[len(fit.z) + kept], np.append(fit.z, fit.coefficients[kept])
     columns, noise = [candidate.columns for candidate in others], fit.noise
     alone = fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)

@@ -42,6 +42,12 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose"]
 
+FAMILIES = {
+    "map_error": "reference", "diurnal_variation": "reference", "reference_bias": "reference",
+    "temperature_offset": "temperature", "temperature_scale": "temperature",
+    "actuator_order": "mass", "clock_offset": "mass", "filter_lag": "mass",
+}  # fmt: skip
+"""Families of causes that describe each other's remnants: those of one family are one finding."""
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 SLOW = 0.5
@@ -239,14 +245,31 @@ def _findings(
 ) -> tuple[Finding, ...]:
     """Collect the results of each cause; its improvement is that over an extension by the others alone."""
     found, fit, model = [], extension.fit, [h.candidate for h in named]
-    after = extension.error - extension.reference_error
-    for own, hypothesis, others in zip(slices(model), named, competing, strict=True):
-        without = error_without(problem, model, own, outcome.fit) if len(model) > 1 else refit.error
-        improvement = paired(without, after, problem.survey.dive, counts)
-        covariance = fit.effects_covariance[own, own]
+    after, places = extension.error - extension.reference_error, slices(model)
+    for group in _families(named):
+        first, *further = group
+        without = refit.error
+        if len(group) < len(named):
+            without = error_without(problem, model, [places[k] for k in group], outcome.fit)
+        own, hypothesis = places[first], named[first]
+        others = (*(CompetingHypothesis(named[k].candidate, 0.0) for k in further), *competing[first])
         odds = odds_over_random_walk(outcome, hypothesis) if _is_slow(problem, hypothesis) else np.inf
-        found.append(Finding(hypothesis, others, improvement, fit.coefficients[own], covariance, odds))
+        found.append(
+            Finding(
+                hypothesis, others, paired(without, after, problem.survey.dive, counts),
+                fit.coefficients[own],
+                fit.effects_covariance[own, own], odds, tuple(model[k] for k in further),
+            )
+        )  # fmt: skip
     return tuple(found)
+
+
+def _families(named: Sequence[Hypothesis]) -> list[list[int]]:
+    """Return the places of the named causes, those of one family together, the strongest of each first."""
+    groups: dict[str, list[int]] = {}
+    for k in sorted(range(len(named)), key=lambda n: -named[n].signal_to_noise):
+        groups.setdefault(FAMILIES.get(named[k].candidate.cause, str(k)), []).append(k)
+    return sorted(groups.values(), key=lambda group: group[0])
 
 
 def _is_slow(problem: Problem, one: Hypothesis) -> bool:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from magbridge.diagnose.assessment.numbers import motion, times_usual
+from magbridge.diagnose.assessment.numbers import motion, telemetry_delay, times_usual
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.words import names_of, number, series_of
+from magbridge.diagnose.words import measured, names_of, number, series_of
 
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
@@ -88,6 +88,16 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
             f"to which a mass moved. With {found.interval:.3g} s between rows, a mass that was not where its "
             "row says would look the same.",
             found._asdict(),
+        )
+    late = telemetry_delay(diagnosis, finding)
+    if late is not None and late.after_nt < late.before_nt:
+        tables = " and ".join(f"[telemetry.{p.name}]" for p in diagnosis.problem.calibration.parameters)
+        yield Note(
+            "telemetry_delay",
+            f"With delay = {measured(late.delay_s, late.sigma_s)} in {tables} of bridge.toml the calibration "
+            f"as given leaves {number(late.after_nt)} nT RMS of {number(late.before_nt)} on this log. Use "
+            "either the delay or the extended calibration, not both.",
+            {"delay_s": late.delay_s, "before_nT": late.before_nt, "after_nT": late.after_nt},
         )
     if any(piece.since for piece in candidate.pieces):
         yield Note(

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
 __all__ = [
-    "Budget", "Delays", "Level", "Motion", "budget", "cancelling", "delays", "level",
-    "motion", "slow_share", "stays", "times_usual",
+    "Budget", "Delays", "Level", "Motion", "TelemetryDelay", "budget", "cancelling", "delays", "level",
+    "motion", "slow_share", "stays", "telemetry_delay", "times_usual",
 ]  # fmt: skip
 
 CANCEL = 0.7
@@ -43,6 +44,19 @@ class Delays(NamedTuple):
     later: FloatArray
     sigma: FloatArray
     rms: float
+
+
+class TelemetryDelay(NamedTuple):
+    """Delay of the telemetry behind the sensor, and what it corrects by itself."""
+
+    delay_s: float
+    """Time by which the telemetry is late, s."""
+    sigma_s: float
+    """Standard deviation of the delay, s."""
+    before_nt: float
+    """RMS error of the corrected field as given, nT."""
+    after_nt: float
+    """RMS error with the telemetry moved by the delay and the calibration as given, nT."""
 
 
 class Motion(NamedTuple):
@@ -105,6 +119,29 @@ def motion(problem: Problem, finding: Finding) -> Motion | None:
     share, usual = float(power[moving].sum() / power.sum()), float(moving.mean())
     interval = float(np.median(np.diff(survey.time)))
     return None if usual > 0.5 or share < 0.8 else Motion(share, usual, interval)
+
+
+def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | None:
+    """Return the delay that a clock offset puts on the telemetry, with the field that it corrects.
+
+    The corrector runs with the calibration as given and with each parameter interpolated to the later time.
+    None for other causes.
+    """
+    candidate = finding.candidate
+    if candidate.cause != "clock_offset":
+        return None
+    delay = float(np.sum(finding.coefficients * candidate.width))
+    sigma = float(np.sqrt(candidate.width @ finding.covariance @ candidate.width))
+    survey, calibration = diagnosis.problem.survey, diagnosis.problem.calibration
+    channels, time = survey.values(calibration.channels), survey.time
+    moved = channels.copy()
+    for k in range(len(calibration.parameters)):
+        moved[:, k] = np.interp(time + delay, time, channels[:, k])
+    errors = [
+        rms((correct(calibration, survey.field, values, time).total - survey.reference)[diagnosis.counts])
+        for values in (channels, moved)
+    ]
+    return TelemetryDelay(delay, sigma, *errors)
 
 
 def slow_share(problem: Problem, finding: Finding) -> float:

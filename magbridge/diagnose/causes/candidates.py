@@ -76,6 +76,8 @@ class Candidate:
     the widths squared and up to a common factor."""
     since: bool = False
     """It is absent from the logs that the calibration was fitted to."""
+    regressors: Callable[[slice], FloatArray] | None = None
+    """Rows -> regressors (r, m) of its effect by central differences, where the live ones contain noise."""
     about: About = "vehicle"
     """``vehicle`` with its sensor; or how the reference is wrong: ``constant``, by ``place`` or ``time``."""
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.memory_effects import ClockEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, of_effect
+from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.compare.interpolation import LOST, rates
 from magbridge.diagnose.compare.problem import Problem, once
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
 
+SHIFTS_S = (0.5, 2.0, 6.0, 20.0, 60.0)
+"""Shifts of the telemetry that are tried, s: those between half an interval and a fiftieth of the log."""
+MIN_SHIFT = 0.1
+"""Shift, in sampling intervals, below which rates of change describe it."""
 MOMENT = 0.01
 """s by which masses are moved forward and back, for a central difference of the nine coefficients."""
 
@@ -48,13 +54,15 @@ def eddy_current(problem: Problem) -> list[Candidate]:
     """A turning conductor carries currents: ``T_i += k_ij dH_j/dt``, i != j (Tolles & Lawson 1950)."""
     names = tuple(i + j for i in AXES for j in AXES if i != j)
     effect = RateEffect(cause="eddy_current", on="eddy")
-    return [of_effect(problem, effect, 0.3, "s", names=names, phi=field_rates(problem))]
+    phi = field_rates(problem)
+    return [of_effect(problem, effect, 0.3, "s", names=names, phi=phi, regressors=lambda rows: phi[:, rows])]
 
 
 def channel_skew(problem: Problem) -> list[Candidate]:
     """One digitiser takes the sensor's axes in turn: ``T_i += tau_i dH_i/dt``."""
     effect = RateEffect(cause="channel_skew", on="skew")
-    return [of_effect(problem, effect, 0.5, "s", phi=field_rates(problem))]
+    phi = field_rates(problem)
+    return [of_effect(problem, effect, 0.5, "s", phi=phi, regressors=lambda rows: phi[:, rows])]
 
 
 def filter_lag(problem: Problem) -> list[Candidate]:
@@ -98,8 +106,49 @@ def clock_offset(problem: Problem) -> list[Candidate]:
     return _delay(problem, ClockEffect(cause="clock_offset"), 5.0)
 
 
+def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
+    r"""Return the mean rates of change of the nine coefficients over a shift of the telemetry.
+
+    Notes
+    -----
+    With theta(p) the nine coefficients and d the shift,
+
+    .. math:: \phi(t) = \frac{\theta(p(t + d)) - \theta(p(t))}{d}
+
+    A mass that moves within one sampling interval has no rate at any sample, but it has moved after a shift.
+    Positions between samples are interpolated, and none across a gap.
+    """
+    survey, kernel = problem.survey, problem.calibration.kernel
+    p, t = survey.values([parameter.name for parameter in problem.calibration.parameters]), survey.time
+    leg = np.cumsum(~survey.follows(LOST))
+
+    def rows_of(rows: slice) -> FloatArray:
+        later = t[rows] + shift
+        near = np.clip(np.searchsorted(t, later, side="left" if shift > 0.0 else "right"), 0, len(t) - 1)
+        near -= 0 if shift > 0.0 else 1
+        moved = np.stack([np.interp(later, t, column) for column in p.T], axis=1)
+        here = p[rows]
+        moved = np.where((leg[np.maximum(near, 0)] == leg[rows])[:, None], moved, here)
+        change = kernel.monomials_of(moved) - kernel.monomials_of(here)
+        return np.asarray(kernel.rate_weights.T @ change / shift)
+
+    return rows_of
+
+
 def _delay(problem: Problem, effect: ClockEffect, width: float, *, positive: bool = False) -> list[Candidate]:
+    """Return the candidates of a delay: by the rates of the masses, and by shifts of their telemetry."""
     if not problem.calibration.parameters:
         return []
-    phi = mass_rates(problem)
-    return [of_effect(problem, effect, width, "s", names=("delay",), phi=phi, positive=positive)]
+    rates, interval = mass_rates(problem), problem.survey.interval
+
+    def rebuild(shift: float) -> Candidate:
+        phi = _averaged(problem, shift) if abs(shift) > MIN_SHIFT * interval else lambda rows: rates[:, rows]
+        return of_effect(
+            problem, effect, width, "s", names=("delay",), phi=phi, positive=positive, regressors=phi,
+            point=GridPoint({"shift": (shift, "s")}, rebuild),
+        )  # fmt: skip
+
+    longest = 0.02 * float(np.ptp(problem.survey.time))
+    shifts = [shift for shift in SHIFTS_S if 0.5 * interval <= shift <= longest]
+    both = [-shift for shift in shifts] if positive else [sign * x for x in shifts for sign in (-1.0, 1.0)]
+    return [rebuild(shift) for shift in (0.0, *both)]

@@ -10,6 +10,7 @@ import numpy as np
 
 from magbridge.arrays import plain
 from magbridge.diagnose.assessment.notes import Note
+from magbridge.diagnose.assessment.numbers import telemetry_delay
 from magbridge.diagnose.assessment.weigh import Assessment
 from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import Candidate
@@ -78,8 +79,18 @@ def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]
         "alternatives": alternatives(competing),
         "disambiguation": causes[candidate.cause].disambiguation if competing else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
+        "configuration": _configuration(diagnosis, finding),
         "improvement": _improvement(finding.improvement, diagnosis),
     }
+
+
+def _configuration(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any] | None:
+    """Return the keys of ``bridge.toml`` that correct for a finding; None where no key does."""
+    late = telemetry_delay(diagnosis, finding)
+    if late is None or late.delay_s <= 0.0 or late.after_nt >= late.before_nt:
+        return None
+    delay = {"delay": _round(late.delay_s)}
+    return {"telemetry": {parameter.name: delay for parameter in diagnosis.problem.calibration.parameters}}
 
 
 def alternatives(competing: tuple[CompetingHypothesis, ...]) -> list[dict[str, Any]]:
@@ -206,6 +217,7 @@ def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
             "count": {"value": int(wrong.rows.size), "sigma": None, "unit": "1"},
             "median_amplitude": {"value": _round(float(np.median(size))), "sigma": None, "unit": "nT"},
         },
+        "configuration": None,
         "improvement": None,
     }
 
