@@ -321,10 +321,10 @@ def show_diagnoses(data: Path, console: Console) -> None:
     for name, vehicle in VEHICLES.items():
         fitted, found = calibrate_and_diagnose(vehicle(data))
         causes = ", ".join(one.candidate.cause for one in found.findings) or "none"
-        low, high = found.total.interval
+        low, high = found.improvement.interval
         shown.add_row(
             name, "{:.2f}-{:.2f}".format(*fitted.scales), found.verdict, causes,
-            f"{found.total.before:.1f}", f"{found.total.after:.1f}", f"{low:.2f}-{high:.2f}",
+            f"{found.improvement.before:.1f}", f"{found.improvement.after:.1f}", f"{low:.2f}-{high:.2f}",
             *(f"{value:.1f}" for value in check_by_tolles_lawson(found)),
         )  # fmt: skip
     console.print(shown)

@@ -1,0 +1,226 @@
+"""Hide effects in logs that others measured, and examine what ``diagnose`` names and promises.
+
+    python tools/hidden_effects.py --data DIR [--snr 12] [--out FILE.parquet]
+
+Each vehicle is calibrated on the first part of its log. An effect is added to the rest, of which the first
+half is diagnosed; the second half is the later part. The size of an effect is its signal-to-noise ratio:
+the whitened norm of what the calibration's own freedom leaves of it, with the noise that ``diagnose`` finds in the
+untouched log. The vehicle's own unexplained effects stay in the log. Promised is the held-out ratio of RMS
+errors that ``diagnose`` reports; real is that ratio on the later part, which no fit has seen. Both are by the
+corrector. Sigma and error are those of the written calibration on the later part.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from measured import VEHICLES, joined
+from rich.console import Console
+from studies import Column, Row, Study, study_options
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.residual import rms
+from magbridge.diagnose.compare.load_survey import load_survey
+from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.improvement import corrected
+from magbridge.diagnose.inference.fit_noise import autoregressive_order
+from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.run import diagnose
+
+TELEMETRY = {"sensor_temperature": "degC", "payload_current": "A"}
+"""Telemetry that is added to every log, and its unit."""
+DELAYS_S = np.geomspace(0.1, 120.0, 40)
+"""Clock offsets among which the one of the asked size is taken, s."""
+FOREIGN = ("relay",)
+"""Effects that no cause describes: any name is wrong."""
+
+
+def with_telemetry(log: xr.Dataset, seed: int) -> xr.Dataset:
+    """Return the log with a temperature that settles and varies, and a current that switches."""
+    rng = np.random.default_rng([4, seed])
+    time = log["time"].to_numpy() - float(log["time"][0])
+    x = time / max(float(time[-1]), 1.0)
+    warm = 12.0 + 9.0 * (1.0 - np.exp(-x / rng.uniform(0.1, 0.4)))
+    warm = warm + 2.0 * np.sin(2.0 * np.pi * (rng.uniform(1.0, 3.0) * x + rng.uniform()))
+    bounds = np.sort(rng.uniform(0.0, 1.0, 2 * rng.integers(8, 15)))
+    current = 1.5 * (np.searchsorted(bounds, x) % 2) + 0.02 * rng.standard_normal(len(x))
+    values = {"sensor_temperature": warm, "payload_current": current}
+    added = {name: ("time", values[name], {"units": unit}) for name, unit in TELEMETRY.items()}
+    return log.assign(added)
+
+
+def shape_of(effect: str, log: xr.Dataset, rng: np.random.Generator) -> FloatArray:
+    """Return the offset (n, 3) of an effect of unit amplitude along a random axis."""
+    x: FloatArray = np.linspace(0.0, 1.0, log.sizes["time"])
+    axis = rng.normal(size=3)
+    series: FloatArray
+    if effect == "temperature_offset":
+        series = log["sensor_temperature"].to_numpy().astype(np.float64) - 12.0
+    elif effect == "current_field":
+        series = log["payload_current"].to_numpy().astype(np.float64)
+    elif effect == "offset_step":
+        series = (x > rng.uniform(0.15, 0.35)).astype(np.float64)
+    else:
+        series = np.searchsorted(np.sort(rng.uniform(0.0, 1.0, 24)), x) % 2.0
+    return np.outer(series, axis / np.linalg.norm(axis))
+
+
+def delayed(log: xr.Dataset, names: tuple[str, ...], delay: float) -> xr.Dataset:
+    """Return the log with the telemetry of the masses late by a delay, s."""
+    time, late = log["time"].to_numpy(), {}
+    for name in names:
+        known = log[name].interpolate_na("time").to_numpy()
+        late[name] = ("time", np.interp(time - delay, time, known), log[name].attrs)
+    return log.assign(late)
+
+
+def shifted(log: xr.Dataset, offset: FloatArray) -> xr.Dataset:
+    """Return the log with an offset (n, 3), nT, added to the sensor's axes."""
+    axes = {
+        f"mag_{axis}": ("time", log[f"mag_{axis}"].to_numpy() + offset[:, k], log[f"mag_{axis}"].attrs)
+        for k, axis in enumerate("xyz")
+    }
+    return log.assign(axes)
+
+
+def signal_to_noise(problem: Problem, null: Joint, change: FloatArray) -> float:
+    """Return the whitened norm of a change of the residual (n,), nT, beyond the calibration's freedom."""
+    noise = null.noise
+    A = noise.filter(problem.calibration_jacobian)
+    y = noise.whiten(change)
+    P = A.T @ A + np.diag(null.prior[: A.shape[1]])
+    b = A.T @ y
+    power = float(y @ y - b @ np.linalg.solve(P, b))
+    return max(power, 0.0) ** 0.5
+
+
+def residual_of(log: xr.Dataset, calibration: Calibration) -> Problem:
+    """Return the comparison of a log with a calibration."""
+    return pose(load_survey([log], calibration), calibration)
+
+
+def hide(
+    effect: str,
+    log: xr.Dataset,
+    first: slice,
+    calibration: Calibration,
+    names: tuple[str, ...],
+    snr: float,
+    seed: int,
+) -> tuple[xr.Dataset, float] | None:
+    """Return the log with an effect of the requested size in its first part, and that size, or None."""
+    rng = np.random.default_rng([7, seed])
+    clean = residual_of(log.isel(time=first), calibration)
+    rough = fit_joint(clean, [], 1, rounds=2)
+    null = fit_joint(clean, [], autoregressive_order(rough.residual, clean.survey.slots))
+
+    def size(changed: xr.Dataset) -> float:
+        other = residual_of(changed.isel(time=first), calibration)
+        both = np.isin(clean.survey.time, other.survey.time)
+        change = np.zeros(len(clean))
+        change[both] = other.residual[np.isin(other.survey.time, clean.survey.time)] - clean.residual[both]
+        return signal_to_noise(clean, null, change)
+
+    if effect == "clock_offset":
+        if not names:
+            return None
+        tried = [(size(delayed(log, names, delay)), delay) for delay in DELAYS_S]
+        found, delay = min(tried, key=lambda one: abs(one[0] - snr))
+        return (delayed(log, names, delay), found) if found > 0.5 * snr else None
+    offset = shape_of(effect, log, rng)
+    scale = 10.0
+    for _ in range(4):  # the size is not quite linear in the amplitude
+        scale *= snr / size(shifted(log, scale * offset))
+    changed = shifted(log, scale * offset)
+    return changed, size(changed)
+
+
+def case(vehicle: str, effect: str, seed: int, snr: float, data: str) -> list[Row]:
+    """Hide one effect in one vehicle's log and diagnose it."""
+    warnings.simplefilter("ignore")
+    known = VEHICLES[vehicle](Path(data))
+    calibration = fit(observations(joined(known.known), known.parameters)).calibration
+    rest = with_telemetry(joined(known.asked), seed)
+    half = rest.sizes["time"] // 2
+    row: Row = {"log": vehicle, "effect": effect, "seed": seed, "failed": ""}
+    hidden = hide(effect, rest, slice(0, half), calibration, known.parameters, snr, seed)
+    if hidden is None:
+        return []
+    changed, row["snr"] = hidden
+    found = diagnose([changed.isel(time=slice(0, half))], calibration)
+    first = [one.candidate.cause for one in found.findings]
+    every = {candidate.cause for one in found.findings for candidate in one.possible}
+    every |= {one.candidate.cause for one in found.unexplained.within} if found.unexplained else set()
+    later = load_survey([changed.isel(time=slice(half, None))], found.calibration)
+    given, written = (corrected(later, one) for one in (calibration, found.calibration))
+    before, after = (rms(one.total - later.reference) for one in (given, written))
+    use = found.assessment
+    return [
+        row | {
+            "found": float(bool(first) or found.unexplained is not None), "named": ", ".join(first) or "none",
+            "right": float(effect in first[:1]), "in_set": float(effect in every),
+            "alone": float(every == {effect}), "false_name": float(bool(first) and effect not in every),
+            "second": float(len(first) > 1), "use": use.fit_for_use, "reason": use.reason,
+            "promised": found.improvement.ratio, "real": after / before,
+            "sigma": float(np.median(written.sigma)), "error": after,
+        }
+    ]  # fmt: skip
+
+
+STUDY = Study(
+    case, ("log", "effect", "named", "use"),
+    {
+        "S/N": Column("snr", form=".1f"), "right": Column("right", form=".0f"),
+        "in set": Column("in_set", form=".0f"),
+        "promised": Column("promised"), "real": Column("real"), "sigma, nT": Column("sigma", form=".0f"),
+        "error, nT": Column("error", form=".0f"),
+    },
+)  # fmt: skip
+
+
+def cell(rows: pd.DataFrame, name: str) -> str:
+    """Return how many of the rows have a property."""
+    return f"{int(rows[name].sum())} of {len(rows)}"
+
+
+def main() -> None:
+    options_of = study_options(__doc__)
+    options_of.add_argument("--data", type=Path, required=True, help="folder of the measured logs")
+    options_of.add_argument("--snr", type=float, default=12.0, help="signal-to-noise ratio of the effects")
+    options_of.add_argument("--seeds", type=int, default=1, help="cases of each effect in each log")
+    options_of.add_argument("--first", type=int, default=0, help="first seed")
+    options = options_of.parse_args()
+    effects = ("temperature_offset", "current_field", "offset_step", "relay", "clock_offset")
+    cases = [
+        (vehicle, effect, seed, options.snr, str(options.data))
+        for seed in range(options.first, options.first + options.seeds)
+        for vehicle in VEHICLES
+        for effect in effects
+    ]
+    rows = STUDY.rows(cases, options)
+    console = Console(width=190)
+    console.print(STUDY.table("Effects hidden in measured logs", rows))
+    own = rows[~rows["effect"].isin(FOREIGN)]
+    foreign = rows[rows["effect"].isin(FOREIGN)]
+    console.print(
+        f"causes: found {cell(own, 'found')}, right first {cell(own, 'right')}, in the set "
+        f"{cell(own, 'in_set')}, alone {cell(own, 'alone')}, a second name {cell(own, 'second')}; foreign "
+        f"with a name {int((foreign['named'] != 'none').sum())} of {len(foreign)}"
+    )
+    worse = rows[(rows["real"] > 1.02)]
+    console.print(f"later part worse than as given by more than 2 %: {len(worse)} of {len(rows)}")
+
+
+if __name__ == "__main__":
+    main()
