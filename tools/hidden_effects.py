@@ -3,11 +3,11 @@
     python tools/hidden_effects.py --data DIR [--snr 12] [--out FILE.parquet]
 
 Each vehicle is calibrated on the first part of its log. An effect is added to the rest, of which the first
-half is diagnosed; the second half is the later part. The size of an effect is its signal-to-noise ratio:
-the whitened norm of what the calibration's own freedom leaves of it, with the noise that ``diagnose`` finds in the
-untouched log. The vehicle's own unexplained effects stay in the log. Promised is the held-out ratio of RMS
-errors that ``diagnose`` reports; real is that ratio on the later part, which no fit has seen. Both are by the
-corrector. Sigma and error are those of the written calibration on the later part.
+half is diagnosed; the second half is the later part. The size of an effect is its signal-to-noise ratio: the
+whitened norm of what the calibration's own freedom leaves of it, by the noise of the untouched log. The
+vehicle's own unexplained effects stay in the log. Promised is the held-out ratio of RMS errors that
+``diagnose`` reports; real is that ratio on the later part, which no fit has seen. Both are by the corrector.
+Sigma and error are those of the written calibration on the later part.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def shape_of(effect: str, log: xr.Dataset, rng: np.random.Generator) -> FloatArr
     elif effect == "offset_step":
         series = (x > rng.uniform(0.15, 0.35)).astype(np.float64)
     else:
-        series = np.searchsorted(np.sort(rng.uniform(0.0, 1.0, 24)), x) % 2.0
+        series = np.asarray(np.searchsorted(np.sort(rng.uniform(0.0, 1.0, 24)), x) % 2, np.float64)
     return np.outer(series, axis / np.linalg.norm(axis))
 
 
@@ -102,7 +102,7 @@ def signal_to_noise(problem: Problem, null: Joint, change: FloatArray) -> float:
     P = A.T @ A + np.diag(null.prior[: A.shape[1]])
     b = A.T @ y
     power = float(y @ y - b @ np.linalg.solve(P, b))
-    return max(power, 0.0) ** 0.5
+    return float(np.sqrt(max(power, 0.0)))
 
 
 def residual_of(log: xr.Dataset, calibration: Calibration) -> Problem:
