@@ -30,13 +30,13 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import rms
 from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.improvement import corrected
 from magbridge.diagnose.inference.fit_noise import autoregressive_order
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.run import diagnose
+from magbridge.estimation.residual import rms
 
 TELEMETRY = {"sensor_temperature": "degC", "payload_current": "A"}
 """Telemetry that is added to every log, and its unit."""

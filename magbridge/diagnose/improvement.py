@@ -25,7 +25,6 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import CorrectedArrays, correct
 from magbridge.calibration.file import decode_calibration
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.residual import Samples, residuals, rms
 from magbridge.correction import Correction
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.derivatives import derivatives
@@ -45,6 +44,7 @@ from magbridge.diagnose.extend import (
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.left_out import HeldOut, held_out
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
+from magbridge.estimation.residual import Samples, residuals, rms
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
 from magbridge.rows import correct_rows
