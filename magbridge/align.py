@@ -103,6 +103,8 @@ class Aligner:
     channels : OneTime
     late_since_us : int
         µs, not 0 while what comes may have waited, at most since then.
+    motion_since_us : int
+        Time of the last report before the motion of the last sample, µs.
     """
 
     def __init__(self, inputs: tuple[Input, ...], settings: Align, power_cycle: int | None = None) -> None:
@@ -111,7 +113,7 @@ class Aligner:
         self.by_name = {what.name: track for what, track in zip(inputs, self.tracks, strict=True)}
         self.power_cycle = power_cycle
         self.offset_suspect = False
-        self.late_since_us = 0
+        self.late_since_us = self.motion_since_us = 0
         self.channels = OneTime()
         self._before_us = NEVER
         self._period_us, self._step_us = 0.0, 0
@@ -207,6 +209,7 @@ class Aligner:
         values: list[float] = []
         spans: list[tuple[int, float, float]] = []
         quality, variance, oldest = 0, 0.0, 0.0
+        self.motion_since_us = sample_us
         for index, track in enumerate(self.tracks):
             if track.last_us == NEVER:
                 what = track.input
@@ -222,8 +225,10 @@ class Aligner:
                 quality |= STALE
                 variance += (settings.stale_growth * age) ** 2
             if track.moved_us == track.last_us or sample_us - track.moved_us <= settle_us:
-                quality |= MOVING  # or it stopped not long ago
                 spans.append((index, low, high))
+                if track.input.is_mass:
+                    quality |= MOVING  # or it stopped not long ago
+                    self.motion_since_us = min(self.motion_since_us, track.reported_before_us)
             if sample_us < track.first_us or (late_us and (undated or sample_us > track.last_us)):
                 quality |= LATE_JOIN
             if undated:

@@ -16,19 +16,20 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import RAISED, Calibration, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
-from magbridge.health import Attitude, Plausibility
-from magbridge.health.direction import Direction
-from magbridge.health.notices import Notices
-from magbridge.health.turns import Turns
+from magbridge.health import DirectionCheck, HealthMonitor, Messages
+from magbridge.health.consistency import MASS_FRACTION
 from magbridge.learning import Learner
 from magbridge.learning.model import TEMPERATURE
 from magbridge.parts import OptionalParts
-from magbridge.records import BEYOND, Corrected, Reading, Vector
+from magbridge.records import BEYOND, Corrected, Quality, Reading, Vector
 from magbridge.toml import convert
 from magbridge.track import Input
 
 __all__ = ["TEMPERATURE", "Correction"]
 
+MOVING = int(Quality.MOVING)
+NOT_MASS_UNITS = frozenset({"A", "mA", "V", "W", "degC", "K", "bar", "dbar", "Pa", "kPa"})
+"""Units of parameters that are not the position of a mass: a sample while they change is not `moving`."""
 MAX_AGE = 30.0
 """s after which telemetry is stale, unless :meth:`magbridge.align.Aligner.tune` has said otherwise."""
 
@@ -58,9 +59,14 @@ class Correction:
         self._given = settings is not None
         calibration = calibration if calibration is not None else identity()
         ranges = {parameter.name: (parameter.low, parameter.high) for parameter in calibration.parameters}
+        units = {parameter.name: parameter.unit for parameter in calibration.parameters}
         inputs = tuple(
-            Input(name, *ranges.get(name, (nan, nan)), max_age=MAX_AGE) for name in calibration.channels
+            Input(name, *ranges.get(name, (nan, nan)), MAX_AGE, units.get(name, "") not in NOT_MASS_UNITS)
+            for name in calibration.channels
         )
+        self._masses = [
+            index for index, one in enumerate(inputs) if one.is_mass and isfinite(one.high - one.low)
+        ]
         self.aligner = Aligner(inputs, settings or Align(), calibration.sensor.power_cycle)
         self.names = tuple(one.name for one in inputs)
         for name in learner.watched if learner is not None else ():
@@ -68,14 +74,13 @@ class Correction:
         self._wants_temperature = TEMPERATURE in self.aligner.by_name
         self._corrector = Corrector(calibration)
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
-        # what has no calibration is not expected to be the Earth's field
-        self._found = found = Notices()
-        self.notices = found.lines
-        self.parts = OptionalParts(found.lines.append)
-        judged = calibration.method != "none"
-        self.plausibility = self._plausibility(calibration) if judged else None
-        self.turns, self.attitude = Turns(found), Attitude(found)
-        self.direction = None if calibration.boresight is None else Direction(found)
+        # a field without a calibration is not expected to be the Earth's
+        self._messages = Messages()
+        self.notices = self._messages.lines
+        self.parts = OptionalParts(self.notices.append)
+        self.health = self._health(calibration) if calibration.method != "none" else None
+        self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
+        self._was_moving = False
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
@@ -124,22 +129,12 @@ class Correction:
             sample.time_us, sample.field, sample.values, sample.quality
         )
         parts = self.parts
-        judged, checked = parts.call(
-            "plausibility check",
-            (0.0, 0),
-            self._check_field,
-            sample,
-            reading,
-            (F, sigma),
-            quality,
-            main_field,
-            where,
-        )
-        quality |= checked
         vector = (x, y, z)
-        judged += parts.call(
-            "attitude check", 0.0, self._check_attitude, sample, vector, F, sigma * sigma, judged, quality
-        )
+        judged = 0.0
+        if self.health is not None:
+            arguments = (self.health, sample, reading, (F, sigma), vector, quality, main_field, where)
+            judged, flags = parts.call("plausibility check", (0.0, 0), self._check_field, *arguments)
+            quality |= flags
         turned = 0.0
         if self.direction is not None:
             turned, flags = parts.call("direction check", (0.0, 0), self._check_direction, sample, vector)
@@ -159,30 +154,44 @@ class Correction:
 
     def _check_field(
         self,
+        health: HealthMonitor,
         sample: Sample,
         reading: Reading,
         total: tuple[float, float],
+        vector: Vector,
         quality: int,
         main_field: float,
         where: tuple[float, float] | None,
     ) -> tuple[float, int]:
-        """Return the variance (nT^2) and the flags that the checks of the total field add."""
-        if self.plausibility is None:
-            return 0.0, 0
+        """Return the variance (nT^2) and the flags that the checks of the corrected field add."""
         if where is not None:
-            self.plausibility.place(sample.time_us, *where)
-        sigma = self.aligner.settings.reference_sigma
-        variance = self.plausibility.check(sample.time_us, reading.field, *total, quality, main_field, sigma)
-        return variance, self.plausibility.flags
+            health.set_position(sample.time_us, *where)
+        is_moving = bool(sample.quality & MOVING)
+        if is_moving and not self._was_moving:
+            health.begin_motion(self.aligner.motion_since_us)
+        self._was_moving = is_moving
+        reference = main_field, self.aligner.settings.reference_sigma
+        variance = health.check(
+            sample.time_us,
+            reading.field,
+            vector,
+            total,
+            quality,
+            reference,
+            reading.temperature,
+            sample.age,
+            lambda: self._mass_changes(sample),
+        )
+        return variance, health.flags
 
-    def _check_attitude(
-        self, sample: Sample, vector: Vector, F: float, variance: float, judged: float, quality: int
-    ) -> float:
-        """Return the variance (nT^2) that the checks of the field against the attitude add."""
-        if self.plausibility is None:
-            return 0.0
-        turns = self.turns.check(sample.time_us, *vector, F, variance + judged, quality)
-        return turns + self.attitude.check(sample.time_us, *vector, F, variance, quality)
+    def _mass_changes(self, sample: Sample) -> list[float]:
+        """Return by how much the total field changes where each mass moves by a fraction of its range, nT."""
+        spans = []
+        for index in self._masses:
+            one, value = self.aligner.tracks[index].input, sample.values[index]
+            half = 0.5 * MASS_FRACTION * (one.high - one.low)
+            spans.append((index, value - half, value + half))
+        return list(self._corrector.changes(sample.field, sample.values, spans))
 
     def _check_direction(self, sample: Sample, vector: Vector) -> tuple[float, int]:
         """Return the variance (nT^2) of each component and the flags that the direction's check adds."""
@@ -208,7 +217,7 @@ class Correction:
             self._corrector.regressors,
             sample.values,
             quality,
-            faulty=self.plausibility is not None and self.plausibility.fault,
+            faulty=self.health is not None and self.health.is_fault,
             reference=main_field,
             where=where,
             age=sample.age,
@@ -228,15 +237,14 @@ class Correction:
             self._raised.replace(calibration.at_level(), values)
         else:
             self._raised = Corrector(calibration.at_level())
-        if self.plausibility is None:
-            self.plausibility = self._plausibility(calibration)
+        if self.health is None:
+            self.health = self._health(calibration)
         elif self.learner is not None:
-            self.plausibility.explain(by, jumps=not self.learner.renewed)
-            self.turns.explain(by)
-            self.attitude.forget()
+            self.health.explain(by, jumps=not self.learner.renewed)
 
-    def _plausibility(self, calibration: Calibration) -> Plausibility:
-        return Plausibility(calibration.noise.sensor, self._found, calibration.reference.level_sigma)
+    def _health(self, calibration: Calibration) -> HealthMonitor:
+        level = calibration.reference.level_sigma
+        return HealthMonitor(calibration.noise, self._messages, level, len(self._masses))
 
     def level(self, sample: Sample, corrected: Corrected) -> float:
         """Return how much of a corrected sample's sigma all samples share, nT; NaN without a level."""

@@ -14,12 +14,16 @@ HISTORY: Final = 1024
 
 
 class Input(NamedTuple):
-    """A parameter that the calibration needs: name, calibrated range, and age (s) from which it is stale."""
+    """A parameter that the calibration needs: name, calibrated range, and age (s) from which it is stale.
+
+    `is_mass` is False where a change is not a motion: a current, a temperature.
+    """
 
     name: str
     low: float
     high: float
     max_age: float
+    is_mass: bool = True
 
 
 class Track:
@@ -80,6 +84,11 @@ class Track:
     def stale(self, time_us: int) -> bool:
         """Say whether the value is unknown, or older than ``max_age``, at `time_us`."""
         return self.lacking or time_us - self.last_us > self.max_age * 1e6
+
+    @property
+    def reported_before_us(self) -> int:
+        """Time of the report before the last one, µs."""
+        return self.history[-2][0] if len(self.history) > 1 else self.last_us
 
     def between(self, begin_us: int) -> tuple[float, float]:
         """Return the least and the greatest value since `begin_us`, what was held then included."""

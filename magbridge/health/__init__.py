@@ -1,12 +1,14 @@
-"""Whether a corrected sample can be the Earth's field, judged by those before it and by the main field.
+"""Checks of corrected samples: whether they can be the Earth's field, and whether the calibration still holds.
 
-Every check is cheap, knows only the time of events, and needs nothing but the samples:
-:mod:`~magbridge.health.level` beside the main field, :mod:`~magbridge.health.axes` that are
-stuck, a :mod:`~magbridge.health.jump` off the trend and what it leaves
-(:mod:`~magbridge.health.moves`), and :mod:`~magbridge.health.scatter` beyond the calibration's.
+:class:`HealthMonitor` runs :mod:`.axes` (repeated readings), :mod:`.level` (the main field), :mod:`.scatter`
+(noise), :mod:`.trend` (outliers and jumps) and :mod:`.consistency` (dependence on attitude, temperature and
+masses); :class:`DirectionCheck` needs the autopilot's attitude. A check is cheap, uses only the times of events, and
+returns flags and a variance. The package uses ``estimation`` and knows neither logs nor MAVLink. Start with
+:mod:`.monitor`.
 """
 
-from magbridge.health.attitude import Attitude
-from magbridge.health.judge import Plausibility
+from magbridge.health.direction import DirectionCheck
+from magbridge.health.messages import Messages
+from magbridge.health.monitor import HealthMonitor
 
-__all__ = ["Attitude", "Plausibility"]
+__all__ = ["DirectionCheck", "HealthMonitor", "Messages"]

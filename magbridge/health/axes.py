@@ -1,72 +1,109 @@
-"""Whether a channel is stuck, or stands at a limit: it repeats its number while the others change.
+r"""Check whether channels repeat their reading: stuck, clipped, or all of them not read again.
 
-How often a healthy one may is learned: a coarse instrument repeats itself, `n` times in a row with the
-probability ``p^n``.
+A healthy channel repeats its reading with a probability p, and n times in a row with :math:`p^n`. It is learned
+for each channel alone, and for all three together. For all three, p is at least what the noise gives: normal noise
+of standard deviation :math:`\sigma`, in steps of q, repeats a channel's reading with the probability
+:math:`q / (2 \sqrt\pi \sigma)`.
 """
 
 from __future__ import annotations
 
-from math import log, nan
+from math import inf, log, nan, pi, sqrt
 from typing import Final
 
-from magbridge.health.notices import Notices
+from magbridge.health.messages import Messages
 from magbridge.records import Vector
 
-__all__ = ["Axes"]
+__all__ = ["RepetitionCheck"]
 
-REPEATS: Final = 256
-"""Samples over which the share of repeated numbers is learned."""
-RARELY: Final = 1e-9
-"""Probability of a run of repeated numbers that a healthy axis does not show."""
-NAMES: Final = "xyz"
+LEARNING_SAMPLES: Final = 256
+"""Samples over which the fraction of repeated readings is learned."""
+MAX_PROBABILITY: Final = 1e-9
+"""Probability of a run of repeated readings that a healthy channel does not show."""
+MIN_FRACTION: Final = 1e-3
+MIN_RUN: Final = 4
+MIN_COMMON_RUN: Final = 3
+AXES: Final = "xyz"
 
 
-class Axis:
-    """One channel as the instrument sends it: whether it repeats itself."""
+class Repetition:
+    """Repetitions of one reading: how many in a row, and how often they occur."""
 
-    __slots__ = ("last", "rail", "run", "share")
+    __slots__ = ("fraction", "last", "limit", "run")
 
     def __init__(self) -> None:
-        self.last = self.rail = nan
+        self.last = self.limit = nan
         self.run = 0
-        self.share = 0.1  # of repeated numbers
+        self.fraction = 0.1  # of repeated readings
+
+    def change(self) -> None:
+        """Record that the reading has changed."""
+        self.run = 0
+        self.fraction += (MIN_FRACTION - self.fraction) / LEARNING_SAMPLES
+
+    def repeat(self, probability: float, min_run: int) -> bool:
+        """Record a repetition; return True if a healthy channel does not repeat its reading so often."""
+        self.run += 1
+        if self.run >= min_run and self.run * log(max(self.fraction, probability)) < log(MAX_PROBABILITY):
+            return True
+        self.fraction += (1.0 - self.fraction) / LEARNING_SAMPLES
+        return False
 
 
-class Axes:
-    """The three channels."""
+class RepetitionCheck:
+    """Check three channels."""
 
-    def __init__(self, notices: Notices) -> None:
-        self._notices = notices
-        self._axes = (Axis(), Axis(), Axis())
-        self._stood = False  # whether an axis has a rail
+    def __init__(self, messages: Messages) -> None:
+        self._messages = messages
+        self._axes = (Repetition(), Repetition(), Repetition())
+        self._common = Repetition()
+        self._has_limit = False
+        self._step = inf  # smallest change of a reading, nT
 
-    def stuck(self, raw: Vector) -> bool:
-        """Say whether an axis repeats its number while another changes, or stands where it once stuck."""
-        first, second, third = self._axes
-        x, y, z = raw
-        same_x, same_y, same_z = x == first.last, y == second.last, z == third.last
-        if not (same_x or same_y or same_z or self._stood):
-            first.last, second.last, third.last = x, y, z
-            first.run = second.run = third.run = 0
-            first.share += (1e-3 - first.share) / REPEATS
-            second.share += (1e-3 - second.share) / REPEATS
-            third.share += (1e-3 - third.share) / REPEATS
+    @property
+    def is_repeating(self) -> bool:
+        """Whether the last reading repeats the one before on all axes."""
+        return self._common.run > 0
+
+    def is_stuck(self, raw: Vector, white_sigma: float) -> bool:
+        """Return True if channels repeat their reading, or read a limit at which they were once stuck.
+
+        Parameters
+        ----------
+        raw : tuple of 3 float
+            Reading, nT.
+        white_sigma : float
+            1-sigma of the white noise, nT.
+        """
+        same = [value == axis.last for value, axis in zip(raw, self._axes, strict=True)]
+        if all(same):
+            return self._repeat_all(white_sigma)
+        self._common.change()
+        stuck = False
+        for number, (axis, value) in enumerate(zip(self._axes, raw, strict=True)):
+            if same[number]:
+                stuck = self._repeat(number, axis, value) or stuck
+                continue
+            change = abs(value - axis.last)
+            if change < self._step:
+                self._step = change
+            axis.last = value
+            axis.change()
+            stuck = stuck or (self._has_limit and abs(value) == axis.limit)
+        return stuck
+
+    def _repeat_all(self, white_sigma: float) -> bool:
+        axis_probability = min(self._step / (2.0 * sqrt(pi) * max(white_sigma, 1e-9)), 1.0)
+        if not self._common.repeat(axis_probability**3, MIN_COMMON_RUN):
             return False
-        if same_x and same_y and same_z:
-            return False
-        stuck = self._repeats(0, first, x, same_x)
-        stuck = self._repeats(1, second, y, same_y) or stuck
-        return self._repeats(2, third, z, same_z) or stuck
+        self._messages.report("repeat", "all axes repeat one reading: sensor or driver at fault")
+        return True
 
-    def _repeats(self, number: int, axis: Axis, value: float, same: bool) -> bool:
-        if not same:
-            axis.last, axis.run = value, 0
-            axis.share += (1e-3 - axis.share) / REPEATS
-            return abs(value) == axis.rail
-        axis.run += 1
-        if abs(value) != axis.rail and (axis.run < 4 or axis.run * log(axis.share) > log(RARELY)):
-            axis.share += (1.0 - axis.share) / REPEATS
+    def _repeat(self, number: int, axis: Repetition, value: float) -> bool:
+        if abs(value) == axis.limit:
+            axis.run += 1
+        elif not axis.repeat(0.0, MIN_RUN):
             return False
-        axis.rail, self._stood = abs(value), True
-        self._notices.report("axis", f"axis {NAMES[number]} stuck at {value:.0f} nT, or clipped there")
+        axis.limit, self._has_limit = abs(value), True
+        self._messages.report("axis", f"axis {AXES[number]} stuck at {value:.0f} nT, or clipped there")
         return True

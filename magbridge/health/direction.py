@@ -16,10 +16,10 @@ from __future__ import annotations
 from math import asin, atan2, cos, degrees, inf, isfinite, nan, pi, radians, remainder, sin, sqrt
 from typing import Final
 
-from magbridge.health.notices import Notices
+from magbridge.health.messages import Messages
 from magbridge.records import Quality
 
-__all__ = ["Direction"]
+__all__ = ["DirectionCheck"]
 
 INCLINED: Final = radians(10.0)
 """Five sigmas of 2 deg: attitude 1.5, boresight 1, main field 0.2 (Chulliat et al. 2020, table 14), rock."""
@@ -38,12 +38,12 @@ LONG_US: Final = 3_600_000_000
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 
 
-class Direction:
+class DirectionCheck:
     """Judges the vector now and then.
 
     Parameters
     ----------
-    notices : Notices, optional
+    messages : Messages, optional
         Takes what is found.
 
     Attributes
@@ -52,10 +52,10 @@ class Direction:
         Of the last sample: :class:`~magbridge.records.Quality` bits.
     """
 
-    def __init__(self, notices: Notices | None = None) -> None:
+    def __init__(self, messages: Messages | None = None) -> None:
         self.flags = 0
-        self._notices = notices or Notices()
-        self.notices = self._notices.lines
+        self._messages = messages or Messages()
+        self.messages = self._messages.lines
         self._roll = self._pitch = self._yaw = nan
         self._attitude_us = -FRESH_US
         self._inclination = self._declination = nan
@@ -114,8 +114,8 @@ class Direction:
         if self._tilted >= LASTING:
             self._tilted_until_us = time_us + LONG_US
             text = f"inclination off by {degrees(tilt):+.0f} deg: axes or mounting wrong"
-            self._notices.report("inclination", text)
+            self._messages.report("inclination", text)
         if self._turned >= LASTING:
             text = f"vector {degrees(turn):+.0f} deg off the heading: axes or compass wrong"
-            self._notices.report("heading", text)
+            self._messages.report("heading", text)
         self.flags = IMPLAUSIBLE if time_us < self._tilted_until_us else 0

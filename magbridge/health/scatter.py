@@ -1,170 +1,224 @@
-"""How much the total field scatters, at several lags, about what rock can do.
+r"""Estimate how much the total field scatters, at several lags, beyond what the crustal field can do.
 
-Neither a jump nor a ramp changes for long the median of second differences ``F(t) - 2 F(t-T) + F(t-2T)``.
-From sample to sample they see white noise. A hum of the period P they see as ``4 sin^2(pi T / P)``: with a
-lag T of a tenth of P little, with one of a third all. How long T may be, is the rock's to say: of a wave of
-length L passed at the speed v they see ``(2 pi v T / L)^2``, 2 % where ``v T`` is :data:`TRAVEL` and L 500 m,
-which is taken off. The largest of the medians is what the field scatters by (as an Allan variance shows at
-each interval what is noise there: Allan 1966, *Statistics of atomic frequency standards*, Proc. IEEE 54:221).
+The median of second differences :math:`F(t) - 2 F(t - T) + F(t - 2T)` changes little with a jump or a ramp. From
+sample to sample it measures white noise. A disturbance of the period P adds :math:`4 \sin^2(\pi T / P)` times its
+amplitude: little at a lag T of a tenth of P, all of it at a third. The crustal field limits T: a wave of length
+L, passed at the speed v, adds :math:`(2 \pi v T / L)^2`, which is 2 % where v T is :data:`TRAVEL_M` and L is
+500 m. That much is subtracted. (The Allan variance shows in the same way at each interval what is noise there:
+Allan 1966, *Statistics of atomic frequency standards*, Proc. IEEE 54:221.)
+
+The calibration's noise model (a white fraction w, the rest an AR(1) process of autocorrelation
+:math:`\rho(T)`) has second differences of variance
+
+.. math:: V(T) = \sigma^2 \left( 6 w + (1 - w)(6 - 8 \rho(T) + 2 \rho(2T)) \right)
+
+The largest ratio of what is measured to V(T) is the factor by which the whole noise, its slow part included, has
+grown: sigma grows by that factor.
 """
 
 from __future__ import annotations
 
-from math import nan
+from math import nan, sqrt
 from typing import Final
 
+from magbridge.calibration.model import Noise
 from magbridge.field.geodesy import separation
-from magbridge.health.notices import Notices
+from magbridge.health.messages import Messages
 
-__all__ = ["QUIETEST", "Scatter"]
+__all__ = ["MIN_NOISE_NT", "Scatter"]
 
-QUIETEST: Final = 0.1
-"""nT: no fluxgate's noise is lower."""
+MIN_NOISE_NT: Final = 0.1
+"""No fluxgate's noise is lower."""
 STEP: Final = 1.02
 """Factor by which a sample moves the median of the second differences."""
-PATIENCE: Final = 6
-FASTEST: Final = 12
-"""Samples in a row that lie on one side of the median before its steps grow, and by how many times at most:
-twenty times the noise is learned in half the samples, and white noise passes for more no oftener."""
-RARE: Final = 4.0
-"""Times the median that counts as three samples: of white noise one in 140 is as large."""
-SWIFT: Final = 60
-"""The n-th step is at least SWIFT/n such factors: at the start the noise is learned in a few samples."""
-ENOUGH: Final = 5
-UNSURE: Final = 4.0
-"""Second differences from which on their median says something of the noise; after n it may be 1 + UNSURE/n
-times as far off as later."""
-INNOVATION: Final = 4.0 / 3.0 / (6.0 * 0.6745**2)
-"""Variance of an innovation over the square of that median. White noise of variance v gives innovations from
-a level with gain 1/2 the variance 4/3 v, second differences 6 v, and the median of a normal variable's
-absolute value is 0.6745 sigma."""
-NOISY: Final = 2.5
-"""How many times the scatter of innovations that the calibration's noise gives is added to sigma, until it is
-half of that."""
-LOUD: Final = 5.0
-"""How many times is reported."""
+RUN_SAMPLES: Final = 6
+MAX_STEPS: Final = 12
+"""Samples in a row on one side of the median before its steps grow, and the largest number of steps: twenty times
+the noise is learned in half the samples, and white noise is taken for more no more often."""
+RARE_RATIO: Final = 4.0
+"""Ratio to the median that counts as three samples: one in 140 of white noise is as large."""
+START_STEPS: Final = 60
+"""The n-th step is at least this number over n steps: at the start the noise is learned in a few samples."""
+MIN_COUNT: Final = 5
+UNCERTAINTY: Final = 4.0
+"""Second differences from which their median is used; after n of them it may be 1 + UNCERTAINTY / n times as far
+off as later."""
+MEDIAN_TO_SIGMA: Final = 1.0 / 0.6745
+"""1-sigma over the median of a normal variable's absolute value."""
+SECOND_DIFFERENCE: Final = 6.0
+"""Variance of second differences of white noise over its own variance."""
+INNOVATION: Final = 4.0 / 3.0
+"""Variance of an innovation from a level with gain 1/2 over that of white noise."""
+FLOOR: Final = 1.125
+"""Smallest variance of an innovation, over that by the noise model."""
+MAX_QUIET_RATIO: Final = 2.5
+"""Ratio of the noise to the calibration's from which it is added to sigma, until it is half of that."""
+REPORTED_RATIO: Final = 5.0
 LAGS: Final = (1, 2, 4, 8)
-KEPT: Final = 2 * LAGS[-1] + 1
-"""Lags, in intervals of which the longest has eight, or six where no samples come then; samples for them."""
-TRAVEL: Final = 12.0
-"""m by which a vehicle goes on within the longest lag, at most."""
-ROCK: Final = 2.2
-"""nT, the median of second differences that rock of 145 nT and 500 m makes then."""
-LONGEST_US: Final = 32_000_000
-"""µs of the longest lag, at most: also a vehicle that stands still is passed by the field's variations."""
-PACE_US: Final = 60_000_000
-"""µs over which the speed is measured, at least."""
+STORED: Final = 2 * LAGS[-1] + 1
+"""Lags in intervals, of which the longest lag has eight, and samples stored for them."""
+TRAVEL_M: Final = 12.0
+"""Distance that a vehicle covers within the longest lag, at most."""
+CRUST_NT: Final = 2.2
+"""Median of second differences that a crustal field of 145 nT and 500 m makes within that distance."""
+MAX_LAG_US: Final = 32_000_000
+"""Longest lag: a vehicle that does not move is passed by the field's variations."""
+SPEED_INTERVAL_US: Final = 60_000_000
+"""Time over which the speed is measured, at least."""
 
 
-class Bends:
-    """The median of second differences at one lag."""
+class MedianDifference:
+    """The median of second differences at one lag, nT."""
 
-    __slots__ = ("count", "median", "rising", "run")
+    __slots__ = ("count", "is_rising", "median", "run")
 
     def __init__(self) -> None:
         self.median = 0.0
         self.count = 0
-        self.run, self.rising = 0, False  # on one side of the median
+        self.run, self.is_rising = 0, False  # on one side of the median
 
-    def take(self, bend: float) -> None:
-        """Take a second difference's absolute value, nT."""
-        rising = bend > self.median
-        self.run = self.run + (3 if bend > RARE * self.median else 1) if rising == self.rising else 0
-        self.rising = rising
-        step = STEP ** max(min(max(self.run - PATIENCE, 1), FASTEST), SWIFT // (self.count + 1))
-        self.median *= step if rising else 1.0 / step
+    def update(self, difference: float) -> None:
+        """Update the median with a second difference's absolute value, nT."""
+        rising = difference > self.median
+        weight = 3 if difference > RARE_RATIO * self.median else 1
+        self.run = self.run + weight if rising == self.is_rising else 0
+        self.is_rising = rising
+        steps = max(min(max(self.run - RUN_SAMPLES, 1), MAX_STEPS), START_STEPS // (self.count + 1))
+        self.median *= STEP**steps if rising else STEP**-steps
         self.count += 1
+
+    @property
+    def variance(self) -> float:
+        """Variance of the second differences, nT²."""
+        sigma = MEDIAN_TO_SIGMA * self.median
+        return sigma * sigma
 
 
 class Scatter:
-    """Scatter of the innovations of a total field.
+    """Estimate the noise of a total field.
 
     Parameters
     ----------
-    noise : float
-        nT, 1-sigma of a channel's noise by the calibration.
+    noise : Noise
+        The calibration's noise model.
+    messages : Messages
+        Receives what is found.
 
     Attributes
     ----------
     variance : float
-        nT², of an innovation from one sample to the next; never less than the calibration's noise gives.
+        Variance of an innovation from one sample to the next, nT²; at least what the calibration's noise gives.
+    speed : float
+        Speed of the vehicle, m/s; NaN while it is not known.
     """
 
-    def __init__(self, noise: float, notices: Notices) -> None:
-        self._notices = notices
-        self._known = noise > 0.0
-        self.floor = 1.5 * max(noise, QUIETEST) ** 2
+    def __init__(self, noise: Noise, messages: Messages) -> None:
+        self._messages, self._noise = messages, noise
+        self._is_known = noise.sensor > 0.0
+        self._sigma2 = max(noise.sensor, MIN_NOISE_NT) ** 2
+        self.floor = FLOOR * INNOVATION * self._sigma2
         self.variance = self.floor
-        self._next = Bends()  # from sample to sample
+        self.speed = nan
+        self._next = MedianDifference()  # from sample to sample
         self._last = self._last_but_one = nan
-        self._lagged = tuple(Bends() for _ in LAGS)
-        self._fields, self._times = [nan] * KEPT, [0] * KEPT
-        self._at = 0
-        self._largest = 0.0  # variance of the others, less the rock's
-        self._noisy = False
-        self._longest_us = 0  # lag; none while the speed is not known
+        self._last_us = self._step_us = 0
+        self._lagged = tuple(MedianDifference() for _ in LAGS)
+        self._fields, self._times = [nan] * STORED, [0] * STORED
+        self._place = 0
+        self._ratio = 0.0  # of the lagged differences' variance to the model's
+        self._is_noisy = False
+        self._max_lag_us = 0  # none while the speed is not known
         self._latitude = self._longitude = nan
-        self._place_us = 0
+        self._position_us = 0
 
     def begin(self, variance: float) -> None:
-        """Take the variance (nT²) that an innovation may have at first."""
+        """Set the variance (nT²) that an innovation may have at first."""
         self.variance = variance
-        self._next.median = (variance / INNOVATION) ** 0.5
-        for bends in self._lagged:
-            bends.median = self._next.median
+        median = (variance / INNOVATION * SECOND_DIFFERENCE) ** 0.5 / MEDIAN_TO_SIGMA
+        for differences in (self._next, *self._lagged):
+            differences.median = median
 
-    def place(self, time_us: int, latitude: float, longitude: float) -> None:
-        """Take where the vehicle is, deg: how fast it goes says how long a lag may be."""
-        apart_us = time_us - self._place_us
-        if 0 <= apart_us < PACE_US or (latitude == self._latitude and longitude == self._longitude):
-            return
+    @property
+    def white_sigma(self) -> float:
+        """1-sigma of the white noise as measured, nT."""
+        return sqrt(self._next.variance / SECOND_DIFFERENCE)
+
+    def _expected(self, lag_us: int) -> float:
+        """Return the variance of second differences at a lag by the noise model, nT²."""
+        noise = self._noise
+        white = noise.white if noise.autocorrelation > 0.0 and noise.interval > 0.0 else 1.0
+        slow = 0.0
+        if white < 1.0:
+            rho = noise.autocorrelation ** (1e-6 * lag_us / noise.interval)
+            slow = 6.0 - 8.0 * rho + 2.0 * rho * rho
+        variance = self._sigma2 * (SECOND_DIFFERENCE * white + (1.0 - white) * slow)
+        return float(max(variance, SECOND_DIFFERENCE * MIN_NOISE_NT**2))
+
+    def set_position(self, time_us: int, latitude: float, longitude: float) -> bool:
+        """Record the position, deg; return True if it has told the speed, which limits the lags."""
+        step_us = time_us - self._position_us
+        if 0 <= step_us < SPEED_INTERVAL_US or (latitude == self._latitude and longitude == self._longitude):
+            return False
         north, east = separation(self._latitude, self._longitude, latitude, longitude)
-        speed = (north * north + east * east) ** 0.5 / (1e-6 * apart_us)
-        if speed == speed:  # noqa: PLR0124 - NaN
-            self._longest_us = round(1e6 * min(TRAVEL / max(speed, 1e-3), 1e-6 * LONGEST_US))
-        self._latitude, self._longitude, self._place_us = latitude, longitude, time_us
+        speed = (north * north + east * east) ** 0.5 / (1e-6 * step_us)
+        self._latitude, self._longitude, self._position_us = latitude, longitude, time_us
+        if speed != speed:  # noqa: PLR0124 - faster than a call
+            return False
+        self.speed = speed
+        self._max_lag_us = round(1e6 * min(TRAVEL_M / max(speed, 1e-3), 1e-6 * MAX_LAG_US))
+        return True
 
     def follow(self, time_us: int, total: float) -> None:
-        """Take a sample."""
-        bend = abs(total - 2.0 * self._last + self._last_but_one)
+        """Update the noise with a sample's total field, nT."""
+        difference = abs(total - 2.0 * self._last + self._last_but_one)
         self._last_but_one, self._last = self._last, total
-        if bend == bend:  # noqa: PLR0124 - NaN
-            self._next.take(bend)
-            self.variance = max(INNOVATION * self._next.median * self._next.median, self.floor)
-        if self._longest_us and not 0 <= time_us - self._times[self._at] < self._longest_us * 3 // 32:
-            self._keep(time_us, total)
+        if difference == difference:  # noqa: PLR0124 - faster than a call
+            self._next.update(difference)
+            step_us = time_us - self._last_us
+            if step_us != self._step_us and step_us > 0:
+                self._step_us = step_us
+                self.floor = FLOOR * INNOVATION / SECOND_DIFFERENCE * self._expected(step_us)
+            self.variance = max(INNOVATION / SECOND_DIFFERENCE * self._next.variance, self.floor)
+        if self._max_lag_us and not 0 <= time_us - self._times[self._place] < self._max_lag_us * 3 // 32:
+            self._store(time_us, total)
+        self._last_us = time_us
 
-    def _keep(self, time_us: int, total: float) -> None:
-        """Keep a sample, and take the second differences from it back."""
-        self._at = at = (self._at + 1) % KEPT
-        self._fields[at], self._times[at] = total, time_us
-        self._largest = 0.0
-        for lag, bends in zip(LAGS, self._lagged, strict=True):
-            middle, first = (at - lag) % KEPT, (at - 2 * lag) % KEPT
+    def _store(self, time_us: int, total: float) -> None:
+        """Store a sample, and update the medians with the second differences that end at it."""
+        self._place = place = (self._place + 1) % STORED
+        self._fields[place], self._times[place] = total, time_us
+        self._ratio = 0.0
+        for lag, differences in zip(LAGS, self._lagged, strict=True):
+            middle, first = (place - lag) % STORED, (place - 2 * lag) % STORED
             late_us = time_us - self._times[middle]
             early_us = self._times[middle] - self._times[first]
-            if late_us <= self._longest_us and abs(late_us - early_us) * 8 <= late_us:
-                bend = abs(total - 2.0 * self._fields[middle] + self._fields[first])
-                if bend == bend:  # noqa: PLR0124 - NaN
-                    bends.take(bend)
-            if bends.count >= ENOUGH:
-                median, rock = bends.median / (1.0 + UNSURE / bends.count), ROCK * (lag / LAGS[-1]) ** 2
-                self._largest = max(self._largest, INNOVATION * (median * median - rock * rock))
+            if late_us <= self._max_lag_us and abs(late_us - early_us) * 8 <= late_us:
+                difference = abs(total - 2.0 * self._fields[middle] + self._fields[first])
+                if difference == difference:  # noqa: PLR0124 - faster than a call
+                    differences.update(difference)
+            if differences.count >= MIN_COUNT:
+                certain = 1.0 + UNCERTAINTY / differences.count
+                crust = (MEDIAN_TO_SIGMA * CRUST_NT * (lag / LAGS[-1]) ** 2) ** 2
+                excess = differences.variance / certain**2 - crust
+                self._ratio = max(self._ratio, excess / self._expected(late_us))
 
-    def explain(self, by: float) -> None:
-        """Take note that another calibration moves the total field `by` nT."""
-        self._last += by
-        self._last_but_one += by
-        self._fields = [field + by for field in self._fields]
+    def explain(self, difference: float) -> None:
+        """Record that another calibration changes the total field by `difference`, nT."""
+        self._last += difference
+        self._last_but_one += difference
+        self._fields = [field + difference for field in self._fields]
 
     def excess(self) -> float:
         """Return the variance (nT²) that more noise than the calibration's adds."""
-        if not self._known or self._next.count < ENOUGH:
+        if not self._is_known or self._next.count < MIN_COUNT:
             return 0.0
-        variance = max(self.variance, self._largest)
-        ratio = (variance / self.floor) ** 0.5
-        sure = 1.0 + UNSURE / self._next.count
-        self._noisy = ratio > NOISY * (0.5 if self._noisy else sure)
-        if ratio > LOUD * sure:
-            self._notices.report("noise", f"noise of {variance**0.5:.0f} nT: sigma is widened")
-        return variance if self._noisy else 0.0
+        squared = max(self.variance / self.floor, self._ratio)
+        ratio = squared**0.5
+        certain = 1.0 + UNCERTAINTY / self._next.count
+        self._is_noisy = ratio > MAX_QUIET_RATIO * (0.5 if self._is_noisy else certain)
+        if not self._is_noisy:
+            return 0.0
+        variance = max(INNOVATION * squared * self._sigma2, self.variance)
+        if ratio > REPORTED_RATIO * certain:
+            self._messages.report("noise", f"noise of {variance**0.5:.0f} nT: sigma is widened")
+        return variance

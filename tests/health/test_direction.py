@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
-from magbridge.health.direction import Direction
+from magbridge.health.direction import DirectionCheck
 from magbridge.records import Quality
 
 NED = np.array([17_000.0, -5_500.0, 48_500.0])
@@ -30,7 +30,7 @@ def judge(
     wrong: FloatArray, attitude_error: FloatArray | None = None, field: FloatArray = NED
 ) -> tuple[FloatArray, FloatArray, list[str]]:
     """Return flags and sigma of each sample, and what was told, of a vector that is `wrong` (3, 3) times."""
-    one, flags, sigma = Direction(), [], []
+    one, flags, sigma = DirectionCheck(), [], []
     one.expect(*field.tolist())
     rng = np.random.default_rng(2)
     for time_us, attitude, body in flight():
@@ -38,7 +38,7 @@ def judge(
         one.attitude(time_us, *(reported + (0.0 if attitude_error is None else attitude_error)).tolist())
         sigma.append(one.check(time_us, *(wrong @ body).tolist()) ** 0.5)
         flags.append(one.flags)
-    return np.array(flags), np.array(sigma), one.notices
+    return np.array(flags), np.array(sigma), one.messages
 
 
 def test_a_right_vector_is_left_alone_and_so_is_one_without_position_or_attitude() -> None:
@@ -70,7 +70,7 @@ def test_exchanged_axes_and_a_mounting_that_is_pitched_are_flagged() -> None:
 def test_a_mounting_that_is_turned_is_reported_and_its_vector_s_sigma_spans_the_difference() -> None:
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
     level = np.hypot(NED[0], NED[1])
-    one = Direction()
+    one = DirectionCheck()
     one.expect(*NED.tolist())
     for k in range(20):
         one.attitude(k * 1_000_000, 0.0, 0.0, 0.0)
@@ -78,22 +78,22 @@ def test_a_mounting_that_is_turned_is_reported_and_its_vector_s_sigma_spans_the_
         assert (variance > 0.0) == (k >= 7)
     assert one.flags == 0, "the total field is right, and which of compass and vector is wrong is not known"
     assert variance**0.5 == pytest.approx(2.0**0.5 * level, rel=1e-6)
-    assert one.notices == ["vector +90 deg off the heading: axes or compass wrong"]
+    assert one.messages == ["vector +90 deg off the heading: axes or compass wrong"]
 
 
 def test_what_the_heading_of_a_vehicle_at_the_pole_is_does_not_matter() -> None:
     polar = np.array([3_000.0, 0.0, 57_000.0])
-    one = Direction()
+    one = DirectionCheck()
     one.expect(*polar.tolist())
     for k in range(20):
         one.attitude(k * 1_000_000, 0.0, 0.0, 3.0)
         assert one.check(k * 1_000_000, *polar.tolist()) == 0.0
-    assert one.notices == []
+    assert one.messages == []
 
 
 def looks(tilts: list[float], every_us: int = 1_000_000, roll: float = 0.0) -> tuple[list[int], Direction]:
     """Return the flags of looks at a vector that is tilted by so many degrees, of a banked vehicle."""
-    one, flags = Direction(), []
+    one, flags = DirectionCheck(), []
     one.expect(*NED.tolist())
     for k, tilt in enumerate(tilts):
         attitude = np.radians([roll, 20.0, 30.0])
@@ -112,14 +112,14 @@ def test_the_inclination_may_be_ten_degrees_off_at_any_bank(roll: float) -> None
     for tilt in (10.3, -10.3):
         flags, one = looks([tilt] * 30, roll=roll)
         assert flags == [0] * 7 + [int(Quality.IMPLAUSIBLE)] * 23
-        assert one.notices == [f"inclination off by {tilt:+.0f} deg: axes or mounting wrong"]
+        assert one.messages == [f"inclination off by {tilt:+.0f} deg: axes or mounting wrong"]
 
 
 def test_eight_looks_in_a_row_have_to_differ_one_a_second() -> None:
     assert not any(looks(([20.0] * 7 + [0.0]) * 5)[0])
     assert not any(looks([20.0] * 60 + [0.0] * 60, every_us=100_000)[0]), "six seconds"
     assert looks([20.0] * 90, every_us=100_000)[0][-1]
-    one = Direction()
+    one = DirectionCheck()
     one.expect(*NED.tolist())
     for k in range(60):  # the heading, too
         one.attitude(k * 1_000_000, 0.0, 0.0, 0.0 if k % 8 == 7 else 2.0)
@@ -136,7 +136,7 @@ def test_what_was_seen_is_remembered_for_an_hour() -> None:
 
 
 def test_attitudes_that_are_older_than_five_seconds_tell_nothing() -> None:
-    one = Direction()
+    one = DirectionCheck()
     one.expect(*NED.tolist())
     one.attitude(0, 0.0, 0.0, 0.0)
     for k in range(100):
@@ -145,10 +145,10 @@ def test_attitudes_that_are_older_than_five_seconds_tell_nothing() -> None:
 
 
 def test_a_wrong_heading_and_a_wrong_inclination_are_each_told() -> None:
-    one = Direction()
+    one = DirectionCheck()
     one.expect(*NED.tolist())
     turned = Rotation.from_euler("z", 90.0, degrees=True).apply(NED)
     for k in range(40):
         one.attitude(k * 1_000_000, 0.0, 0.0, 0.0)
         one.check(k * 1_000_000, *(turned if k < 20 else NED * [1.0, 1.0, -1.0]).tolist())
-    assert [text.split()[0] for text in one.notices] == ["vector", "inclination"]
+    assert [text.split()[0] for text in one.messages] == ["vector", "inclination"]

@@ -1,0 +1,123 @@
+r"""Kalman filter in covariance form, for scalar measurements and with considered states.
+
+A measurement y of the state x has the residual :math:`r = e + h^T x`, of which e is known and h is the row of
+derivatives. With the covariance P and the noise variance R, innovation v, its variance S and the gain k are
+
+.. math:: v = e + h^T x, \quad S = h^T P h + R, \quad k = P h / S, \quad x \leftarrow x - k v
+
+A state is *considered* (Schmidt 1966, Advances in Control Systems 3:293) if its gain is set to zero: its
+uncertainty stays in S, but the measurement does not change it. The covariance update of Joseph's form holds
+for any gain (Bar-Shalom, Li & Kirubarajan 2001, eq. 5.2.3-18)::
+
+    P <- P - k (P h)^T - (P h) k^T + k S k^T
+
+Covariance form needs no inverse of a prior that is certain of some combinations of states, and the variance of
+every prediction is a by-product.
+"""
+
+from __future__ import annotations
+
+from math import log, pi, sqrt
+
+import numpy as np
+
+from magbridge.arrays import FloatArray, IndexArray
+
+__all__ = ["KalmanFilter"]
+
+
+class KalmanFilter:
+    """Estimate a state from scalar residuals.
+
+    Parameters
+    ----------
+    mean : (n,) array
+        State at the start.
+    covariance : (n, n) array
+        Covariance of `mean`.
+
+    Attributes
+    ----------
+    mean, covariance : (n,), (n, n) arrays
+        State and its covariance after the last step.
+    innovation, variance : float
+        Innovation v of the last measurement and its variance S.
+    row : (n,) array
+        Derivatives h of the last residual by the state.
+    """
+
+    def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
+        self.mean = np.array(mean, float)
+        self.covariance = np.array(covariance, float)
+        self.innovation, self.variance = 0.0, 1.0
+        self.row = np.zeros(len(self.mean))
+        self._Ph = np.zeros(len(self.mean))
+
+    def predict(
+        self, transition: FloatArray, noise: FloatArray | None = None, states: slice | IndexArray | None = None
+    ) -> None:
+        """Move some states on in time, by ``x <- F x`` and ``P <- F P F^T + Q``.
+
+        Parameters
+        ----------
+        transition : (m, m) array
+            F, of the `states`.
+        noise : (m, m) array, optional
+            Q, covariance of the process noise.
+        states : slice or (m,) int array, optional
+            The states that F moves; by default all.
+        """
+        chosen = slice(None) if states is None else states
+        P = self.covariance
+        self.mean[chosen] = transition @ self.mean[chosen]
+        P[chosen] = transition @ P[chosen]
+        P[:, chosen] = P[:, chosen] @ transition.T
+        if noise is not None:
+            block = np.ix_(states, states) if isinstance(states, np.ndarray) else (chosen, chosen)
+            P[block] += noise
+
+    def innovate(self, residual: float, row: FloatArray, noise: float) -> float:
+        """Compare a measurement with its prediction; set innovation and variance, and return the innovation.
+
+        Parameters
+        ----------
+        residual : float
+            e, the part of the residual that does not depend on the state linearly.
+        row : (n,) array
+            h, derivatives of the residual by the state.
+        noise : float
+            R, variance of the measurement's noise.
+        """
+        self.row = row
+        self._Ph = self.covariance @ row
+        self.variance = float(row @ self._Ph) + noise
+        self.innovation = residual + float(row @ self.mean)
+        return self.innovation
+
+    def update(self, considered: slice | IndexArray | None = None) -> FloatArray:
+        """Update the state with the last measurement and return the gain (n,).
+
+        Parameters
+        ----------
+        considered : slice or int array, optional
+            States that the measurement must not change.
+        """
+        gain = self._Ph / self.variance
+        if considered is not None:
+            gain[considered] = 0.0
+        self.mean -= gain * self.innovation
+        # Joseph's form, which holds for a gain that is not the optimal one
+        cross = np.outer(gain, self._Ph)
+        self.covariance -= cross
+        self.covariance -= cross.T
+        self.covariance += np.outer(self.variance * gain, gain)
+        return np.asarray(gain)
+
+    def log_likelihood(self) -> float:
+        """Return the log-likelihood of the last innovation, ``-(v^2 / S + log(2 pi S)) / 2``."""
+        return -0.5 * (self.innovation**2 / self.variance + log(2.0 * pi * self.variance))
+
+    @property
+    def sigma(self) -> float:
+        """1-sigma of the innovation, in the measurement's unit."""
+        return sqrt(self.variance)

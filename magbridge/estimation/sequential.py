@@ -1,0 +1,198 @@
+r"""Sequential test of a Kalman filter's innovations for changes of unknown onset, amplitude and kind.
+
+While its model holds, a filter's innovations v are white, of variance S. A change of amplitude a adds
+:math:`\phi^T a` to them. Here :math:`\phi` is the signature as the filter sees it: the signature f in the
+residual, and what the filter has already absorbed of the change (Willsky & Jones 1976, IEEE Trans. Automatic
+Control 21:108),
+
+.. math:: \phi = f + \Xi^T h, \qquad \Xi \leftarrow \Xi - k \phi^T
+
+With :math:`a \sim N(0, I)` in the unit of each change, the log-likelihood ratio of 'change' over 'no change' is
+
+.. math:: L = \tfrac12 y^T (I + M)^{-1} y - \tfrac12 \log \det(I + M), \quad
+          M = \sum \phi \phi^T / S, \quad y = \sum \phi v / S
+
+It is a mixture over all amplitudes, so that none needs to be known. Each kind of change is tested with several
+onsets at a time. They restart after 4, 16, 64 ... measurements. As L starts from 0, :math:`e^L` is a martingale
+of mean 1 each time, and it exceeds :math:`e^h` by chance with a probability of at most :math:`e^{-h}` (Ville's
+inequality).
+
+Where S is known up to a factor only, of an inverse chi-squared distribution with :math:`\nu` degrees of freedom, the
+factor is integrated out. With the n normalised squares :math:`V = \sum v^2 / S` since the onset,
+
+.. math:: L = \frac{\nu + n}{2} \log \frac{\nu + V}{\nu + V - y^T (I + M)^{-1} y}
+          - \tfrac12 \log \det(I + M)
+
+The estimated amplitude is :math:`\hat a = (I + M)^{-1} y`, of covariance :math:`(I + M)^{-1}`.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.estimation.kalman import KalmanFilter
+
+__all__ = ["ALARM_LOG_RATIO", "SequentialTest"]
+
+ALARM_LOG_RATIO: Final = 18.0
+"""h, threshold of L. Eight kinds of change have 2.7 onsets a measurement: by chance an alarm in ``e^18 / 2.7``
+measurements at most, 3 years at 0.25 Hz, while the noise is as stated."""
+RESTART_PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
+"""Measurements after which an onset is replaced by a new one."""
+PROMISING_LOG_RATIO: Final = 6.0
+"""L from which on an onset is not replaced."""
+OUTSTANDING_SIGMA: Final = 3.0
+"""Normalised innovation at which the shortest onset restarts."""
+EXCESS_NOISE_SAMPLES: Final = 3000
+"""Measurements over which the ratio of the innovations' variance to S is estimated."""
+MAX_INNOVATION_SIGMA: Final = 8.0
+"""Normalised innovation that counts as it is; a larger one has a larger variance."""
+MAX_SQUARED_INNOVATION: Final = 9.0
+"""Normalised squared innovation that counts for that ratio, at most."""
+
+
+class SequentialTest:
+    """Test several kinds of change, each with several onsets.
+
+    Parameters
+    ----------
+    kinds : int
+        Number of kinds of change; each has up to three components.
+    states : int
+        Number of states n of the filter.
+    retention_samples : float
+        Measurements over which evidence is forgotten; infinite by default.
+    noise_dof : float
+        Degrees of freedom with which S is known, if not 0.
+
+    Attributes
+    ----------
+    kind : (rows,) int array
+        Kind of change of each row; each onset of a kind is a row.
+    onset : (rows,) array
+        Time of each row's onset, s.
+    count : (rows,) int array
+        Measurements since then.
+    statistic : (rows,) array
+        L.
+    amplitude : (rows, 3) array
+        Estimated amplitudes.
+    squared_residual : float
+        Square of what the likeliest change leaves of the last innovation, over S.
+    absorbed : (n, rows, 3) array
+        Xi, what the filter has absorbed of each component.
+    """
+
+    def __init__(self, kinds: int, states: int, retention_samples: float = np.inf, noise_dof: float = 0.0) -> None:
+        self.kind: IndexArray = np.repeat(np.arange(kinds), len(RESTART_PERIODS))
+        self._period = np.tile(RESTART_PERIODS, kinds)
+        self._states, self._keep = states, 1.0 - 1.0 / retention_samples
+        self._excess, self._dof = 1.0, noise_dof
+        self.squared_residual = 1.0
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard all evidence; the estimate of the excess noise stays."""
+        rows = len(self.kind)
+        self._M = np.zeros((rows, 3, 3))
+        self._energy = np.zeros((rows, 3, 3))
+        self._y = np.zeros((rows, 3))
+        self._squares, self._samples = np.zeros(rows), np.zeros(rows)
+        self.absorbed = np.zeros((self._states, rows, 3))
+        self._phi = np.zeros((rows, 3))
+        self.onset = np.zeros(rows)
+        self.count = self._period.copy()
+        self.statistic = np.zeros(rows)
+        self.amplitude = np.zeros((rows, 3))
+
+    def begin(self, time: float, normalised_innovation: float) -> BoolArray:
+        """Restart the onsets whose period is over; return which rows those are (rows,).
+
+        Parameters
+        ----------
+        time : float
+            Time of the measurement, s.
+        normalised_innovation : float
+            ``v / sqrt(S)``.
+        """
+        self.count += 1
+        unpromising = self.statistic < PROMISING_LOG_RATIO
+        begins = (self.count > self._period) & unpromising
+        if abs(normalised_innovation) > OUTSTANDING_SIGMA:
+            shortest = slice(None, None, len(RESTART_PERIODS))
+            begins[shortest] |= unpromising[shortest]
+        if begins.any():
+            self._M[begins] = self._energy[begins] = 0.0
+            self._y[begins] = 0.0
+            self._squares[begins] = self._samples[begins] = 0.0
+            self.absorbed[:, begins] = 0.0
+            self.onset[begins], self.count[begins] = time, 1
+        return np.asarray(begins)
+
+    def test(self, estimator: KalmanFilter, signatures: FloatArray, null: FloatArray | None = None) -> float:
+        """Test the filter's innovation and return the largest statistic.
+
+        Parameters
+        ----------
+        estimator : KalmanFilter
+            The filter, after :meth:`.KalmanFilter.innovate` and before its update.
+        signatures : (rows, 3) array
+            f, what one unit of each component adds to the residual.
+        null : (rows,) array, optional
+            1-sigma of the amplitude that the model itself allows, in units of the change.
+        """
+        S = estimator.variance
+        phi = signatures + np.tensordot(estimator.row, self.absorbed, axes=1)
+        self._phi = phi
+        v = estimator.innovation
+        likeliest = int(self.statistic.argmax())
+        residual = v - float(phi[likeliest] @ self.amplitude[likeliest])
+        self.squared_residual = residual * residual / S
+        if self._dof:
+            S = max(S, (v / MAX_INNOVATION_SIGMA) ** 2)
+        else:
+            squared = min(v * v / S, MAX_SQUARED_INNOVATION)
+            self._excess += (squared - self._excess) / EXCESS_NOISE_SAMPLES
+            S *= max(1.0, self._excess)
+        if self._keep < 1.0:
+            self._M *= self._keep
+            self._y *= self._keep
+            self._squares *= self._keep
+            self._samples *= self._keep
+        self._M += phi[:, :, None] * phi[:, None, :] / S
+        self._energy += signatures[:, :, None] * signatures[:, None, :]
+        self._y += phi * (v / S)
+        self._squares += v * v / S
+        self._samples += 1.0
+        self.amplitude, self.statistic = self._mixture(np.ones(len(phi)))
+        if null is not None:
+            self.statistic = self.statistic - self._mixture(null * null)[1]
+        return float(self.statistic.max())
+
+    def _mixture(self, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return amplitudes (rows, 3) and L (rows,) for amplitudes of variance `prior` (rows,)."""
+        W = prior[:, None, None] * self._M + np.eye(3)
+        amplitude = prior[:, None] * np.linalg.solve(W, self._y[:, :, None])[:, :, 0]
+        explained = np.sum(self._y * amplitude, axis=1)
+        if self._dof:
+            squares = self._dof + self._squares
+            ratio = 0.5 * (self._dof + self._samples) * np.log(squares / np.maximum(squares - explained, 1e-9))
+        else:
+            ratio = 0.5 * explained
+        return np.asarray(amplitude), np.asarray(ratio - 0.5 * np.log(np.linalg.det(W)))
+
+    def update(self, gain: FloatArray) -> None:
+        """Record that the filter was updated with `gain` (n,)."""
+        self.absorbed -= gain[:, None, None] * self._phi[None]
+
+    def covariance(self, row: int) -> FloatArray:
+        """Return the covariance (3, 3) of a row's amplitude."""
+        return np.asarray(np.linalg.inv(self._M[row] + np.eye(3)))
+
+    def rms(self, row: int) -> float:
+        """Return the root mean square of what a row's change adds to the residual."""
+        a = self.amplitude[row]
+        return float(np.sqrt(max(float(a @ self._energy[row] @ a) / float(self.count[row]), 0.0)))

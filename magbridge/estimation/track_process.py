@@ -1,0 +1,98 @@
+r"""Error of a reference along a track, and the noise's memory, as the states of a Kalman filter.
+
+The field differs from its reference by a constant and by a crustal field along the track. The latter is a
+Gauss-Markov process of Matern covariance with smoothness 3/2: its value b and slope b' are two states (Hartikainen
+& Sarkka 2010, MLSP, section 4.2). With :math:`\lambda = \sqrt 3 / \ell`,
+
+.. math:: F = e^{-\lambda d}
+          \begin{pmatrix} 1 + \lambda d & d \\ -\lambda^2 d & 1 - \lambda d \end{pmatrix}, \quad
+          P_\infty = \sigma^2\, \mathrm{diag}(1, \lambda^2), \quad Q = P_\infty - F P_\infty F^T
+
+A fraction of the samples' noise is white, the rest is an AR(1) process. That is the third state, and the constant
+is the fourth.
+"""
+
+from __future__ import annotations
+
+from math import exp, sqrt
+
+import numpy as np
+
+from magbridge.arrays import FloatArray
+
+__all__ = ["CORRELATION_LENGTH_M", "TRACK_STATES", "TrackProcess"]
+
+TRACK_STATES = 4
+"""Crustal field (nT) and its slope (nT/m), slow noise (nT), and the constant (nT)."""
+CORRELATION_LENGTH_M = 1_000.0
+"""Length over which the crustal field changes, where a survey does not tell it."""
+MIN_WHITE_NT = 0.05
+"""1-sigma of the white noise that every sample has."""
+
+
+class TrackProcess:
+    """Dynamics of the reference's error along a track.
+
+    Parameters
+    ----------
+    sensor : float
+        1-sigma of a channel's noise, nT.
+    spread : float
+        1-sigma of the crustal field, nT.
+    constant : float
+        1-sigma of the constant, nT.
+    length : float
+        Correlation length of the crustal field, m.
+    autocorrelation, interval : float
+        Autocorrelation of the slow noise from a sample to the next, `interval` (s) later; 0: all is white.
+    white : float
+        Fraction of the noise's variance that is white.
+    reference : float
+        1-sigma of the reference's own white noise, nT.
+
+    Attributes
+    ----------
+    spread, constant : float
+        As given.
+    initial : (4, 4) array
+        Covariance at the start, and far from any sample.
+    white_variance : float
+        Variance of the white noise, nT².
+    """
+
+    def __init__(
+        self,
+        sensor: float,
+        spread: float,
+        constant: float = 0.0,
+        length: float = CORRELATION_LENGTH_M,
+        autocorrelation: float = 0.0,
+        interval: float = 1.0,
+        white: float = 0.0,
+        reference: float = 0.0,
+    ) -> None:
+        slow = (1.0 - white) * sensor**2 if autocorrelation > 0.0 else 0.0
+        self.spread, self.constant = spread, constant
+        self._decay = autocorrelation, interval or 1.0
+        self._lambda = sqrt(3.0) / length
+        self.initial = np.diag([spread**2, (spread * self._lambda) ** 2, slow, constant**2])
+        self.white_variance = max(sensor**2 - slow, MIN_WHITE_NT**2) + reference**2
+
+    def transition(self, metres: float, seconds: float) -> tuple[FloatArray, FloatArray]:
+        """Return transition F and process noise Q, both (4, 4), over a distance and a time."""
+        rate = self._lambda
+        x = min(rate * metres, 300.0)
+        rho, interval = self._decay
+        F = np.zeros((TRACK_STATES, TRACK_STATES))
+        fall = exp(-x)
+        F[0, 0], F[0, 1] = fall * (1.0 + x), fall * x / rate
+        F[1, 0], F[1, 1] = -fall * rate * x, fall * (1.0 - x)
+        F[2, 2] = rho ** min(seconds / interval, 1e4) if rho > 0.0 else 0.0
+        F[3, 3] = 1.0
+        Q = self.initial - F @ self.initial @ F.T
+        return F, np.asarray(0.5 * (Q + Q.T))
+
+    @staticmethod
+    def row(scale: float) -> FloatArray:
+        """Return the derivatives (4,) of a residual ``(total field - reference) / scale`` by the states."""
+        return np.array([-1.0 / scale, 0.0, -1.0, -1.0 / scale])

@@ -1,0 +1,254 @@
+r"""Check whether the corrected total field depends on what it must not depend on.
+
+The Earth's field does not depend on the vehicle's attitude, temperature or mass positions. An error of the
+calibration does. With u the direction of the corrected field in sensor axes, an error changes the total field by
+
+- :math:`u^T a` (offset), :math:`\theta u^T a` (offset that follows the temperature), :math:`t\,u^T a` (drift),
+- :math:`u_x^2 a_x + u_y^2 a_y + u_x u_y a_{xy}` (gain),
+- :math:`a\, \partial F / \partial p` (telemetry of a mass p).
+
+A Kalman filter predicts the total field from the crustal field along the track alone
+(:mod:`magbridge.estimation.track_process`); :mod:`magbridge.estimation.sequential` tests its innovations for each
+of these errors. The calibration's own uncertainty is part of the null hypothesis. After an alarm, sigma includes
+the estimated error of the present sample and its uncertainty, weighted over the onsets and errors that fit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from math import exp, isfinite
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from magbridge.calibration.model import Noise
+from magbridge.estimation.kalman import KalmanFilter
+from magbridge.estimation.sequential import RESTART_PERIODS, SequentialTest
+from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
+from magbridge.health.messages import Messages
+
+__all__ = ["ConsistencyCheck"]
+
+MIN_INTERVAL_S: Final = 1.0
+MAX_INTERVAL_S: Final = 4.0
+INTERVAL_M: Final = 25.0
+"""Time and distance from one sample to the next that is tested."""
+CRUST_SIGMA_NT: Final = 145.0
+CONSTANT_SIGMA_NT: Final = 1000.0
+MAX_GAP_S: Final = 600.0
+"""Pause after which the crustal field is not known any more."""
+OFFSET_NT: Final = 20.0
+DRIFT_NT_PER_H: Final = 10.0
+PER_DEGREE_NT: Final = 1.0
+GAIN_NT: Final = 60.0
+MASS_FRACTION: Final = 0.03
+"""1-sigma of each error: of offset, drift and temperature for an axis, of gain in the Earth's field, of telemetry
+as a fraction of the calibrated range."""
+RETENTION_SAMPLES: Final = 2000.0
+"""Tested samples over which evidence is forgotten."""
+ALARM_LOG_RATIO: Final = 15.0
+"""L above which an alarm begins: by chance once in a million tested samples at most."""
+NOISE_DOF: Final = 8.0
+"""Degrees of freedom with which the noise of the innovations is known."""
+CLEAR_LOG_RATIO: Final = 4.0
+"""L below which an alarm ends."""
+COMPETING_LOG_RATIO: Final = 5.0
+"""Distance from the largest L within which an error and an onset count."""
+MAX_PENDING: Final = 64
+MAX_INNOVATION_SIGMA: Final = 5.0
+AGREEING: Final = 3
+"""An innovation beyond so many sigmas is ignored, unless it is the third in a row."""
+STRAIGHT: Final = 0.05
+"""Change of the unit vector within which the attitude is the same."""
+MIN_STRAIGHT_SAMPLES: Final = 8
+"""Samples of one attitude from which the roughness is known."""
+ADAPTATION: Final = 0.02
+MAX_SQUARE: Final = 16.0
+MAX_LOG_ROUGHNESS: Final = 5.0
+"""How the logarithm of the crustal field's roughness follows one normalised squared innovation, and its bounds."""
+DEGENERATE_NT: Final = 1e-6
+
+
+class Sample(NamedTuple):
+    """A sample to test."""
+
+    time_us: int
+    """Time, µs."""
+    unit: tuple[float, float, float]
+    """Direction of the corrected field."""
+    anomaly: float
+    """Corrected total field less the main field where that is known, nT."""
+    sigma: float
+    """Part of its 1-sigma that is not common to all samples, nT."""
+    temperature: float
+    """Temperature of the sensor, degC; NaN where it is not known."""
+    mass_changes: tuple[float, ...]
+    """Change of the total field where each mass moves by :data:`MASS_FRACTION` of its range, nT."""
+    speed: float
+    """Speed at which the crustal field is crossed, m/s."""
+
+
+class ConsistencyCheck:
+    """Test the total field for dependence on attitude, temperature, time and mass positions.
+
+    Parameters
+    ----------
+    noise : Noise
+        The calibration's noise model.
+    masses : int
+        Number of mass positions that the calibration depends on.
+    messages : Messages
+        Receives what is found.
+
+    Attributes
+    ----------
+    is_wrong : bool
+        Whether an alarm is active.
+    """
+
+    def __init__(self, noise: Noise, masses: int, messages: Messages) -> None:
+        self._messages = messages
+        self._process = TrackProcess(
+            max(noise.sensor, 0.1), CRUST_SIGMA_NT, CONSTANT_SIGMA_NT,
+            autocorrelation=noise.autocorrelation, interval=noise.interval, white=noise.white,
+        )  # fmt: skip
+        self._noise2 = noise.sensor**2
+        self._masses = masses
+        self._test = SequentialTest(4 + masses, TRACK_STATES, RETENTION_SAMPLES, NOISE_DOF)
+        self._log_roughness, self._straight_samples = 0.0, 0
+        self._scale = np.full(masses, np.nan)
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard all evidence, as with another calibration."""
+        self._filter = KalmanFilter(np.zeros(TRACK_STATES), self._process.initial)
+        self._test.restart()
+        self._start = np.zeros(len(self._test.kind))  # regressor of each row at its onset
+        self._time_us, self._due_us, self._level = 0, 0, 0.0
+        self._pending: deque[Sample] = deque(maxlen=MAX_PENDING)
+        self._outliers = 0
+        self._last_unit = np.zeros(3)
+        self._temperature = 0.0
+        self._weights: list[tuple[int, float]] = []
+        self.is_wrong = False
+
+    def is_due(self, time_us: int, speed: float) -> bool:
+        """Return True if it is time to test a sample of a vehicle that moves at a speed, m/s."""
+        interval = MAX_INTERVAL_S
+        if speed > 0.0:
+            interval = min(max(INTERVAL_M / speed, MIN_INTERVAL_S), MAX_INTERVAL_S)
+        return not 0 <= time_us - self._due_us < 0.99e6 * interval
+
+    def add(self, sample: Sample) -> None:
+        """Add a sample; it is tested once newer telemetry has come."""
+        self._due_us = sample.time_us
+        self._pending.append(sample)
+
+    def drop(self, since_us: int) -> None:
+        """Discard samples after `since_us`, when a motion may have begun."""
+        while self._pending and self._pending[-1].time_us > since_us:
+            self._pending.pop()
+
+    def confirm(self, reported_us: int) -> None:
+        """Test the samples that were taken before the telemetry of `reported_us`."""
+        while self._pending and self._pending[0].time_us <= reported_us:
+            self._test_sample(self._pending.popleft())
+
+    def _test_sample(self, sample: Sample) -> None:
+        time_us, unit, total, sigma, temperature, mass_changes, speed = sample
+        seconds = 1e-6 * (time_us - self._time_us)
+        if not 0.0 < seconds < MAX_GAP_S:
+            if self._time_us == 0 or seconds < 0.0:
+                self.restart()
+                self._level = total
+            seconds = min(max(seconds, 0.0), 1e5)
+        self._time_us = time_us
+        if isfinite(temperature):
+            self._temperature = temperature
+        F, Q = self._process.transition(speed * exp(self._log_roughness / 3.0) * seconds, seconds)
+        self._filter.predict(F, Q)
+        absorbed = self._test.absorbed
+        absorbed[:] = np.tensordot(F, absorbed, axes=1)
+        v = self._filter.innovate(total - self._level, self._process.row(1.0), self._process.white_variance)
+        normalised = v / self._filter.sigma
+        self._outliers = self._outliers + 1 if abs(normalised) > MAX_INNOVATION_SIGMA else 0
+        if 0 < self._outliers < AGREEING and not self.is_wrong:
+            return
+        begins = self._test.begin(1e-6 * time_us, normalised)
+        f = self._signatures(1e-6 * time_us, unit, mass_changes, begins)
+        systematic = max(sigma * sigma - self._noise2, 0.0) ** 0.5
+        largest = self._test.test(self._filter, f, self._null(systematic))
+        self._learn_roughness(self._test.squared_residual, np.array(unit))
+        self._test.update(self._filter.update())
+        self._decide(largest, sigma)
+
+    def _learn_roughness(self, squared: float, unit: Any) -> None:
+        """Let the crustal field's curvature follow the innovations where the attitude stays the same."""
+        turned = float(np.abs(unit - self._last_unit).max())
+        self._last_unit = unit
+        if turned < STRAIGHT and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:
+            self._straight_samples += 1
+            self._log_roughness += ADAPTATION * (min(squared, MAX_SQUARE) - 1.0)
+            self._log_roughness = min(max(self._log_roughness, -MAX_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
+
+    def _null(self, systematic: float) -> Any:
+        """Return the amplitude (rows,) that the calibration's own uncertainty (nT) allows."""
+        units = [OFFSET_NT, np.inf, np.inf, GAIN_NT, *np.maximum(np.nan_to_num(self._scale), DEGENERATE_NT)]
+        return np.repeat(np.minimum(systematic / np.array(units), 1.0), len(RESTART_PERIODS))
+
+    def _signatures(
+        self, time: float, unit: tuple[float, float, float], mass_changes: Sequence[float], begins: Any
+    ) -> Any:
+        """Return what one unit of each row's error adds to the total field (rows, 3), nT."""
+        x, y, z = unit
+        onsets = len(RESTART_PERIODS)
+        u = np.array([x, y, z])
+        f = np.zeros((len(self._start), 3))
+        regressors = np.repeat([0.0, self._temperature, time / 3600.0], onsets)
+        part = slice(0, 3 * onsets)
+        self._start[part] = np.where(begins[part], regressors, self._start[part])
+        since = regressors - self._start[part]
+        f[:onsets] = OFFSET_NT * u
+        f[onsets : 2 * onsets] = PER_DEGREE_NT * since[onsets : 2 * onsets, None] * u
+        f[2 * onsets : 3 * onsets] = DRIFT_NT_PER_H * since[2 * onsets :, None] * u
+        f[3 * onsets : 4 * onsets] = GAIN_NT * np.array([x * x, y * y, x * y])
+        for k, change in enumerate(mass_changes):
+            f[(4 + k) * onsets : (5 + k) * onsets, 0] = change
+            before = self._scale[k]
+            self._scale[k] = abs(change) if np.isnan(before) else 0.98 * before + 0.02 * abs(change)
+        self._last_signatures = f
+        return f
+
+    def _decide(self, largest: float, sigma: float) -> None:
+        """Begin or end an alarm, and weigh the errors that fit."""
+        statistic = self._test.statistic
+        best = int(np.argmax(statistic))
+        size = self._test.rms(best)
+        # an error that sigma covers is not an alarm, nor is one while the crust's roughness is not known
+        matters = size > sigma and self._straight_samples >= MIN_STRAIGHT_SAMPLES
+        if self.is_wrong:
+            self.is_wrong = largest > CLEAR_LOG_RATIO
+        else:
+            self.is_wrong = matters and largest > ALARM_LOG_RATIO
+        self._weights = []
+        if not self.is_wrong:
+            return
+        rows = np.flatnonzero(statistic > largest - COMPETING_LOG_RATIO).tolist()
+        shares = [exp(float(statistic[row]) - largest) for row in rows]
+        total = sum(shares)
+        self._weights = [(row, share / total) for row, share in zip(rows, shares, strict=True)]
+        kind = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
+        text = f"field depends on the attitude or a mass, {size:.0f} nT: {kind[min(int(self._test.kind[best]), 4)]} wrong"
+        self._messages.report("consistency", text)
+
+    def variance(self) -> float:
+        """Return the variance (nT²) to add to that of samples like the last one that was tested."""
+        if not self.is_wrong:
+            return 0.0
+        variance = 0.0
+        for row, share in self._weights:
+            f = self._last_signatures[row]
+            error = float(f @ self._test.amplitude[row])
+            variance += share * (error * error + float(f @ self._test.covariance(row) @ f))
+        return variance

@@ -1,0 +1,153 @@
+"""Check one corrected sample after the other, by all checks that need no attitude from the autopilot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import inf, sqrt
+from typing import Final
+
+from magbridge.calibration.model import Noise
+from magbridge.health.axes import RepetitionCheck
+from magbridge.health.consistency import ConsistencyCheck, Sample
+from magbridge.health.level import LevelCheck
+from magbridge.health.messages import Messages
+from magbridge.health.scatter import Scatter
+from magbridge.health.trend import TrendCheck
+from magbridge.records import Quality, Vector
+
+__all__ = ["HealthMonitor"]
+
+MAX_AGE_S: Final = 60.0
+"""Age of telemetry after which a sample is tested without waiting for newer telemetry."""
+
+IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
+UNSTEADY: Final = int(Quality.MOVING | Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
+"""Flags of a sample by which no trend is followed."""
+
+
+class HealthMonitor:
+    """Check sample after sample.
+
+    Parameters
+    ----------
+    noise : Noise
+        The calibration's noise model.
+    messages : Messages, optional
+        Receives what is found.
+    level : float
+        Part of every sample's sigma that is common to all samples, nT.
+    masses : int
+        Number of positions that the calibration depends on.
+
+    Attributes
+    ----------
+    flags : int
+        :class:`~magbridge.records.Quality` bits of the last sample.
+    is_fault : bool
+        Whether the last sample is an outlier, comes from a faulty sensor, or is not the Earth's field.
+    """
+
+    def __init__(
+        self, noise: Noise, messages: Messages | None = None, level: float = 0.0, masses: int = 0
+    ) -> None:
+        self._common = level * level
+        self.flags = 0
+        self.is_fault = False
+        messages = messages or Messages()
+        self.messages = messages.lines
+        self._axes, self._level = RepetitionCheck(messages), LevelCheck(messages)
+        self._scatter = Scatter(noise, messages)
+        self._trend = TrendCheck(self._scatter, messages)
+        self._consistency = ConsistencyCheck(noise, masses, messages)
+        self._unit: Vector = (0.0, 0.0, 0.0)
+
+    def set_position(self, time_us: int, latitude: float, longitude: float) -> None:
+        """Record the vehicle's position, deg: what is noise, and not the crustal field, depends on the speed."""
+        if self._scatter.set_position(time_us, latitude, longitude):
+            self._trend.set_speed(self._scatter.speed)
+
+    def begin_motion(self, since_us: int) -> None:
+        """Record that telemetry reports a motion, which may have begun after `since_us`."""
+        self._trend.retract(since_us)
+        self._consistency.drop(since_us)
+
+    def check(
+        self,
+        time_us: int,
+        raw: Vector,
+        field: Vector,
+        total_field: tuple[float, float],
+        quality: int,
+        main_field: tuple[float, float],
+        temperature: float,
+        age: float,
+        mass_changes: Callable[[], Sequence[float]],
+    ) -> float:
+        """Check a sample: set :attr:`flags`, return the variance (nT²) to add to the field's.
+
+        Parameters
+        ----------
+        time_us : int
+            Time, µs.
+        raw : tuple of 3 float
+            Reading, nT.
+        field : tuple of 3 float
+            Corrected vector, nT.
+        total_field : tuple of 2 float
+            Corrected total field and its 1-sigma, nT.
+        quality : int
+            Flags so far.
+        main_field : tuple of 2 float
+            Main field, NaN where the position is not known, and 1-sigma of the Earth's field about it, nT.
+        temperature : float
+            Temperature of the sensor, degC; NaN where it is not known.
+        age : float
+            Age of the oldest telemetry, s.
+        mass_changes : callable
+            Returns by how much the total field changes where each mass moves, see :class:`.consistency.Sample`.
+        """
+        self.flags = 0
+        self.is_fault = True
+        total, sigma = total_field
+        reference, reference_sigma = main_field
+        level, trend = self._level, self._trend
+        stuck = self._axes.is_stuck(raw, self._scatter.white_sigma)
+        if not 0.0 < total < inf:
+            if total == 0.0:
+                level.check(time_us, total, sigma, reference, reference_sigma, steady=True)
+                self.flags = IMPLAUSIBLE
+            return 0.0
+        steady = not quality & UNSTEADY
+        variance = level.check(time_us, total, sigma, reference, reference_sigma, steady)
+        doubtful = stuck or level.is_wrong
+        trend.is_outlier = False
+        unit = field[0] / total, field[1] / total, field[2] / total
+        apart = sqrt(max(sigma * sigma - self._common, 0.0))
+        if not steady:
+            trend.has_moved = True
+        elif not (self._axes.is_repeating and stuck):
+            dx, dy, dz = unit[0] - self._unit[0], unit[1] - self._unit[1], unit[2] - self._unit[2]
+            turned = sqrt(dx * dx + dy * dy + dz * dz)
+            self._unit = unit
+            variance += trend.check(time_us, total, apart, turned, learn=not doubtful)
+        self.is_fault = doubtful or trend.is_outlier or time_us < level.until_us
+        variance += trend.jump_variance(time_us)
+        if self.is_fault or trend.is_away:
+            self.flags = IMPLAUSIBLE
+        consistency = self._consistency
+        speed = trend.crossing_speed
+        if steady and not self.flags and trend.is_established and consistency.is_due(time_us, speed):
+            anomaly = total - reference if reference == reference else total  # noqa: PLR0124 - NaN
+            new = Sample(time_us, unit, anomaly, apart, temperature, tuple(mass_changes()), speed)
+            consistency.add(new)
+        consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))
+        return variance + self._scatter.excess() + consistency.variance()
+
+    def explain(self, difference: float, *, jumps: bool) -> None:
+        """Record that another calibration changes the total field by `difference` (nT) and explains `jumps`."""
+        if difference == difference:  # noqa: PLR0124 - NaN
+            self._trend.explain(difference)
+            self._scatter.explain(difference)
+        self._consistency.restart()
+        if jumps:
+            self._trend.forget()

@@ -1,0 +1,327 @@
+r"""Check whether the total field leaves its own trend.
+
+The corrected total field does not depend on the attitude, and it changes slowly with the position. A Kalman
+filter follows its level L and its slope s, as an integrated random walk of intensity q (Bar-Shalom, Li &
+Kirubarajan 2001, *Estimation with Applications to Tracking and Navigation*, section 6.2.2):
+
+.. math:: F = \begin{pmatrix} 1 & T \\ 0 & 1 \end{pmatrix}, \quad
+          Q = q \begin{pmatrix} T^3/3 & T^2/2 \\ T^2/2 & T \end{pmatrix} + \sigma^2 |\Delta u|\, e_1 e_1^T
+
+A crustal field of standard deviation :math:`\sigma_c` and correlation length :math:`\ell` (Matern, smoothness
+3/2), crossed at the speed v, has :math:`q = 4 (\sqrt 3 v / \ell)^3 \sigma_c^2`. From there q follows the
+normalised innovations, so that the rate of change at any speed is part of the model. The second term is what the
+calibration's own error changes where the direction of the field turns by :math:`|\Delta u|`.
+
+A sample whose innovation exceeds :data:`GATE_SIGMA` is an outlier (section 5.4 of the same book). Three outliers
+that agree with each other are a jump. Samples after a jump are flagged while the sum of jumps is not zero, and
+sigma is the largest of them. It is kept for a while after the field has come back.
+
+Telemetry reports a motion after it has begun. When it does, the filter returns to its state at the last report
+before the motion, so that what the motion did meanwhile is not a jump.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import exp, log, nan
+from typing import Final, NamedTuple
+
+from magbridge.health.messages import Messages
+from magbridge.health.scatter import Scatter
+
+__all__ = ["GATE_SIGMA", "TrendCheck"]
+
+GATE_SIGMA: Final = 7.0
+"""Sigmas of an innovation; 5.5 would be one false alarm a month, were the noise Gaussian."""
+GATE: Final = GATE_SIGMA * GATE_SIGMA
+CRUST_SIGMA_NT: Final = 145.0
+CRUST_LENGTH_M: Final = 1000.0
+CURVATURE: Final = 4.0 * (3.0**0.5 / CRUST_LENGTH_M) ** 3 * CRUST_SIGMA_NT**2
+"""nT²/m³: q is this times the speed cubed."""
+MIN_INTENSITY: Final = 1e-4
+"""nT²/s³, q where the speed is not known: a slope of 0.05 nT/s that is forgotten within half a minute."""
+SLOPE_NT_PER_S: Final = 0.5
+"""1-sigma of the slope at the start."""
+ADAPTATION: Final = 0.02
+"""By how much log q follows one normalised squared innovation."""
+MAX_SQUARE: Final = 16.0
+"""Normalised squared innovation that counts, at most."""
+AGREEING: Final = 3
+"""Outliers that agree with each other are a jump; so many samples establish the trend at the start."""
+ESTABLISHED_SAMPLES: Final = 256
+"""Samples from which q is known without a speed."""
+SPIKE_DECAY: Final = 0.3
+BURST_DECAY: Final = 0.8
+BURST_SAMPLES: Final = 8
+"""Fraction of an outlier's square that is added to the variance of the next sample. An outlier within so many
+samples of another is rather noise than a spike: the next sample is as bad."""
+LASTING_US: Final = 120_000_000
+"""Duration after which a jump is not transient."""
+HOLD_US: Final = 60_000_000
+MAX_HOLD_US: Final = 3_600_000_000
+MAX_MOTION_HOLD_US: Final = 86_400_000_000
+"""Time for which sigma remembers a jump that came back: at first, at most, and at most after motions."""
+CHECKPOINT_US: Final = 1_000_000
+CHECKPOINTS: Final = 64
+FORGIVING_LOG_RATIO: Final = -7.0
+"""Log-likelihood ratio of 'the jump is an offset' over 'it is not' below which a jump is discarded."""
+
+
+class State(NamedTuple):
+    """Level (nT), slope (nT/s), their covariance, and the jumps so far, after a sample."""
+
+    time_us: int
+    level: float
+    slope: float
+    p_level: float
+    p_cross: float
+    p_slope: float
+    jump_sum: float
+    largest: float
+    jumps: int
+    since_us: int
+    until_us: int
+
+
+class TrendCheck:
+    """Follow the total field and find outliers and jumps.
+
+    Parameters
+    ----------
+    scatter : Scatter
+        Noise of the samples.
+    messages : Messages
+        Receives what is found.
+
+    Attributes
+    ----------
+    is_outlier : bool
+        Whether the last sample is an outlier.
+    has_moved : bool
+        Whether a mass may have moved since the last sample.
+    is_away : bool
+        Whether the field has jumped and not come back.
+    """
+
+    def __init__(self, scatter: Scatter, messages: Messages) -> None:
+        self._scatter, self._messages = scatter, messages
+        self.is_outlier = self.has_moved = self.is_away = False
+        self._now: State | None = None
+        self._checkpoints: deque[State] = deque(maxlen=CHECKPOINTS)
+        self._sigma = 0.0
+        self._log_q = log(MIN_INTENSITY)
+        self._min_log_q = log(MIN_INTENSITY)
+        self._has_speed = False
+        self._before = nan  # level before a sample that only time or a motion made acceptable
+        self._accepted = 0
+        self._unrest, self._decay, self._quiet = 0.0, SPIKE_DECAY, BURST_SAMPLES
+        self._candidate, self._agreed, self._candidate_us = nan, 0, 0
+        self._offset_log_ratio = 0.0
+
+    @property
+    def is_established(self) -> bool:
+        """Whether the rate at which the field changes is known, from the speed or from the samples."""
+        return self._has_speed or self._accepted >= ESTABLISHED_SAMPLES
+
+    @property
+    def crossing_speed(self) -> float:
+        """Speed (m/s) at which a vehicle would cross a crustal field that changes as this one does."""
+        return float((exp(max(self._log_q, self._min_log_q)) / CURVATURE) ** (1.0 / 3.0))
+
+    def set_speed(self, speed: float) -> None:
+        """Record the vehicle's speed, m/s."""
+        self._has_speed = True
+        self._min_log_q = log(max(CURVATURE * min(speed, 300.0) ** 3, 0.1 * MIN_INTENSITY))
+
+    def check(self, time_us: int, total: float, sigma: float, turned: float, *, learn: bool) -> float:
+        """Follow the trend; return the variance (nT²) to add to that of a sample that is an outlier.
+
+        Parameters
+        ----------
+        time_us : int
+            Time, µs.
+        total, sigma : float
+            Corrected total field and the part of its 1-sigma that is not common to all samples, nT.
+        turned : float
+            Change of the field's direction since the last sample, rad.
+        learn : bool
+            Whether the sample may be another level of the field.
+        """
+        self.is_outlier = False
+        scatter, now = self._scatter, self._now
+        if now is None:
+            if learn:
+                self._begin(time_us, total, sigma, scatter.variance)
+                scatter.begin(9.0 * max(sigma * sigma, scatter.floor))
+            return 0.0
+        noise = scatter.variance
+        # prediction
+        T = 1e-6 * (time_us - now.time_us)
+        q = exp(max(self._log_q, self._min_log_q))
+        level = now.level + T * now.slope
+        p_slope = now.p_slope + q * T
+        p_cross = now.p_cross + T * now.p_slope + 0.5 * q * T * T
+        p_still = now.p_level + T * (2.0 * now.p_cross + T * now.p_slope) + q * T * T * T / 3.0
+        p_level = p_still + sigma * sigma * min(turned, 2.0)
+        if self.has_moved:
+            p_level += sigma * sigma + self._sigma * self._sigma
+        S = p_level + noise
+        e = total - level
+        scatter.follow(time_us, total)
+        predicted = now._replace(
+            time_us=time_us, level=level, p_level=p_level, p_cross=p_cross, p_slope=p_slope
+        )
+        if e * e <= GATE * S:
+            self._before = level if e * e > GATE * (p_still + noise) else nan
+            return self._accept(predicted, e, S, sigma, noise)
+        if self._accepted < AGREEING:
+            # which of the first samples is the outlier is not known
+            if self.has_moved and learn:
+                self._jump(time_us, e, noise)
+            self._begin(time_us, total, sigma, noise)
+            self._accepted = 0
+            return 0.0
+        self._now = predicted
+        self._adapt(MAX_SQUARE)
+        self._unrest = min(e * e, 16.0 * GATE * S)
+        self._decay = BURST_DECAY if self._quiet < BURST_SAMPLES else SPIKE_DECAY
+        self._quiet = 0
+        self.is_outlier = True
+        if learn:
+            self._agree(time_us, total, sigma, S, noise)
+        return e * e
+
+    def _accept(self, predicted: State, e: float, S: float, sigma: float, noise: float) -> float:
+        """Update the filter; return what past outliers add, nT²."""
+        self._accepted += 1
+        self._agreed = 0
+        k_level, k_slope = predicted.p_level / S, predicted.p_cross / S
+        self._now = predicted._replace(
+            level=predicted.level + k_level * e,
+            slope=predicted.slope + k_slope * e,
+            p_level=predicted.p_level * (1.0 - k_level),
+            p_cross=predicted.p_cross * (1.0 - k_level),
+            p_slope=max(predicted.p_slope - k_slope * predicted.p_cross, 0.0),
+        )
+        self._sigma, self.has_moved = sigma, False
+        self._adapt(min(e * e / S, MAX_SQUARE))
+        checkpoints = self._checkpoints
+        if not checkpoints or not 0 <= predicted.time_us - checkpoints[-1].time_us < CHECKPOINT_US:
+            checkpoints.append(self._now)
+        self._unrest = self._unrest * self._decay if self._unrest > noise else 0.0
+        self._quiet += 1
+        return self._unrest
+
+    def _adapt(self, square: float) -> None:
+        """Let q follow a normalised squared innovation, whose mean is 1 if q is right."""
+        self._log_q = max(self._log_q + ADAPTATION * (square - 1.0), self._min_log_q)
+
+    def _begin(self, time_us: int, level: float, sigma: float, noise: float) -> None:
+        self._now = State(
+            time_us, level, 0.0, noise, 0.0, SLOPE_NT_PER_S**2, 0.0, 0.0, 0, 0, 0
+        ) if self._now is None else self._now._replace(
+            time_us=time_us, level=level, p_level=noise, p_cross=0.0,
+            p_slope=max(self._now.p_slope, SLOPE_NT_PER_S**2),
+        )
+        self._sigma, self.has_moved = sigma, False
+
+    def _agree(self, time_us: int, total: float, sigma: float, S: float, noise: float) -> None:
+        """Record an outlier, which may be of another level."""
+        difference = total - self._candidate
+        if self._agreed and difference * difference <= GATE * S:
+            self._agreed += 1
+            self._candidate += 0.5 * difference
+        else:
+            self._candidate, self._agreed = total, 1
+        if self._agreed == AGREEING:
+            assert self._now is not None
+            back = self._candidate - self._before
+            if not back * back <= GATE * S:  # else the last sample that was accepted was the outlier
+                self._jump(time_us, self._candidate - self._now.level, noise)
+            self._begin(time_us, self._candidate, sigma, noise)
+            self._agreed = 0
+
+    def retract(self, since_us: int) -> None:
+        """Return to the state before `since_us`: a motion had begun after that, which is reported only now."""
+        while self._checkpoints and self._checkpoints[-1].time_us > since_us:
+            self._checkpoints.pop()
+        if self._checkpoints and self._now is not None and self._now.time_us > since_us:
+            self._now = self._checkpoints[-1]
+        self._agreed, self._unrest, self._quiet = 0, 0.0, BURST_SAMPLES
+        self.has_moved = True
+
+    def explain(self, difference: float) -> None:
+        """Record that another calibration changes the total field by `difference`, nT."""
+        if self._now is not None:
+            self._now = self._now._replace(level=self._now.level + difference)
+        self._candidate += difference
+        self._checkpoints.clear()
+
+    # -- jumps ---------------------------------------------------------------------------------------------
+
+    def _jump(self, time_us: int, jump: float, noise: float) -> None:
+        """Record that the level has jumped, nT."""
+        now = self._now
+        assert now is not None
+        largest_zero, by_motion = GATE * noise, self.has_moved
+        since_us, until_us = now.since_us, now.until_us
+        if now.jump_sum * now.jump_sum <= largest_zero:
+            since_us = time_us
+            self._offset_log_ratio = 0.0
+        elif time_us - since_us > LASTING_US:
+            until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
+        total = now.jump_sum + jump
+        hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (HOLD_US, MAX_HOLD_US)
+        until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
+        self._now = now._replace(
+            jump_sum=total,
+            largest=max(now.largest, abs(total), abs(jump)),
+            jumps=now.jumps + 1,
+            since_us=since_us,
+            until_us=until_us,
+        )
+        if by_motion:
+            text = f"field jumps by {jump:+.0f} nT as a mass moves: calibration or telemetry wrong"
+            self._messages.report("move", text)
+        else:
+            self._messages.report("jump", f"field jumps by {jump:+.0f} nT, which no telemetry explains")
+
+    def jump_variance(self, time_us: int) -> float:
+        """Set :attr:`is_away`; return the variance (nT²) that the jumps add."""
+        self.is_away = False
+        now = self._now
+        if now is None or not now.jumps:
+            return 0.0
+        self.is_away = now.jump_sum * now.jump_sum > GATE * self._scatter.variance
+        if not self.is_away and time_us >= now.until_us:
+            self._now = now._replace(jump_sum=0.0, largest=0.0)
+            return 0.0
+        return now.largest * now.largest
+
+    def weigh_turn(self, change: float, variance: float, turned: float) -> None:
+        """Test with a turn whether the jump is an offset: such an offset changes the field in every turn.
+
+        Parameters
+        ----------
+        change, variance : float
+            Change of the total field over the turn, nT, and its variance without an offset, nT².
+        turned : float
+            Change of the field's unit vector.
+        """
+        now = self._now
+        if now is None or not now.largest:
+            return
+        # an offset of the jump's amplitude, in a random direction
+        more = variance + (now.largest * turned) ** 2 / 3.0
+        self._offset_log_ratio += 0.5 * (change * change * (1.0 / variance - 1.0 / more) - log(more / variance))
+        self._offset_log_ratio = min(self._offset_log_ratio, 10.0)
+        if self._offset_log_ratio < FORGIVING_LOG_RATIO:
+            self.forget()
+
+    def forget(self) -> None:
+        """Discard the jumps: another calibration, or the evidence since, explains them."""
+        if self._now is not None:
+            self._now = self._now._replace(jump_sum=0.0, largest=0.0, jumps=0, until_us=0)
+        self._checkpoints.clear()
+        self._offset_log_ratio = 0.0
+

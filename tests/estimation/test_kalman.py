@@ -1,0 +1,105 @@
+"""The Kalman filter against batch least squares, and the sequential test against scipy's Gaussian densities."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import multivariate_normal
+
+from magbridge.estimation.kalman import KalmanFilter
+from magbridge.estimation.sequential import SequentialTest
+from magbridge.estimation.track_process import TrackProcess
+
+
+def test_filter_agrees_with_batch_least_squares() -> None:
+    rng = np.random.default_rng(1)
+    n, m = 4, 60
+    prior = np.diag(rng.uniform(1.0, 4.0, n))
+    H, y, R = rng.normal(size=(m, n)), rng.normal(size=m), rng.uniform(0.5, 2.0, m)
+    kalman = KalmanFilter(np.zeros(n), prior)
+    total = 0.0
+    for h, e, r in zip(H, y, R, strict=True):
+        kalman.innovate(float(e), h, float(r))
+        total += kalman.log_likelihood()
+        kalman.update()
+    information = np.linalg.inv(prior) + H.T @ (H / R[:, None])
+    np.testing.assert_allclose(kalman.covariance, np.linalg.inv(information), atol=1e-10)
+    np.testing.assert_allclose(kalman.mean, np.linalg.solve(information, -H.T @ (y / R)), atol=1e-10)
+    joint = multivariate_normal(np.zeros(m), H @ prior @ H.T + np.diag(R))
+    np.testing.assert_allclose(total, joint.logpdf(y), rtol=1e-9)
+
+
+def test_considered_state_keeps_its_mean_and_its_uncertainty() -> None:
+    kalman = KalmanFilter(np.zeros(2), np.diag([4.0, 9.0]))
+    for _ in range(50):
+        kalman.innovate(5.0, np.array([1.0, 1.0]), 1.0)
+        kalman.update(considered=slice(1, 2))
+    assert kalman.mean[1] == 0.0
+    assert kalman.covariance[1, 1] == 9.0
+    assert kalman.covariance[0, 0] > 8.0, "the other state is known no better than the considered one"
+
+
+def test_prediction_of_some_states_is_that_of_the_whole_transition() -> None:
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(5, 5))
+    part, states = rng.normal(size=(2, 2)), np.array([1, 3])
+    whole = np.eye(5)
+    whole[np.ix_(states, states)] = part
+    kalman = KalmanFilter(rng.normal(size=5), A @ A.T)
+    mean, covariance = whole @ kalman.mean, whole @ kalman.covariance @ whole.T
+    kalman.predict(part, states=states)
+    np.testing.assert_allclose(kalman.mean, mean)
+    np.testing.assert_allclose(kalman.covariance, covariance, atol=1e-12)
+
+
+def test_statistic_is_the_log_likelihood_ratio_of_a_random_amplitude() -> None:
+    rng = np.random.default_rng(3)
+    m, R = 40, 0.7
+    F = rng.normal(size=(m, 3))
+    y = F @ np.array([0.4, -0.3, 0.8]) + rng.normal(0.0, R**0.5, m)
+    kalman = KalmanFilter(np.zeros(1), np.eye(1) * 2.0)
+    test = SequentialTest(1, 1)
+    row = 5  # the longest onset, which begins with the first sample and is not replaced
+    for f, e in zip(F, y, strict=True):
+        kalman.innovate(float(e), np.array([1.0]), R)
+        test.begin(0.0, 0.0)
+        test._excess = 1.0
+        test.test(kalman, np.repeat(f[None], 6, axis=0))
+        test.update(kalman.update())
+    null = 2.0 * np.ones((m, m)) + R * np.eye(m)
+    ratio = multivariate_normal(np.zeros(m), null + F @ F.T).logpdf(y) - multivariate_normal(
+        np.zeros(m), null
+    ).logpdf(y)
+    np.testing.assert_allclose(test.statistic[row], ratio, rtol=0.02)
+    posterior = np.linalg.inv(np.eye(3) + F.T @ np.linalg.solve(null, F))
+    np.testing.assert_allclose(
+        test.amplitude[row], posterior @ F.T @ np.linalg.solve(null, y), atol=0.02
+    )
+    np.testing.assert_allclose(test.covariance(row), posterior, atol=0.01)
+
+
+def test_statistic_of_unknown_noise_is_the_ratio_of_student_densities() -> None:
+    rng = np.random.default_rng(4)
+    m, dof = 30, 8.0
+    F = rng.normal(size=(m, 3))
+    y = 20.0 * rng.normal(size=m)
+    test = SequentialTest(1, 1, noise_dof=dof)
+    kalman = KalmanFilter(np.zeros(1), np.zeros((1, 1)))
+    for f, e in zip(F, y, strict=True):
+        kalman.innovate(float(e), np.array([1.0]), 1.0 + 1e4)  # none is clipped
+        test.begin(0.0, 0.0)
+        test.test(kalman, np.repeat(f[None], 6, axis=0))
+        test.update(kalman.update())
+    S = 1.0 + 1e4
+    both = S * np.eye(m) + F @ F.T
+    squares = (y @ y / S, y @ np.linalg.solve(both, y))
+    ratio = 0.5 * (dof + m) * np.log((dof + squares[0]) / (dof + squares[1]))
+    ratio -= 0.5 * np.linalg.slogdet(both / S)[1]
+    np.testing.assert_allclose(test.statistic[5], ratio, atol=1e-8)
+
+
+def test_track_process_is_matern() -> None:
+    process = TrackProcess(1.0, 60.0, 30.0, length=800.0)
+    F, Q = process.transition(500.0, 10.0)
+    x = 3.0**0.5 * 500.0 / 800.0
+    np.testing.assert_allclose((F @ process.initial)[0, 0], 60.0**2 * (1.0 + x) * np.exp(-x))
+    np.testing.assert_allclose(F @ process.initial @ F.T + Q, process.initial, atol=1e-9)

@@ -1,0 +1,127 @@
+"""Errors that follow the attitude widen sigma; a fast vehicle over a steep anomaly raises nothing."""
+
+from __future__ import annotations
+
+from math import nan
+
+import numpy as np
+import pytest
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.model import Noise
+from magbridge.health import HealthMonitor
+from magbridge.records import Quality
+
+FIELD = 52_000.0
+IMPLAUSIBLE = int(Quality.IMPLAUSIBLE)
+
+
+def glide(seed: int, n: int = 2700) -> tuple[FloatArray, FloatArray]:
+    """Return directions (n, 3) of the field in dives and turns, and a crustal anomaly (n,), every 4 s."""
+    rng = np.random.default_rng(seed)
+    time = 4.0 * np.arange(n)
+    pitch = np.where((time // 840.0) % 2 == 0.0, -0.42, 0.42)
+    heading = np.radians(110.0) * (time // 2400.0)
+    for angle in (pitch, heading):
+        angle[:] = np.convolve(np.pad(angle, 10, "edge"), np.ones(11) / 11, "same")[10:-10]
+    pitch = pitch + np.radians(rng.normal(0.0, 0.6, n))
+    h, v = 0.35, 0.94
+    u = np.stack(
+        [
+            np.cos(pitch) * np.cos(heading) * h - np.sin(pitch) * v,
+            -np.sin(heading) * h,
+            np.sin(pitch) * np.cos(heading) * h + np.cos(pitch) * v,
+        ],
+        axis=1,
+    )
+    way = 0.35 * time
+    crust = 25.0 * np.sin(way / 230.0 + seed) + 15.0 * np.sin(way / 140.0)
+    return u, crust
+
+
+def monitor(total: FloatArray, u: FloatArray, warmth: FloatArray, *, speed: float, step: float) -> tuple[FloatArray, FloatArray, list[str]]:
+    """Return sigma (n,), flags (n,) and messages; each sample's own sigma is 1.5 nT."""
+    health = HealthMonitor(Noise(1.0))
+    sigma, flags = np.empty(len(total)), np.empty(len(total), int)
+    for k, F in enumerate(total.tolist()):
+        time_us = round(1e6 * step * (k + 1))
+        health.set_position(time_us, 47.0 + speed * step * k / 111_200.0, -59.0)
+        field = tuple((F * u[k]).tolist())
+        more = health.check(time_us, field, field, (F, 1.5), 0, (FIELD, 145.0), float(warmth[k]), 0.0, list)
+        sigma[k], flags[k] = (1.5**2 + more) ** 0.5, health.flags
+    return sigma, flags, health.messages
+
+
+@pytest.mark.parametrize("fault", ["none", "offset", "gain", "temperature", "drift"])
+def test_error_that_follows_the_attitude_widens_sigma(fault: str) -> None:
+    u, crust = glide(3)
+    time = 4.0 * np.arange(len(u))
+    warmth = 10.0 + 4.0 * np.sin(time / 700.0)
+    amount = {
+        "none": np.zeros(len(u)),
+        "offset": 15.0 * np.ones(len(u)),
+        "temperature": 3.0 * (warmth - 10.0),
+        "drift": 20.0 * time / 3600.0,
+    }
+    late = time > 1500.0
+    error = 300.0 * u[:, 0] ** 2 * late if fault == "gain" else amount.get(fault, crust) * u[:, 0] * late
+    noise = np.random.default_rng(7).normal(0.0, 1.0, len(u))
+    sigma, flags, messages = monitor(FIELD + crust + error + noise, u, warmth, speed=0.35, step=4.0)
+    if fault == "none":
+        assert not flags.any()
+        assert (sigma == 1.5).all()
+        assert messages == []
+        return
+    plain = (flags == 0) & (time > 5000.0)
+    assert np.mean((np.abs(error + noise) > 3.0 * sigma)[plain]) < 0.02
+    assert messages
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plane_over_a_steep_anomaly_is_not_flagged(seed: int) -> None:
+    """22 m/s over 120 nT within a kilometre, at 5 Hz, with turns: up to 17 nT/s."""
+    rng = np.random.default_rng(seed)
+    time = 0.2 * np.arange(4000)
+    crust = 120.0 * np.sin(2.0 * np.pi * 22.0 * time / 1000.0 + seed) + 60.0 * np.sin(0.2 * time)
+    heading = np.cumsum(0.2 * 0.17 * ((time % 90.0) < 9.0))
+    heading += np.radians(np.convolve(rng.normal(size=4000), np.ones(10) / 10, "same"))
+    u = np.stack([0.5 * np.cos(heading), -0.5 * np.sin(heading), np.full(4000, 0.87)], axis=1)
+    total = FIELD + crust + rng.normal(0.0, 0.7, 4000)
+    sigma, flags, _ = monitor(total, u, np.full(4000, nan), speed=22.0, step=0.2)
+    assert np.mean(flags != 0) <= 0.003
+    assert np.mean(sigma > 3.0) < 0.05
+
+
+def test_reading_that_repeats_on_all_axes_is_flagged_after_a_few() -> None:
+    u, crust = glide(1, 900)
+    raw = np.round((FIELD + crust)[:, None] * u + np.random.default_rng(2).normal(0.0, 1.0, u.shape), 3)
+    raw[600:] = raw[600]
+    health = HealthMonitor(Noise(1.0))
+    flags = []
+    for k, field in enumerate(raw.tolist()):
+        total = float(np.linalg.norm(field))
+        health.check(
+            4_000_000 * (k + 1), tuple(field), tuple(field), (total, 1.5), 0, (FIELD, 145.0), nan, 0.0, list
+        )
+        flags.append(health.flags)
+    assert not any(flags[:600])
+    assert all(flags[604:])
+    assert "all axes repeat one reading" in health.messages[0]
+
+
+def test_motion_that_is_reported_late_is_not_a_jump() -> None:
+    """At 10 Hz a mass moves for a second before its report: nothing is flagged after the motion."""
+    health = HealthMonitor(Noise(1.0))
+    rng = np.random.default_rng(5)
+    moving, flags = int(Quality.MOVING), []
+    for k in range(3000):
+        time_us = 100_000 * (k + 1)
+        off = 8.0 * min(max(k - 1000, 0), 10) if k < 1200 else 0.0  # 80 nT within a second, then reported
+        quality = moving if 1010 <= k < 1200 else 0
+        if k == 1010:
+            health.begin_motion(time_us - 1_000_000)
+        total = FIELD + off + float(rng.normal())
+        field = (0.3 * total, 0.2 * total, 0.93 * total)
+        health.check(time_us, field, field, (total, 1.5), quality, (FIELD, 145.0), nan, 0.0, list)
+        flags.append(health.flags)
+    assert not any(flags[1200:])

@@ -1,0 +1,313 @@
+"""Simulate vehicles with dipole masses, for studies of health checks and of in-flight calibration.
+
+Nothing here comes from the simulator ``sitl``: the vehicle is a hard iron, a soft iron and two or more point
+dipoles that move, the crustal field is a random Fourier sum over the plane, and the noise is white or 1/f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import xarray as xr
+
+from magbridge.arrays import FloatArray
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration
+from magbridge.correction import Correction
+from magbridge.field.igrf import igrf
+from magbridge.records import Quality, Reading
+
+__all__ = ["START_S", "Crust", "Published", "Track", "Vehicle", "calibrate", "correct_live", "glider_track", "plane_track"]
+
+START_S = 1_780_000_000.0
+"""Time of the first sample, s since 1970 UTC."""
+METRES_PER_DEGREE = 111_200.0
+MU0_OVER_4PI_NT = 100.0
+"""mu_0 / 4 pi in nT m^3 / (A m^2)."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """A trajectory with its telemetry: `time` (n,) s, attitude (n, 3) rad, position (deg, m), masses."""
+
+    time: FloatArray
+    attitude: FloatArray
+    latitude: FloatArray
+    longitude: FloatArray
+    depth: FloatArray
+    masses: dict[str, FloatArray]
+    temperature: FloatArray
+
+    def metres(self) -> FloatArray:
+        """Return north and east of the first position (n, 2), m."""
+        north = (self.latitude - self.latitude[0]) * METRES_PER_DEGREE
+        east = (self.longitude - self.longitude[0]) * METRES_PER_DEGREE * np.cos(np.radians(self.latitude[0]))
+        return np.stack([north, east], axis=1)
+
+
+class Crust:
+    """A random crustal anomaly (nT) of a standard deviation and a shortest wavelength (m)."""
+
+    def __init__(self, seed: int, sigma_nt: float, wavelength_m: float, waves: int = 60) -> None:
+        rng = np.random.default_rng([seed, 11])
+        length = wavelength_m * np.exp(rng.uniform(0.0, 2.0, waves))
+        angle = rng.uniform(0.0, 2.0 * np.pi, waves)
+        self._k = 2.0 * np.pi / length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, waves)
+        self._amplitude = sigma_nt * np.sqrt(2.0 / waves)
+
+    def at_position(self, metres: FloatArray) -> FloatArray:
+        """Return the anomaly (n,) at north and east (n, 2), m."""
+        return np.asarray(self._amplitude * np.cos(metres @ self._k.T + self._phase).sum(axis=1))
+
+
+def flicker(rng: np.random.Generator, seconds: FloatArray, sigma_nt: float) -> FloatArray:
+    """Return 1/f noise (n, 3): Ornstein-Uhlenbeck processes of 1 to 10,000 s, one a half decade."""
+    step = float(seconds[1] - seconds[0])
+    times = 10.0 ** np.arange(0.0, 4.01, 0.5)
+    out = np.zeros((len(seconds), 3))
+    for tau in times:
+        keep = np.exp(-step / tau)
+        state = rng.normal(size=3)
+        shocks = rng.normal(size=(len(seconds), 3)) * np.sqrt(1.0 - keep**2)
+        for k, shock in enumerate(shocks):
+            state = keep * state + shock
+            out[k] += state
+    return np.asarray(sigma_nt * out / np.sqrt(len(times)))
+
+
+class Vehicle:
+    """Hard iron, soft iron, dipole masses and the currents of one vehicle, drawn from `seed`."""
+
+    def __init__(self, seed: int, masses: tuple[str, ...] = ("battpos", "ballast"), current: str = "") -> None:
+        rng = np.random.default_rng([seed, 3])
+        self.masses, self.current = masses, current
+        self._hard = rng.normal(0.0, 800.0, 3)
+        soft = rng.normal(0.0, 0.012, (3, 3))
+        self._soft = np.eye(3) + soft
+        self._moment = {name: rng.normal(0.0, 1.6, 3) for name in masses}
+        self._induced = {name: abs(rng.normal(0.0, 1.0e-5)) for name in masses}  # A m^2 per nT
+        self._home = {}
+        for name in masses:
+            away = rng.normal(size=3)
+            self._home[name] = away / np.linalg.norm(away) * rng.uniform(0.55, 0.75)
+        self._per_ampere = rng.normal(0.0, 4.0, 3)
+
+    def field(self, track: Track, anomaly: FloatArray, masses: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Return the field that the sensor would read (n, 3) without noise, and the true total field (n,), nT."""
+        ned = igrf(track.longitude, track.latitude, track.depth, track.time)
+        total = np.linalg.norm(ned, axis=1)
+        ned = ned * ((total + anomaly) / total)[:, None]
+        body = to_body(track.attitude, ned)
+        out = body @ self._soft.T + self._hard
+        for name in self.masses:
+            r = self._home[name] + masses[name][:, None] * np.array([0.0254, 0.0, 0.0])
+            distance = np.linalg.norm(r, axis=1)[:, None]
+            n = r / distance
+            moment = self._moment[name] + self._induced[name] * body
+            along = np.sum(n * moment, axis=1)[:, None]
+            out = out + MU0_OVER_4PI_NT * (3.0 * n * along - moment) / distance**3
+        if self.current:
+            out = out + masses[self.current][:, None] * self._per_ampere
+        return np.asarray(out), np.asarray(total + anomaly)
+
+
+def to_body(attitude: FloatArray, ned: FloatArray) -> FloatArray:
+    """Rotate (n, 3) from north-east-down to forward-starboard-down axes by roll, pitch, heading (n, 3), rad."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(attitude).T, np.sin(attitude).T
+    n, e, d = ned.T
+    x = cp * cy * n + cp * sy * e - sp * d
+    y = (sr * sp * cy - cr * sy) * n + (sr * sp * sy + cr * cy) * e + sr * cp * d
+    z = (cr * sp * cy + sr * sy) * n + (cr * sp * sy - sr * cy) * e + cr * cp * d
+    return np.stack([x, y, z], axis=1)
+
+
+def smooth(values: FloatArray, samples: float) -> FloatArray:
+    """Return a moving mean, which makes ramps of steps."""
+    width = max(round(samples), 1)
+    padded = np.concatenate([np.full(width, values[0]), values, np.full(width, values[-1])])
+    kernel = np.ones(width) / width
+    return np.asarray(np.convolve(padded, kernel, "same")[width:-width])
+
+
+def wander(rng: np.random.Generator, n: int, step: float, tau: float, sigma: float) -> FloatArray:
+    """Return an Ornstein-Uhlenbeck process (n,)."""
+    keep = np.exp(-step / tau)
+    out = np.empty(n)
+    state = rng.normal()
+    for k, shock in enumerate(rng.normal(size=n) * np.sqrt(1.0 - keep**2)):
+        state = keep * state + shock
+        out[k] = state
+    return smooth(sigma * out, 3.0 / step)
+
+
+def glider_track(
+    seed: int, hours: float, rate_hz: float, *, spirals: bool = False, start_s: float = START_S
+) -> Track:
+    """Return a glider's dives over a criss-cross, or ten banked spirals for a calibration."""
+    rng = np.random.default_rng([seed, 5, int(spirals)])
+    step = 1.0 / rate_hz
+    n = int(3600.0 * hours * rate_hz)
+    seconds = step * np.arange(n)
+    half = 180.0 if spirals else 840.0
+    leg = np.floor(seconds / half)
+    climbing = leg % 2 == 1
+    jitter = rng.normal(size=int(leg[-1]) + 1)
+    steep = np.radians(24.0) + np.radians(3.0) * jitter[leg.astype(int)]
+    pitch = smooth(np.where(climbing, steep, -steep), 25.0 / step)
+    battpos = smooth(np.where(climbing, -0.8, 0.8) + 0.12 * jitter[leg.astype(int)], 20.0 / step)
+    trims = rng.normal(0.0, 0.05, int(seconds[-1] / 240.0) + 1)[(seconds / 240.0).astype(int)]
+    battpos = battpos + smooth(trims, 4.0 / step)
+    ballast = smooth(np.where(climbing, 1.0, -1.0), 30.0 / step)
+    if spirals:
+        run = (seconds / (3600.0 * hours / 10.0)).astype(int)
+        bank = np.radians(rng.uniform(-35.0, 35.0, 10))
+        heading = np.cumsum(np.full(n, np.radians(2.2) * step))
+        roll = smooth(bank[np.minimum(run, 9)], 10.0 / step)
+        battpos = battpos * (0.4 + 0.12 * np.minimum(run, 9))
+        ballast = ballast * (1.0 - 0.09 * (np.minimum(run, 9) % 5))
+    else:
+        course = np.radians(rng.choice([20.0, 110.0, 200.0, 290.0], int(seconds[-1] / 2400.0) + 2))
+        course += rng.normal(0.0, 0.15, len(course))
+        heading = np.unwrap(course)[(seconds / 2400.0).astype(int)]
+        heading = smooth(heading, 40.0 / step)
+        roll = np.radians(rng.uniform(-3.0, 3.0)) + np.zeros(n)
+    for angle, sigma in ((pitch, 0.6), (roll, 0.8), (heading, 2.0)):
+        angle += np.radians(wander(rng, n, step, 20.0, sigma))
+    vertical = 0.16 * np.sin(pitch) / np.sin(np.radians(24.0))
+    depth = np.maximum(1.0 - np.cumsum(vertical) * step, 0.0)
+    speed = 0.35
+    north, east = (np.cumsum(speed * f(heading)) * step for f in (np.cos, np.sin))
+    latitude = 47.5 + north / METRES_PER_DEGREE
+    longitude = -59.0 + east / (METRES_PER_DEGREE * np.cos(np.radians(47.5)))
+    temperature = 4.0 + 9.0 / (1.0 + np.exp((depth - 40.0) / 6.0))
+    return Track(
+        start_s + seconds,
+        np.stack([roll, pitch, heading], axis=1),
+        latitude,
+        longitude,
+        depth,
+        {"battpos": battpos, "ballast": ballast},
+        temperature,
+    )
+
+
+def plane_track(seed: int, hours: float, rate_hz: float, *, start_s: float = START_S, box: bool = False) -> Track:
+    """Return a plane at 22 m/s with turns of 90 degrees every few minutes, and its battery current, A."""
+    rng = np.random.default_rng([seed, 6, int(box)])
+    step = 1.0 / rate_hz
+    n = int(3600.0 * hours * rate_hz)
+    seconds = step * np.arange(n)
+    leg = 60.0 if box else 200.0
+    turns = rng.choice([-0.5, 0.5], int(seconds[-1] / leg) + 2) * np.pi
+    heading = smooth(np.cumsum(turns)[(seconds / leg).astype(int)], 9.0 / step)
+    rate = np.gradient(heading, step)
+    roll = np.arctan(22.0 * rate / 9.81)
+    pitch = np.radians(2.0) + np.zeros(n)
+    if box:
+        roll = roll + np.radians(10.0) * np.sin(2.0 * np.pi * seconds / 5.0) * (seconds % leg > 35.0)
+        pitch = pitch + np.radians(8.0) * np.sin(2.0 * np.pi * seconds / 6.3) * (seconds % leg > 25.0)
+    for angle, sigma in ((pitch, 0.7), (roll, 1.0), (heading, 0.7)):
+        angle += np.radians(wander(rng, n, step, 2.0, sigma))
+    current = 11.0 + wander(rng, n, step, 8.0, 1.0) + smooth(8.0 * np.abs(rate) / 0.17, 2.0 / step)
+    speed = 22.0
+    north, east = (np.cumsum(speed * f(heading)) * step for f in (np.cos, np.sin))
+    return Track(
+        start_s + seconds,
+        np.stack([roll, pitch, heading], axis=1),
+        -35.39 + north / METRES_PER_DEGREE,
+        149.17 + east / (METRES_PER_DEGREE * np.cos(np.radians(35.39))),
+        np.full(n, -684.0),
+        {"batt_current": current},
+        np.full(n, 22.0),
+    )
+
+
+def calibrate(vehicle: Vehicle, track: Track, noise: FloatArray, *, unit: str = "") -> Calibration:
+    """Fit a calibration to runs whose true total field is known."""
+    field, total = vehicle.field(track, np.zeros(len(track.time)), track.masses)
+    data = {f"mag_{axis}": ("time", (field + noise)[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")}
+    data |= {name: ("time", values, {"units": unit}) for name, values in track.masses.items()}
+    data["reference_field"] = "time", total, {"units": "nT"}
+    data["segment"] = "time", np.floor(10.0 * np.arange(len(total)) / len(total)).astype(int).astype(str)
+    log = xr.Dataset(data, coords={"time": track.time})
+    return fit(observations(log, vehicle.masses + (vehicle.current,) * bool(vehicle.current)), "auto").calibration
+
+
+@dataclass
+class Published:
+    """What was published for each sample: total field and sigma (nT), flags, and the messages with their row."""
+
+    total: FloatArray
+    sigma: FloatArray
+    quality: FloatArray
+    notices: list[tuple[int, str]]
+
+    def plain(self) -> FloatArray:
+        """Return whether each sample has no flag except a missing boresight."""
+        return np.asarray((self.quality.astype(int) & ~int(Quality.NO_BORESIGHT)) == 0)
+
+
+def telemetry_events(
+    track: Track, interval_s: float, lag_s: float, lost: FloatArray | None
+) -> Iterator[tuple[float, int]]:
+    """Yield time and row of each telemetry report; none where `lost` (n,) is true."""
+    step = float(track.time[1] - track.time[0])
+    every = max(round(interval_s / step), 1)
+    shift = round(lag_s / step)
+    for row in range(0, len(track.time), every):
+        if lost is None or not lost[row]:
+            yield float(track.time[max(row - shift, 0)]), row
+
+
+def correct_live(
+    correction: Correction,
+    track: Track,
+    field: FloatArray,
+    reported: dict[str, FloatArray],
+    *,
+    every: int = 1,
+    interval_s: float = 1.0,
+    lost: FloatArray | None = None,
+    main_field: FloatArray | None = None,
+) -> Published:
+    """Feed a correction with readings (every `every`-th row) and telemetry, in the order of time.
+
+    A row's telemetry comes just before its reading, if the row has any: what moves after a report is not
+    known until the next.
+    """
+    rows = np.arange(0, len(track.time), every)
+    total, sigma = np.full((2, len(rows)), np.nan)
+    quality, notices = np.zeros(len(rows)), []
+    if main_field is None:
+        ned = igrf(track.longitude, track.latitude, track.depth, track.time)
+        main_field = np.linalg.norm(ned, axis=1)
+    step = float(track.time[1] - track.time[0])
+    reports = max(round(interval_s / step), 1)
+    stamps = (np.rint(track.time * 1e6).astype(np.int64) & ~3).tolist()
+    fields, warmth, main = field.tolist(), track.temperature.tolist(), main_field.tolist()
+    where = list(zip(track.latitude.tolist(), track.longitude.tolist(), strict=True))
+    values = {name: column.tolist() for name, column in reported.items()}
+    for k, row in enumerate(rows.tolist()):
+        for report in range(row - every + 1, row + 1):
+            if report >= 0 and report % reports == 0 and (lost is None or not lost[report]):
+                for name, column in values.items():
+                    correction.telemetry(name, column[report], stamps[report])
+        reading = Reading(tuple(fields[row]), temperature=warmth[row])
+        _, one = correction.reading(reading, stamps[row], main_field=main[row], where=where[row])
+        total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
+        for text in correction.notices:
+            notices.append((k, text))
+        correction.notices.clear()
+        if correction.learner is not None:
+            notices += [(k, notice.text) for notice in correction.learner.notices]
+            correction.learner.notices.clear()
+    return Published(total, sigma, quality, notices)
+
+
+def with_masses(track: Track, **masses: FloatArray) -> Track:
+    """Return a track with other mass positions."""
+    return replace(track, masses=track.masses | masses)
