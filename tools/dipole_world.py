@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
@@ -20,7 +21,17 @@ from magbridge.correction import Correction
 from magbridge.field.igrf import igrf
 from magbridge.records import Quality, Reading
 
-__all__ = ["START_S", "Crust", "Published", "Track", "Vehicle", "calibrate", "correct_live", "glider_track", "plane_track"]
+__all__ = [
+    "START_S",
+    "Crust",
+    "Published",
+    "Track",
+    "Vehicle",
+    "calibrate",
+    "correct_live",
+    "glider_track",
+    "plane_track",
+]
 
 START_S = 1_780_000_000.0
 """Time of the first sample, s since 1970 UTC."""
@@ -82,7 +93,9 @@ def flicker(rng: np.random.Generator, seconds: FloatArray, sigma_nt: float) -> F
 class Vehicle:
     """Hard iron, soft iron, dipole masses and the currents of one vehicle, drawn from `seed`."""
 
-    def __init__(self, seed: int, masses: tuple[str, ...] = ("battpos", "ballast"), current: str = "") -> None:
+    def __init__(
+        self, seed: int, masses: tuple[str, ...] = ("battpos", "ballast"), current: str = ""
+    ) -> None:
         rng = np.random.default_rng([seed, 3])
         self.masses, self.current = masses, current
         self._hard = rng.normal(0.0, 800.0, 3)
@@ -96,8 +109,10 @@ class Vehicle:
             self._home[name] = away / np.linalg.norm(away) * rng.uniform(0.55, 0.75)
         self._per_ampere = rng.normal(0.0, 4.0, 3)
 
-    def field(self, track: Track, anomaly: FloatArray, masses: dict[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return the field that the sensor would read (n, 3) without noise, and the true total field (n,), nT."""
+    def field(
+        self, track: Track, anomaly: FloatArray, masses: dict[str, FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the noiseless reading (n, 3) and the true total field (n,), nT."""
         ned = igrf(track.longitude, track.latitude, track.depth, track.time)
         total = np.linalg.norm(ned, axis=1)
         ned = ned * ((total + anomaly) / total)[:, None]
@@ -116,7 +131,7 @@ class Vehicle:
 
 
 def to_body(attitude: FloatArray, ned: FloatArray) -> FloatArray:
-    """Rotate (n, 3) from north-east-down to forward-starboard-down axes by roll, pitch, heading (n, 3), rad."""
+    """Rotate (n, 3) from north-east-down to body axes by roll, pitch and heading (n, 3), rad."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(attitude).T, np.sin(attitude).T
     n, e, d = ned.T
     x = cp * cy * n + cp * sy * e - sp * d
@@ -176,7 +191,7 @@ def glider_track(
         heading = smooth(heading, 40.0 / step)
         roll = np.radians(rng.uniform(-3.0, 3.0)) + np.zeros(n)
     for angle, sigma in ((pitch, 0.6), (roll, 0.8), (heading, 2.0)):
-        angle += np.radians(wander(rng, n, step, 20.0, sigma))
+        angle[:] = angle + np.radians(wander(rng, n, step, 20.0, sigma))
     vertical = 0.16 * np.sin(pitch) / np.sin(np.radians(24.0))
     depth = np.maximum(1.0 - np.cumsum(vertical) * step, 0.0)
     speed = 0.35
@@ -185,7 +200,7 @@ def glider_track(
     longitude = -59.0 + east / (METRES_PER_DEGREE * np.cos(np.radians(47.5)))
     temperature = 4.0 + 9.0 / (1.0 + np.exp((depth - 40.0) / 6.0))
     return Track(
-        start_s + seconds,
+        np.asarray(start_s + seconds, float),
         np.stack([roll, pitch, heading], axis=1),
         latitude,
         longitude,
@@ -195,7 +210,9 @@ def glider_track(
     )
 
 
-def plane_track(seed: int, hours: float, rate_hz: float, *, start_s: float = START_S, box: bool = False) -> Track:
+def plane_track(
+    seed: int, hours: float, rate_hz: float, *, start_s: float = START_S, box: bool = False
+) -> Track:
     """Return a plane at 22 m/s with turns of 90 degrees every few minutes, and its battery current, A."""
     rng = np.random.default_rng([seed, 6, int(box)])
     step = 1.0 / rate_hz
@@ -211,12 +228,12 @@ def plane_track(seed: int, hours: float, rate_hz: float, *, start_s: float = STA
         roll = roll + np.radians(10.0) * np.sin(2.0 * np.pi * seconds / 5.0) * (seconds % leg > 35.0)
         pitch = pitch + np.radians(8.0) * np.sin(2.0 * np.pi * seconds / 6.3) * (seconds % leg > 25.0)
     for angle, sigma in ((pitch, 0.7), (roll, 1.0), (heading, 0.7)):
-        angle += np.radians(wander(rng, n, step, 2.0, sigma))
+        angle[:] = angle + np.radians(wander(rng, n, step, 2.0, sigma))
     current = 11.0 + wander(rng, n, step, 8.0, 1.0) + smooth(8.0 * np.abs(rate) / 0.17, 2.0 / step)
     speed = 22.0
     north, east = (np.cumsum(speed * f(heading)) * step for f in (np.cos, np.sin))
     return Track(
-        start_s + seconds,
+        np.asarray(start_s + seconds, float),
         np.stack([roll, pitch, heading], axis=1),
         -35.39 + north / METRES_PER_DEGREE,
         149.17 + east / (METRES_PER_DEGREE * np.cos(np.radians(35.39))),
@@ -229,24 +246,28 @@ def plane_track(seed: int, hours: float, rate_hz: float, *, start_s: float = STA
 def calibrate(vehicle: Vehicle, track: Track, noise: FloatArray, *, unit: str = "") -> Calibration:
     """Fit a calibration to runs whose true total field is known."""
     field, total = vehicle.field(track, np.zeros(len(track.time)), track.masses)
-    data = {f"mag_{axis}": ("time", (field + noise)[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")}
+    data: dict[str, Any] = {
+        f"mag_{axis}": ("time", (field + noise)[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")
+    }
     data |= {name: ("time", values, {"units": unit}) for name, values in track.masses.items()}
     data["reference_field"] = "time", total, {"units": "nT"}
     data["segment"] = "time", np.floor(10.0 * np.arange(len(total)) / len(total)).astype(int).astype(str)
     log = xr.Dataset(data, coords={"time": track.time})
-    return fit(observations(log, vehicle.masses + (vehicle.current,) * bool(vehicle.current)), "auto").calibration
+    return fit(
+        observations(log, vehicle.masses + (vehicle.current,) * bool(vehicle.current)), "auto"
+    ).calibration
 
 
 @dataclass
 class Published:
-    """What was published for each sample: total field and sigma (nT), flags, and the messages with their row."""
+    """Total field and sigma (nT) and flags of each sample, and the messages with their row."""
 
     total: FloatArray
     sigma: FloatArray
     quality: FloatArray
     notices: list[tuple[int, str]]
 
-    def plain(self) -> FloatArray:
+    def plain(self) -> BoolArray:
         """Return whether each sample has no flag except a missing boresight."""
         return np.asarray((self.quality.astype(int) & ~int(Quality.NO_BORESIGHT)) == 0)
 
@@ -299,8 +320,7 @@ def correct_live(
         reading = Reading(tuple(fields[row]), temperature=warmth[row])
         _, one = correction.reading(reading, stamps[row], main_field=main[row], where=where[row])
         total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
-        for text in correction.notices:
-            notices.append((k, text))
+        notices += [(k, text) for text in correction.notices]
         correction.notices.clear()
         if correction.learner is not None:
             notices += [(k, notice.text) for notice in correction.learner.notices]

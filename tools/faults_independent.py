@@ -5,8 +5,8 @@
     python3 tools/faults_independent.py --clean 14             false alarms in 14 days at 0.25 Hz
 
 Each vehicle has dipole masses and 1/f noise (:mod:`dipole_world`). It is calibrated with ten runs whose true
-field is known, and then flies for six hours. A fault begins after 1.5 hours. A sample is wrong if it has no flag
-and its error exceeds three of its own sigmas.
+field is known, and then flies for six hours. A fault begins after 1.5 hours. A sample is wrong if it has no
+flag and its error exceeds three of its own sigmas.
 """
 
 from __future__ import annotations
@@ -27,10 +27,9 @@ from dipole_world import (
     flicker,
     glider_track,
     plane_track,
-    with_masses,
 )
 from rich.console import Console
-from terminal import command_line, table
+from studies import command_line, table
 
 from magbridge.arrays import FloatArray
 from magbridge.correction import Correction
@@ -94,7 +93,9 @@ def shift_telemetry(inches: float) -> Fault:
 def thermocline(flight: Flight) -> None:
     """Let the offset of two axes follow the temperature by 12 nT a dive."""
     warmth = flight.track.temperature - flight.track.temperature.min()
-    flight.field += 12.0 / 9.0 * warmth[:, None] * np.array([0.0, 0.6, 0.8]) * (flight.seconds >= 0.0)[:, None]
+    flight.field += (
+        12.0 / 9.0 * warmth[:, None] * np.array([0.0, 0.6, 0.8]) * (flight.seconds >= 0.0)[:, None]
+    )
 
 
 def step_offset(axis: int) -> Fault:
@@ -209,7 +210,8 @@ def score(flight: Flight, published: Published) -> Score:
     plain = published.plain()
     error = np.abs(published.total - flight.truth)
     wrong = plain & ~(error <= 3.0 * published.sigma)
-    hit = since & (~plain | (published.sigma > 3.0 * np.median(published.sigma[~since] if (~since).any() else 1e9)))
+    usual = np.median(published.sigma[~since]) if (~since).any() else 1e9
+    hit = since & (~plain | (published.sigma > 3.0 * usual))
     first = float(flight.seconds[np.argmax(hit)]) if hit.any() else np.nan
     late = since & (flight.seconds > 300.0) if flight.seconds[-1] > 300.0 else since
     return Score(
@@ -229,7 +231,12 @@ def run(name: str, seed: int, hours: float) -> Score:
     flight, correction = fly(seed, kind, hours)
     fault(flight)
     published = correct_live(
-        correction, flight.track, flight.field, flight.reported, lost=flight.lost, interval_s=flight.interval_s
+        correction,
+        flight.track,
+        flight.field,
+        flight.reported,
+        lost=flight.lost,
+        interval_s=flight.interval_s,
     )
     return score(flight, published)
 

@@ -43,15 +43,12 @@ TESTS = {
     "estimation/noise": "estimation/test_noise.py",
     "diagnose/inference/evidence": "diagnose/test_evidence.py",
     "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py",
-    "health/attitude": "test_attitude.py",
-    "health/axes": "test_plausibility.py test_plausibility_numbers.py",
-    "health/judge": "test_plausibility.py test_plausibility_numbers.py",
-    "health/jump": "test_plausibility.py test_plausibility_numbers.py",
-    "health/level": "test_plausibility.py test_plausibility_numbers.py",
-    "health/moves": "test_plausibility.py test_plausibility_numbers.py",
-    "health/scatter": "test_plausibility.py test_plausibility_numbers.py",
-    "health/turns": "test_turns.py",
-    "health/direction": "test_direction.py",
+    "health/axes": "health/test_monitor.py health/test_consistency.py",
+    "health/consistency": "health/test_consistency.py",
+    "health/direction": "health/test_direction.py",
+    "health/level": "health/test_monitor.py",
+    "health/scatter": "health/test_monitor.py",
+    "health/trend": "health/test_monitor.py health/test_consistency.py",
 }
 """The tests that have to see a change to each module."""
 SLOWER = 5.0

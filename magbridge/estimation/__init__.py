@@ -10,4 +10,8 @@ residuals are correlated), :mod:`.information` (what data say about unknowns), :
 :mod:`.hyperparameters` (what physics expects, and how wide), :mod:`.blocks` and :mod:`.select` (further
 unknowns of a fit, and which of them stay), :mod:`.gaussian_field`, :mod:`.nodes`, :mod:`.sparse` and
 :mod:`.elimination` (a random field in place with a sparse precision).
+
+The live part needs numpy only: :mod:`.kalman` (a filter with considered states), :mod:`.track_process` (the
+reference's error along a track, as its states) and :mod:`.sequential` (a test of its innovations for
+changes).
 """

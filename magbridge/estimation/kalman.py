@@ -11,8 +11,8 @@ for any gain (Bar-Shalom, Li & Kirubarajan 2001, eq. 5.2.3-18)::
 
     P <- P - k (P h)^T - (P h) k^T + k S k^T
 
-Covariance form needs no inverse of a prior that is certain of some combinations of states, and the variance of
-every prediction is a by-product.
+Covariance form needs no inverse of a prior that is certain of some combinations of states, and the variance
+of every prediction is a by-product.
 """
 
 from __future__ import annotations
@@ -54,7 +54,10 @@ class KalmanFilter:
         self._Ph = np.zeros(len(self.mean))
 
     def predict(
-        self, transition: FloatArray, noise: FloatArray | None = None, states: slice | IndexArray | None = None
+        self,
+        transition: FloatArray,
+        noise: FloatArray | None = None,
+        states: slice | IndexArray | None = None,
     ) -> None:
         """Move some states on in time, by ``x <- F x`` and ``P <- F P F^T + Q``.
 

@@ -7,18 +7,19 @@ Control 21:108),
 
 .. math:: \phi = f + \Xi^T h, \qquad \Xi \leftarrow \Xi - k \phi^T
 
-With :math:`a \sim N(0, I)` in the unit of each change, the log-likelihood ratio of 'change' over 'no change' is
+With :math:`a \sim N(0, I)` in the unit of each change, the log-likelihood ratio of 'change' over 'no change'
+is
 
 .. math:: L = \tfrac12 y^T (I + M)^{-1} y - \tfrac12 \log \det(I + M), \quad
           M = \sum \phi \phi^T / S, \quad y = \sum \phi v / S
 
-It is a mixture over all amplitudes, so that none needs to be known. Each kind of change is tested with several
-onsets at a time. They restart after 4, 16, 64 ... measurements. As L starts from 0, :math:`e^L` is a martingale
-of mean 1 each time, and it exceeds :math:`e^h` by chance with a probability of at most :math:`e^{-h}` (Ville's
-inequality).
+It is a mixture over all amplitudes, so that none needs to be known. Each kind of change is tested with
+several onsets at a time. They restart after 4, 16, 64 ... measurements. As L starts from 0, :math:`e^L` is a
+martingale of mean 1 each time, and it exceeds :math:`e^h` by chance with a probability of at most
+:math:`e^{-h}` (Ville's inequality).
 
-Where S is known up to a factor only, of an inverse chi-squared distribution with :math:`\nu` degrees of freedom, the
-factor is integrated out. With the n normalised squares :math:`V = \sum v^2 / S` since the onset,
+Where S is known up to a factor only, of an inverse chi-squared distribution with :math:`\nu` degrees of
+freedom, the factor is integrated out. With the n normalised squares :math:`V = \sum v^2 / S` since the onset,
 
 .. math:: L = \frac{\nu + n}{2} \log \frac{\nu + V}{\nu + V - y^T (I + M)^{-1} y}
           - \tfrac12 \log \det(I + M)
@@ -38,8 +39,8 @@ from magbridge.estimation.kalman import KalmanFilter
 __all__ = ["ALARM_LOG_RATIO", "SequentialTest"]
 
 ALARM_LOG_RATIO: Final = 18.0
-"""h, threshold of L. Eight kinds of change have 2.7 onsets a measurement: by chance an alarm in ``e^18 / 2.7``
-measurements at most, 3 years at 0.25 Hz, while the noise is as stated."""
+"""h, threshold of L. Eight kinds of change have 2.7 onsets a measurement: by chance an alarm in ``e^18 /
+2.7`` measurements at most, 3 years at 0.25 Hz, while the noise is as stated."""
 RESTART_PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
 """Measurements after which an onset is replaced by a new one."""
 PROMISING_LOG_RATIO: Final = 6.0
@@ -86,7 +87,9 @@ class SequentialTest:
         Xi, what the filter has absorbed of each component.
     """
 
-    def __init__(self, kinds: int, states: int, retention_samples: float = np.inf, noise_dof: float = 0.0) -> None:
+    def __init__(
+        self, kinds: int, states: int, retention_samples: float = np.inf, noise_dof: float = 0.0
+    ) -> None:
         self.kind: IndexArray = np.repeat(np.arange(kinds), len(RESTART_PERIODS))
         self._period = np.tile(RESTART_PERIODS, kinds)
         self._states, self._keep = states, 1.0 - 1.0 / retention_samples
@@ -179,7 +182,9 @@ class SequentialTest:
         explained = np.sum(self._y * amplitude, axis=1)
         if self._dof:
             squares = self._dof + self._squares
-            ratio = 0.5 * (self._dof + self._samples) * np.log(squares / np.maximum(squares - explained, 1e-9))
+            ratio = (
+                0.5 * (self._dof + self._samples) * np.log(squares / np.maximum(squares - explained, 1e-9))
+            )
         else:
             ratio = 0.5 * explained
         return np.asarray(amplitude), np.asarray(ratio - 0.5 * np.log(np.linalg.det(W)))

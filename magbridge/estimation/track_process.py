@@ -1,15 +1,15 @@
 r"""Error of a reference along a track, and the noise's memory, as the states of a Kalman filter.
 
 The field differs from its reference by a constant and by a crustal field along the track. The latter is a
-Gauss-Markov process of Matern covariance with smoothness 3/2: its value b and slope b' are two states (Hartikainen
-& Sarkka 2010, MLSP, section 4.2). With :math:`\lambda = \sqrt 3 / \ell`,
+Gauss-Markov process of Matern covariance with smoothness 3/2: its value b and slope b' are two states
+(Hartikainen & Sarkka 2010, MLSP, section 4.2). With :math:`\lambda = \sqrt 3 / \ell`,
 
 .. math:: F = e^{-\lambda d}
           \begin{pmatrix} 1 + \lambda d & d \\ -\lambda^2 d & 1 - \lambda d \end{pmatrix}, \quad
           P_\infty = \sigma^2\, \mathrm{diag}(1, \lambda^2), \quad Q = P_\infty - F P_\infty F^T
 
-A fraction of the samples' noise is white, the rest is an AR(1) process. That is the third state, and the constant
-is the fourth.
+A fraction of the samples' noise is white, the rest is an AR(1) process. That is the third state, and the
+constant is the fourth.
 """
 
 from __future__ import annotations

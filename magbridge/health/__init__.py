@@ -1,9 +1,10 @@
-"""Checks of corrected samples: whether they can be the Earth's field, and whether the calibration still holds.
+"""Check corrected samples: can they be the Earth's field, and does the calibration still hold.
 
 :class:`HealthMonitor` runs :mod:`.axes` (repeated readings), :mod:`.level` (the main field), :mod:`.scatter`
 (noise), :mod:`.trend` (outliers and jumps) and :mod:`.consistency` (dependence on attitude, temperature and
-masses); :class:`DirectionCheck` needs the autopilot's attitude. A check is cheap, uses only the times of events, and
-returns flags and a variance. The package uses ``estimation`` and knows neither logs nor MAVLink. Start with
+masses); :class:`DirectionCheck` needs the autopilot's attitude. A check is cheap, uses only the times of
+events, and returns flags and a variance. The package uses ``estimation`` and knows neither logs nor MAVLink.
+Start with
 :mod:`.monitor`.
 """
 

@@ -1,8 +1,9 @@
 r"""Check whether channels repeat their reading: stuck, clipped, or all of them not read again.
 
-A healthy channel repeats its reading with a probability p, and n times in a row with :math:`p^n`. It is learned
-for each channel alone, and for all three together. For all three, p is at least what the noise gives: normal noise
-of standard deviation :math:`\sigma`, in steps of q, repeats a channel's reading with the probability
+A healthy channel repeats its reading with a probability p, and n times in a row with :math:`p^n`. It is
+learned for each channel alone, and for all three together. For all three, p is at least what the noise gives:
+normal noise of standard deviation :math:`\sigma`, in steps of q, repeats a channel's reading with the
+probability
 :math:`q / (2 \sqrt\pi \sigma)`.
 """
 
@@ -85,8 +86,7 @@ class RepetitionCheck:
                 stuck = self._repeat(number, axis, value) or stuck
                 continue
             change = abs(value - axis.last)
-            if change < self._step:
-                self._step = change
+            self._step = min(self._step, change)
             axis.last = value
             axis.change()
             stuck = stuck or (self._has_limit and abs(value) == axis.limit)

@@ -1,16 +1,19 @@
 r"""Check whether the corrected total field depends on what it must not depend on.
 
 The Earth's field does not depend on the vehicle's attitude, temperature or mass positions. An error of the
-calibration does. With u the direction of the corrected field in sensor axes, an error changes the total field by
+calibration does. With u the direction of the corrected field in sensor axes, an error changes the total field
+by
 
-- :math:`u^T a` (offset), :math:`\theta u^T a` (offset that follows the temperature), :math:`t\,u^T a` (drift),
+- :math:`u^T a` (offset), :math:`\theta u^T a` (offset that follows the temperature), :math:`t\,u^T a`
+(drift),
 - :math:`u_x^2 a_x + u_y^2 a_y + u_x u_y a_{xy}` (gain),
 - :math:`a\, \partial F / \partial p` (telemetry of a mass p).
 
 A Kalman filter predicts the total field from the crustal field along the track alone
-(:mod:`magbridge.estimation.track_process`); :mod:`magbridge.estimation.sequential` tests its innovations for each
-of these errors. The calibration's own uncertainty is part of the null hypothesis. After an alarm, sigma includes
-the estimated error of the present sample and its uncertainty, weighted over the onsets and errors that fit.
+(:mod:`magbridge.estimation.track_process`); :mod:`magbridge.estimation.sequential` tests its innovations for
+each of these errors. The calibration's own uncertainty is part of the null hypothesis. After an alarm, sigma
+includes the estimated error of the present sample and its uncertainty, weighted over the onsets and errors
+that fit.
 """
 
 from __future__ import annotations
@@ -43,8 +46,8 @@ DRIFT_NT_PER_H: Final = 10.0
 PER_DEGREE_NT: Final = 1.0
 GAIN_NT: Final = 60.0
 MASS_FRACTION: Final = 0.03
-"""1-sigma of each error: of offset, drift and temperature for an axis, of gain in the Earth's field, of telemetry
-as a fraction of the calibrated range."""
+"""1-sigma of each error: of offset, drift and temperature for an axis, of gain in the Earth's field, of
+telemetry as a fraction of the calibrated range."""
 RETENTION_SAMPLES: Final = 2000.0
 """Tested samples over which evidence is forgotten."""
 ALARM_LOG_RATIO: Final = 15.0
@@ -66,7 +69,8 @@ MIN_STRAIGHT_SAMPLES: Final = 8
 ADAPTATION: Final = 0.02
 MAX_SQUARE: Final = 16.0
 MAX_LOG_ROUGHNESS: Final = 5.0
-"""How the logarithm of the crustal field's roughness follows one normalised squared innovation, and its bounds."""
+"""How the logarithm of the crust's roughness follows a normalised squared innovation; its bounds."""
+KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
 DEGENERATE_NT: Final = 1e-6
 
 
@@ -238,8 +242,8 @@ class ConsistencyCheck:
         shares = [exp(float(statistic[row]) - largest) for row in rows]
         total = sum(shares)
         self._weights = [(row, share / total) for row, share in zip(rows, shares, strict=True)]
-        kind = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
-        text = f"field depends on the attitude or a mass, {size:.0f} nT: {kind[min(int(self._test.kind[best]), 4)]} wrong"
+        kind = KINDS[min(int(self._test.kind[best]), len(KINDS) - 1)]
+        text = f"field depends on the attitude or a mass, {size:.0f} nT: {kind} wrong"
         self._messages.report("consistency", text)
 
     def variance(self) -> float:

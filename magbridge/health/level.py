@@ -1,8 +1,9 @@
 """Check whether the Earth has such a total field at the position, or anywhere.
 
-The Earth's total field is the sum of the main field and the crustal field. The main field alone is off by 145 nT
-(1-sigma over the Earth, crustal field and disturbances included: the error model of Chulliat et al. 2020, *The
-US/UK World Magnetic Model for 2020-2025*), or by ``align.reference_sigma``. A total field further off than
+The Earth's total field is the sum of the main field and the crustal field. The main field alone is off by 145
+nT (1-sigma over the Earth, crustal field and disturbances included: the error model of Chulliat et al. 2020,
+*The US/UK World Magnetic Model for 2020-2025*), or by ``align.reference_sigma``. A total field further off
+than
 :data:`MAX_SIGMA` is not the Earth's. Without a position, it is compared with the extremes on the Earth.
 
 The reference bounds every error: while the field is more than :data:`FAR_SIGMA` off, sigma includes the

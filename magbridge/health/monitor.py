@@ -17,6 +17,8 @@ from magbridge.records import Quality, Vector
 
 __all__ = ["HealthMonitor"]
 
+SUPPOSED_SPEED: Final = 30.0
+"""Speed until it is known, m/s."""
 MAX_AGE_S: Final = 60.0
 """Age of telemetry after which a sample is tested without waiting for newer telemetry."""
 
@@ -59,10 +61,14 @@ class HealthMonitor:
         self._scatter = Scatter(noise, messages)
         self._trend = TrendCheck(self._scatter, messages)
         self._consistency = ConsistencyCheck(noise, masses, messages)
+        self._has_position = False
         self._unit: Vector = (0.0, 0.0, 0.0)
 
     def set_position(self, time_us: int, latitude: float, longitude: float) -> None:
-        """Record the vehicle's position, deg: what is noise, and not the crustal field, depends on the speed."""
+        """Record the vehicle's position, deg; what is noise and what is crust depends on the speed."""
+        if not self._has_position:
+            self._has_position = True
+            self._trend.set_speed(SUPPOSED_SPEED)
         if self._scatter.set_position(time_us, latitude, longitude):
             self._trend.set_speed(self._scatter.speed)
 
@@ -104,7 +110,8 @@ class HealthMonitor:
         age : float
             Age of the oldest telemetry, s.
         mass_changes : callable
-            Returns by how much the total field changes where each mass moves, see :class:`.consistency.Sample`.
+            Returns by how much the total field changes where each mass moves, see
+            :class:`.consistency.Sample`.
         """
         self.flags = 0
         self.is_fault = True
@@ -144,7 +151,7 @@ class HealthMonitor:
         return variance + self._scatter.excess() + consistency.variance()
 
     def explain(self, difference: float, *, jumps: bool) -> None:
-        """Record that another calibration changes the total field by `difference` (nT) and explains `jumps`."""
+        """Record that another calibration changes the total field by `difference`, nT."""
         if difference == difference:  # noqa: PLR0124 - NaN
             self._trend.explain(difference)
             self._scatter.explain(difference)

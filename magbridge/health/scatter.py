@@ -1,19 +1,19 @@
 r"""Estimate how much the total field scatters, at several lags, beyond what the crustal field can do.
 
-The median of second differences :math:`F(t) - 2 F(t - T) + F(t - 2T)` changes little with a jump or a ramp. From
-sample to sample it measures white noise. A disturbance of the period P adds :math:`4 \sin^2(\pi T / P)` times its
-amplitude: little at a lag T of a tenth of P, all of it at a third. The crustal field limits T: a wave of length
-L, passed at the speed v, adds :math:`(2 \pi v T / L)^2`, which is 2 % where v T is :data:`TRAVEL_M` and L is
-500 m. That much is subtracted. (The Allan variance shows in the same way at each interval what is noise there:
-Allan 1966, *Statistics of atomic frequency standards*, Proc. IEEE 54:221.)
+The median of second differences :math:`F(t) - 2 F(t - T) + F(t - 2T)` changes little with a jump or a ramp.
+From sample to sample it measures white noise. A disturbance of the period P adds :math:`4 \sin^2(\pi T / P)`
+times its amplitude: little at a lag T of a tenth of P, all of it at a third. The crustal field limits T: a
+wave of length L, passed at the speed v, adds :math:`(2 \pi v T / L)^2`, which is 2 % where v T is
+:data:`TRAVEL_M` and L is 500 m. That much is subtracted. (The Allan variance shows in the same way at each
+interval what is noise there: Allan 1966, *Statistics of atomic frequency standards*, Proc. IEEE 54:221.)
 
 The calibration's noise model (a white fraction w, the rest an AR(1) process of autocorrelation
 :math:`\rho(T)`) has second differences of variance
 
 .. math:: V(T) = \sigma^2 \left( 6 w + (1 - w)(6 - 8 \rho(T) + 2 \rho(2T)) \right)
 
-The largest ratio of what is measured to V(T) is the factor by which the whole noise, its slow part included, has
-grown: sigma grows by that factor.
+The largest ratio of what is measured to V(T) is the factor by which the whole noise, its slow part included,
+has grown: sigma grows by that factor.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ STEP: Final = 1.02
 """Factor by which a sample moves the median of the second differences."""
 RUN_SAMPLES: Final = 6
 MAX_STEPS: Final = 12
-"""Samples in a row on one side of the median before its steps grow, and the largest number of steps: twenty times
-the noise is learned in half the samples, and white noise is taken for more no more often."""
+"""Samples in a row on one side of the median before its steps grow, and the largest number of steps: twenty
+times the noise is learned in half the samples, and white noise is taken for more no more often."""
 RARE_RATIO: Final = 4.0
 """Ratio to the median that counts as three samples: one in 140 of white noise is as large."""
 START_STEPS: Final = 60
 """The n-th step is at least this number over n steps: at the start the noise is learned in a few samples."""
 MIN_COUNT: Final = 5
 UNCERTAINTY: Final = 4.0
-"""Second differences from which their median is used; after n of them it may be 1 + UNCERTAINTY / n times as far
-off as later."""
+"""Second differences from which their median is used; after n of them it may be 1 + UNCERTAINTY / n times as
+far off as later."""
 MEDIAN_TO_SIGMA: Final = 1.0 / 0.6745
 """1-sigma over the median of a normal variable's absolute value."""
 SECOND_DIFFERENCE: Final = 6.0
@@ -107,7 +107,8 @@ class Scatter:
     Attributes
     ----------
     variance : float
-        Variance of an innovation from one sample to the next, nT²; at least what the calibration's noise gives.
+        Variance of an innovation from one sample to the next, nT²; at least what the calibration's noise
+        gives.
     speed : float
         Speed of the vehicle, m/s; NaN while it is not known.
     """

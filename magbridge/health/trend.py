@@ -9,15 +9,15 @@ Kirubarajan 2001, *Estimation with Applications to Tracking and Navigation*, sec
 
 A crustal field of standard deviation :math:`\sigma_c` and correlation length :math:`\ell` (Matern, smoothness
 3/2), crossed at the speed v, has :math:`q = 4 (\sqrt 3 v / \ell)^3 \sigma_c^2`. From there q follows the
-normalised innovations, so that the rate of change at any speed is part of the model. The second term is what the
-calibration's own error changes where the direction of the field turns by :math:`|\Delta u|`.
+normalised innovations, so that the rate of change at any speed is part of the model. The second term is what
+the calibration's own error changes where the direction of the field turns by :math:`|\Delta u|`.
 
-A sample whose innovation exceeds :data:`GATE_SIGMA` is an outlier (section 5.4 of the same book). Three outliers
-that agree with each other are a jump. Samples after a jump are flagged while the sum of jumps is not zero, and
-sigma is the largest of them. It is kept for a while after the field has come back.
+A sample whose innovation exceeds :data:`GATE_SIGMA` is an outlier (section 5.4 of the same book). Three
+outliers that agree with each other are a jump. Samples after a jump are flagged while the sum of jumps is not
+zero, and sigma is the largest of them. It is kept for a while after the field has come back.
 
-Telemetry reports a motion after it has begun. When it does, the filter returns to its state at the last report
-before the motion, so that what the motion did meanwhile is not a jump.
+Telemetry reports a motion after it has begun. When it does, the filter returns to its state at the last
+report before the motion, so that what the motion did until then is not a jump.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ AGREEING: Final = 3
 """Outliers that agree with each other are a jump; so many samples establish the trend at the start."""
 ESTABLISHED_SAMPLES: Final = 256
 """Samples from which q is known without a speed."""
+LARGE_CHANGE: Final = 2.0
+"""Change of log q that another speed makes."""
 SPIKE_DECAY: Final = 0.3
 BURST_DECAY: Final = 0.8
 BURST_SAMPLES: Final = 8
@@ -64,7 +66,7 @@ MAX_MOTION_HOLD_US: Final = 86_400_000_000
 CHECKPOINT_US: Final = 1_000_000
 CHECKPOINTS: Final = 64
 FORGIVING_LOG_RATIO: Final = -7.0
-"""Log-likelihood ratio of 'the jump is an offset' over 'it is not' below which a jump is discarded."""
+"""Log-likelihood ratio of 'the jump is an offset' over 'it is not' below which it is discarded."""
 
 
 class State(NamedTuple):
@@ -112,6 +114,7 @@ class TrendCheck:
         self._log_q = log(MIN_INTENSITY)
         self._min_log_q = log(MIN_INTENSITY)
         self._has_speed = False
+        self._slope_variance = SLOPE_NT_PER_S**2
         self._before = nan  # level before a sample that only time or a motion made acceptable
         self._accepted = 0
         self._unrest, self._decay, self._quiet = 0.0, SPIKE_DECAY, BURST_SAMPLES
@@ -130,8 +133,11 @@ class TrendCheck:
 
     def set_speed(self, speed: float) -> None:
         """Record the vehicle's speed, m/s."""
-        self._has_speed = True
-        self._min_log_q = log(max(CURVATURE * min(speed, 300.0) ** 3, 0.1 * MIN_INTENSITY))
+        floor = log(max(CURVATURE * min(speed, 300.0) ** 3, 0.1 * MIN_INTENSITY))
+        if floor < self._min_log_q - LARGE_CHANGE:  # nothing was learned under the speed supposed so far
+            self._log_q = floor + LARGE_CHANGE
+        self._min_log_q, self._has_speed = floor, True
+        self._slope_variance = max(SLOPE_NT_PER_S, 3.0**0.5 * CRUST_SIGMA_NT / CRUST_LENGTH_M * speed) ** 2
 
     def check(self, time_us: int, total: float, sigma: float, turned: float, *, learn: bool) -> float:
         """Follow the trend; return the variance (nT²) to add to that of a sample that is an outlier.
@@ -217,11 +223,12 @@ class TrendCheck:
         self._log_q = max(self._log_q + ADAPTATION * (square - 1.0), self._min_log_q)
 
     def _begin(self, time_us: int, level: float, sigma: float, noise: float) -> None:
-        self._now = State(
-            time_us, level, 0.0, noise, 0.0, SLOPE_NT_PER_S**2, 0.0, 0.0, 0, 0, 0
-        ) if self._now is None else self._now._replace(
-            time_us=time_us, level=level, p_level=noise, p_cross=0.0,
-            p_slope=max(self._now.p_slope, SLOPE_NT_PER_S**2),
+        """Begin a trend at a level, nT; the jumps so far and the slope stay."""
+        if self._now is None:
+            self._now = State(time_us, level, 0.0, noise, 0.0, self._slope_variance, 0.0, 0.0, 0, 0, 0)
+        p_slope = max(self._now.p_slope, self._slope_variance)
+        self._now = self._now._replace(
+            time_us=time_us, level=level, p_level=noise, p_cross=0.0, p_slope=p_slope
         )
         self._sigma, self.has_moved = sigma, False
 
@@ -242,7 +249,7 @@ class TrendCheck:
             self._agreed = 0
 
     def retract(self, since_us: int) -> None:
-        """Return to the state before `since_us`: a motion had begun after that, which is reported only now."""
+        """Return to the state before `since_us`, after which a motion began that is reported only now."""
         while self._checkpoints and self._checkpoints[-1].time_us > since_us:
             self._checkpoints.pop()
         if self._checkpoints and self._now is not None and self._now.time_us > since_us:
@@ -313,7 +320,9 @@ class TrendCheck:
             return
         # an offset of the jump's amplitude, in a random direction
         more = variance + (now.largest * turned) ** 2 / 3.0
-        self._offset_log_ratio += 0.5 * (change * change * (1.0 / variance - 1.0 / more) - log(more / variance))
+        self._offset_log_ratio += 0.5 * (
+            change * change * (1.0 / variance - 1.0 / more) - log(more / variance)
+        )
         self._offset_log_ratio = min(self._offset_log_ratio, 10.0)
         if self._offset_log_ratio < FORGIVING_LOG_RATIO:
             self.forget()
@@ -324,4 +333,3 @@ class TrendCheck:
             self._now = self._now._replace(jump_sum=0.0, largest=0.0, jumps=0, until_us=0)
         self._checkpoints.clear()
         self._offset_log_ratio = 0.0
-

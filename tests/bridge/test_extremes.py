@@ -92,9 +92,9 @@ def test_a_part_that_raises_is_switched_off_and_the_sample_is_published(
     def fail(*_: object, **__: object) -> float:
         raise ZeroDivisionError("made for this test")
 
-    plausibility = bridge._correction.plausibility
-    assert plausibility is not None
-    monkeypatch.setattr(plausibility, "check", fail)
+    health = bridge._correction.health
+    assert health is not None
+    monkeypatch.setattr(health, "check", fail)
     for second in (1, 2, 3):
         assert [message.name for message in sent(bridge, second)].count("MAG_FIELD") == 1
     texts = [text for _, text in bridge.component.announcer.texts]

@@ -91,7 +91,9 @@ def test_what_the_heading_of_a_vehicle_at_the_pole_is_does_not_matter() -> None:
     assert one.messages == []
 
 
-def looks(tilts: list[float], every_us: int = 1_000_000, roll: float = 0.0) -> tuple[list[int], Direction]:
+def looks(
+    tilts: list[float], every_us: int = 1_000_000, roll: float = 0.0
+) -> tuple[list[int], DirectionCheck]:
     """Return the flags of looks at a vector that is tilted by so many degrees, of a banked vehicle."""
     one, flags = DirectionCheck(), []
     one.expect(*NED.tolist())

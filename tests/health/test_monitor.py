@@ -243,7 +243,7 @@ def test_rock_that_is_come_upon_little_by_little_is_no_fault() -> None:
     flight = Flight(n=3000)
     rise = np.interp(np.arange(3000), [200, 2000], [200.0, 600.0])
     flight.raw += rise[:, None] * flight.raw / np.linalg.norm(flight.raw, axis=1)[:, None]
-    flags, sigma, reported = flight.judge()
+    flags, sigma, _ = flight.judge()
     assert not flags.any()
     far = np.linalg.norm(flight.raw, axis=1) - FIELD > 3.0 * np.hypot(145.0, SIGMA)
     assert (sigma[~far & (np.arange(3000) < 1500)] == SIGMA).all()
