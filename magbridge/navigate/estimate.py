@@ -133,10 +133,12 @@ class Estimate:
             _, start = prior(self.options, sigma)
             start[2:, 2:] += self.P[2:, 2:]
             self._begin(np.concatenate([there, self.x[2:]]), start, "a fix contradicts the filter")
-            self._described, self._nowhere = self._described and not self._lost, 0.0
+            self._nowhere = 0.0
         else:
             self._filter.update_position(float(there[0]), float(there[1]), fused_sigma or sigma)
             self._read()
+        if self._lost and not self._fixed:
+            self._described, self._nowhere = False, 0.0
         self._monitor, self._confirmed, self._fixed = None, True, True
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
@@ -180,7 +182,7 @@ class Estimate:
             seconds = (block.time_us - then_us) * 1e-6
             self.step = Step(seconds, travelled - before, motion.since(earlier))
             self._measured = block.time_us, travelled, motion
-            self._judge(block, seen.log_likelihood)
+            self._judge(block, seen)
         self._choose(on_the_map)
         proven = self._confirmed and self._described
         doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
@@ -246,11 +248,16 @@ class Estimate:
         self.jumps.append(Jump(self.time_us, north, east, widest(self.alone), cause))
         self._monitor, self._confirmed, self._fixed = None, False, False
 
-    def _judge(self, block: Block, likelihood: float) -> None:
+    def _judge(self, block: Block, seen: Innovation) -> None:
         """Compare the filter with competing ones, and replace it if one of them has won."""
         assert self._filter is not None
         unmapped = self._unmapped.update(block, self.step, self._filter.curvature_variance)
-        self._nowhere = max(self._nowhere + unmapped - likelihood, -log(self.options.doubt))
+        against = unmapped - seen.log_likelihood
+        if (
+            not seen.accepted
+        ):  # the likelihood is limited by the gate: what was rejected never speaks for the map
+            against = max(against, 0.0)
+        self._nowhere = max(self._nowhere + against, -log(self.options.doubt))
         if self._nowhere > log(self.options.doubt):
             self._search_anew()
             return

@@ -436,6 +436,8 @@ class _FieldTest:
         unmapped = self._unmapped.update(block, whole, tracker.curvature_variance)
         if not seen.variance > 0.0:  # off the map
             return
+        if not seen.accepted:  # as the filter does: what was rejected never speaks for the map
+            unmapped = max(unmapped, seen.log_likelihood)
         self._against = min(max(self._against - seen.log_likelihood + unmapped, 0.0), self.limit)
         for name, other in (("log_odds_of_map", unmapped), ("log_odds_of_position", filter_likelihood)):
             total = getattr(self, name) + seen.log_likelihood - other

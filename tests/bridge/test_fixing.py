@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from passages import PLACE
 from vehicle import ACK, ARDUPILOT, PX4, Bench
 
 GOOD = {"fix_type": 3, "lat": 495000000, "lon": -579000000, "h_acc": 2000}
@@ -168,3 +169,38 @@ def test_a_fix_soon_after_another_is_widened_where_it_is_fused() -> None:
     later = bench.fix(sigma=20.0)[0]["eph"]
     assert soon == pytest.approx(2.0 * later)
     assert later > 20.0
+
+
+@pytest.mark.parametrize(
+    ("stack", "version", "widened"),
+    [(PX4, None, True), (PX4, (1, 18), True), (PX4, (1, 16), False), (ARDUPILOT, (4, 7), False)],
+)
+def test_px4_fuses_an_external_position_since_december_2025(
+    stack: int, version: tuple[int, int] | None, widened: bool
+) -> None:
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE")
+    asked = bench.receive("HEARTBEAT", autopilot=stack)
+    assert [(one["command"], one["param1"]) for one in asked] == [(512, 148.0)], "AUTOPILOT_VERSION"
+    if version:
+        bench.receive("AUTOPILOT_VERSION", flight_sw_version=version[0] << 24 | version[1] << 16)
+    bench.fix(sigma=20.0)
+    bench.to(1)
+    assert (bench.fix(sigma=20.0)[0]["param3"] > 40.0) is widened
+
+
+def test_an_autopilot_that_does_not_use_the_fixes_is_reported() -> None:
+    """It answers ACCEPTED, or nothing at all, and flies on 600 m away: within a minute that is said."""
+    bench = Bench("EXTERNAL_POSITION_ESTIMATE")
+    there = {"lat": round(PLACE[0] * 1e7) + 54_000, "lon": round(PLACE[1] * 1e7)}
+    for k in range(60):
+        bench.to(k)
+        bench.fix()
+        bench.receive("COMMAND_ACK", **ACK, result=0)
+        bench.receive("GLOBAL_POSITION_INT", **there)
+    assert bench.texts_with("not use") == ["the autopilot does not use the fixes: its position is 601 m off"]
+    near = {**there, "lat": round(PLACE[0] * 1e7) + 100}
+    for k in range(60, 130):
+        bench.to(k)
+        bench.fix()
+        bench.receive("GLOBAL_POSITION_INT", **near)
+    assert bench.texts_with("not use") == []

@@ -152,3 +152,50 @@ def test_depth_counts_from_the_sea_on_high_ground() -> None:
     assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-346.0)
     bench.receive("GLOBAL_POSITION_INT", alt=347_000)
     assert bench.navigation.motion._frame.depth(bench.now_us) == pytest.approx(-347.0)
+
+
+def test_an_airspeed_that_is_the_speed_over_ground_is_not_used() -> None:
+    """ArduPilot's Rover and Sub without an airspeed sensor: VFR_HUD repeats GPS_RAW_INT.vel."""
+    bench = made("EXTERNAL_POSITION_ESTIMATE", ARDUPILOT)
+    bench.receive("ATTITUDE", yaw=0.0)
+    for k in range(1, 11):
+        bench.to(k)
+        bench.receive("GPS_RAW_INT", fix_type=1, vel=331)
+        bench.receive("VFR_HUD", airspeed=3.3125, groundspeed=3.2)
+        bench.receive("VFR_HUD", airspeed=3.2, groundspeed=3.2)
+    assert source(bench) is Source.NONE
+    bench.to(12)
+    assert bench.texts_with("airspeed") == ["VFR_HUD.airspeed is the speed over ground: not used"]
+    bench.receive("VFR_HUD", airspeed=2.9, groundspeed=3.2)
+    assert source(bench) is Source.SPEED
+
+
+@pytest.mark.parametrize(
+    ("report", "flags"),
+    [("EKF_STATUS_REPORT", 1 | 128), ("ESTIMATOR_STATUS", 2 | 128), ("ESTIMATOR_STATUS", 1)],
+)
+def test_a_velocity_that_the_autopilot_does_not_vouch_for_is_not_used(report: str, flags: int) -> None:
+    bench = made()
+    bench.receive(report, flags=flags)
+    local(bench, 1, 1.0)
+    assert source(bench) is Source.NONE
+    bench.receive(report, flags=1 | 2 | 8)
+    local(bench, 2, 2.0)
+    assert source(bench) is Source.TRACK
+
+
+def test_a_turn_between_two_reports_is_averaged_and_uncertain() -> None:
+    """22 m/s, reports once a second, a turn of 90 degrees in 4 s: the error of a held heading adds up."""
+    bench = made("EXTERNAL_POSITION_ESTIMATE", ARDUPILOT)
+    north = east = 0.0
+    for k in range(11):
+        bench.to(k)
+        bench.receive("ATTITUDE", yaw=np.radians(np.clip(22.5 * (k - 3), 0.0, 90.0)))
+        bench.receive("VFR_HUD", airspeed=22.0)
+    for step in np.arange(0.0, 10.0, 0.001) + 0.0005:
+        along = np.radians(np.clip(22.5 * (step - 3.0), 0.0, 90.0))
+        north, east = north + 0.022 * np.cos(along), east + 0.022 * np.sin(along)
+    assert moved(bench) == pytest.approx((north, east), abs=1.0)
+    noise = bench.navigation.navigator._reckoning.noise
+    assert 1.0 < noise.nn + noise.ee < 50.0
+    assert noise.turns == pytest.approx(2.0 * 22.0**2, rel=0.7)

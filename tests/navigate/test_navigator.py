@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from msgspec.structs import replace
 from navigation_studies.lost import carried
-from navigation_studies.simulated import PLACE, Map, sail, track_over
+from navigation_studies.simulated import PLACE, Map, sail, synthetic, track_over
 
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
@@ -185,3 +185,19 @@ def test_the_main_field_is_that_of_the_day_to_which_the_clock_was_set(
         innovations.append([record.innovation for record in records])
     assert len(innovations[0]) > 2
     assert innovations[1] == pytest.approx(innovations[0], abs=1e-3)
+
+
+def test_lost_is_not_ended_by_the_next_fix(grid: AnomalyGrid, options: Options) -> None:
+    """Over an unrelated field five times as rough, fixes give the position, but the navigator stays lost."""
+    elsewhere = synthetic(Map(150, 1500), 9)
+    unrelated = track_over(elsewhere, options, 5, hours=1.0)
+    nav = _fresh(grid, options)
+    feed(nav, unrelated, slice(0, 600))
+    assert nav.estimate.state is State.LOST
+    for row in range(600, 900, 10):
+        time_us = round(1e6 * float(unrelated["time"][row])) - 1_000_000
+        latitude, longitude = (float(unrelated[f"truth_{name}"][row]) for name in ("latitude", "longitude"))
+        nav.fix(time_us, latitude, longitude, 5.0)
+        more, _ = feed(nav, unrelated, slice(row, row + 10))
+        assert not any(record.valid for record in more)
+        assert {record.state for record in more} <= {State.LOST}

@@ -99,6 +99,51 @@ def test_px4_takes_its_sensor_by_id_and_believes_a_nan_to_a_metre() -> None:
     assert autopilot.filter.sigma < 1.0
 
 
+def test_px4_has_several_global_positions_and_modes() -> None:
+    far = {**HERE, "lat": round(PLACE[0] * 1e7) + 54_000}
+    for mode, airspeed, outcome in ((0, True, "fused"), (1, True, "refused: gate"), (1, False, "fused")):
+        autopilot, now_us = flown(Px4, 30, agp_mode=mode, airspeed=airspeed, agp_ids=(1, 2))
+        autopilot.receive(BRIDGE.pack("GLOBAL_POSITION_SENSOR", **{**far, "id": 2}), now_us)
+        assert dict(autopilot.taken) == {outcome: 1}, (mode, airspeed)
+
+
+def test_px4_refuses_an_external_position_only_if_it_is_no_number() -> None:
+    autopilot, now_us = flown(Px4, 0)
+    now_us -= 500_000
+    assert external(autopilot, now_us, param2=nan) == 1
+    autopilot.filter.wind = 3.0, 0.0
+    assert external(autopilot, now_us) == 0, "with GPS: a hard reset"
+    assert autopilot.filter.wind == (0.0, 0.0)
+    claims = []
+    for replaces in (True, False):
+        autopilot, now_us = flown(Px4, 60, replaces_claim=replaces)
+        for k in range(10):
+            external(autopilot, now_us + k, param3=30.0)
+        claims.append(autopilot.filter.sigma)
+    assert claims[0] == pytest.approx(30.0)
+    assert claims[1] < 15.0, "since December 2025 it is fused"
+
+
+def test_ardupilots_proposed_change_fuses_and_accepts_a_global_position() -> None:
+    autopilot, now_us = flown(ArduPilot, 60, fuses_positions=True)
+    before = autopilot.filter.position[0]
+    assert external(autopilot, now_us) == 0
+    assert before < autopilot.filter.position[0] < 30.0
+    autopilot.receive(BRIDGE.pack("GLOBAL_POSITION_SENSOR", **HERE), now_us)
+    assert autopilot.taken["fused"] == 1
+
+
+def test_ardupilot_cannot_arm_without_visual_odometry_and_reports_that_nothing_aids() -> None:
+    rover, now_us = flown(ArduPilot, 20, airspeed=False)
+    assert isinstance(rover, ArduPilot)
+    assert not rover.can_arm
+    report = rover.step(now_us + 1_000_000, Truth(PLACE, 0.0, 0.0, 0.0, 0.0, None))
+    flags = next(m["flags"] for m in Codec(255, 1).parse(report) if m.name == "EKF_STATUS_REPORT")
+    assert flags & 128
+    rover.receive(BRIDGE.pack("ODOMETRY", **POSE), now_us + 1_000_000)
+    assert rover.can_arm
+
+
 def test_px4_locks_gps_out_while_another_position_aids() -> None:
     """60 m off with 5 m claimed, five times a second: GPS comes back only once that ends."""
     autopilot, now_us = flown(Px4, 60)

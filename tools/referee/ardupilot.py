@@ -23,6 +23,8 @@ RETRY = 10.0
 """s of refused positions after which it resets to them: AP_NavEKF3.h, posRetryTimeUseVel_ms."""
 GATE = 5.0
 """Sigmas: EK3_POS_I_GATE 500, AP_NavEKF3.cpp."""
+ATTITUDE, VELOCITY_HORIZ, POS_HORIZ_ABS, CONST_POS_MODE = 1, 2, 16, 128
+"""EKF_STATUS_REPORT.flags"""
 UNHEALTHY = 0.3
 """s without data: AP_VisualOdom_Backend.cpp, healthy()."""
 
@@ -31,6 +33,14 @@ class ArduPilot(Autopilot):
     """A Plane (or a glider) with airspeed; without, a Rover.
 
     Its source set is switched to external navigation when GPS is lost, as a user or a script does.
+
+    Parameters
+    ----------
+    viso_quality_min : int
+        VISO_QUAL_MIN.
+    fuses_positions : bool
+        With the change that is proposed (pull request 31738): EXTERNAL_POSITION_ESTIMATE is fused, and
+        GLOBAL_POSITION_SENSOR is accepted and fused.
 
     Attributes
     ----------
@@ -44,9 +54,14 @@ class ArduPilot(Autopilot):
     WALK = 5e-4
     """AP_NavEKF3_core.cpp: each 12 ms the variance grows by sq(dt * EK3_WIND_P_NSE), 0.2."""
 
-    def __init__(self, *args: Any, viso_quality_min: int = 0, **settings: Any) -> None:
+    def __init__(
+        self, *args: Any, viso_quality_min: int = 0, fuses_positions: bool = False, **settings: Any
+    ) -> None:
         super().__init__(*args, **settings)
         self.internal_errors = 0
+        self._fuses = fuses_positions
+        if fuses_positions:
+            self._takes[spec("GLOBAL_POSITION_SENSOR").id] = self._sensor
         self._quality_min = viso_quality_min
         self._visual_us = self._fused_us = -(10**12)  # came; was fused
         self._reset_counter: int | None = None
@@ -85,9 +100,30 @@ class ArduPilot(Autopilot):
         age = min(max(message["param2"], 0.0), 5.0)  # moved on by its own velocity, for 5 s at most
         north, east = self.local((message["x"] * 1e-7, message["y"] * 1e-7))
         vn, ve = self.filter.velocity
+        if self._fuses:
+            self.filter.fuse((north + vn * age, east + ve * age), sigma**2)
+            return MAV_RESULT.ACCEPTED
         self.filter.reset((north + vn * age, east + ve * age), sigma**2)
         self._resets += 1
         return MAV_RESULT.ACCEPTED
+
+    def _sensor(self, message: Message) -> str:
+        if self.since_gps() < DECLARED or not self.aiding:
+            return "unused: GPS is the source"
+        eph = message["eph"]
+        sigma = max(POSITION_NOISE if isnan(eph) else eph, POSITION_NOISE)
+        self.filter.fuse(self.local((message["lat"] * 1e-7, message["lon"] * 1e-7)), sigma**2)
+        return "fused"
+
+    @property
+    def can_arm(self) -> bool:
+        """Whether it passes the check 'VisOdom: not healthy' (AP_Arming.cpp), with VISO_TYPE 1."""
+        return self.healthy
+
+    def _status(self) -> bytes:
+        # AP_NavEKF3_Outputs.cpp, send_status_report: without aiding the position is held
+        flags = ATTITUDE | (VELOCITY_HORIZ | POS_HORIZ_ABS if self.aiding else CONST_POS_MODE)
+        return self._codec.pack("EKF_STATUS_REPORT", flags=flags)
 
     def _odometry(self, message: Message) -> str:
         # GCS_Common.cpp, handle_odometry

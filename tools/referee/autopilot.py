@@ -184,6 +184,10 @@ class Autopilot:
         """Answer EXTERNAL_POSITION_ESTIMATE."""
         raise NotImplementedError
 
+    def _status(self) -> bytes:
+        """Return what it reports of its filter."""
+        return b""
+
     # ---- telemetry -----------------------------------------------------------------------------------
 
     def _origin(self) -> bytes:
@@ -196,7 +200,7 @@ class Autopilot:
         vn, ve = self.filter.velocity
         data = pack("HEARTBEAT", type=MAV_TYPE.SUBMARINE, autopilot=self.STACK)
         yaw, pitch = radians(truth.heading), radians(truth.pitch)
-        data += pack("ATTITUDE", time_boot_ms=boot_ms, yaw=yaw, pitch=pitch)
+        data += pack("ATTITUDE", time_boot_ms=boot_ms, yaw=yaw, pitch=pitch) + self._status()
         gps = {"fix_type": NO_FIX}
         if truth.gps is not None:
             gps = {"fix_type": FIX_3D, "h_acc": round(truth.accuracy * 1e3)}
@@ -209,9 +213,9 @@ class Autopilot:
         where = {"lat": round(latitude * 1e7), "lon": east_e7(longitude), "alt": round(-1e3 * truth.depth)}
         data += pack("GLOBAL_POSITION_INT", time_boot_ms=boot_ms, **where, **speed)
         if "VFR_HUD" in self._streams:
-            data += pack(
-                "VFR_HUD", airspeed=truth.speed if self._airspeed else 0.0, groundspeed=hypot(vn, ve)
-            )
+            # GCS_Common.cpp, vfr_hud_airspeed: without a sensor, the speed over ground by GPS
+            ground = hypot(vn, ve)
+            data += pack("VFR_HUD", airspeed=truth.speed if self._airspeed else ground, groundspeed=ground)
         down = truth.depth + self.origin[2]
         if "LOCAL_POSITION_NED" in self._streams:
             local = {"x": north, "y": east, "z": down, "vx": vn, "vy": ve}

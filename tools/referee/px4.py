@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isnan
 from typing import Any
 
@@ -17,7 +18,7 @@ RETRY = 7.0
 """s without a position fused, after which one resets: ekf2/EKF/common.h, reset_timeout_max."""
 GATE = 3.0
 """Sigmas: EKF2_AGPn_GATE."""
-EXTERNAL_GATE = 5.0
+EXTERNAL_GATE = 10.0
 """Sigmas: ekf2/EKF/ekf.cpp, resetGlobalPosToExternalObservation."""
 DEFAULT_ACCURACY = 50.0
 """m: ekf2/EKF2.cpp, kDefaultExternalPosAccuracy."""
@@ -28,64 +29,93 @@ class Px4(Autopilot):
 
     Parameters
     ----------
-    agp_id : int
-        EKF2_AGP0_ID; 0 is off.
+    agp_ids : sequence of int
+        EKF2_AGP0_ID, EKF2_AGP1_ID ...; 0 is off. Each is a source of its own (since early 2026).
+    agp_mode : int
+        EKF2_AGPn_MODE: 0, a source that was refused for long is reset to; 1, only if nothing else gives a
+        velocity, as airspeed does.
+    replaces_claim : bool
+        Up to version 1.16: EXTERNAL_POSITION_ESTIMATE replaces the uncertainty; later it is fused.
     """
 
     STACK = MAV_AUTOPILOT.PX4
     WALK = 2.5e-3
     """EKF2_WIND_NSD, 0.05 m/s²/√Hz."""
 
-    def __init__(self, *args: Any, agp_id: int = 1, **settings: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        agp_ids: Sequence[int] = (1,),
+        agp_mode: int = 0,
+        replaces_claim: bool = False,
+        **settings: Any,
+    ) -> None:
         super().__init__(*args, **settings)
-        self._id = agp_id
-        self._pushed_us = self._fused_us = -(10**12)
+        self._mode, self._replaces = agp_mode, replaces_claim
+        never = -(10**12)
+        self._pushed_us = {number: never for number in agp_ids if number}
+        self._fused_us = dict(self._pushed_us)
         self._takes[spec("GLOBAL_POSITION_SENSOR").id] = self._sensor
         self._takes[spec("ODOMETRY").id] = self._odometry
 
     def _active(self) -> bool:
         """Return whether an auxiliary position aids."""
-        return min(self._now_us - self._fused_us, self._now_us - self._pushed_us) * 1e-6 < STOPPED
+        return any(
+            self._now_us - min(self._fused_us[number], self._pushed_us[number]) < STOPPED * 1e6
+            for number in self._fused_us
+        )
 
     def _gps_wins(self) -> bool:
         # ekf2/EKF/aid_sources/gnss/gps_control.cpp: reset only while no other position aids
         return self._refused_for() > RETRY and not self._active()
 
     def _external(self, message: Message) -> MAV_RESULT:
-        # ekf2/EKF2.cpp: while it dead-reckons (in the air), and all are numbers
-        if self.since_gps() < 1.0 or self._active() or not finite(message["param2"]):
+        # ekf2/EKF2.cpp, MAV_CMD_EXTERNAL_POSITION_ESTIMATE (582b8f0a2b): refused only if no number
+        place_e7 = message["x"], message["y"]
+        if not finite(message["param2"], *place_e7):
             return MAV_RESULT.TEMPORARILY_REJECTED
         accuracy = message["param3"]
         if not finite(accuracy) or accuracy <= 1e-7:
             accuracy = DEFAULT_ACCURACY
-        place = self.local((message["x"] * 1e-7, message["y"] * 1e-7))
+        place = self.local((place_e7[0] * 1e-7, place_e7[1] * 1e-7))
         variance = max(accuracy, 0.01) ** 2
-        # ekf2/EKF/ekf.cpp: below 1 m, or far off, a hard reset; else all the way there, wind learning from it
-        if accuracy < 1.0 or self.filter.distance(place, variance) > EXTERNAL_GATE:
+        aided = self.since_gps() < 1.0 or self._active()
+        # ekf2/EKF/ekf.cpp: while GPS or an auxiliary position aids, below 1 m, or far off, a hard reset that
+        # forgets the wind; else all the way there, the wind learning from it
+        if aided or accuracy < 1.0 or self.filter.distance(place, variance) > EXTERNAL_GATE:
             self.filter.reset(place, variance)
-        else:
+            self.filter.wind = 0.0, 0.0
+        elif self._replaces:
             self.filter.force(place, variance)
+        else:  # bbf32a537e, December 2025: the position moves fully, the variance is that of a fused one
+            before = self.filter.pp
+            self.filter.force(place, variance)
+            self.filter.pp = before * variance / (before + variance)
         self._resets += 1
         return MAV_RESULT.ACCEPTED
 
     def _sensor(self, message: Message) -> str:
         # mavlink/mavlink_receiver.cpp: one slot an id, the arrival is the time
-        if self._id == 0 or message["id"] != self._id:
+        number = message["id"]
+        if number not in self._pushed_us:
             return "dropped: id"
-        self._pushed_us = self._now_us
+        self._pushed_us[number] = self._now_us
         # ekf2/EKF/aid_sources/aux_global_position_control.cpp: max(eph, EKF2_AGPn_NOISE) drops a NaN
         eph = message["eph"]
         variance = max(1.0 if isnan(eph) else eph, 1.0) ** 2
         place = self.local((message["lat"] * 1e-7, message["lon"] * 1e-7))
-        unfused = (self._now_us - self._fused_us) * 1e-6
+        unfused = (self._now_us - max(self._fused_us.values())) * 1e-6
+        # aux_global_position_control.cpp, isResetAllowed: no other position aids; with mode 1, nor does a
+        # velocity, as which airspeed with sideslip counts (estimator_interface.cpp)
+        allowed = self.since_gps() > RETRY and not (self._mode == 1 and self._airspeed)
         if self.filter.distance(place, variance) <= GATE:
             self.filter.fuse(place, variance)
-        elif unfused > RETRY and self.since_gps() > RETRY:  # isResetAllowed: no other position aids
+        elif unfused > RETRY and allowed:
             self.filter.reset(place, variance)
             self._resets += 1
         else:
             return "refused: gate"
-        self._fused_us = self._now_us
+        self._fused_us[number] = self._now_us
         return "fused"
 
     def _odometry(self, message: Message) -> str:
