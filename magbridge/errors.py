@@ -22,7 +22,7 @@ from pathlib import Path
 
 __all__ = [
     "CalibrationError", "ConfigError", "DataError", "FormatError", "MagbridgeError", "MissingExtra",
-    "OutOfRange", "PluginError", "PortError", "WriteError", "WrongUse",
+    "NoSolutionError", "OutOfRange", "PluginError", "PortError", "WriteError", "WrongUse",
 ]  # fmt: skip
 
 
@@ -77,6 +77,10 @@ class FormatError(DataError, ValueError):
 
 class CalibrationError(DataError, ValueError):
     """A calibration that cannot be fitted, read or used."""
+
+
+class NoSolutionError(CalibrationError):
+    """A fit that collapsed or did not converge; another method may have a solution."""
 
 
 class OutOfRange(DataError, ValueError):

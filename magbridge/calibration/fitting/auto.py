@@ -23,12 +23,12 @@ import numpy as np
 from magbridge.calibration.fitting.climb import Climbed, climb, thinned
 from magbridge.calibration.fitting.ends import flown
 from magbridge.calibration.fitting.known import Known
-from magbridge.calibration.fitting.left_out import leave_out, refitted
+from magbridge.calibration.fitting.left_out import carried_forward, leave_out, refitted
 from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, nominal, nominal_samples, starts
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.errors import CalibrationError
+from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.hyperparameters import is_maximum
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import NoiseModel, fit_slow_and_white
@@ -92,29 +92,37 @@ def fit_auto(
             "widths_nT": dict(zip(family.names, np.exp(best.widths.eta).tolist(), strict=True)),
         },
     )  # fmt: skip
-    doubtful = known is None and (left.ratio > 1.0 or not data.names)
-    return (_simpler(data, found, best) if doubtful else None) or found
+    if known is not None or (left.ratio <= 1.0 and data.names):
+        return found
+    forward = carried_forward(samples, prior, best.solution.z, best.noise)
+    found.details["forward_nT"] = forward
+    return _simpler(data, found, best) or found
 
 
 def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
-    """Return the fit of one ellipsoid, if it predicts the parts left out better.
+    """Return the fit of one ellipsoid, if it predicts held-out parts better than `found`.
 
-    Where both are one ellipsoid each is fitted again without the part; with parameters the first order tells
-    enough. Beside a reference that is nearly constant such errors reward a collapse: so not if its scales are
-    those of no sensor, and further from 1 than those of `found`.
+    Both are fitted again without each part: parts among the others, and the later parts of the log from the
+    earlier ones. What counts is the geometric mean of the two errors' ratios. If the reference is nearly
+    constant, such errors reward a collapse: the ellipsoid is not taken if its scales are implausible, and
+    further from 1 than those of `found`.
     """
     try:
         one, simpler = nominal(data), fit_nominal(data)
     except CalibrationError:
         return None
-    if data.names:
-        return simpler if simpler.details["left_out_nT"] < found.details["left_out_nT"] else None
-    white = replace(one.noise, autocorrelation=0.0, white=0.0)  # as it was fitted
-    prior = best.family.at(best.widths.eta)
-    better = refitted(nominal_samples(data), one.prior, one.z, white, data.runs) < refitted(
-        found.samples, prior, best.solution.z, best.noise, data.runs
+    # the nominal fit was not whitened, so its refits are not
+    samples, white = nominal_samples(data), replace(one.noise, autocorrelation=0.0, white=0.0)
+    prior, z, noise = best.family.at(best.widths.eta), best.solution.z, best.noise
+    forward = carried_forward(samples, one.prior, one.z, white) / found.details["forward_nT"]
+    simpler.details["forward_nT"] = forward * found.details["forward_nT"]
+    if data.names:  # to first order is enough to compare fits that differ by their parameters
+        among = simpler.details["left_out_nT"] / found.details["left_out_nT"]
+        return simpler if among * forward < 1.0 else None
+    among = refitted(samples, one.prior, one.z, white, data.runs) / refitted(
+        found.samples, prior, z, noise, data.runs
     )
-    return simpler if better and _shrinks(simpler) <= max(_shrinks(found), SHRUNK) else None
+    return simpler if among * forward < 1.0 and _shrinks(simpler) <= max(_shrinks(found), SHRUNK) else None
 
 
 def _shrinks(found: Fit) -> float:
@@ -152,7 +160,7 @@ def _best(samples: Samples, family: PriorFamily) -> Climbed:
             last = climb(samples, answer.family, answer.solution.z, answer.widths.eta, noise)
         if last.solution.settled and is_maximum(last.quadratic, last.family, last.widths):
             return last
-    raise CalibrationError("auto: no start reached a maximum of the evidence; the data contradict themselves")
+    raise NoSolutionError("auto: no start reached a maximum of the evidence; the data contradict themselves")
 
 
 def _remembering(samples: Samples, answer: Climbed) -> Climbed:

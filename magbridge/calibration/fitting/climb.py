@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.estimation.hyperparameters import Hyperparameters, maximise_evidence
 from magbridge.estimation.information import GaussianInformation, covariance_of
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, Whitening, estimate_noise
@@ -14,7 +14,7 @@ from magbridge.estimation.optimise import Solution, gauss_newton
 from magbridge.estimation.priors import Prior, PriorFamily
 from magbridge.estimation.residual import Samples, jacobian, residuals, residuals_of
 
-__all__ = ["Climbed", "climb", "thinned"]
+__all__ = ["Climbed", "climb", "thinned", "thinned_rows"]
 
 ENOUGH, BLOCK = 6000, 50
 """Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
@@ -34,15 +34,20 @@ class Climbed:
     score: float
 
 
+def thinned_rows(n: int) -> IndexArray:
+    """Return the rows of blocks of neighbours, spread evenly over n samples; all rows if these are few."""
+    if n <= ENOUGH:
+        return np.arange(n)
+    first = np.linspace(0, n // BLOCK - 1, ENOUGH // BLOCK).astype(int) * BLOCK
+    return (first[:, None] + np.arange(BLOCK)).ravel()
+
+
 def thinned(samples: Samples) -> Samples:
-    """Take blocks of neighbours evenly over all samples: enough to choose a start by."""
-    blocks = len(samples.field) // BLOCK
-    if len(samples.field) <= ENOUGH:
+    """Return blocks of neighbours, spread evenly over all samples: enough to choose a start by."""
+    n = len(samples.field)
+    if n <= ENOUGH:
         return samples
-    rows = (
-        np.linspace(0, blocks - 1, ENOUGH // BLOCK).astype(int)[:, None] * BLOCK + np.arange(BLOCK)
-    ).ravel()
-    part = samples.part(rows)
+    part = samples.part(thinned_rows(n))
     part.steps[::BLOCK] = np.inf
     return part
 

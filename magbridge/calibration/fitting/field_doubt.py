@@ -73,10 +73,11 @@ def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[floa
 def _spread(value: Callable[[FloatArray], float], top: float) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations (2,) along the axes, columns (2, 2), of the evidence's curvature."""
     a, b = STEP * np.eye(2)
-    bend = np.diag([value(x) + value(-x) - 2.0 * top for x in (a, b)]) / STEP**2
-    both = value(a + b) + value(-a - b) - 2.0 * top
-    bend[0, 1] = bend[1, 0] = 0.5 * (both / STEP**2 - np.trace(bend))
-    if not np.isfinite(bend).all():
+    second = np.array([value(x) + value(-x) - 2.0 * top for x in (a, b, a + b)]) / STEP**2
+    if not np.isfinite(second).all():
         return np.full(2, 0.1), np.eye(2)
+    # second differences along both axes and their diagonal give the Hessian
+    bend = np.diag(second[:2])
+    bend[0, 1] = bend[1, 0] = 0.5 * (second[2] - second[:2].sum())
     values, axes = np.linalg.eigh(-bend)
     return np.maximum(values, WIDEST**-2.0) ** -0.5, axes

@@ -16,7 +16,7 @@ from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
 from magbridge.columns import CHANNELS
-from magbridge.errors import CalibrationError
+from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.residual import robust_scale
 from magbridge.field.reference import other_units
 
@@ -34,7 +34,11 @@ METHODS: dict[str, str] = {
 
 ONE_ATTITUDE = 5.0
 """deg: all samples within that of their mean direction are one attitude."""
-NOT_FOUND = "the rock could not be found with the calibration: what it does is left in the errors"
+NO_FIELD_IN_PLACE = "the crustal field was not found with the calibration: its part stays in the errors"
+ONE_ELLIPSOID = (
+    "method auto has no solution, so that one ellipsoid was fitted (method nominal), without parameters"
+)
+WITHOUT_PARAMETERS = "method nominal has no solution: used was method auto, without parameters"
 UNKNOWN_LENGTH = 500.0
 """m, taken for the rock's where no field in place was fitted."""
 LEVEL = 145.0
@@ -75,8 +79,12 @@ def fit(
     Raises
     ------
     CalibrationError
-        The data do not support the fit, or there is no such method. Where ``auto`` is ``survey`` and that fit
-        has no answer, it is one without a field in place, and the calibration warns of it.
+        The data do not support the fit, or there is no such method.
+
+    Notes
+    -----
+    If ``auto`` is ``survey`` and that fit has no solution, the fit is one without a field in place. If
+    ``auto`` has no solution, it is ``nominal``, and conversely. The calibration warns of either.
     """
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
@@ -98,21 +106,45 @@ def fit(
             known = np.isfinite(data.place[:, :2]).all(axis=1) | (method == "survey")
             away = tuple(jumped(data.place[known, :2], data.time[known]))
             data = data.part(~(far_off(data.place[:, :2]) & known))
-        try:
-            level = {"level": bias} if method == "survey" else {}
-            found = _function(method)(data, order, **level, **options)
-        except CalibrationError:
-            if not in_place or "position_sigma" in options:
-                raise
-            method, away = "auto", (*away, NOT_FOUND)
-            found = _function(method)(data, order, **options)
+        found, method, notes = _first_solution(data, method, order, bias, in_place, options)
         if method == "auto":
             found = replace(found, open=tuple(left_open(data, UNKNOWN_LENGTH)))
-        found = replace(found, open=(*away, *found.open))
+        found = replace(found, open=(*away, *notes, *found.open))
         if (kept := found.details.pop("flown", None)) is not None:
             data = data.part(kept)
             found.details["ends"] = int((~kept).sum())
         return judged(found if method == "survey" else _biased(found, bias), data)
+
+
+def _first_solution(
+    data: Observations, method: str, order: int, bias: float, in_place: bool, options: dict[str, Any]
+) -> tuple[Fit, str, tuple[str, ...]]:
+    """Return the fit of the first method that has a solution, that method, and what it lacks.
+
+    CalibrationError: no method has one; the message is that of the first.
+    """
+    bare = replace(data, parameters=data.parameters[:, :0], names=(), units=())
+    attempts: list[tuple[str, Observations, dict[str, Any], tuple[str, ...]]] = []
+    if method == "survey":
+        attempts.append(("survey", data, {"level": bias, **options}, ()))
+    if method != "survey" or (in_place and "position_sigma" not in options):
+        lacking: tuple[str, ...] = (NO_FIELD_IN_PLACE,) if in_place else ()
+        attempts.append(("auto" if in_place else method, data, options, lacking))
+    if attempts[-1][0] == "auto" and not options:
+        attempts.append(("nominal", bare, {}, (*attempts[-1][3], ONE_ELLIPSOID)))
+    elif method == "nominal" and not options:
+        attempts.append(("auto", bare, {}, (WITHOUT_PARAMETERS,)))
+    failures: list[CalibrationError] = []
+    for name, part, own, notes in attempts:
+        try:
+            return _function(name)(part, order, **own), name, notes
+        except NoSolutionError as error:
+            failures.append(error)
+        except CalibrationError as error:
+            if not in_place or failures:
+                raise
+            failures.append(error)
+    raise failures[0]
 
 
 def _function(method: str) -> Callable[..., Fit]:

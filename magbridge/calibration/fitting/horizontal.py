@@ -21,11 +21,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.nominal import HARD_IRON_SIGMA, SCALE_SIGMA, check_scales, nominal_samples
+from magbridge.calibration.fitting.nominal import check_scales, nominal_samples
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.errors import CalibrationError
 from magbridge.estimation.noise import estimate_noise
+from magbridge.estimation.priors import SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA
 from magbridge.estimation.residual import residuals_of
 from magbridge.wording import counted
 
@@ -59,7 +60,7 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
     level = Rotation.from_euler("YX", data.attitude[:, 1::-1])
     ned = data.reference_ned
     horizontal, vertical = np.hypot(ned[:, 0], ned[:, 1]), ned[:, 2]
-    widths = np.array([SCALE_SIGMA] * 9 + [HARD_IRON_SIGMA] * 3)
+    widths = np.array([SOFT_IRON_SIGMA] * 9 + [WIDE_HARD_IRON_SIGMA] * 3)
 
     def misfit(x: FloatArray, sigma: float) -> FloatArray:
         B, T = np.eye(3) + x[:9].reshape(3, 3), F_0 * x[9:]

@@ -31,6 +31,7 @@ from magbridge.calibration.fitting.answer import Answer
 from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder
 from magbridge.calibration.fitting.known import Known
+from magbridge.calibration.fitting.left_out import leave_out
 from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.nominal import check_scales
 from magbridge.calibration.fitting.observations import Observations
@@ -39,7 +40,7 @@ from magbridge.calibration.fitting.pose import Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.calibration.fitting.rounds import SEARCHED, SETTLED, WIDE, Rounds
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
-from magbridge.errors import CalibrationError
+from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.blocks import ParameterBlock, slow_functions
 from magbridge.estimation.noise import NoiseModel
 from magbridge.estimation.priors import Prior, PriorFamily
@@ -95,7 +96,7 @@ def fit_in_place(
     try:
         found, survey = _settled(survey, posed.family)
     except np.linalg.LinAlgError as problem:
-        raise CalibrationError("the fit to the survey has no answer: rock cannot be told apart") from problem
+        raise NoSolutionError("the fit to the survey has no answer: rock cannot be told apart") from problem
     prior, z = found.family.at(found.widths.eta), found.z
     coefficients = prior.coefficients(z)
     check_scales(samples, coefficients)
@@ -104,10 +105,14 @@ def fit_in_place(
     lifted = replace(
         samples, reference=samples.reference + found.lacking, field=samples.field - survey.offset(z[q:])
     )
+    noise = NoiseModel(found.widths.sigma, found.choice.rho)
+    own = Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset)
+    # predict parts from the others, the field in place as found: a figure to compare parameters by
+    left = leave_out(lifted, own, z[:q], replace(noise, weight=survey.kept.astype(float)), data.runs)
+    details = {**_details(found, survey), "left_out_nT": left.rms}
     fit = assemble(
         data, lifted, posed.ranges, posed.exponents, coefficients, prior.E @ covariance @ prior.E.T,
-        NoiseModel(found.widths.sigma, found.choice.rho), "survey",
-        prior=Prior(prior.precision[:q, :q], prior.E[:, :q], prior.offset), details=_details(found, survey),
+        noise, "survey", prior=own, details=details,
     )  # fmt: skip
     calibration = with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
     if level:

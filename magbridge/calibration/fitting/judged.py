@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.boresight import find_boresight, magnetic_headings
 from magbridge.calibration.fitting.crossings import rough_rock
 from magbridge.calibration.fitting.identify import combinations, expected_ratio, heading_gap, warnings_for
@@ -26,6 +29,11 @@ LIKELIER = 3.0
 """Nats by which one more order is likelier (20:1) where the one that was asked for is too low."""
 WORSE = 1.25
 """Errors of parts left out over what a fit claims for them, from which on a pilot should know."""
+MIN_SIGNAL_TO_NOISE = 3.0
+"""Standard deviation of the field along the sensor axis with the least variation, over the noise. Below it,
+noise is more than a tenth of the variance there: a fit takes noise for attitudes (errors in variables of
+second order), and 6,000 samples of 1,500 nT noise gave an ideal compass an offset of 13,900 nT at nine
+sigmas."""
 GAIN = 0.08
 """Departure of the middle scale from 1 that few sensors have, four sigmas of the prior: a wrong reference
 shrinks all scales, and a real flight was off by as much that had met rock (0.88 to 0.94)."""
@@ -54,6 +62,7 @@ def judged(found: Fit, data: Observations) -> Fit:
     noise = calibration.noise.sensor
     warnings = (
         *_warnings(ratio, noise, heading_gap(data), lasting),
+        *_noise_for_attitudes(found.samples.field, noise),
         *rough_rock(data, found.details.get("rock"), noise),
     )
     if ratio > UNSUPPORTED:
@@ -98,6 +107,16 @@ def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterato
         yield (
             f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
             "cannot be told from the Earth's"
+        )
+
+
+def _noise_for_attitudes(field: FloatArray, noise: float) -> Iterator[str]:
+    """Report if the sensor's noise (nT) is not small against the variation of the field (n, 3), nT."""
+    least = float(np.sqrt(max(np.linalg.eigvalsh(np.cov(field.T))[0], 0.0)))
+    if least < MIN_SIGNAL_TO_NOISE * noise:
+        yield (
+            f"the noise of {noise:.0f} nT is not small against the variation of the field along one axis "
+            f"({least:.0f} nT), so that noise passes for attitudes: average readings, or turn further"
         )
 
 

@@ -26,13 +26,14 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.fitting.climb import thinned_rows
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, effective_fraction
 from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_equations
 from magbridge.estimation.priors import Prior
 from magbridge.estimation.residual import Samples, jacobian, residuals, residuals_of, robust_scale
 
-__all__ = ["LeftOut", "leave_out", "refitted"]
+__all__ = ["LeftOut", "carried_forward", "leave_out", "refitted"]
 
 PARTS, BLOCKS = 10, 4
 """Parts at most, where the log has runs; and blocks of neighbours where it has fewer runs than three, or one
@@ -41,6 +42,8 @@ ATTITUDES = 6
 """Groups of samples with the field in like directions, each of which is left out, too."""
 LASTING = 0.98
 """Autocorrelation of neighbours from which on a group of like attitude cannot be left out."""
+FORWARD_PARTS = 4
+"""Parts of a log in time, of which the earlier ones predict the next."""
 STEPS = 10
 """Gauss-Newton's, at most, of a fit without a part: it begins at the fit to all."""
 TESTED = 20_000
@@ -136,6 +139,29 @@ def refitted(
         kept.steps[1:][np.diff(others) > 1] = np.inf
         found = gauss_newton(kept, prior, replace(noise, weight=weight[others]), z, steps=STEPS)
         e[rows] = residuals_of(samples.part(rows), prior.coefficients(found.z))
+    limit = OUTLIER_SIGMA * robust_scale(e)
+    return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
+
+
+def carried_forward(samples: Samples, prior: Prior, z: FloatArray, noise: NoiseModel) -> float:
+    """Return the RMS error, nT, of parts of a log that a fit to the earlier parts alone is carried to.
+
+    Forward chaining (Hyndman & Athanasopoulos 2021, Forecasting, section 5.10): the first k of
+    :data:`FORWARD_PARTS` parts predict the next one. What a log cannot determine at its beginning, and what
+    has changed since, counts here, but not where parts between others are held out. Arguments as for
+    :func:`refitted`.
+    """
+    rows = thinned_rows(len(samples.field))
+    weight = np.ones(len(samples.field)) if noise.weight is None else noise.weight
+    parts = np.array_split(rows, FORWARD_PARTS)
+    errors = []
+    for k in range(1, FORWARD_PARTS):
+        earlier = np.concatenate(parts[:k])
+        kept = samples.part(earlier)
+        kept.steps[1:][np.diff(earlier) > 1] = np.inf
+        found = gauss_newton(kept, prior, replace(noise, weight=weight[earlier]), z, steps=STEPS)
+        errors.append(residuals_of(samples.part(parts[k]), prior.coefficients(found.z)))
+    e = np.concatenate(errors)
     limit = OUTLIER_SIGMA * robust_scale(e)
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
 

@@ -18,27 +18,18 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.left_out import leave_out
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.errors import CalibrationError
+from magbridge.errors import NoSolutionError
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import NoiseModel, effective_fraction, estimate_noise, fit_slow_and_white
 from magbridge.estimation.optimise import gauss_newton
-from magbridge.estimation.priors import Prior
+from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
 from magbridge.estimation.residual import Samples, residuals_of, scales_and_offsets
 
-__all__ = [
-    "GAIN_SIGMA", "HARD_IRON_SIGMA", "SCALE_SIGMA", "check_scales", "fit_nominal", "nominal",
-    "nominal_samples", "starts",
-]  # fmt: skip
+__all__ = ["check_scales", "fit_nominal", "nominal", "nominal_samples", "starts"]
 
-SCALE_SIGMA = 0.015
-"""Prior 1-sigma by which scales differ from each other, and of soft iron, on a vehicle."""
-GAIN_SIGMA = 0.02
-"""Prior 1-sigma of the gain that the three axes share: data of all attitudes overrule it."""
 ALL_AROUND = 0.05
 """Least variance of the field along any axis, over its square: 1/3 where all attitudes are seen, and 1 % on a
 glider that never rolls."""
-HARD_IRON_SIGMA = 0.6
-"""Prior 1-sigma of the hard iron, as a fraction of the field."""
 
 
 class Ellipsoid(NamedTuple):
@@ -71,7 +62,7 @@ def nominal(
     *,
     axes_fixed: bool = False,
     equal_xz: bool = False,
-    scale_sigma: float = SCALE_SIGMA,
+    scale_sigma: float = SOFT_IRON_SIGMA,
     gain_sigma: float = GAIN_SIGMA,
 ) -> Ellipsoid:
     """Fit one ellipsoid.
@@ -89,7 +80,7 @@ def nominal(
 
     Raises
     ------
-    CalibrationError
+    NoSolutionError
         The fit collapsed or did not settle.
     """
     samples = nominal_samples(data)
@@ -114,7 +105,7 @@ def nominal(
             best = (value, found, noise, rho)
     if best is None:
         check_scales(samples, E @ z)  # a fit on its way to collapse never settles: that is the better message
-        raise CalibrationError("nominal: no start settled; are the samples those of one sensor?")
+        raise NoSolutionError("nominal: no start settled; are the samples those of one sensor?")
     _, found, noise, rho = best
     noise = fit_slow_and_white(
         residuals_of(samples, E @ found.z), samples.steps, replace(noise, autocorrelation=rho)
@@ -128,7 +119,7 @@ def nominal(
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
     """Return the prior precision, in units of the field, of the numbers that E leaves free."""
-    covariance = np.diag(np.array([scale_sigma] * 6 + [HARD_IRON_SIGMA] * 3) ** 2)
+    covariance = np.diag(np.array([scale_sigma] * 6 + [WIDE_HARD_IRON_SIGMA] * 3) ** 2)
     covariance[:3, :3] += gain_sigma**2
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
 
@@ -152,7 +143,7 @@ def starts(samples: Samples) -> list[FloatArray]:
 def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     """Refuse a collapsed fit; `coefficients` are (9 m,), nT.
 
-    CalibrationError: where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field,
+    NoSolutionError: where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field,
     where the attitudes do not tell it from a scale. All around, any T is known as well as the noise allows.
     """
     seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
@@ -165,7 +156,7 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
         listed = ", ".join(f"{value:.3g}" for value in scales[worst])
         alike = scales[worst, 2] < 1.2 * scales[worst, 0]
         counts = f"a reading counts {scales[worst].mean():.3g} nT, or " if alike else ""
-        raise CalibrationError(
+        raise NoSolutionError(
             f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
             f"{samples.F_0:.0f} nT; {counts}there are too few attitudes to tell scale from offset"
         )

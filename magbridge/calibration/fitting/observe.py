@@ -16,6 +16,7 @@ from magbridge.errors import CalibrationError
 from magbridge.field.declination import with_true_heading
 from magbridge.field.geodesy import separation
 from magbridge.field.reference import earth_field, placed, positions
+from magbridge.one_time import interpolate_to_rows
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -92,36 +93,21 @@ def observations(
 
 
 def at_one_time(ds: xr.Dataset) -> xr.Dataset:
-    """Return a log whose channels were read in turn with all of them at the rows' times.
+    """Return a log whose channels were sampled sequentially, with all channels at the rows' times.
 
-    Each is brought there by its slope, of the parabola through three readings. In a spiral a delay of 0.3 s
-    is a rotation by a degree, always the same way. Left in, it would be absorbed by the coefficients, and
-    remain there when the vehicle flies straight. So would the lag of the slope that can be known live
-    (:mod:`magbridge.one_time`).
+    See :func:`~magbridge.one_time.interpolate_to_rows`. In a spiral a delay of 0.3 s is a rotation by a
+    degree, always in the same direction: the coefficients would absorb it, and keep it when the vehicle flies
+    straight.
     """
     late = [axis for axis in "xyz" if {f"mag_{axis}", f"mag_time_{axis}"} <= set(ds.variables)]
-    channels = {f"mag_{axis}": ("time", _at(ds, axis), ds[f"mag_{axis}"].attrs) for axis in late}
+    channels = {f"mag_{axis}": ("time", _at_rows(ds, axis), ds[f"mag_{axis}"].attrs) for axis in late}
     return ds.assign(channels).drop_vars([f"mag_time_{axis}" for axis in late])
 
 
-def _at(ds: xr.Dataset, axis: str) -> FloatArray:
-    values, sampled = _column(ds, f"mag_{axis}"), _column(ds, f"mag_time_{axis}")
+def _at_rows(ds: xr.Dataset, axis: str) -> FloatArray:
+    """Return a channel (n,), nT, at the rows' times."""
     time = np.asarray(ds["time"].values, float)
-    known = np.isfinite(sampled) & np.isfinite(values)
-    if known.sum() < 2 or np.array_equal(sampled[known], time[known]):
-        return values
-    s, common = sampled[known], np.full(len(values), np.nan)
-    fresh = np.r_[True, s[1:] > np.maximum.accumulate(s)[:-1]]  # others repeat a reading
-    of, s, f = np.cumsum(fresh) - 1, s[fresh], values[known][fresh]
-    if len(s) < 2:
-        return values
-    h = np.diff(s)
-    r, bend = np.diff(f) / h, np.zeros(len(f))
-    bend[1:-1] = np.diff(r) / (h[1:] + h[:-1])
-    bend[1:-1][h[1:] > GAP * h[:-1]] = 0.0
-    d = s[of] - time[known]
-    common[known] = f[of] - d * np.r_[r[0], r][of] - d * (np.r_[h[0], h][of] - d) * bend[of]
-    return common
+    return interpolate_to_rows(time, _column(ds, f"mag_time_{axis}"), _column(ds, f"mag_{axis}"))[0]
 
 
 def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple[float, float]]:

@@ -3,7 +3,7 @@
 A drone's motors move its field in proportion to their currents, and its log holds battery and motor
 currents, throttles and servos, most of which say the same. So they are added one by one: first that which
 explains most of the residual of the fit so far (:mod:`.hints`), as long as a fit with it predicts the parts
-left out better.
+left out better, and the later parts of the log from the earlier ones.
 """
 
 from __future__ import annotations
@@ -87,6 +87,8 @@ def best_parameters(
             continue
         left = float(further.details["left_out_nT"])
         worth_it = left < BETTER * without and bool(further.calibration.channels)
+        if {"forward_nT"} <= found.details.keys() & further.details.keys():
+            worth_it = worth_it and further.details["forward_nT"] < found.details["forward_nT"]
         offers.append(Offer(name, without, left, worth_it))
         if worth_it:
             found, taken, failures = further, (*taken, name), 0

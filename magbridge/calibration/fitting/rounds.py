@@ -19,7 +19,7 @@ from magbridge.calibration.fitting.field_search import (
     same_noise,
 )
 from magbridge.calibration.fitting.survey_samples import SurveySamples
-from magbridge.errors import CalibrationError
+from magbridge.errors import NoSolutionError
 from magbridge.estimation.blocks import ParameterBlock, with_blocks
 from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field, sum_rows
 from magbridge.estimation.gaussian_field import GaussianField
@@ -121,7 +121,7 @@ class Rounds:
             if self.offers and (still or turn == self.until + PATIENCE):
                 self._weigh_offers(turn)
         if moved > self.sigma:
-            raise CalibrationError("the fit to the survey did not settle: the data contradict themselves")
+            raise NoSolutionError("the fit to the survey did not settle: the data contradict themselves")
         return answer
 
     def _round(self, turn: int) -> Answer:

@@ -15,6 +15,7 @@ from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import positions, reference_field
+from magbridge.one_time import interpolate_to_rows
 from magbridge.records import BEYOND
 from magbridge.wording import counted
 
@@ -146,7 +147,9 @@ def _columns(
     for axis in "xyz":  # a log of axes that were sampled in turn has a time for each
         sampled = table.pop(f"mag_time_{axis}", None)
         if sampled is not None and np.isfinite(sampled).all() and not np.array_equal(sampled, time):
-            table[f"mag_{axis}"] = _at(time, sampled, table[f"mag_{axis}"], trusted)
+            values, cubic = interpolate_to_rows(time, sampled, table[f"mag_{axis}"])
+            # where the cubic term is large or unknown, the channel is not known well enough
+            table[f"mag_{axis}"] = np.where(np.abs(cubic) <= trusted, values, np.nan)
             in_turn = True
     marks = {"fitted": fitted, "learned": learned}
     table |= {"time": time} | {name: np.full(time.size, float(mark)) for name, mark in marks.items()}
@@ -157,30 +160,6 @@ def _columns(
     if {"latitude", "longitude"} <= set(table):
         table["longitude"], table["latitude"], _ = positions(ds)
     return table
-
-
-def _at(time: FloatArray, sampled: FloatArray, values: FloatArray, trusted: float) -> FloatArray:
-    """Return an axis at the row's time: the cubic through its sample, the one after and the two before.
-
-    Linear interpolation is off by the curvature of a turn: tenths of a nanotesla, always with the same sign.
-    Where the cubic term itself exceeds `trusted`, nT, the axis is not known well enough: NaN.
-    """
-    out = np.full(time.size, np.nan)
-    fresh = np.append(True, np.diff(sampled) > 0.0)  # others repeat a reading
-    if not fresh.all():
-        out[fresh] = _at(time[fresh], sampled[fresh], values[fresh], trusted)
-        return out
-    if time.size < 4:
-        return out
-    a, b, c, d, t = sampled[:-3], sampled[1:-2], sampled[2:-1], sampled[3:], time[2:-1]
-    first = (values[2:-1] - values[1:-2]) / (c - b)
-    after = (values[3:] - values[2:-1]) / (d - c)
-    before = (values[1:-2] - values[:-3]) / (b - a)
-    second, earlier = (after - first) / (d - b), (first - before) / (c - a)
-    bend = (second - earlier) / (d - a) * (t - b) * (t - c) * (t - d)
-    out[2:-1] = values[2:-1] + first * (t - c) + second * (t - c) * (t - b) + bend
-    out[2:-1][np.abs(bend) > trusted] = np.nan
-    return out
 
 
 def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray:

@@ -14,14 +14,13 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.compare.derivatives import derivatives
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.estimation.noise import whiten
+from magbridge.estimation.priors import HARD_IRON_SIGMA_NT, SOFT_IRON_SIGMA
 from magbridge.estimation.residual import Samples, robust_scale
 
 __all__ = ["FALL", "floor", "isotropic", "noise_sigma", "prior"]
 
 BROADEST = 1e-3
 """Least precision, in units of the posterior's, of a direction that only the repeated logs determined."""
-SOFT, HARD = 0.02, 2000.0
-"""Soft iron, as a fraction of the field, and hard iron, nT: plausible sizes (1-sigma) on any vehicle."""
 FALL = 0.3
 """Share of a coefficient's plausible size that remains from one power of a mass' position to the next."""
 HELD = 0.1
@@ -126,7 +125,7 @@ def _physical(calibration: Calibration) -> FloatArray:
         if isinstance(term, Polynomial):
             for i, exponents in enumerate(term.exponents):
                 fall = FALL ** sum(exponents)
-                width[k + 9 * i : k + 9 * i + 6] = SOFT * calibration.reference.field * fall
-                width[k + 9 * i + 6 : k + 9 * i + 9] = HARD * fall
+                width[k + 9 * i : k + 9 * i + 6] = SOFT_IRON_SIGMA * calibration.reference.field * fall
+                width[k + 9 * i + 6 : k + 9 * i + 9] = HARD_IRON_SIGMA_NT * fall
         k += term.size
     return width
