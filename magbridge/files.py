@@ -22,9 +22,9 @@ ROOM = 1 << 20
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a path beside `path` to write to; rename it onto `path` when the block succeeds.
 
-    When the block raises, what was written is removed and `path` is as it was. The partial file of a process
-    that was killed is removed at the next write. The suffix is kept, because some writers choose the format
-    by it.
+    The file is synced to the disk before it is renamed. When the block raises, what was written is removed
+    and `path` is as it was. The partial file of a process that was killed is removed at the next write. The
+    suffix is kept, because some writers choose the format by it.
 
     WriteError: the operating system does not let the file be written: no folder, no permission, no room.
     """
@@ -34,7 +34,9 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         _clear(target)
     try:
         yield temporary
+        _sync(temporary)
         temporary.replace(target)
+        _sync(target.parent)
     except MagbridgeError:
         raise
     except OSError as error:
@@ -43,6 +45,18 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # it was renamed, or never made
             temporary.unlink()
+
+
+def _sync(path: Path) -> None:
+    """Write a file or a folder through to the disk, so that a power cut leaves no empty file."""
+    if os.name == "nt" and path.is_dir():  # Windows syncs no folders
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without fsync: the rename is all that there is
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def existing(path: Path) -> Path:

@@ -45,6 +45,30 @@ def test_systemd_finds_nothing_wrong_with_the_service(tmp_path: Path) -> None:
     assert not [line for line in done.stderr.splitlines() if "magbridge.service" in line]
 
 
+MAX_EXPOSURE = 3.0
+"""Of ten, as `systemd-analyze security` computes it."""
+
+
+def test_the_service_is_confined() -> None:
+    analyse = shutil.which("systemd-analyze")
+    if analyse is None:
+        pytest.skip("systemd-analyze is not installed")
+    command = [analyse, "security", "--offline=true", str(PACKAGING / "magbridge.service")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = re.search(r"exposure level for magbridge.service: ([\d.]+)", done.stdout)
+    if found is None:
+        pytest.skip(f"this systemd-analyze reads no files: {done.stderr.strip()[:100]}")
+    assert float(found[1]) < MAX_EXPOSURE
+
+
+def test_the_container_runs_unprivileged_from_the_lock_on_a_pinned_base() -> None:
+    lines = (PACKAGING / "Containerfile").read_text(encoding="utf-8").splitlines()
+    bases = [line.split()[1] for line in lines if line.startswith("FROM ")]
+    assert all(re.fullmatch(r"python:3\.\d+\.\d+-slim-\w+", base) for base in bases), bases
+    assert any("uv sync --locked" in line for line in lines)
+    assert [line.split()[1] for line in lines if line.startswith("USER ")] == ["magbridge"]
+
+
 def test_the_rule_names_each_adapter_once() -> None:
     lines = [
         line for line in (PACKAGING / "99-magbridge.rules").read_text().splitlines() if line[:1] not in "#"

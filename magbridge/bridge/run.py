@@ -69,6 +69,7 @@ def run(path: Path) -> None:
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
+    keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
     log = _open_log(config, edge, pipeline)
     _stop_on_signals(edge)
     # not before a signal would end the bridge in good order: who hears it may send one

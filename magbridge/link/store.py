@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -44,7 +43,5 @@ def load(path: str | Path) -> Kept:
 
 def save(path: str | Path, kept: Kept) -> None:
     """Write the file, whole or not at all, and sync it to the disk: power may be cut at any moment."""
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write(msgspec.json.format(msgspec.json.encode(kept), indent=2))
-        file.flush()
-        os.fsync(file.fileno())
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=2))
