@@ -24,36 +24,48 @@ What there is:
 - ``Corrector``: the same for many readings, one by one
 - ``Correction``: readings and telemetry, aligned and corrected as the bridge does it
 - ``correct_rows``: a log, corrected: total field, vector, anomaly, sigmas and flags
-- ``plot``: pictures: ``corrected``, ``residuals``, ``grid``; each returns matplotlib's axes
+- ``heading``: the heading of corrected vectors, with its standard deviation
+- ``plan``: the calibration runs to run next
+- ``diagnose``: the errors of the model in logs, their causes, and an extended calibration
+- ``survey``: an anomaly map from corrected logs
+- ``navigate``: the track that the field and a map give
+- ``plot``: plots: ``corrected``, ``residuals``, ``grid``; each returns matplotlib's axes
 - ``MagbridgeError``: what every error is that magbridge raises; its text is one line
 
-:func:`magbridge.diagnose.run.diagnose` and :func:`magbridge.navigate.batch.navigate` go on from there. Each
-name is imported when it is first asked for: the bridge itself needs few of them. And since the program begins
-here, too, where Ctrl-C would still print a traceback, nothing at all is imported at once.
+Functions that take a Dataset accept ``time`` in seconds since 1970 UTC or as ``datetime64``. Each name is
+imported when it is first used, because the bridge itself needs few of them.
 """
 
 TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge import plot
+    from magbridge.api import (
+        correct_rows,
+        diagnose,
+        navigate,
+        observations,
+        reference_field,
+        survey,
+        write,
+    )
     from magbridge.calibration.correct import correct
     from magbridge.calibration.corrector import Corrector
     from magbridge.calibration.file import load, save
     from magbridge.calibration.fitting.fit import fit
-    from magbridge.calibration.fitting.observe import observations
+    from magbridge.calibration.heading import heading
     from magbridge.calibration.model import Calibration
+    from magbridge.calibration.planning.plan import plan
     from magbridge.correction import Correction
     from magbridge.errors import MagbridgeError
     from magbridge.field.read import read_grid
-    from magbridge.field.reference import reference_field
-    from magbridge.logs import read, write
+    from magbridge.logs import read
     from magbridge.logs.frames import from_frame, to_frame
-    from magbridge.rows import correct_rows
     from magbridge.version import __version__
 
 __all__ = [
     "Calibration", "Correction", "Corrector", "MagbridgeError", "__version__", "correct", "correct_rows",
-    "fit", "from_frame", "load", "observations", "plot", "read", "read_grid", "reference_field", "save",
-    "to_frame", "write",
+    "diagnose", "fit", "from_frame", "heading", "load", "navigate", "observations", "plan", "plot", "read",
+    "read_grid", "reference_field", "save", "survey", "to_frame", "write",
 ]  # fmt: skip
 
 _HOMES = {
@@ -63,17 +75,22 @@ _HOMES = {
     "MagbridgeError": "errors",
     "__version__": "version",
     "correct": "calibration.correct",
-    "correct_rows": "rows",
+    "correct_rows": "api",
+    "diagnose": "api",
     "fit": "calibration.fitting.fit",
     "from_frame": "logs.frames",
+    "heading": "calibration.heading",
     "load": "calibration.file",
-    "observations": "calibration.fitting.observe",
+    "navigate": "api",
+    "observations": "api",
+    "plan": "calibration.planning.plan",
     "read": "logs",
     "read_grid": "field.read",
-    "reference_field": "field.reference",
+    "reference_field": "api",
     "save": "calibration.file",
+    "survey": "api",
     "to_frame": "logs.frames",
-    "write": "logs",
+    "write": "api",
 }
 
 

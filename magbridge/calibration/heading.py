@@ -77,8 +77,8 @@ def level_vector(vector: FloatArray, roll: FloatArray, pitch: FloatArray) -> Flo
 
 def heading(
     vector: FloatArray,
-    roll: FloatArray,
-    pitch: FloatArray,
+    roll: FloatArray | float,
+    pitch: FloatArray | float,
     declination: FloatArray | float = 0.0,
     *,
     covariance: FloatArray | None = None,
@@ -92,7 +92,7 @@ def heading(
     ----------
     vector : (n, 3) array
         nT, corrected field in body axes.
-    roll, pitch : (n,) array
+    roll, pitch : (n,) array or float
         rad.
     declination : (n,) array or float
         deg, east positive; NaN where unknown.
@@ -112,7 +112,8 @@ def heading(
         sigma there is that of a uniform angle, 180 / sqrt(3) deg.
     """
     vector = np.asarray(vector, float).reshape(-1, 3)
-    roll, pitch = np.broadcast_to(roll, len(vector)), np.broadcast_to(pitch, len(vector))
+    roll = np.broadcast_to(np.asarray(roll, float), len(vector))
+    pitch = np.broadcast_to(np.asarray(pitch, float), len(vector))
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         h_x, h_y, h_z = level_vector(vector, roll, pitch).T
         horizontal_squared = h_x * h_x + h_y * h_y
