@@ -11,6 +11,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
+from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.candidates import Candidate, slices
@@ -79,7 +80,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
 
 
 def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list[int]]:
-    """Drop the rates of change that make the live correction worse.
+    """Drop the rates of change and the delays that make the live correction worse.
 
     In flight the next sample is not known yet, so a rate is a backward difference, which is mostly noise if
     the vehicle sways from sample to sample.
@@ -91,7 +92,7 @@ def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list
     """
     dropped: list[int] = []
     for place, effect in enumerate(calibration.effects):
-        if not isinstance(effect, RateEffect):
+        if not isinstance(effect, (RateEffect, ClockEffect)):
             continue
         kept, without = (without_effects_at(calibration, some) for some in (dropped, [*dropped, place]))
         if _power(survey, without) < _power(survey, kept):

@@ -24,6 +24,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import CorrectedArrays, correct
 from magbridge.calibration.file import decode_calibration
+from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.correction import Correction
 from magbridge.diagnose.causes.candidates import Candidate, slices
@@ -42,7 +43,7 @@ from magbridge.diagnose.extend import (
     without_effects_at,
 )
 from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.left_out import HeldOut, held_out
+from magbridge.diagnose.inference.left_out import HeldOut, held_out, paired
 from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
 from magbridge.estimation.residual import Samples, residuals, rms
 from magbridge.field.grid import AnomalyGrid
@@ -69,6 +70,8 @@ MAX_FRACTION_OUTSIDE = 0.01
 """Fraction of the probes that may exceed the limit."""
 MAX_CHECKED_ROWS = 20_000
 """Most rows of a log that are corrected with the written file."""
+MAX_RATIO = 1.02
+"""Upper end of the interval of the RMS ratio, from which the corrected field may become worse."""
 MAX_PROMISE_RATIO = 1.1
 """Ratio of the corrected field's held-out RMS to the linear prediction from which the two disagree."""
 
@@ -172,6 +175,12 @@ def _attempt(
         )
     calibration = with_map_error(settled, model, fit, calibration)
     calibration = _covering(problem, calibration, error, [counts, counts & (out.fold == out.fold.max())])
+    if model and not any(isinstance(effect, TimeEffect) for c in model for effect in c.effects):
+        # Forward chaining: the second half by a fit of the first, as a later log will be corrected
+        late = np.cumsum(counts) > 0.5 * counts.sum()
+        halves = held_out(settled, blocks, fit, groups=late.astype(np.int64))
+        forward, _ = _held_out_error(problem, model, fit, halves, dropped)
+        calibration = _covering(problem, calibration, forward, [counts & late])
     extension = Extension(
         calibration, settled, tuple(blocks), fit, error, reference_error,
         corrected(problem.survey, calibration).sigma, out.score, day_error,
@@ -215,9 +224,10 @@ def _refusal(
     allowed, moved = _departure(problem, extension)
     if moved > allowed:
         return "outside_prior", (allowed, moved)
-    before = (corrected(problem.survey, problem.calibration).total - problem.survey.reference)[counts]
-    if not extension.reference_error.any() and rms(extension.error[counts]) > rms(before):
-        return "worse", (rms(before), rms(extension.error[counts]))
+    before = corrected(problem.survey, problem.calibration).total - problem.survey.reference
+    change = paired(before, extension.error, problem.survey.dive, counts)
+    if not extension.reference_error.any() and change.interval[1] > MAX_RATIO:
+        return "worse", (change.before, change.before * change.interval[1])
     return "", (0.0, 0.0)
 
 

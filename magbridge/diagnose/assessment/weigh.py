@@ -57,8 +57,8 @@ REFUSALS = {
     "corrector leaves {1} nT",
     "outside_prior": "It would move the corrected field by {1} nT where this log does not determine it and "
     "the calibration allows {0} nT",
-    "worse": "On parts left out of the fit it would leave {1} nT RMS, and the calibration as given leaves "
-    "{0} nT",
+    "worse": "On parts left out of the fit the calibration as given leaves {0} nT RMS, and the extended one "
+    "up to {1} nT (95 %)",
     "written_file": "The written file, read back, corrects this log with an error of {1} nT RMS, and the "
     "calibration as given with one of {0} nT",
 }
