@@ -82,6 +82,10 @@ class Link(Table, frozen=True):
         return self.url.startswith(("udpin:", "tcpin:"))
 
 
+MAX_DELAY_S = 600.0
+"""Longest delay of telemetry, s."""
+
+
 class Telemetry(Table, frozen=True):
     """``[telemetry.NAME]``: a field of a message that becomes the parameter NAME.
 
@@ -101,6 +105,8 @@ class Telemetry(Table, frozen=True):
     """Of the parameter, as in the calibration."""
     max_age: Positive = 30.0
     """s; an older value is stale."""
+    delay: float = 0.0
+    """Time by which the telemetry is late, s: a value stamped t was true at t - delay."""
     component: SystemId | None = None
     """Only what this component sends counts; without it, the autopilot's, else what the first sends that is
     heard."""
@@ -110,6 +116,8 @@ class Telemetry(Table, frozen=True):
             raise ValueError(f"scale: a number other than 0, not {self.scale}")
         if not isfinite(self.offset):
             raise ValueError(f"offset: a number, not {self.offset}")
+        if not abs(self.delay) <= MAX_DELAY_S:
+            raise ValueError(f"delay: at most {MAX_DELAY_S:g} s either way, not {self.delay}")
 
 
 class CalibrationFile(Table, frozen=True):

@@ -88,6 +88,7 @@ def test_another_encoding(tmp_path: Path) -> None:
         ('unit = "in"', "max_age = inf", "telemetry.battpos.max_age: expected `float` <= 1000000000"),
         ('unit = "in"', "scale = 0.0", "telemetry.battpos: scale: a number other than 0"),
         ('unit = "in"', "offset = nan", "telemetry.battpos: offset: a number, not nan"),
+        ('unit = "in"', "delay = 1e4", "telemetry.battpos: delay: at most 600 s either way, not 10000.0"),
         ("HIGHRES_IMU = 0", "HIGHRES_IMU = 'fast'", "publish.HIGHRES_IMU: expected `float`, got `str`"),
         (
             'url = "udpout:192.0.2.1:14550"',

@@ -257,7 +257,8 @@ class Pipeline:
             for name, value, when_us in self._telemetry.values(message, time_us, component.vehicle.clock):
                 if self._sources.admit(name, message.component, time_us):
                     guessed = self._late and when_us == time_us
-                    self._correction.telemetry(name, value, when_us, guessed=guessed)
+                    true_us = when_us - self._telemetry.delays_us[name]
+                    self._correction.telemetry(name, value, true_us, guessed=guessed)
             if not is_possible(message):
                 self.component.announcer.state(
                     f"impossible {message.name}", f"{message.name} with impossible values ignored",

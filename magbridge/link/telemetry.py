@@ -90,6 +90,11 @@ class TelemetryMap:
     path : Path
         The configuration, for errors.
 
+    Attributes
+    ----------
+    delays_us : dict of str to int
+        Time in µs by which each parameter is late: to be subtracted from the time of its values.
+
     Raises
     ------
     ConfigError
@@ -100,6 +105,7 @@ class TelemetryMap:
         self, telemetry: Mapping[str, Telemetry], autopilot: int = 1, path: Path = Path("bridge.toml")
     ) -> None:
         self._autopilot = autopilot
+        self.delays_us = {name: round(what.delay * 1e6) for name, what in telemetry.items()}
         self._by_id: dict[int, list[Extractor]] = {}
         self._times: dict[int, Callable[[bytes], tuple[int, int]] | None] = {}
         for name, what in telemetry.items():

@@ -153,6 +153,25 @@ def test_a_mass_rate_is_the_drives_speed_while_it_moves(problem: Problem) -> Non
     np.testing.assert_allclose(share, -lag.width[0] / clock.width[0])
 
 
+def test_a_mass_that_moves_within_one_interval_is_seen_by_a_shift(problem: Problem) -> None:
+    """It has no rate at any sample, but its telemetry has moved after a shift."""
+    name = problem.calibration.parameters[0].name
+    channel = problem.survey.channels[name]
+    low, high = channel.extent
+    jump = channel._replace(values=np.where(np.arange(len(problem)) < 100, low, high))
+    channels = {
+        k: c if k == name else c._replace(values=np.full(len(problem), c.values[0]))
+        for k, c in problem.survey.channels.items()
+    }
+    moved = pose(replace(problem.survey, channels=channels | {name: jump}), problem.calibration)
+    rates, *shifts = CAUSES["clock_offset"].candidates(moved)
+    whole = slice(0, len(moved))
+    assert not rates.columns(whole).any()
+    seen = {float(c.point.shape["shift"][0]): set(np.flatnonzero(c.columns(whole)[:, 0])) for c in shifts}
+    assert any(rows and max(rows) < 100 for shift, rows in seen.items() if shift > 0.0)
+    assert any(rows and min(rows) >= 100 for shift, rows in seen.items() if shift < 0.0)
+
+
 def test_a_candidate_profiled_again_stays_its_own_channels(problem: Problem) -> None:
     cold = Channel(problem.survey.channels["warm"].values[::-1].copy(), "degC", ("temperature",))
     survey = replace(problem.survey, channels={**problem.survey.channels, "cold": cold})
