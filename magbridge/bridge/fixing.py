@@ -1,4 +1,4 @@
-"""When a fix goes to the autopilot, and what it answers: every start, stop and refusal is told once."""
+"""Send fixes to the autopilot and report, once each, every start, stop and refusal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PX4_KEEPS_CLAIM = 1, 16
 """Version of PX4 up to which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's own uncertainty; a later one
 fuses it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""
 UNANSWERED = 3
-"""Commands in a row without an answer before that is told."""
+"""Commands in a row without an answer before that is reported."""
 HINTS = {
     MAV_RESULT.FAILED: " (it still uses GPS, has no origin, or nothing measures its speed)",
     MAV_RESULT.TEMPORARILY_REJECTED: " (it does not dead-reckon)",
@@ -72,7 +72,7 @@ class Gps:
 
 
 class Fixing:
-    """Sends fixes while the autopilot has no GPS, and hears its answers.
+    """Sends fixes while the autopilot has no GPS, and receives its answers.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class Fixing:
         Of :data:`~magbridge.link.fixes.FIXES`.
     component : Component
     frame : Frame
-        Has heard each message before.
+        Has received each message before.
     gnss : GnssMonitor
         Has tested each GPS position before.
 
@@ -121,7 +121,7 @@ class Fixing:
 
     @property
     def is_fused(self) -> bool:
-        """Return True if the autopilot fuses a fix with what it knows, so that it must be widened."""
+        """Return True if the autopilot fuses a fix with its own position, so that it must be widened."""
         replaced = self._version is not None and self._version <= PX4_KEEPS_CLAIM
         return self._kind.fused or (self.stack == MAV_AUTOPILOT.PX4 and not replaced)
 
@@ -186,7 +186,7 @@ class Fixing:
         return "GPS is suspect" if suspect else ""
 
     def _await_answer(self) -> None:
-        """Count a fix that the autopilot has not yet answered; tell where it answers none."""
+        """Count a fix that the autopilot has not yet answered; report if it answers none."""
         self._waiting += 1
         if self._waiting > UNANSWERED:
             text = "the autopilot does not answer fixes"

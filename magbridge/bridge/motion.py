@@ -63,7 +63,7 @@ class Motion:
     navigator : Navigator
     component : Component
     frame : Frame
-        Has heard each message before.
+        Has received each message before.
     velocity_stays : callable
         Whether a fix leaves the autopilot's velocity as it was, so that this remains a measurement.
 

@@ -158,7 +158,7 @@ class Navigation:
 def open_navigation(
     config: Config, wanted: Wanted, calibration: Calibration | None
 ) -> Callable[[Component], Navigation]:
-    """Return what makes the navigation that a configuration asks for, given the component it speaks through.
+    """Return a function that makes the navigation of a configuration for a component.
 
     Where the configuration sets neither ``noise`` nor ``bias_sigma``, both are taken from the calibration.
 

@@ -26,7 +26,7 @@ MAX_SPEED_M_S: Final = 350.0
 """m/s: no vehicle that carries a fluxgate is faster."""
 MAX_JUMP_M: Final = 10_000.0
 """m beyond what MAX_SPEED_M_S allows: the main field changes by 50 nT at most over that, so that a correction
-of a long dead reckoning is no jump."""
+of a long dead reckoning is not a jump."""
 SUSPECT_US: Final = 900_000_000
 """µs for which the vehicle must stay at a position beyond a jump until the bridge uses that position."""
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
@@ -41,7 +41,7 @@ class Position:
     Parameters
     ----------
     notify : callable
-        Receives the reason why there is no main field at a known position.
+        Receives the reason why the main field is unknown at a known position.
 
     """
 
@@ -67,7 +67,7 @@ class Position:
     def update(self, message: Message, time_us: int) -> None:
         """Use a GLOBAL_POSITION_INT; ignore one that states an unknown or impossible position.
 
-        After a jump that speed and time do not allow there is no main field, hence no anomaly, until the
+        After a jump that speed and time do not allow, main field and anomaly are unknown until the
         vehicle is near the former track again or has stayed beyond the jump for :data:`SUSPECT_US`.
         """
         lat, lon, altitude = message["lat"], message["lon"], message["alt"] * 1e-3

@@ -1,6 +1,6 @@
 """A position fix, in the messages that autopilots take as one: each as the receiver's own source asks for it.
 
-What a receiver does with a field is said beside the field, with the file that does it: ArduPilot's of
+A comment at each field names what a receiver does with it, and the source file: ArduPilot's of
 December 2025, PX4's of August 2026.
 """
 
@@ -74,10 +74,10 @@ def widened(fix: Fix, seconds: float) -> Fix:
 
     Notes
     -----
-    The errors of successive fixes are alike, but an autopilot's filter takes them for independent and would
-    soon claim to know the position better than the fixes do. Fixes of variance R, dt apart, are to it white
-    noise of the density N = R dt. A filter whose velocity (or wind) walks with the density q (`WALK`), fed
-    with that, comes to the variance
+    The errors of successive fixes are correlated, but an autopilot's filter takes them for independent and
+    would soon claim to know the position better than the fixes do. Fixes of variance R, every dt, are to it
+    white noise of the density N = R dt. A filter whose velocity (or wind) walks with the density q (`WALK`),
+    fed with that, comes to the variance
 
         P = √2 q^(1/4) N^(3/4)
 
@@ -125,7 +125,7 @@ def global_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> No
     """Send GLOBAL_POSITION_SENSOR, which PX4 fuses as an auxiliary position.
 
     PX4 (``mavlink_receiver.cpp``, ``aux_global_position_control.cpp``) takes its arrival as its time, and a
-    sigma that is no number as 1 m.
+    sigma that is not a number as 1 m.
     """
     outbox.send(
         "GLOBAL_POSITION_SENSOR",
@@ -186,7 +186,7 @@ class Kind(NamedTuple):
     refused_by: dict[int, str]
     """Autopilots that cannot use it, and what to set instead."""
     fused: bool
-    """The receiver weighs it against what it knows; else it puts its position there."""
+    """The receiver fuses it with its own position; else it puts its position there."""
     local: bool = False
     """It holds a :class:`Pose`."""
     trusted_to: float = inf
@@ -212,7 +212,7 @@ FIXES: dict[str, Kind] = {
     "ODOMETRY": Kind(
         odometry,
         5.0,
-        # EKF2's EV position learns our offset as a bias, and drops what comes 0.25 s late (ev_control.cpp)
+        # EKF2's EV position learns our offset as a bias, and drops messages 0.25 s late (ev_control.cpp)
         {MAV_AUTOPILOT.PX4: "PX4 makes a bias of ODOMETRY: use GLOBAL_POSITION_SENSOR"},
         fused=True,
         local=True,

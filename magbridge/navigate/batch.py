@@ -116,7 +116,7 @@ def navigate(
 def samples_of(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArray, RealArray]:
     """Return time (n,), s, total field and its sigma (n,), nT; NaN where a sample must not be used.
 
-    FormatError: there is no total field, or time does not increase.
+    FormatError: the total field is missing, or time does not increase.
     """
     if "total_field" not in deployment:
         raise FormatError(source, "expected total_field: correct the log with a calibration first")

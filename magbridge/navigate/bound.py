@@ -84,7 +84,7 @@ def position_bound(
     -----
     Tichavský, Muravchik & Nehorai 1998, eq. 21; with linear motion and the map's slope at the true position
     it is the covariance of a Kalman filter that knows where to linearise,
-    ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map there is no measurement.
+    ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map, measurements are missing.
     """
     grid, o = lasting_errors(grid, options or Options())
     corners = np.asarray(time, float)

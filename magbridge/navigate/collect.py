@@ -1,7 +1,8 @@
 """Samples to blocks: samples between which the map is linear become one measurement, their mean.
 
 A block is full when one more sample, as far on as the last, would lie beyond it: where every step is longer
-than a block, every sample is one, and no two that lie further apart than the map's detail are averaged.
+than a block, every sample is one, and samples farther from each other than the map's detail are never
+averaged.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Collector:
         Parameters
         ----------
         time_us, utc_offset_us : int
-            µs of a clock that is never set, and what is to be added for UNIX time: the main field has a date.
+            µs of a clock that is never set, and the offset to UNIX time: the main field has a date.
         where : DeadReckoning
             At the place of the sample.
         total_field, sigma : float

@@ -113,7 +113,7 @@ class DeadReckoning:
         return offset(self.latitude, self.longitude, self._velocity[0] * elapsed, self._velocity[1] * elapsed)
 
     def telemetry(self, time: float, values: dict[str, float]) -> None:
-        """Take in what is known at `time`.
+        """Use the telemetry of `time`.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class DeadReckoning:
         The velocity v₀ of the previous report, Δt ago, became v₁ at an unknown moment, uniformly distributed
         over Δt. The motion in Δt then has the mean (v₀ + v₁) Δt/2 and the covariance
         (v₁ - v₀)(v₁ - v₀)ᵀ Δt²/12. An error of heading or speed turns with the vehicle, so that a turn
-        changes what it does to the velocity in proportion to v₁ - v₀.
+        changes the error of the velocity in proportion to v₁ - v₀.
         """
         north, east = velocity[0] - self._velocity[0], velocity[1] - self._velocity[1]
         elapsed = min(time - self._reported, MAX_REPORT_INTERVAL_S)

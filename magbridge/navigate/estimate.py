@@ -30,7 +30,7 @@ JOIN, SPLIT = 1.2, 1.5
 FINER = 0.8
 """Share of the resolution: it changes only if a measurement asks for one finer than this."""
 DOUBTFUL = 1.0
-"""Log odds: another place explains the field better, though not yet beyond doubt."""
+"""Log odds: another place explains the field better, but not yet at the odds of ``options.doubt``."""
 SPREADS = (2.0, 4.0, 2.0, 8.0)
 """1-sigma of successive searches, over the reach."""
 
@@ -49,8 +49,8 @@ class Estimate:
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     valid : bool
         The position can be used: the map has described the field at odds of ``options.doubt``; the
-        filter began as wide as competing filters do, or they have since come to the same place; and nothing
-        speaks against it now.
+        filter began as wide as competing filters do, or they have since come to the same place; and no test
+        rejects it now.
     moved : tuple of ndarray
         F and Q of the last prediction, for a smoother.
     jumps : list of Jump
@@ -90,7 +90,7 @@ class Estimate:
 
     @property
     def begun(self) -> bool:
-        """Whether a measurement has been taken in."""
+        """Whether a measurement has been used."""
         return self._filter is not None
 
     @property
@@ -202,7 +202,7 @@ class Estimate:
             self._filter.predict(F, Q)
 
     def other_motion(self) -> None:
-        """From now on dead reckoning follows other telemetry: what it misses, the current, is another."""
+        """From now on dead reckoning follows other telemetry, so its error, the current, is another."""
         if self._filter is None:
             return
         banks = [self._monitor.here, self._monitor.elsewhere] if self._monitor else []
@@ -293,7 +293,7 @@ class Estimate:
         """Return the bias's 1-sigma, nT, at other places; and that of half of them, 0: it is the same there.
 
         Where the position was known, the field told the bias, wherever the filter has gone since: from then
-        on it may have changed by what was claimed. After a search that is in doubt, too.
+        on it may have changed by its prior sigma. After a search it is uncertain, too.
         """
         o = self._claimed
         level = o.bias_sigma

@@ -154,7 +154,7 @@ def _best_shift(
     latitude, longitude, depth : array, (n,)
         deg, m.
     anomaly : array, (n,)
-        nT; a constant is taken out.
+        nT; a constant is subtracted.
     """
     shifts = np.linspace(-SEARCH, SEARCH, LATTICE)
     per_latitude, per_longitude = metres_per_degree(float(np.mean(latitude)))

@@ -65,7 +65,7 @@ an unrelated smooth field predicts as well as the map."""
 FRESH_US = 10_000_000
 """µs for which a position, or a report of the receiver's, holds."""
 CORRELATION_TIME_S = 30.0
-"""s over which the errors of successive positions are alike."""
+"""s over which the errors of successive positions are correlated."""
 OK_STATE, DETECTED_STATE = 1, 3
 """GPS_JAMMING_STATE and GPS_SPOOFING_STATE: nothing found; found and not mitigated."""
 
@@ -195,8 +195,8 @@ class GnssMonitor:
 
         Notes
         -----
-        Errors of one variance σ² that are alike over τ, each Δt, count as independent ones of the variance
-        σ² (1 + τ/Δt).
+        Errors of one variance σ² that are correlated over τ, each Δt, count as independent ones
+        of the variance σ² (1 + τ/Δt).
         """
         if len(self._history) < 2:
             return sigma
@@ -287,7 +287,7 @@ class GnssMonitor:
         jumped = False
         for then in (history[-1], history[2 * len(history) // 3], history[0]) if history else ():
             seconds = max((time_us - then.time_us) * 1e-6, 0.0)
-            # what was known of the current before the positions were wrong
+            # the estimate of the current from before the positions were wrong
             known = then if self._trusted is None else self._trusted
             age = max((time_us - known.time_us) * 1e-6, 0.0)
             changed = o.current_sigma * sqrt(min(2.0 * age / o.current_time, 1.0))
@@ -436,7 +436,7 @@ class _FieldTest:
         unmapped = self._unmapped.update(block, whole, tracker.curvature_variance)
         if not seen.variance > 0.0:  # off the map
             return
-        if not seen.accepted:  # as the filter does: what was rejected never speaks for the map
+        if not seen.accepted:  # as the filter does: a rejected measurement is never evidence for the map
             unmapped = max(unmapped, seen.log_likelihood)
         self._against = min(max(self._against - seen.log_likelihood + unmapped, 0.0), self.limit)
         for name, other in (("log_odds_of_map", unmapped), ("log_odds_of_position", filter_likelihood)):

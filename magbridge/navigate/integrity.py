@@ -1,7 +1,8 @@
 """Integrity: whether the filter should still be trusted, by comparison with other explanations of the field.
 
 A filter at the wrong place has innocent innovations, because it has moved to where they are small. The error
-shows only when another explanation predicts the same measurements better. Two are kept beside the filter:
+shows only when another explanation predicts the same measurements better. Two are kept in addition to the
+filter:
 *elsewhere*, a bank of hypotheses spread around it; and *nowhere*, a random field as rough as the map but
 unrelated to it.
 
@@ -98,9 +99,9 @@ class Unmapped:
 class IntegrityMonitor:
     """Two banks compared on equal terms: *here* begins at the filter, *elsewhere* is spread around it.
 
-    Both take in the same measurements, several blocks averaged to one, because a bank costs more than a
+    Both use the same measurements, several blocks averaged to one, because a bank costs more than a
     filter and the comparison can wait a minute. The filter starts a new monitor once it is confirmed or
-    begins anew.
+    starts again.
 
     Parameters
     ----------

@@ -34,14 +34,14 @@ __all__ = [
 N_STATES = 6
 NO_MOTION_NOISE = MotionNoise()
 FINE = 0.35
-"""Share of the spread that one measurement allows: errors of successive ones are alike and add up."""
+"""Share of the spread that one measurement allows: errors of successive ones are correlated and add up."""
 
 
 class Block(NamedTuple):
     """Samples close enough together to be one measurement."""
 
     time_us: int
-    """µs, their mean time."""
+    """Mean time of the samples, µs."""
     latitude: float
     longitude: float
     """`latitude`, `longitude`: deg, dead-reckoned, their mean."""
@@ -136,7 +136,7 @@ def resolution(grid: AnomalyGrid, options: Options, variance: float) -> float:
         Bias and map error.
     variance : float
         nT², of a measurement. A sixteenth of what bias and map error gain until the next is added (as for
-        half the spread): those errors persist, and so do the curvature's.
+        half the spread): those errors persist, as the error by curvature does.
 
     Notes
     -----

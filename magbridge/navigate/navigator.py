@@ -106,7 +106,7 @@ class Navigator:
         return self._correct(time_us, place, sigma, monitor.fused_sigma(time_us, known))
 
     def _prediction(self, time_us: int) -> Prediction:
-        """Return what is known of the position at a time from the last update on."""
+        """Return the predicted position at a time from the last update on."""
         now, where = self.estimate, self._reckoning
         F, Q = transition(now.options, max((time_us - now.time_us) * 1e-6, 0.0), 0.0)
         x, P = F @ now.x, F @ now.P @ F.T + Q

@@ -46,7 +46,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     noise_time: NotNegative = 0.0
     """s, correlation time of that noise; noise that lasts longer than a few intervals belongs to the bias."""
     gate: Positive = 16.0
-    """Largest innovation squared over its variance that is taken in."""
+    """Largest innovation squared over its variance that is accepted."""
     interval: NotNegative = 20.0
     """s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
     correlation length."""
@@ -64,7 +64,7 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     options : Options
         Their bias is that of all other sources: the map's level, the field's variation in time.
     calibration : Calibration
-        Of the total field that will be taken in.
+        Of the total field that will be used.
     sigma : float
         nT, 1-sigma that the calibration claims for a typical sample.
 

@@ -19,7 +19,7 @@ def own_bound(
     Parameters
     ----------
     field : OwnField
-        What was measured.
+        The measured field.
     place, slopes : (n, 2) array
         The true places, m, and the field's slopes there, nT/m; NaN where not known: such blocks tell nothing.
     typical : (q,) array

@@ -1,4 +1,4 @@
-r"""The likelihood of a track in a field that nobody has mapped: how well it agrees with itself.
+r"""The likelihood of a track in an unmapped field: how well it agrees with itself.
 
 With drift d(t), a field f in place and the calibration's error b,
 
@@ -25,19 +25,19 @@ __all__ = ["KINDS", "OwnField", "drift_functions"]
 KINDS = ("exponential, once smooth", "exponential, twice smooth", "Gaussian")
 """Matern's covariances of smoothness 3/2 and 5/2, and the limit of both (Rasmussen & Williams, eq. 4.17)."""
 SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
-"""nT of rock, and the 1-sigma of its logarithm: sea floor and land as airborne surveys meet them."""
+"""nT of the crustal field, and the 1-sigma of its logarithm: sea floor and land by airborne surveys."""
 LENGTH_SPREAD, NOISE_SPREAD = np.log(6.0), np.log(1.3)
 """1-sigma of the logarithm of the length, and of the noise over what the calibration claims."""
 STEPS, SHARE = 4.0, 2.5
 """The shortest length expected, over the distance of neighbours; the longest, over the track's extent."""
 LEVEL = 10.0
-"""The level's 1-sigma, over the scatter of what was measured: it is not known."""
+"""The level's 1-sigma, over the scatter of the measured field: it is not known."""
 KNOTS, WAVES, LEFT_OUT = 240, 48, 1e-4
 """Times at which a drift's covariance is taken, its functions at most, and the share they may leave out."""
 FARTHEST = 8.0
 """Sigmas of its prior beyond which no size, length or noise is tried."""
 LOST = -1e300
-"""Log likelihood of what is impossible."""
+"""Log likelihood of an impossible track."""
 
 
 def drift_functions(time: FloatArray, options: Options) -> FloatArray:

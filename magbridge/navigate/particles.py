@@ -64,7 +64,7 @@ def sample(
     """Return `number` particles of the posterior of u (q,), N(0, 1) beforehand, and of one of `kinds` models.
 
     `counts` says how many data each stage has; after one that is `hopeless`, by its u (k, q) and its count,
-    no more are taken in.
+    no more are used.
     """
     rng = np.random.default_rng(0)
     u, kind = rng.normal(size=(number, q)), rng.integers(0, kinds, number)
@@ -90,7 +90,7 @@ def sample(
 
 
 def _step(gained: FloatArray, share: float) -> tuple[float, FloatArray]:
-    """Return the next share of the new likelihood, and the particles' weights (k,) by what it gains them."""
+    """Return the next share of the new likelihood, and the particles' weights (k,) by their gain."""
 
     def weighed(to: float) -> FloatArray:
         w = np.exp((to - share) * (gained - gained.max()))

@@ -44,11 +44,11 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     innovation_variance: float
     """`innovation`, `innovation_variance`: nT, nT²; measured minus expected anomaly; NaN off the map."""
     gate: float
-    """Largest innovation squared over variance that is taken in."""
+    """Largest innovation squared over variance that is accepted."""
     accepted: bool
-    """The measurement was taken in."""
+    """The measurement was accepted."""
     depth: float
-    """m."""
+    """Depth of the vehicle, m."""
     anomaly: float
     """nT, measured: total field minus main field at the dead-reckoned position."""
     map_anomaly: float
@@ -57,7 +57,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     bias_sigma: float
     """`bias`, `bias_sigma`: nT, of the calibration."""
     map_error: float
-    """nT."""
+    """Estimated error of the map, nT."""
     current_north: float
     current_east: float
     """`current_north`, `current_east`: m/s."""
