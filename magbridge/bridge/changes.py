@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from magbridge.bridge.position import CLOCK_SET_US
 from magbridge.bridge.sensor_line import SensorLine
-from magbridge.link.announcer import Announcer
+from magbridge.link.output import Announcer
 from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.enums import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 

@@ -14,7 +14,7 @@ from magbridge.learning import Learner
 from magbridge.learning.causes import CAUSES
 from magbridge.learning.start import class_prior
 from magbridge.link.component import Component
-from magbridge.link.rates import Rate
+from magbridge.link.output import Rate
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAG_LEARNING_STATE, MAV_SEVERITY
 

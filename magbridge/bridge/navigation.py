@@ -18,7 +18,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.read import read_grid
 from magbridge.link.component import Component
 from magbridge.link.fixes import FIXES, Kind
-from magbridge.link.rates import Rate
+from magbridge.link.output import Rate
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.navigate import Navigator, Options, Record, State

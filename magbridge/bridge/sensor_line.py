@@ -6,8 +6,7 @@ import re
 from collections.abc import Callable
 from typing import Final
 
-from magbridge.link.announcer import Announcer
-from magbridge.link.timers import Timers
+from magbridge.link.output import Announcer, Timers
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Vector
 
@@ -149,11 +148,11 @@ class SensorLine:
     def _wake(self, time_us: int, listen_us: int = 0) -> None:
         self.state, self._received_us = MAG_PORT_STATE.SILENT, time_us
         if listen_us:
-            self._timers.at("command", time_us + listen_us, lambda t: self._command(t, self._commands))
+            self._timers.once("command", time_us + listen_us, lambda t: self._command(t, self._commands))
         else:
             self._command(time_us, self._commands)
 
     def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
         if commands:
             self.to_send.append(commands[0])
-            self._timers.at("command", time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:]))
+            self._timers.once("command", time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:]))

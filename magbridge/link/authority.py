@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from magbridge.config import Telemetry
-from magbridge.link.announcer import Announcer
+from magbridge.link.output import Announcer
 from magbridge.mavlink import Message, Source
 from magbridge.mavlink.enums import MAV_SEVERITY, MAV_TYPE
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from math import isfinite
 
-from magbridge.link.announcer import Announcer
 from magbridge.link.authority import Authority
-from magbridge.link.outbox import Outbox
+from magbridge.link.output import Announcer, Outbox
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
 

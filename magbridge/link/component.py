@@ -8,17 +8,15 @@ from functools import partial
 
 from magbridge.config import Link
 from magbridge.link import metadata
-from magbridge.link.announcer import Announcer
 from magbridge.link.authority import Authority
 from magbridge.link.commands import Commands
 from magbridge.link.message_rates import DEFAULTS, LIMITS, MessageRates
-from magbridge.link.outbox import Outbox
+from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.link.parameter_service import ParameterService
 from magbridge.link.parameters import Parameters, Tunable, rates
 from magbridge.link.publish import PUBLISHED, Publisher
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.requests import StreamRequests
-from magbridge.link.timers import Timers
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.enums import MAV_SEVERITY

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from magbridge.link.outbox import Outbox
+from magbridge.link.output import Outbox
 from magbridge.mavlink.enums import GLOBAL_POSITION_SRC, MAV_AUTOPILOT, MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
 from magbridge.mavlink.messages import east_e7
 

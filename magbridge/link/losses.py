@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from magbridge.link.announcer import Announcer
-from magbridge.link.timers import Timers
+from magbridge.link.output import Announcer, Timers
 from magbridge.mavlink.enums import MAV_SEVERITY
 
 __all__ = ["Losses", "Numbers"]

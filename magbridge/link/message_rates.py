@@ -6,10 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from magbridge.errors import ConfigError
+from magbridge.link.output import Rate, Timers, period_us
 from magbridge.link.parameters import Parameters, rate_name
 from magbridge.link.publish import PUBLISHED
-from magbridge.link.rates import Rate, period_us
-from magbridge.link.timers import Timers
 from magbridge.mavlink import Codec, spec
 
 __all__ = ["DEFAULTS", "LIMITS", "MessageRates", "check_publish"]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from magbridge.link.announcer import Announcer
 from magbridge.link.authority import Authority
-from magbridge.link.outbox import Outbox
+from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.link.parameters import Parameters
-from magbridge.link.timers import Timers
 from magbridge.mavlink import Message
 from magbridge.mavlink.enums import MAV_PARAM_TYPE, MAV_SEVERITY
 
@@ -77,7 +75,7 @@ class ParameterService:
         self._unasked -= 1
         if self._unasked:
             self._begin()
-            self._timers.at("parameters unasked", time_us + REPEAT_US, self._list_unasked)
+            self._timers.once("parameters unasked", time_us + REPEAT_US, self._list_unasked)
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
         """Begin to send all parameters, one every `PACE_US`; of a list under way, the rest comes first."""

@@ -8,8 +8,7 @@ from struct import Struct
 from typing import Final
 
 from magbridge.align import Sample, nearest
-from magbridge.link.outbox import Outbox
-from magbridge.link.rates import Rate
+from magbridge.link.output import Outbox, Rate
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.records import Corrected

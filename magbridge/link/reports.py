@@ -8,7 +8,7 @@ from math import nan
 from typing import NamedTuple
 
 from magbridge.link.metadata import GENERAL, crc32, uri
-from magbridge.link.outbox import Outbox
+from magbridge.link.output import Outbox
 from magbridge.link.vehicle import Vehicle
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import (

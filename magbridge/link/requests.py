@@ -6,9 +6,7 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Final
 
-from magbridge.link.announcer import Announcer
-from magbridge.link.outbox import Outbox
-from magbridge.link.timers import Timers
+from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
@@ -138,7 +136,7 @@ class StreamRequests:
             param2=1e6 / self.rate_of(number),
         )
         deadline = self._outbox.codec.now_us + ANSWER_US
-        self._timers.at("stream request", deadline, lambda _: self._ask_next())
+        self._timers.once("stream request", deadline, lambda _: self._ask_next())
 
     def _answered(self, result: int) -> None:
         """Report a denial, and go on with the next request."""

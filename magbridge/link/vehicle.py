@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from magbridge.link.announcer import Announcer
 from magbridge.link.clock import VehicleClock
 from magbridge.link.losses import Losses
-from magbridge.link.timers import Timers
+from magbridge.link.output import Announcer, Timers
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE
 from magbridge.mavlink.messages import MESSAGES
@@ -106,7 +105,7 @@ class Vehicle:
         if self.state != MAG_PORT_STATE.OK:
             self._announcer.state("autopilot", f"{who} found", MAV_SEVERITY.INFO)
         self.state = MAG_PORT_STATE.OK
-        self._timers.at("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
+        self._timers.once("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
 
     def _vanish(self, who: str) -> None:
         self.state = MAG_PORT_STATE.LOST

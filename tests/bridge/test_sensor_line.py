@@ -12,9 +12,7 @@ from magbridge.bridge.events import Event, Start
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.model import Parameter
-from magbridge.link.announcer import Announcer
-from magbridge.link.outbox import Outbox
-from magbridge.link.timers import Timers
+from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAG_PORT_NAME
 from magbridge.records import Channel

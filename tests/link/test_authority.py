@@ -12,10 +12,8 @@ from small import START, small_bridge
 from magbridge.bridge.events import Event, Start
 from magbridge.calibration.model import Parameter
 from magbridge.config import Telemetry
-from magbridge.link.announcer import Announcer
 from magbridge.link.authority import Sources
-from magbridge.link.outbox import Outbox
-from magbridge.link.timers import Timers
+from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT
 from magbridge.records import Channel

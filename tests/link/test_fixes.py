@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from scipy.linalg import solve_continuous_are
 
 from magbridge.link.fixes import FIXES, WALK, Fix, Pose, widened
-from magbridge.link.outbox import Outbox
+from magbridge.link.output import Outbox
 from magbridge.mavlink import Codec, Message
 
 NOW = 1_780_000_123_456_000

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from magbridge.link.announcer import Announcer
-from magbridge.link.outbox import Outbox
+from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.link.requests import StreamRequests, needed_rates
-from magbridge.link.timers import Timers
 from magbridge.mavlink import Codec, Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_TYPE
 

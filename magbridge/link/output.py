@@ -1,0 +1,222 @@
+"""What the component sends, and when: the queue of frames, timers, rates and announcements.
+
+All times are event times in µs since 1970 UTC, so that a replay sends the same frames at the same times.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from magbridge.mavlink import Codec, Spec
+from magbridge.mavlink.enums import MAV_SEVERITY
+
+__all__ = ["FOREVER", "Announcer", "Outbox", "Rate", "Timers", "period_us"]
+
+FOREVER = 1 << 62
+"""µs: the deadline where no timer is set."""
+MAX_PERIOD_US = 1e15
+"""µs, 31 years: a lower rate has this period."""
+STATUSTEXT_LENGTH = 50
+"""Characters in one STATUSTEXT (definition of the message, common.xml)."""
+TEXTS_KEPT = 32
+"""Texts that are kept for stderr."""
+ANNOUNCEMENT_INTERVAL_US = 1_000_000
+"""µs between two announcements of a state that changes quickly; the latest is always announced."""
+
+
+class Outbox:
+    """Packs and queues what the services send; the bridge drains it.
+
+    Attributes
+    ----------
+    codec : Codec
+        Its ``now_us`` is the event time that the next frame gets.
+    frames : list of (int, bytes)
+        Event time in µs, frame; in the order in which to send.
+    """
+
+    def __init__(self, codec: Codec) -> None:
+        self.codec = codec
+        self.frames: list[tuple[int, bytes]] = []
+
+    def send(self, _name: str, **fields: Any) -> None:
+        """Pack a message by name; a field that is not given is zero."""
+        self.frames.append((self.codec.now_us, self.codec.pack(_name, **fields)))
+
+    def put(self, layout: Spec, payload: bytes) -> None:
+        """Send a packed payload (``layout.struct.pack(...)``): the fastest way."""
+        self.frames.append((self.codec.now_us, self.codec.frame(layout, payload)))
+
+    def drain(self) -> list[tuple[int, bytes]]:
+        """Return and clear the frames."""
+        frames, self.frames = self.frames, []
+        return frames
+
+
+class Timers:
+    """Calls the actions that are due, in the order of their deadlines.
+
+    The result depends only on the times given to :meth:`advance`, not on when it is called: a replay, which
+    calls it at other moments, fires the same timers at the same times.
+
+    Attributes
+    ----------
+    next_deadline : int
+        µs at which the next timer fires; `FOREVER` where none is set.
+    """
+
+    def __init__(self) -> None:
+        self._deadlines: dict[str, int] = {}
+        self._actions: dict[str, tuple[int, Callable[[int], None]]] = {}  # period in µs, and action
+        self._next = ""
+        self.next_deadline = FOREVER
+
+    def every(self, name: str, period_us: int, action: Callable[[int], None], first_us: int) -> None:
+        """Call ``action(deadline)`` at `first_us` and every `period_us` (a multiple of 4) from there."""
+        self._set(name, first_us, max(period_us & ~3, 4), action)
+
+    def once(self, name: str, time_us: int, action: Callable[[int], None]) -> None:
+        """Call ``action(time_us)`` once."""
+        self._set(name, time_us, 0, action)
+
+    def cancel(self, name: str) -> None:
+        """Remove a timer, if there is one."""
+        self._deadlines.pop(name, None)
+        if name == self._next:
+            self._find_next()
+
+    def delay(self, name: str, delay_us: int) -> None:
+        """Fire a timer, if there is one, later by `delay_us` (a multiple of 4)."""
+        if name in self._deadlines:
+            self._deadlines[name] += delay_us & ~3
+            self._find_next()
+
+    def advance(self, t_us: int, begin: Callable[[int], None]) -> None:
+        """Fire all timers that are due up to `t_us`, with ``begin(deadline)`` before each."""
+        while self.next_deadline <= t_us:
+            name, deadline = self._next, self.next_deadline
+            period, action = self._actions[name]
+            if period:
+                self._deadlines[name] = deadline + period
+            else:
+                del self._deadlines[name]
+            self._find_next()
+            begin(deadline)
+            action(deadline)
+
+    def _set(self, name: str, deadline: int, period: int, action: Callable[[int], None]) -> None:
+        self._deadlines[name], self._actions[name] = deadline, (period, action)
+        if name == self._next or deadline <= self.next_deadline:
+            self._find_next()
+
+    def _find_next(self) -> None:
+        """Find the next timer; of two with the same deadline, the one that was set first."""
+        self._next = min(self._deadlines, key=self._deadlines.__getitem__, default="")
+        self.next_deadline = self._deadlines.get(self._next, FOREVER)
+
+
+def period_us(hertz: float) -> int:
+    """Return the µs between two messages at a rate above 0, which may be as low as 1e-300 Hz."""
+    return round(min(1e6 / hertz, MAX_PERIOD_US))
+
+
+class Rate:
+    """Thins a stream of samples to a rate, in event time and without drift.
+
+    Parameters
+    ----------
+    hertz : float
+        1/s; 0 passes every sample, a negative rate none.
+    """
+
+    __slots__ = ("_next_us", "_period_us", "hertz")
+
+    def __init__(self, hertz: float) -> None:
+        self.set(hertz)
+
+    def set(self, hertz: float) -> None:
+        """Change the rate; the next sample is sent."""
+        self.hertz = hertz
+        self._period_us = period_us(hertz) if hertz > 0 else 0
+        self._next_us = 0
+
+    def due(self, t_us: int) -> bool:
+        """Return whether the sample at `t_us` is sent.
+
+        Slots are one period apart, and a sample may be early by a quarter of a period, so that a stream with
+        jitter at exactly this rate passes completely. After a pause, or a step far back in time, the slots
+        start again at the sample.
+        """
+        if self.hertz <= 0:
+            return self.hertz == 0
+        ahead = self._next_us - t_us
+        if ahead * 4 > self._period_us:
+            if ahead <= 2 * self._period_us:
+                return False
+        elif ahead > -self._period_us:
+            self._next_us += self._period_us
+            return True
+        self._next_us = t_us + self._period_us
+        return True
+
+
+class Announcer:
+    """Sends STATUSTEXT, and the text of a state only when the state has changed.
+
+    Attributes
+    ----------
+    texts : deque of (MAV_SEVERITY, str)
+        The last texts sent; another thread may take them out and print them.
+    """
+
+    def __init__(self, outbox: Outbox, timers: Timers) -> None:
+        self._outbox, self._timers = outbox, timers
+        self.texts: deque[tuple[MAV_SEVERITY, str]] = deque(maxlen=TEXTS_KEPT)
+        self._announced: dict[str, tuple[str, int]] = {}
+        self._chunked_texts = 0
+
+    def send_statustext(self, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO) -> None:
+        """Send `text`, in chunks where it is long; a character outside ASCII becomes a question mark."""
+        self.texts.append((severity, text))
+        data = text.encode("ascii", "replace")
+        chunks = [data[i : i + STATUSTEXT_LENGTH] for i in range(0, len(data), STATUSTEXT_LENGTH)]
+        if len(chunks) > 1:
+            self._chunked_texts = self._chunked_texts % 0xFFFF + 1
+            if len(chunks[-1]) == STATUSTEXT_LENGTH:
+                chunks.append(b"")  # the receiver waits for a chunk that is not full
+        for i, chunk in enumerate(chunks):
+            self._outbox.send(
+                "STATUSTEXT",
+                severity=severity,
+                text=chunk,
+                id=self._chunked_texts if len(chunks) > 1 else 0,
+                chunk_seq=i,
+            )
+
+    def forget(self, key: str) -> None:
+        """Announce the next state of `key` even if it is the one that was announced last."""
+        self._announced.pop(key, None)
+
+    def state(
+        self, key: str, text: str, severity: MAV_SEVERITY = MAV_SEVERITY.INFO, *, recurring: bool = False
+    ) -> None:
+        """Announce that the state of `key` is now `text`, unless that was announced last.
+
+        A `recurring` event is announced again, but not within `ANNOUNCEMENT_INTERVAL_US`.
+        """
+        now_us = self._outbox.codec.now_us
+        last_text, last_us = self._announced.get(key, ("", now_us - ANNOUNCEMENT_INTERVAL_US))
+        elapsed_us = now_us - last_us
+        timer = f"announce {key}"
+        self._timers.cancel(timer)
+        if text == last_text and not (recurring and elapsed_us >= ANNOUNCEMENT_INTERVAL_US):
+            return
+        if elapsed_us < ANNOUNCEMENT_INTERVAL_US:
+            self._timers.once(
+                timer, last_us + ANNOUNCEMENT_INTERVAL_US, lambda _: self.state(key, text, severity)
+            )
+            return
+        self._announced[key] = text, now_us
+        self.send_statustext(text, severity)
