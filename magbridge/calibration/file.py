@@ -26,6 +26,9 @@ FORMAT = 4
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
 ``white`` share, ``level`` and the reference's ``level_sigma``: each is written only where there is any."""
 
+MAX_SIGMA = 1e15
+"""The largest noise (nT) or standard deviation of a coefficient that is accepted: its square is a float32."""
+
 AS_IN_MEMORY = (
     "software", "method", "sensor", "parameters", "noise", "reference", "boresight", "runs", "inputs",
     "level",
@@ -199,14 +202,16 @@ def _check_settings(content: _File) -> None:
             raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
     if not content.reference.field > 0.0:
         raise CalibrationError("reference: field: expected nT, > 0")
-    if not content.noise.sensor >= 0.0:
-        raise CalibrationError("noise: sensor: expected nT, >= 0")
+    if not 0.0 <= content.noise.sensor <= MAX_SIGMA:
+        raise CalibrationError(f"noise: sensor: expected nT, 0 to {MAX_SIGMA:g}")
     if not 0.0 <= content.noise.white <= 1.0:
         raise CalibrationError("noise: white: expected a share, 0 to 1")
 
 
 def _check_covariance(covariance: FloatArray, whose: str = "") -> None:
     """Symmetric and positive semidefinite, up to rounding."""
+    if np.abs(covariance).max(initial=0.0) > MAX_SIGMA**2:
+        raise CalibrationError(f"{whose}covariance: expected standard deviations up to {MAX_SIGMA:g}")
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     with np.errstate(over="ignore"):  # a covariance beside a variance of zero: refused below
         correlation = covariance / scale / scale[:, None]

@@ -14,7 +14,8 @@ __all__ = ["write_definitions"]
 OURS = Path(__file__).with_name("magbridge.xml")
 WITH_ARDUPILOT = "magbridge_ardupilotmega.xml"
 """For stations of ArduPilot, whose own messages are more than the common ones."""
-DIALECTS = OURS.name, WITH_ARDUPILOT
+DIALECTS = {OURS.name: "magbridge_dialect.py", WITH_ARDUPILOT: "magbridge_ardupilotmega.py"}
+"""The XML of each dialect, and its module; a module named magbridge would hide the package."""
 BOTH = """<?xml version="1.0"?>
 <!-- ArduPilot's messages and those of magbridge. -->
 <mavlink>
@@ -45,7 +46,7 @@ def write_definitions(folder: Path) -> list[Path]:
     DataError
         Its generator made no module.
     """
-    import pymavlink  # noqa: PLC0415 - the bridge itself does without
+    import pymavlink  # noqa: PLC0415 - the generator takes long to import
     from pymavlink.generator import mavgen, mavparse  # noqa: PLC0415
 
     shipped = Path(pymavlink.__file__).parent / "dialects" / "v20"
@@ -59,8 +60,8 @@ def write_definitions(folder: Path) -> list[Path]:
             included = mavparse.MAVXML(str(folder / name), mavparse.PROTOCOL_2_0).include
         wanted += [one for one in included if one not in wanted]
     written = []
-    for name in DIALECTS:
-        module = (folder / name).with_suffix(".py")
+    for name, module_name in DIALECTS.items():
+        module = folder / module_name
         reported = StringIO()
         with (
             redirect_stdout(reported),

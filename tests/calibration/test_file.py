@@ -148,6 +148,10 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
     "a coefficient less": (
         lambda c: c["coefficients"].pop(), CalibrationError, "covariance: expected 38 x 38"),
     "a row less": (_drop_row, CalibrationError, "covariance: expected 39"),
+    "a noise of 1e308 nT": (
+        lambda c: c["noise"].update(sensor=1e308), CalibrationError, "noise: sensor: expected nT, 0 to"),
+    "a variance of 1e308": (
+        lambda c: c["covariance"][0].__setitem__(0, 1e308), CalibrationError, "standard deviations up to"),
     "negative variance": (
         lambda c: c["covariance"][0].__setitem__(0, -1.0), CalibrationError, "a variance is negative"),
     "not symmetric": (

@@ -348,6 +348,6 @@ def test_the_dialect_for_other_programs(command: Command) -> None:
     mavgen = ["-m", "pymavlink.tools.mavgen", "--lang=Python3", "--wire-protocol=2.0", "-o", str(again), xml]
     subprocess.run([sys.executable, *mavgen], check=True, capture_output=True)
     names = {"MAVLINK_MSG_ID_MAG_FIELD", "MAVLINK_MSG_ID_MAG_COLUMN", "MAVLINK_MSG_ID_HEARTBEAT"}
-    for module in (again, folder / "magbridge.py", folder / "magbridge_ardupilotmega.py"):
+    for module in (again, folder / "magbridge_dialect.py", folder / "magbridge_ardupilotmega.py"):
         text = module.read_text(encoding="utf-8")
         assert all(f"{name} = " in text for name in names)
