@@ -141,14 +141,18 @@ def _delay(problem: Problem, effect: ClockEffect, width: float, *, positive: boo
         return []
     rates, interval = mass_rates(problem), problem.survey.interval
 
-    def rebuild(shift: float) -> Candidate:
-        phi = _averaged(problem, shift) if abs(shift) > MIN_SHIFT * interval else lambda rows: rates[:, rows]
-        return of_effect(
-            problem, effect, width, "s", names=("delay",), phi=phi, positive=positive, regressors=phi,
-            point=GridPoint({"shift": (shift, "s")}, rebuild),
-        )  # fmt: skip
-
     longest = 0.02 * float(np.ptp(problem.survey.time))
     shifts = [shift for shift in SHIFTS_S if 0.5 * interval <= shift <= longest]
     both = [-shift for shift in shifts] if positive else [sign * x for x in shifts for sign in (-1.0, 1.0)]
+
+    def rebuild(shift: float) -> Candidate:
+        by_rates = abs(shift) <= MIN_SHIFT * interval
+        phi = (lambda rows: rates[:, rows]) if by_rates else _averaged(problem, shift)
+        # The rates are as likely beforehand as all shifts together
+        likelier = float(np.log(0.5 * (len(both) + 1) / (1 if by_rates else len(both)))) if both else 0.0
+        return of_effect(
+            problem, effect, width, "s", names=("delay",), phi=phi, positive=positive, regressors=phi,
+            point=GridPoint({"shift": (shift, "s")}, rebuild, likelier),
+        )  # fmt: skip
+
     return [rebuild(shift) for shift in (0.0, *both)]
