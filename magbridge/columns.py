@@ -73,7 +73,7 @@ COLUMNS: dict[str, Column] = {
     "quality": Column("1", "flags of a doubtful sample"),
 }
 CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
-"""What ``magbridge correct`` writes beside ``time``."""
+"""What ``magbridge correct`` writes in addition to ``time``."""
 
 NT_PER_UNIT = {
     "fT": 1e-6, "pT": 1e-3, "nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9,
@@ -128,11 +128,11 @@ _SAME = {other: unit for unit, others in _SPELLINGS.items() for other in others}
 MAX_NAMES = 60
 """Largest number of columns that a message names."""
 YEAR_1980 = 315_532_800.0
-"""s since 1970: no log of a magnetometer with a computer is older, but a clock that nobody set is."""
+"""s since 1970: no log of a magnetometer with a computer is older; a clock that was never set is."""
 
 
 def counts_from_boot(deployment: xr.Dataset) -> bool:
-    """Say whether a deployment's times count from a boot, on a day that nobody knows.
+    """Say whether a deployment's times count from a boot, on an unknown day.
 
     So its log says (``time_reference = boot``), or they are before 1980.
     """
@@ -188,10 +188,10 @@ def decoded(deployment: xr.Dataset) -> xr.Dataset:
 
 
 def factor(unit: str, column: str) -> float | None:
-    """Return the factor from `unit` to the unit of `column`; None where there is no conversion.
+    """Return the factor from `unit` to the unit of `column`; None without a conversion.
 
-    A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1. So is that of a unit
-    which is undeclared (empty, or the 1 that is then written).
+    A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1. The factor of an
+    undeclared unit is 1, too (empty, or the 1 that is then written).
     """
     if unit in ("", "1"):
         return 1.0

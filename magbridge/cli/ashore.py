@@ -110,8 +110,8 @@ def simulate(
         A log whose attitude, position and masses drive the simulation instead of the scenario's mission;
         may be repeated. Each call makes a world around its logs: for one world, give all logs in one call.
     reference
-        What reference_field holds, instead of what the scenario says: none leaves it out, as where nobody
-        knows the field; true is the true total field; map is the main field and an airborne survey's anomaly.
+        What reference_field holds, instead of what the scenario says: none leaves it out, as where the field
+        is not known; true is the true total field; map is the main field and an airborne survey's anomaly.
     map_output
         Also write the anomaly grid that an aeromagnetic survey of the simulated world would have produced.
     """
@@ -169,8 +169,8 @@ def map(  # noqa: A001 - the command's name
     survey_altitude
         Altitude in m of the surveys whose grids do not say it: one for all grids, or repeated, one for each.
     smooth
-        Wavelength in km: of shorter waves less than half stays, and what is taken out counts as the map's
-        sigma. By default nothing is smoothed.
+        Wavelength in km: of shorter waves less than half stays, and the part that is removed counts as the
+        map's sigma. By default nothing is smoothed.
     mask
         A CSV of longitude,latitude (deg): the polygon outside which the map is blank.
     spacing

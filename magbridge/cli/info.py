@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 WIDE = 110
-"""Characters of a terminal from which on the meanings have room."""
+"""Characters of a terminal from which on the meanings are shown."""
 
 
 @command("info FILE... [OPTIONS]")

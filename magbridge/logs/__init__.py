@@ -1,7 +1,7 @@
 """Deployments in and out: one module per format, one table of them, one reader and one writer.
 
 A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). A row is one time of the
-magnetometer sample; every other column holds what was known at that time:
+magnetometer sample; every other column holds the values known at that time:
 
 - logs of a live link (``.tlog``, ``.BIN``, ``.ulg``): the last value received at or before the row, NaN
   before the first and when it is older than 30 s. This is what the bridge itself would have known, so a
@@ -11,11 +11,11 @@ magnetometer sample; every other column holds what was known at that time:
 
 :mod:`.registry` is the table of formats, and says what a format's module has. :mod:`.reading` and
 :mod:`.writing` are for all formats; :mod:`.options` is what a user can say about a log. The formats are
-:mod:`.text` (CSV), :mod:`.netcdf` (with :mod:`.seaglider` and :mod:`.cf`), :mod:`.parquet`,
-:mod:`.telemetry` (with its ``telemetry_*``), :mod:`.ardupilot`, :mod:`.px4` and :mod:`.slocum`. They
-share :mod:`.resample` (telemetry brought to the rows; :mod:`.autopilot` does so for both autopilots),
-:mod:`.deployment` (what they return) and :mod:`.checks` (what is dropped); :mod:`.merge` makes one stream of
-several. :mod:`.tlog` stands apart: it writes the bridge's log.
+:mod:`.text` (CSV), :mod:`.netcdf` (with :mod:`.seaglider` and :mod:`.cf`), :mod:`.parquet`, :mod:`.telemetry`
+(with its ``telemetry_*``), :mod:`.ardupilot`, :mod:`.px4` and :mod:`.slocum`. They share :mod:`.resample`
+(telemetry brought to the rows; :mod:`.autopilot` does so for both autopilots), :mod:`.deployment` (what they
+return) and :mod:`.checks` (values that are dropped); :mod:`.merge` makes one stream of several. :mod:`.tlog`
+is separate: it writes the bridge's log.
 """
 
 from magbridge.logs.options import Options

@@ -6,9 +6,9 @@ matrix (``COMPASS_DIA``, ``COMPASS_ODI``) are in the log, too, and are undone, s
 
     MAG = D (s raw + Ofs) + MO        with D of DIA and ODI, and s = ``COMPASS_SCALE``, which is left in
 
-UTC is the median of what the GPS fixes say, so one damaged record does not date the log. Of several compasses
-that is read which the estimator names (``XKFS``), or the first that is enabled (``COMPASS_USE``) and healthy.
-Survey magnetometers (``MAGH``, G, of DroneCAN's high-resolution messages) follow the compasses.
+UTC is the median of what the GPS fixes say, so one damaged record does not date the log. The compass that is
+read is the one which the estimator names (``XKFS``), or the first that is enabled (``COMPASS_USE``) and
+healthy. Survey magnetometers (``MAGH``, G, of DroneCAN's high-resolution messages) follow the compasses.
 
 References
 ----------
@@ -61,7 +61,7 @@ IDS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the log in pieces of at most `rows` rows; what is read of it is held whole.
+    """Yield the log in pieces of at most `rows` rows; the values that are read are held whole.
 
     FormatError: no magnetometer in it.
     """

@@ -1,7 +1,7 @@
 """Which fields of which of ArduPilot's records become columns, and in what unit.
 
-A log of ArduPilot 3.6 or later declares its units itself (``FMTU``, ``UNIT``, ``MULT``); what it declares
-goes before this table.
+A log of ArduPilot 3.6 or later declares its units itself (``FMTU``, ``UNIT``, ``MULT``); units that it
+declares replace those of this table.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def in_declared_units(flash: Flash) -> Fields:
 
 
 def in_hundredths(flash: Flash, fields: Fields) -> tuple[Fields, list[str]]:
-    """Return `fields` with the factor 0.01 for powers in hundredths, and what was found for the user.
+    """Return `fields` with the factor 0.01 for powers in hundredths, and a note for the user.
 
     Logs up to 2015 hold voltage and current of ``CURR`` as integers in hundredths, and do not declare it.
     """

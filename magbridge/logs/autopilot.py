@@ -1,7 +1,7 @@
 """An autopilot's own log as a deployment: what ArduPilot's, PX4's and a robot's have in common.
 
 A row is a sample of one of the magnetometers, that in use (:mod:`.compasses`); every other column is the last
-value before it. A log that does not tell UTC counts from the boot, and says so in the attribute
+value before it. A log that does not tell UTC counts from the boot, and has the attribute
 ``time_reference = "boot"``. Each boot is a run with its own UTC.
 """
 
@@ -43,7 +43,7 @@ class Magnetometer(NamedTuple):
 
 
 class Run(NamedTuple):
-    """What was logged from one boot to the next."""
+    """The records between one boot and the next."""
 
     magnetometers: list[Magnetometer]
     """At least one."""
@@ -113,7 +113,7 @@ def _assembled(path: Path, run: Run, wanted: Compass) -> xr.Dataset:
 
 
 def _one_after_the_other(runs: list[xr.Dataset]) -> list[str]:
-    """Move runs that begin before the end of the one before them, in place; return what was moved."""
+    """Move runs that begin before the end of the one before them, in place; return a note for each."""
     notes, ended = [], -inf
     for k, run in enumerate(runs):
         time = run["time"].values

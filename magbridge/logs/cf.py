@@ -32,7 +32,7 @@ NANOSECONDS = re.compile(r"(nanosecond|nanosec|nsec|ns)s?(?= since)")
 def epoch(path: Path, variable: Any) -> tuple[float, float]:
     """Return the s since 1970 at which a time variable is 0, and the s in one of its units.
 
-    FormatError: its unit is no unit of time since a date.
+    FormatError: its unit is not a time since a date.
     """
     units, calendar = (str(getattr(variable, name, "")) for name in ("units", "calendar"))
     unit = 1.0
@@ -54,7 +54,7 @@ def floats(variable: Any, rows: slice | tuple[slice, ...] = ALL) -> FloatArray:
     Missing are the values that the variable declares as missing, compared as stored, before unpacking, and
     rounded to the variable's type where they are of another; and those never written, which the library fills
     with a number of its own. ``valid_range`` is ignored: one that begins at 0 would discard a depth of -2 cm.
-    FormatError: packed by what is no number.
+    FormatError: packed by something other than a number.
     """
     variable.set_auto_maskandscale(False)
     stored = np.asarray(variable[rows])

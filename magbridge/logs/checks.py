@@ -1,6 +1,6 @@
-"""What no deployment can hold is dropped and counted: times that do not increase, impossible values.
+"""Drop and count values that no deployment can hold: times that do not increase, impossible values.
 
-One damaged record costs itself, not what follows. Of the times the longest increasing series is kept: a clock
+One damaged record costs only itself. The longest increasing series of times is kept: a clock
 that was set back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time
 become one. A value beyond what nature has is unknown (NaN). A file of which half is wrong is in other units,
 or in another order, and is refused.
@@ -63,11 +63,11 @@ def increasing(file: str | Path, time: FloatArray, *, after: float = -np.inf) ->
 def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) -> Iterator[xr.Dataset]:
     """Yield the pieces of a deployment, each given with the numbers of its rows, without what cannot be.
 
-    Attributes of a piece count what it lost, ``rows_dropped duplicate_rows values_dropped``; ``losses`` has a
+    Attributes of a piece count its losses, ``rows_dropped duplicate_rows values_dropped``; ``losses`` has a
     line for the first in each column of the file.
 
     FormatError: at least half of the rows, or of a column's values, cannot be, or, if `strict`, any: names
-    the first. Or what `pieces` raise, after what came before it.
+    the first. Or the error of `pieces`, after the pieces before it.
     """
     checks = _Checks(file, strict)
     last: xr.Dataset | None = None
@@ -83,7 +83,7 @@ def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) 
     if not broken:
         checks.finish()
     if last is not None:
-        yield checks.counted(last)  # with what was lost behind it
+        yield checks.counted(last)  # with the losses behind it
     for error in broken:
         raise error
 
@@ -97,7 +97,7 @@ def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator
 
 
 class _Checks:
-    """What was wrong in a file so far."""
+    """The faults of a file so far."""
 
     def __init__(self, file: str | Path, strict: bool) -> None:
         self._faults = Faults(file, strict=strict)
@@ -119,7 +119,7 @@ class _Checks:
         return dataset
 
     def counted(self, dataset: xr.Dataset) -> xr.Dataset:
-        """Return a piece with what was lost since the last one was returned."""
+        """Return a piece with the losses since the last one was returned."""
         return with_losses(dataset, *self._faults.since_last())
 
     def _times(self, time: FloatArray, rows: Sequence[int], ahead: FloatArray) -> tuple[IndexArray, int]:
@@ -160,7 +160,7 @@ class _Checks:
 
 
 def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:
-    """Return which `values` (n,) of a column cannot be, and what was expected; "" where anything can be."""
+    """Return which `values` (n,) of a column cannot be, and the expectation; "" where anything can be."""
     unit = usual(unit)
     if name in MOST:
         return np.abs(values) > MOST[name], f"expected {unit}, at most {MOST[name]:g}"
@@ -176,12 +176,12 @@ def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> t
 
 
 def _wrong(time: FloatArray, after: float) -> IndexArray:
-    """Return the indices at which `time` (n,) is no time, or does not increase."""
+    """Return the indices at which `time` (n,) is not a time, or does not increase."""
     return np.flatnonzero(~((np.diff(time, prepend=after) > 0) & (np.abs(time) < YEAR_10000)))
 
 
 def _disorder(time: FloatArray) -> str:
-    """Return what was expected of times (n,) most of which run backwards, or are repeated; "" for others."""
+    """Return the expectation for times (n,) most of which run backwards, or are repeated; "" for others."""
     steps = np.diff(time)
     if len(steps) > 1 and np.mean(steps < 0.0) > 0.5:
         return "expected times that increase, they run backwards: sort the rows by time"
@@ -195,7 +195,7 @@ def _disorder(time: FloatArray) -> str:
 
 
 def _expected(time: float, before: float, then: float = np.inf) -> str:
-    """Return what was expected between two other times, s, in place of `time`."""
+    """Return the expectation between two other times, s, in place of `time`."""
     if YEAR_10000 <= abs(time) < np.inf:
         return f"expected seconds since 1970, not {time!r}"
     if before < time and then <= time:

@@ -1,8 +1,8 @@
 """Times as text files write them, in seconds since 1970-01-01 UTC.
 
 A number counts from an epoch (Unix, Excel, Julian, GPS ...), a text is a calendar's date (:mod:`.stamps`).
-What the heading does not say is told by size: an Excel serial of today is 46,000, a Julian date 2.46
-million, a Unix time 1.8e9. GPS time cannot be told from Unix time by its size: it must be named. Where
+Where the heading does not state the kind, the size decides: an Excel serial of today is 46,000, a Julian date
+2.46 million, a Unix time 1.8e9. GPS time and Unix time have the same size: GPS time must be named. Where
 several columns are the time (date and time of day, GPS week and second), they come joined by blanks.
 """
 
@@ -43,7 +43,7 @@ WORDS = {
     "ms": r"milli|[_ .]ms$", "us": r"micro|[_ .]us$|time_?us$", "ns": r"nano|[_ .]ns$", "excel": "excel",
     "mjd": "mjd|modified", "julian": "julian|^jd$",
 }  # fmt: skip
-"""Kind -> what in a heading says so."""
+"""Kind -> words in a heading."""
 SIZES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e6))
 """Kinds that count days, and between which numbers their times lie (1982 to 2064, 1943 to 2080, 1968 to
 2077)."""
@@ -71,9 +71,9 @@ class Clock(NamedTuple):
     kind: str
     """A key of :data:`EPOCHS`, ``iso``, or a pattern of :meth:`datetime.strptime`."""
     assumed: str = ""
-    """What was taken for granted; empty where the file says it all."""
+    """The assumption; empty where the file says it all."""
     boot: bool = False
-    """Times count from a start that nobody knows."""
+    """Times count from an unknown start."""
 
     @property
     def is_text(self) -> bool:
@@ -92,7 +92,7 @@ class Counter(NamedTuple):
     """The state of a count of ms or us, or of any count from a boot, in the course of a file."""
 
     shift_s: float
-    """Added to the count, s, for what it has wrapped around and for the runs before."""
+    """Added to the count, s, for its wraps and for the runs before."""
     last: FloatArray
     """Its last values (n,), s, before the shift."""
     end_s: float

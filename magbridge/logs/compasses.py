@@ -41,7 +41,7 @@ class Compass(msgspec.Struct, frozen=True, omit_defaults=True):
     """From 0, as the log counts; the option ``--compass`` takes it."""
     samples: int
     rate: float
-    """Hz, the median."""
+    """Median rate, Hz."""
     id: str = ""
     """The device's id or topic; the option takes it, too. Empty where the log does not say."""
     enabled: bool | None = None
@@ -57,12 +57,12 @@ class Compass(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def fit(self) -> bool:
-        """Whether nothing in the log speaks against its use."""
+        """Whether the log has no reason against its use."""
         return self.enabled is not False and (self.healthy is None or self.healthy >= HEALTHY)
 
     @property
     def words(self) -> str:
-        """What is known of it, in a few words."""
+        """Description of the compass, in a few words."""
         facts = [f"id {self.id}"] if self.id else []
         facts.append(f"{self.rate:.3g} Hz, {counted(self.samples, 'sample')}")
         facts += ["disabled"] if self.enabled is False else []
@@ -94,7 +94,7 @@ def choose(path: Path, found: Sequence[Compass], wanted: str | None) -> list[Com
     Raises
     ------
     FormatError
-        There is no compass of that number or id.
+        No compass has that number or id.
     """
     if wanted is None:
         best = min(found, key=lambda one: (not one.fit, not one.in_use, one.number))
@@ -108,7 +108,7 @@ def choose(path: Path, found: Sequence[Compass], wanted: str | None) -> list[Com
 
 
 def compass_notes(found: Sequence[Compass], wanted: str | None) -> list[str]:
-    """Return what a user should be told of the choice: that there was one, and what speaks against it."""
+    """Return notes on the choice: which compass was chosen of which, and reasons against it."""
     best = next(one for one in found if one.chosen)
     words = []
     if wanted is None and len(found) > 1:

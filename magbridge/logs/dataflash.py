@@ -58,7 +58,7 @@ class Records(NamedTuple):
 
 
 class Flash(NamedTuple):
-    """What was read of a log."""
+    """The records that were read of a log."""
 
     records: dict[str, Records]
     """By the name of the kind."""
@@ -152,7 +152,7 @@ def _lengths(data: Bytes, headers: IndexArray, kinds: list[_Kind]) -> IndexArray
             table[kind.number] = kind.length
     lengths = table[numbers]
     for kind, first, _ in spans:
-        if first:  # described anew, as after a boot with other firmware
+        if first:  # described again, as after a boot with other firmware
             lengths[(numbers == kind.number) & (headers >= first)] = kind.length
     return lengths
 
@@ -180,7 +180,7 @@ def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
         found.append((k, last))
         linked = bool(meets[b])
         following = int(after[b])
-        if not joins[last]:  # what follows is no header: damage after this record, or in it
+        if not joins[last]:  # no header follows: damage after this record, or in it
             inside = bisect_left(joined, last + 1)
             cut = inside < len(joined) and joined[inside] < following
             if cut or ends[last] > size:
@@ -211,7 +211,7 @@ def _decoded(data: Bytes, kind: _Kind, at: IndexArray, wanted: Collection[str]) 
 
 
 def _joined(first: Records, second: Records) -> Records:
-    """Return the records of a kind that was described anew, as one: the fields that both have."""
+    """Return the records of a kind that was described again, as one: the fields that both have."""
     return Records(
         np.concatenate([first.at, second.at]),
         {name: np.concatenate([first.fields[name], second.fields[name]])

@@ -1,7 +1,7 @@
 """ArduPilot's log as text, a record a line (``.log``), as Mission Planner and ``mavlogdump.py`` write it.
 
 ``FMT`` lines describe the others as in the binary log; values are already in the unit of the field. Lines
-that are no record are counted.
+without a record are counted.
 """
 
 from __future__ import annotations

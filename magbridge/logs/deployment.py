@@ -26,7 +26,8 @@ MEANING = {"heading_reference": "true", "time_reference": "utc"}
 SETTINGS = "align.", "telemetry."
 """What the names of the numbers begin with by which a bridge corrected, as its log declares them."""
 CHANGES = "align.changes"
-"""One of them: how often a setting was changed in the course of the log; the others are of its start."""
+"""Setting that counts how often a setting was changed in the course of the log; the others are of its
+start."""
 COUNTERS = {
     "bytes_skipped": ("byte skipped", "bytes skipped"),
     "damages": ("damaged place", "damaged places"),
@@ -44,9 +45,9 @@ not copied to a file that is written."""
 GUESSED = "guessed"
 """Attribute that says what a file left open and was taken for granted; it goes the way of the counts, too."""
 HISTORY = "history"
-"""Attribute that keeps such things in what is written, a line for each."""
+"""Attribute that keeps assumptions in files that are written, a line for each."""
 LOSSES = "losses"
-"""Attribute that names what was skipped, a line for each file and column. It goes the way of the counts."""
+"""Attribute that names the losses, a line for each file and column. It goes the way of the counts."""
 NOTES = "notes"
 """Attribute with a line for each choice that reading made: which of several compasses, a name, a unit."""
 
@@ -121,7 +122,7 @@ def _describe(name: str, unit: str, long_name: str | None) -> dict[str, Any]:
 
 
 def sliced(dataset: xr.Dataset, rows: int) -> Iterator[xr.Dataset]:
-    """Yield a deployment in memory in pieces of at most `rows` rows; the first has what it counts."""
+    """Yield a deployment in memory in pieces of at most `rows` rows; the first has the counts."""
     for start in range(0, dataset.sizes["time"], rows):
         part = dataset.isel(time=slice(start, start + rows))
         yield uncounted(part) if start else part
@@ -230,7 +231,7 @@ def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
 
 
 def named_losses(*pieces: Mapping[str, Any]) -> list[str]:
-    """Return the lines that name what was skipped in the pieces of a deployment."""
+    """Return the lines that name the losses in the pieces of a deployment."""
     return [line for attrs in pieces for line in str(attrs.get(LOSSES, "")).splitlines()]
 
 

@@ -20,7 +20,7 @@ LABELS = {"total_field": "total field, nT", "anomaly": "anomaly, nT", "total_fie
 
 
 def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
-    """Draw the total field with its 2-sigma band, the anomaly where there is one, and what is flagged.
+    """Draw the total field with its 2-sigma band, the anomaly where there is one, and flagged samples.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def draw_corrected(log: xr.Dataset, path: str | Path) -> None:
 
 
 def corrected_panel(axis: Axes, log: xr.Dataset, name: str) -> None:
-    """Draw a column of a corrected log against time, flagged samples apart; a field with its 2-sigma band.
+    """Draw a column of a corrected log against time, with flagged samples and the 2-sigma band of a field.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What is wrong in a file: counted, the first of each column named, and when there is too much of it."""
+"""Count the faults of a file: counted, the first of each column named, and when there is too much of it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ REFUSED = 0.5
 
 
 class Faults:
-    """What was wrong in a file so far.
+    """The faults of a file so far.
 
     Attributes
     ----------
@@ -36,9 +36,9 @@ class Faults:
     def note(
         self, column: str, count: int, row: int, expected: str, counter: str = "", *, wrong: bool = True
     ) -> None:
-        """Count what is wrong in a column, also in `counter`; `row` and `expected` are of the first.
+        """Count the faults in a column, also in `counter`; `row` and `expected` are of the first.
 
-        What is only not known, not `wrong`, may be most of it. FormatError: `strict`.
+        Unknown values are not `wrong`, and may be most of a column. FormatError: `strict`.
         """
         error = FormatError(self._file, expected, row=row, column=column or None)
         if self._strict:
@@ -51,7 +51,7 @@ class Faults:
             self._lines.append(str(error))
 
     def remark(self, line: str) -> None:
-        """Add a line to those that name what was lost."""
+        """Add a line to those that name the losses."""
         self._lines.append(line)
 
     def count(self, column: str, known: int) -> None:
@@ -59,11 +59,11 @@ class Faults:
         self._known[column] += known
 
     def lost(self, **counts: int) -> None:
-        """Count what was lost, by the counters of a deployment."""
+        """Count losses, by the counters of a deployment."""
         self._counts.update(counts)
 
     def since_last(self) -> tuple[Counter[str], list[str]]:
-        """Return what was lost since the last call: how much, and the lines that name it."""
+        """Return the losses since the last call: how much, and the lines that name it."""
         last = self._counts, self._lines
         self._counts, self._lines = Counter(), []
         return last

@@ -34,7 +34,7 @@ def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **at
     Raises
     ------
     FormatError
-        There is no time; a column does not hold numbers; a unit does not fit.
+        It has no time; a column does not hold numbers; a unit does not fit.
     """
     named = dict(split(str(name)) for name in frame.columns)
     frame = frame.set_axis(list(named), axis=1)

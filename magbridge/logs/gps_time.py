@@ -11,7 +11,7 @@ __all__ = ["GPS_EPOCH", "WEEK", "leap_seconds"]
 GPS_EPOCH = 315_964_800.0
 """s since 1970 of 1980-01-06, where GPS weeks begin."""
 WEEK = 604_800.0
-"""s."""
+"""Length of a GPS week, s."""
 LEAPS = (
     (1_483_228_800, 18),
     (1_435_708_800, 17),

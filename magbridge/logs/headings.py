@@ -68,7 +68,7 @@ ALIASES = {
     "longitude": ("lon", "long", "lng", "laenge", "lnge", "geolaenge"),
     "depth": ("depthm", "tiefe", "profondeur", "profundidad"),
 }
-"""Our name -> what others call it, the surest first."""
+"""Our name -> names in other programs, the surest first."""
 TOWED = "magnetometer", "mag", "sensor", "towfish", "fish", "tow", "layback"
 """Words before a position that say that it is the towed sensor's, not the ship's."""
 AROUND = re.compile(
@@ -82,7 +82,7 @@ MAX_SENSORS = 8
 def split(heading: str) -> tuple[str, str]:
     """Return the name and the unit of a heading: ``Bx [uT]``, ``Bx (uT)``, ``Bx/uT``, ``Bx_uT``, ``Bx, uT``.
 
-    Where there is no unit it is empty; a number in brackets, as in ``magADC[0]``, is an index.
+    Without a unit it is empty; a number in brackets, as in ``magADC[0]``, is an index.
     """
     match = HEADING.fullmatch(heading.strip())
     assert match is not None
@@ -112,7 +112,8 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
     """Return, for columns under another name than ours that are known to mean the same: position -> our name.
 
     The three axes are recognised together or not at all: one `b_x` alone may be anything. Three columns in
-    units of a magnetic field, alike but for their x, y and z, are the axes whatever they are called.
+    units of a magnetic field, with names that differ only in x, y and z, are the axes whatever they are
+    called.
     """
     words = list(map(bare, names))
     found: dict[int, str] = {}
@@ -152,7 +153,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
 
 
 def _position(words: Sequence[str]) -> dict[int, str]:
-    """Return the positions of latitude and longitude among bare names, both from columns named alike.
+    """Return the positions of latitude and longitude among bare names, both from columns with similar names.
 
     A towed sensor's position comes before one without such words, and that before any other.
     """
@@ -172,7 +173,7 @@ def _position(words: Sequence[str]) -> dict[int, str]:
 def _ending_alike(words: Sequence[str]) -> dict[int, str]:
     """Return the positions of the three axes among bare names that end in them, if no others do.
 
-    Of several sensors whose names differ by a number, those of the lowest number.
+    If the names of several sensors differ by a number, the axes are those of the lowest number.
     """
     sensors: dict[str, dict[str, int]] = {}
     for k, word in enumerate(words):
@@ -186,7 +187,7 @@ def _ending_alike(words: Sequence[str]) -> dict[int, str]:
 
 
 def _further_axes(names: Sequence[str], words: Sequence[str], first: Mapping[str, int]) -> dict[int, str]:
-    """Return the positions of the axes of further sensors, named as the first but for their number."""
+    """Return the positions of the axes of further sensors, named as the first with another number."""
     if not all(f"mag_{axis}" in first for axis in AXES):
         return {}
     found: dict[int, str] = {}

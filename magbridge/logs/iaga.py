@@ -25,7 +25,7 @@ from magbridge.logs.packed import opened
 __all__ = ["chunks"]
 
 UNKNOWN = 88_888.0
-"""nT; this, and 99,999, stand for what was not recorded, or not observed."""
+"""nT; this, and 99,999, stand for values that were not recorded, or not observed."""
 TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
 """Elements whose length is the total field, the surest first."""
 

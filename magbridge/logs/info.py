@@ -38,7 +38,7 @@ USES: dict[str, Needs] = {
     "replay": ((CHANNELS,),),
     "simulate --trajectory-from": ((ATTITUDE,), (POSITION,)),
 }
-"""Command -> what it needs: of each group, one of the alternatives, each a set of columns."""
+"""Command -> its needs: of each group, one of the alternatives, each a set of columns."""
 GAP = 2.5
 """A pause longer than this many sampling intervals is a gap."""
 ABOVE = 2.0
@@ -63,7 +63,7 @@ def info(log: xr.Dataset) -> dict[str, Any]:
         ``rows``, ``start``, ``end`` (s since 1970), ``interval_s``, ``rate_hz``, ``gaps``, ``longest_gap_s``,
         ``references`` (what heading and time refer to), ``guessed``, ``skipped``,
         ``losses`` (which name it), ``notes``, ``compasses``, ``columns`` (name, unit, meaning, share known,
-        lowest, highest, interval of its changes), ``uses`` (command -> what it lacks) and ``hints``.
+        lowest, highest, interval of its changes), ``uses`` (command -> missing columns) and ``hints``.
     """
     log = in_seconds(log)
     time = log["time"].to_numpy().astype(float)
@@ -117,7 +117,7 @@ def telemetry(log: xr.Dataset) -> list[str]:
 
 
 def movers(log: xr.Dataset) -> list[str]:
-    """Return the telemetry that may be what moves the field: currents, throttles, positions; no states."""
+    """Return the telemetry that may move the field: currents, throttles, positions; no states."""
     reckoned = {name for names in RECKONING for name in names}
     return [
         name
@@ -166,7 +166,7 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     if moving := movers(log):
         hints.append(f"may move the field, for --parameter: {' '.join(moving)} (auto: those that do)")
     if any(lacking(log, needs) for needs in USES.values()):
-        hints.append('what is lacking may stand under another name: --column NAME="THEIRS [unit]"')
+        hints.append('a missing column may have another name: --column NAME="THEIRS [unit]"')
     empty = [one["name"] for one in columns if not one["known"]]
     if empty:
         hints.append(f"never known: {' '.join(empty)}")

@@ -3,8 +3,8 @@
 Comments (``#``, ``%``, ``//``) and lines of a preamble come first, then the headings, perhaps a row of units,
 then the rows. A heading may itself be a comment. A file without headings is read where its columns are
 declared by their numbers: ``column_1`` is the first. The separator is the one by which headings and rows have
-the same number of fields; decimal commas are known by cells like ``-12,5``. What was guessed is kept, to be
-told.
+the same number of fields; decimal commas are known by cells like ``-12,5``. Assumptions are kept for the
+user.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ MAX_COLUMNS = 4_096
 """Largest number of columns that is read."""
 ATTRIBUTE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
 is_remark = re.compile(r"[#%/]|\s*(?:line|tie)[\s:]*[\w.:]+\s*$", re.IGNORECASE).match
-"""Whether a line is no row: a comment, or what Geosoft and others write between the lines of a survey."""
+"""Return a match if a line is not a row: a comment, or what Geosoft and others write between the lines of a
+survey."""
 SEPARATORS = ";", "\t", "|", ","
 BLANKS = " "
 """Stands for any number of blanks between fields."""
@@ -83,7 +84,7 @@ class Layout:
     fill: float = nan
     """The number that stands for a missing value."""
     foreign: bool = True
-    """Not written by us: no metadata stand beside it."""
+    """Not written by this program: without metadata next to it."""
     guesses: list[str] = field(default_factory=list)
     """What the file does not say and was taken for granted."""
 
@@ -105,7 +106,7 @@ def layout_of(
     foreign: bool = True,
     further: Sequence[str] = (),
 ) -> Layout:
-    """Return the layout of the file that begins with these lines; `foreign`: nothing stands beside it.
+    """Return the layout of the file that begins with these lines; `foreign`: without metadata next to it.
 
     `further` are lines behind them, by whose values units are found.
 
@@ -148,7 +149,7 @@ def layout_of(
 
 
 def _are_values(row: Sequence[str]) -> bool:
-    """Whether a row is no headings: all are numbers, or it and most of its cells begin with a digit."""
+    """Return True if a row holds values: all cells are numbers, or most begin with a digit."""
     there = [cell for cell in row if cell]
     return all(map(NUMBER.fullmatch, there)) or (there[0][0].isdigit() and _mostly_digits(there))
 

@@ -28,7 +28,7 @@ TOTAL = re.compile(
 
 
 SCALAR = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")
-"""The same next to a vector, whose length may be there under the other names."""
+"""Names of a scalar sensor next to a vector, whose length may be there under the other names."""
 ANGLES = "roll", "pitch", "heading"
 NEAR_HALF_TURN_RAD = 0.1
 """Largest distance, rad, of the extreme heading from half a turn or a whole turn, to be in rad."""
@@ -112,7 +112,7 @@ def _numbers(found: Layout, rows: Sequence[Sequence[str]], place: int) -> FloatA
 
 
 def _length(found: Layout, rows: Sequence[Sequence[str]], places: Sequence[int]) -> float:
-    """Return the median length of the vector that stands in some columns; 0 where there are no numbers."""
+    """Return the median length of the vector that stands in some columns; 0 without numbers."""
     lengths = []
     for row in rows:
         try:

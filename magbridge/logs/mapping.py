@@ -35,7 +35,7 @@ class Source(Table, frozen=True, rename={"heading": "from"}):
     offset: float = 0.0
     """`scale`, `offset`: By which their number becomes one in `unit`."""
     valid: str | None = None
-    """Their name of a column that is 0 where there is no value."""
+    """Their name of a column that is 0 where a value is missing."""
 
     def __post_init__(self) -> None:
         if not (isfinite(self.scale) and self.scale and isfinite(self.offset)):
@@ -53,7 +53,8 @@ class Declared(Table, frozen=True):
     """The number that stands for a missing value."""
     separator: str | None = None
     decimal: Literal[".", ","] | None = None
-    """`separator`, `decimal`: Of a text file; found by looking where they are not given."""
+    """`separator`, `decimal`: Characters of a text file; found in its first lines where they are not
+    given."""
     zone: str | None = None
     """Time zone (``Europe/Berlin``) of times of day that do not say theirs; UTC if not given."""
 

@@ -3,8 +3,8 @@
 A row becomes a message in each topic that knows something of it: ``/magnetometer`` (raw), ``/field``
 (corrected), ``/quality`` (the flags, each also as a truth value), ``/vehicle`` (attitude, place, speed) and
 ``/telemetry`` (everything else). ``/position`` repeats the place as a ``foxglove.LocationFix``, which a map
-panel draws. What a row does not know is not in its message. Reading is for what is written here; the MCAP of
-robots is read as :mod:`.rosbag`.
+panel draws. What a row does not know is not in its message. Only files written by this module are read; the
+MCAP of robots is read as :mod:`.rosbag`.
 
 References
 ----------

@@ -26,9 +26,9 @@ def merge(
 ) -> Iterator[xr.Dataset]:
     """Yield the logs that `sources` open as one deployment in pieces, sorted in time, with the same columns.
 
-    Each log is opened for its first piece, which gives its start and its columns; where there is no room to
-    keep that, it is opened again when the stream has reached its start. Short pieces, as of many short logs,
-    are joined to pieces of `rows` rows. A log without a piece is left out.
+    Each log is opened for its first piece, which gives its start and its columns; where memory does not
+    suffice for that, it is opened again when the stream has reached its start. Short pieces, as of many short
+    logs, are joined to pieces of `rows` rows. A log without a piece is left out.
 
     A sensor's own logs, those `named` or found by :func:`~magbridge.logs.sensor_log.sensor_logs`, get the
     telemetry of the vehicle's logs, which are held whole.
@@ -94,7 +94,7 @@ def _in_order(
 ) -> Iterator[list[xr.Dataset]]:
     """Yield the logs' rows up to one time after another, up to which none can add another row.
 
-    `starts` are the times (s) of their first rows: none is opened before, but for those `opened` already.
+    `starts` are the times (s) of their first rows: none is opened before, except those in `opened`.
     """
     waiting = deque(sorted((start, k) for k, start in starts.items()))
     active: dict[int, Opened] = {}

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["HEMISPHERES", "name_columns", "on_side"]
 
 COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
-"""What is declared to be the time where a file has none: the rows, so many a second."""
+"""Declaration of the time where a file has none: the rows, so many a second."""
 HOUR = re.compile(
     r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d([.,]\d*)?", re.IGNORECASE
 )
@@ -34,7 +34,7 @@ DATED = re.compile("(?<!up)(date|datum|fecha|jour|yyyy.?mm.?dd|dd.?mm.?yy|mm.?dd
 TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECASE)
 """What in a heading says that the column holds times, if it is the only one."""
 REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
-"""Words in brackets behind a heading that are no unit."""
+"""Words in brackets behind a heading that are not a unit."""
 MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
 """A cell that is a date with its time of day."""
 CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
@@ -42,7 +42,7 @@ CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
 HOUR_AND_MINUTE = re.compile(r"([01]?\d|2[0-3])?[0-5]?\d(\.\d+)?")
 """A cell that is a time of day as HHMM.mmm, as in the exchange format MGD77T."""
 OF_THE_DAY = re.compile("day|sod|utc|midnight", re.IGNORECASE)
-"""What in a heading says that seconds count from midnight, beside a date."""
+"""What in a heading says that seconds count from midnight, next to a date."""
 JOINED = {
     "seconds and nanoseconds": ("(.*stamp)?(secs?|seconds)", "(.*stamp)?(nanosecs?|nsecs?|nanoseconds)"),
     "GPS week and seconds": (
@@ -235,7 +235,7 @@ def _in_a_day(cell: str) -> bool:
 
 
 def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Leave out the columns of others that hold texts; N and S, E and W are signs of a position."""
+    """Leave out columns of other programs that hold texts; N and S, E and W are signs of a position."""
     left = []
     for k, name in enumerate(found.names):
         values = {row[k] for row in rows if k < len(row) and row[k]}

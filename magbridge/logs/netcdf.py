@@ -177,7 +177,7 @@ class FileWriter:
 
 
 def _history(before: str) -> str:
-    """Return the history, an entry a line, with this writing after what was there before."""
+    """Return the history, an entry a line, with this writing at its end."""
     written = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by magbridge {__version__}"
     return "\n".join(line for line in (*before.splitlines(), written) if line)
 

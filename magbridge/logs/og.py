@@ -1,7 +1,7 @@
 """OceanGliders OG1.0: what a glider's file must say beyond its measurements.
 
-A ``metadata.toml`` says of people, platform and sensor what no log knows. Positions of GPS fixes are those of
-``gps_latitude`` and ``gps_longitude``, where a log has them.
+A ``metadata.toml`` says of people, platform and sensor the facts that no log has. Positions of GPS fixes are
+those of ``gps_latitude`` and ``gps_longitude``, where a log has them.
 
 References
 ----------
@@ -29,7 +29,7 @@ ATTRIBUTES = (
     *("contributing_institutions", "contributing_institutions_role"),
     *("contributing_institutions_role_vocabulary", "rtqc_method"),
 )
-"""Global attributes that are mandatory and that nobody else can know."""
+"""Global attributes that are mandatory and are not in any log."""
 PLATFORM = {
     "PLATFORM_SERIAL_NUMBER": "glider serial number",
     "PLATFORM_MODEL": "model of the glider",
@@ -126,7 +126,7 @@ def _deployed(file: Any, known: dict[str, Any]) -> None:
 
 
 def _fixes(file: Any, known: dict[str, Any]) -> None:
-    """Add the places of the GPS fixes, with their times; unknown where the log has none apart."""
+    """Add the places of the GPS fixes, with their times; unknown where the log has no separate ones."""
     there = {name: file.variables.get(column.upper()) for name, column in FIXES.items()}
     nothing = np.full(len(known["TIME"]), np.nan)
     fixed = {name: nothing if one is None else floats(one) for name, one in there.items()}
@@ -144,7 +144,7 @@ def _fixes(file: Any, known: dict[str, Any]) -> None:
 
 
 def _sensor(file: Any, sensor: dict[str, str]) -> None:
-    """Add the magnetometer's variable, and name it in what it has measured."""
+    """Add the magnetometer's variable, and name it in the variables that it measured."""
     name = "SENSOR_MAGNETOMETER_" + "".join(c if c.isalnum() else "_" for c in sensor["sensor_serial_number"])
     variable = file.createVariable(name, str)
     variable.setncatts({"long_name": sensor["sensor_model"], **sensor})

@@ -1,4 +1,4 @@
-"""Times in the order in which they were written: which rows to leave out, and where a clock began anew."""
+"""Times in the order in which they were written: which rows to leave out, and where a clock started again."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
 
 
 def boots(time: FloatArray) -> IndexArray:
-    """Return the rows at which the clock began anew, the first row included.
+    """Return the rows at which the clock started again, the first row included.
 
     Parameters
     ----------

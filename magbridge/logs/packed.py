@@ -14,7 +14,7 @@ __all__ = ["DAMAGE", "is_packed", "opened"]
 PACKERS: dict[bytes, Any] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\0": lzma.open}
 """First bytes -> how it is unpacked."""
 DAMAGE = EOFError, zlib.error, lzma.LZMAError
-"""What damaged ones raise, beside OSError."""
+"""Errors of damaged ones, in addition to OSError."""
 
 
 def is_packed(path: Path) -> bool:

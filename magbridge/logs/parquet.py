@@ -1,6 +1,6 @@
 """Parquet: one float64 column per variable, its unit and meaning in the field's metadata.
 
-Columns of others are found as those of a text file (:mod:`.naming`).
+Columns of other programs are found as those of a text file (:mod:`.naming`).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
 
 
 def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, Clock | None]:
-    """Return what the columns are, by names and first rows; and how times are read that are no stamps."""
+    """Return what the columns are, by names and first rows; and how times that are not stamps are read."""
     schema = file.schema_arrow
     first = next(file.iter_batches(batch_size=HEADER), None)
     if first is None:

@@ -2,8 +2,9 @@
 
 The field is in gauss, as the driver gives it, before PX4's own calibration: that of ``sensor_mag`` or, where
 the log has it at a higher rate, that of ``vehicle_magnetometer``, from which the offsets and scales of
-``CAL_MAGn`` are taken off again. The oldest logs have it in ``sensor_combined``. Of several compasses that is
-read which flew: the one that ``vehicle_magnetometer`` names, if it is enabled (``CAL_MAGn_PRIO`` is not 0).
+``CAL_MAGn`` are removed again. The oldest logs have it in ``sensor_combined``. The compass that is read is
+the one which flew: the one that ``vehicle_magnetometer`` names, if it is enabled (``CAL_MAGn_PRIO`` is not
+0).
 
 ``heading`` is the estimator's yaw. ``depth`` is the local position's z, down from where the vehicle was
 switched on. UTC is the median of what the GPS messages say.
@@ -105,7 +106,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     FormatError: not a ULog, or no magnetometer in it.
     """
     try:
-        with path.open("rb") as file, redirect_stdout(None):  # pyulog prints what it finds damaged
+        with path.open("rb") as file, redirect_stdout(None):  # pyulog prints a line for each damage
             log = ULog(file, [*FIELDS, *NEEDED])
     except (ULogException, ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(path, f"expected a PX4 log: {error}") from None

@@ -1,7 +1,8 @@
 """Deployments from files of any format, one or several, whole or in pieces.
 
-What is bad is dropped, counted and named in attributes (:func:`magbridge.logs.deployment.with_losses`), and
-the rest is read: rows and values by :mod:`magbridge.logs.checks`, a whole file of several here.
+Bad rows and values are dropped, counted and named in attributes
+(:func:`magbridge.logs.deployment.with_losses`), and the rest is read: rows and values by
+:mod:`magbridge.logs.checks`, a whole file of several here.
 """
 
 from __future__ import annotations
@@ -59,15 +60,15 @@ def read(
     -------
     xarray.Dataset
         On ``time``; each variable float64 with ``units`` and ``long_name``. Attributes: ``source`` (the
-        file's name, and what it says of its own source), ``heading_reference`` where it is not true north,
-        ``time_reference`` where time does not count from 1970, counts of what was skipped (``rows_dropped``
-        ...), and ``losses``, which names it.
+        file's name, and the source that it states), ``heading_reference`` where it is not true north,
+        ``time_reference`` where time does not count from 1970, counts of losses (``rows_dropped`` ...), and
+        ``losses``, which names it.
 
     Raises
     ------
     FormatError
-        Nothing can be read: names file, row, column and what was expected. Of several files, one that cannot
-        be read is skipped and counted, unless `options` are strict.
+        Nothing can be read: names file, row, column and expectation. One of several files that cannot be read
+        is skipped and counted, unless `options` are strict.
     MissingExtra
         The format needs a package that is not installed.
     """
@@ -179,7 +180,7 @@ def _with_another(path: Path, given: Collection[Path]) -> bool:
 
 
 def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Any]]:
-    """Return what is read of the small files that need a child process, by their places: one for all."""
+    """Return the contents of the small files that need a child process, by their places: one for all."""
     small = [k for k, path in enumerate(paths) if path.is_file() and 0 < path.stat().st_size < SMALL]
     formats = {k: form for k in small if (form := format_of(paths[k])).guarded}
     if len(formats) < 2:
@@ -201,7 +202,7 @@ def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]
 def _chunks(
     path: Path, rows: int, options: Options, together: Iterator[Any] | None = None
 ) -> Iterator[xr.Dataset]:
-    """Yield one file in pieces, checked and dated; `together` is what is read of it with others."""
+    """Yield one file in pieces, checked and dated; `together` are its contents, read with other files."""
     from magbridge.logs.checks import checked  # noqa: PLC0415 - xarray is for ashore
     from magbridge.logs.deployment import passed_over  # noqa: PLC0415
 

@@ -5,11 +5,11 @@ with damage). A package adds a format with an entry point in the group ``magbrid
 without its dot, and the module (``examples/format`` is such a package).
 
 A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` where
-:class:`~magbridge.logs.options.Options` make a difference to it. It yields deployments of at most `rows`
-rows in the order of the file, or pairs of a deployment and the numbers of its rows in the file. What is wrong
-with their times and values is :mod:`magbridge.logs.checks`' business. A format that can be written also has
+:class:`~magbridge.logs.options.Options` make a difference to it. It yields deployments of at most `rows` rows
+in the order of the file, or pairs of a deployment and the numbers of its rows in the file. Faults in their
+times and values are found by :mod:`magbridge.logs.checks`. A format that can be written also has
 ``FileWriter(path)`` with ``append(dataset, first=...)`` and ``close()``; where its file has no room for
-attributes, also ``metadata``, bytes that are written beside it.
+attributes, also ``metadata``, bytes that are written next to it.
 """
 
 from __future__ import annotations
@@ -51,9 +51,10 @@ class Format(NamedTuple):
     guarded: bool = False
     """Whether another library reads it, which damage may hang or crash: it is read in a child process."""
     compasses: bool = False
-    """Whether it heeds itself which compass the options ask for; else its columns are looked through."""
+    """Whether it handles itself which compass the options ask for; else its columns are looked through."""
     maps_columns: bool = False
-    """Whether it heeds itself what the options declare of columns; else they are renamed when it is read."""
+    """Whether it handles itself the columns that the options declare of columns; else they are renamed when
+    it is read."""
     packed: bool = False
     """Whether it may be compressed as a whole."""
     plugin: EntryPoint | None = None
@@ -125,7 +126,7 @@ OTHERS = {
     rb"\s*(?!\{[^\n]*\}\s*\n\s*\{)[{\[]\s*[\"{\[]": "JSON: save it as CSV, or as one object a line (.jsonl)",
     rb"[A-Z]{3} [A-Z]{3}\d{4} \d{3} \d\d [A-Z]{4} ": "INTERMAGNET's IMF: ask for IAGA-2002",
 }
-"""First bytes of what is no log, or none that is read -> what it is, and what to do."""
+"""First bytes of files that are not logs, or not read -> what they are, and the remedy."""
 
 
 @cache
@@ -141,7 +142,7 @@ def _plugins() -> dict[str, Format]:
 
 
 def _writes(point: EntryPoint) -> bool:
-    """Tell whether a package's format can be written; a faulty one is told of when it is read."""
+    """Tell whether a package's format can be written; a faulty one is reported when it is read."""
     try:
         return hasattr(load(point), "FileWriter")
     except PluginError:

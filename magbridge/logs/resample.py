@@ -28,7 +28,7 @@ def latest(at: FloatArray, time: FloatArray, values: FloatArray, max_age: float 
     at : (n,) array
         s, the rows.
     time, values : (m,) array
-        s, not decreasing, and the values received then; NaN is no value.
+        s, not decreasing, and the values received then; NaN is a missing value.
     max_age : float
         s, of the oldest value that is still used.
 
@@ -61,10 +61,10 @@ def linear(
     at : (n,) array
         s, the rows.
     time, values : (m,) array
-        s, increasing, and the values measured then; NaN is no value.
+        s, increasing, and the values measured then; NaN is a missing value.
     max_gap : float
-        s; the result is NaN between neighbours farther apart, except at the neighbours' own times, and
-        farther beyond an end. Nearer to an end, the value there is held.
+        s; the result is NaN between neighbours with a longer interval, except at the neighbours' own times,
+        and farther beyond an end. Nearer to an end, the value there is held.
     period : float, optional
         Circumference of the circle that the values lie on: 360 for a heading in degrees.
     start : float

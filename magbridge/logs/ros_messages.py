@@ -1,4 +1,4 @@
-"""What is read of which ROS messages, turned to the frames of this project.
+"""Values of ROS messages, turned to the frames of this project.
 
 ROS has x forward, y left, z up in the body (FLU) and east, north, up in the world (ENU); here it is forward,
 right, down (FRD) and north, east, down (NED). mavros' topics are in ROS' frames, too. An orientation is used
@@ -35,12 +35,12 @@ class Kind(NamedTuple):
     """A type of message."""
 
     name: str
-    """Of the type."""
+    """Name of the type."""
     row: Callable[[Any], dict[str, float]]
     """Returns the values of a message by name."""
     columns: Callable[[str, int, Values], Columns]
     """Returns column, unit and values of the topic's name, its number among those of this type (from 0), and
-    the values of all messages. Of several topics that have a column, the first is taken."""
+    the values of all messages. The first of several topics with a column is taken."""
     header: bool = True
     """It begins with a ``std_msgs/Header``."""
     doubles: int = 0
@@ -180,4 +180,5 @@ KINDS = {
         ),
     )
 }
-"""Type to what is read of it. mavros' other topics are of these types, but for its outputs to the servos."""
+"""Type to the values that are read. mavros' other topics are of these types, except its outputs to the
+servos."""

@@ -71,7 +71,7 @@ class _Stream(NamedTuple):
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
-    """Yield the bag in pieces of at most `rows` rows; what is read of it is held whole.
+    """Yield the bag in pieces of at most `rows` rows; the values that are read are held whole.
 
     FormatError: not a bag, or no ``MagneticField`` in it.
     """
@@ -104,7 +104,7 @@ def _magnetometer(number: int, stream: _Stream, notes: list[str]) -> Magnetomete
     length = float(np.nanmedian(np.linalg.norm(tesla, axis=0)))
     unit = _unit(length)
     if unit != "T":
-        notes.append(f"{stream.topic}: {length:.3g} T is no field on Earth: read as {length:.3g} {unit}")
+        notes.append(f"{stream.topic}: {length:.3g} T is not a field on Earth: read as {length:.3g} {unit}")
     x, y, z = NT_PER_UNIT[unit] * tesla
     time = stream.time
     compass = Compass(number, len(time), rate(time), stream.topic)
@@ -186,7 +186,7 @@ def _short(name: str) -> str:
 
 
 def _times(kind: Kind, recorded: FloatArray, messages: Sequence[bytes]) -> FloatArray:
-    """Return the stamps of the headers, s; the recorder's where there is no header, or it is empty."""
+    """Return the stamps of the headers, s; the recorder's without a header, or where it is empty."""
     if not kind.header:
         return recorded
     stamps = np.frombuffer(b"".join(one[: STAMP.itemsize] for one in messages), STAMP)

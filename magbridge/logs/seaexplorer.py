@@ -1,10 +1,10 @@
 """SeaExplorer gliders: ``.gli`` (navigation) and ``.pld1`` (payload), raw or sub-sampled, also gzipped.
 
-Text with semicolons; positions are degrees and minutes written together, 9999 is a code for "not known". Of
+Text with semicolons; positions are degrees and minutes written together, 9999 is a code for "not known". In
 the navigation, ``LinPos`` (mm) and ``AngPos`` (deg) are where the battery is, ``BallastPos`` (cc) is the
 ballast: moving masses, as ``battpos``, ``battery_roll`` and ``ballast``. A payload's columns keep their names
-in small letters, but for the CTD's and a vector magnetometer's. Its rows get attitude and masses from the
-navigation file of the same dive, where that lies beside it.
+in small letters, except the CTD's and a vector magnetometer's. Its rows get attitude and masses from the
+navigation file of the same dive, where that is in the same folder.
 
 Whether ``Heading`` is true or magnetic the file does not say. It is taken as true, and said; against the
 compass of an acoustic profiler on SEA063 it was 14 deg off (quartiles 12 and 16) where the declination was 6.
@@ -68,14 +68,14 @@ NAMES = {
 NAV_ONLY = {
     *("Altitude", "DesiredH", "BallastCmd", "LinCmd", "AngCmd", "NavState", "SecurityLevel", "Declination")
 }
-"""Columns of the navigation that are no telemetry of what is."""
+"""Columns of the navigation that are not measured."""
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """Yield the file in pieces of at most `rows` rows; it is held whole.
 
-    The rows of a payload's file have what only the navigation file of its dive knows, which lies beside it:
-    attitude and masses, linearly between two samples of the navigation.
+    The rows of a payload's file have what only the navigation file of its dive knows, which is in the same
+    folder: attitude and masses, linearly between two samples of the navigation.
 
     FormatError: not a SeaExplorer's file, or cut short while it was compressed.
     """
@@ -86,7 +86,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _navigation_of(path: Path) -> Path | None:
-    """Return the navigation file of the dive whose payload a file holds; None where it is not beside it."""
+    """Return the navigation file of the dive whose payload a file holds; None without one in its folder."""
     if (named := PAYLOAD.fullmatch(path.name)) is None:
         return None
     dive = re.compile(rf"{re.escape(named['mission'])}\.gli\.\w+\.{named['dive']}(\.gz)?")

@@ -8,7 +8,7 @@ the IGRF rotated by the logged attitude, dives of SG167, SG171, SG180, SG236, SG
   to 5 % with few elements off the diagonal above 0.05;
 - what a count is worth, the compass's type says (:data:`NT_PER_COUNT`). The matrix's diagonal is 0.95 to 1.04
   counts/mG for the types 1, 2 and 6, and 1.75 to 1.91 for type 4;
-- ``head`` is magnetic (the file says so, and with that the matrix's elements between x and y vanish);
+- ``head`` is magnetic (the file states it, and with that the matrix's elements between x and y vanish);
   ``magnetic_variation`` is kept as an attribute, 0.1 deg coarse;
 - ``pitchCtl`` is in cm, ``rollCtl`` in deg, ``vbdCC`` in cc: ``(AD - centre) * CNV`` of each mass's
   potentiometer. Older firmware logs them with every sample (the formula gives SG167's to 2e-4 cm); newer only
@@ -81,7 +81,7 @@ class Dive:
     settings: dict[str, float] = field(default_factory=dict)
     """Parameters of the log, as ``COMPASS_DEVICE``."""
     manoeuvres: dict[str, FloatArray] = field(default_factory=dict)
-    """(m,) each: ``st_secs`` and ``end_secs``, s since 1970, and what was logged of each, as ``pitch_ctl``.
+    """(m,) each: ``st_secs`` and ``end_secs``, s since 1970, and the values logged of each, as ``pitch_ctl``.
     """
     elsewhere: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     """(k,) each: Times, s, and values of what has its own times: positions, CTD."""
@@ -133,7 +133,7 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
 def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[float, list[str]]:
     """Return the nT in a count of the compass in use, and a remark where that had to be estimated.
 
-    Of an unknown type: what gives the sphere through the counts the radius of the Earth's field. The
+    For an unknown type: what gives the sphere through the counts the radius of the Earth's field. The
     calibration's scales are free to differ from it.
     """
     use = known.settings.get("COMPASS_USE", 0.0)

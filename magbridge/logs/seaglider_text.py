@@ -32,7 +32,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     """
     samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
     if not samples.is_file():
-        raise FormatError(path, f"expected {samples.name}, the samples of this dive, beside it")
+        raise FormatError(path, f"expected {samples.name}, the samples of this dive, in the same folder")
     known = _samples(samples)
     if log.is_file():
         _add_log(known, log)

@@ -32,7 +32,7 @@ __all__ = ["VehicleTelemetry", "combine", "refuse_offset", "sensor_logs", "with_
 MIN_GAP_S = 30.0
 """Shortest gap between two values of a column, s, across which it is not interpolated."""
 GAP_INTERVALS = 4.0
-"""The same in median intervals of the column, for columns that are updated rarely."""
+"""Shortest gap in median intervals of the column, for columns that are updated rarely."""
 MAX_STATES = 8
 """Largest number of different integers in a column that is taken for a switch, and held."""
 SCALAR = "total_field"
@@ -107,7 +107,7 @@ class VehicleTelemetry:
         sensor : Dataset (time)
             A piece of a sensor's log.
         is_first : bool
-            What was skipped in the vehicle's logs is counted with this piece.
+            Losses of the vehicle's logs are counted with this piece.
 
         Raises
         ------
@@ -225,7 +225,7 @@ def combine(logs: Sequence[xr.Dataset], named: Sequence[bool], clock_offset_s: f
 
 
 def refuse_offset(clock_offset_s: float) -> None:
-    """Raise WrongUse if a clock offset is given where there is no sensor's log next to a vehicle's."""
+    """Raise WrongUse if a clock offset is given without a sensor's log next to a vehicle's."""
     if clock_offset_s:
         raise WrongUse("--clock-offset: expected a sensor's log next to a vehicle's logs; see --sensor-log")
 

@@ -1,10 +1,10 @@
 """Slocum: flight ``.dbd .mbd .sbd``, science ``.ebd .nbd .tbd``, compressed ``.dcd`` ..., as text ``.dba``.
 
 A row is a cycle of the flight computer; values that were not updated in a cycle are interpolated linearly.
-The science file of the same name beside a flight file is joined to it, and the other way round: either name,
-or both, give the same deployment. The list of sensors is read from the file ``<crc>.cac`` beside the file, or
-in a folder ``cac`` or ``cache`` beside it or above. A science file begins with the sensors' start values, 0
-degC at 0 bar, which nobody measured: they are left out.
+The science file of the same name as a flight file is joined to it, and the other way round: either name, or
+both, give the same deployment. The list of sensors is read from the file ``<crc>.cac`` in the folder of the
+file, or in a folder ``cac`` or ``cache`` there or above. A science file begins with the sensors' start
+values, 0 degC at 0 bar, which are not measured: they are left out.
 
 Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer
 of its own, so there is no ``mag_x``: the log can drive a simulated one. To correct the log of an instrument
@@ -159,7 +159,7 @@ def _read(path: Path | None) -> Tracks:
             if error.value == dbdreader.DBD_ERROR_CACHE_NOT_FOUND:
                 cache_id = next(iter(error.data.missing_cache_files))
                 raise FormatError(
-                    path, f"expected {cache_id}.cac, the list of its sensors, beside it or in a folder cac"
+                    path, f"expected {cache_id}.cac, the list of its sensors, next to it or in a folder cac"
                 ) from None
             raise FormatError(path, f"expected a Slocum file: {error}") from None
         except (ValueError, KeyError, IndexError, UnicodeDecodeError, RuntimeError, OverflowError) as error:

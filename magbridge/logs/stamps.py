@@ -1,7 +1,7 @@
 """Dates and times of day as text files write them: which pattern fits them all, and when that was.
 
 A pattern is one of :meth:`datetime.strptime`, or ends in `` s``, for the seconds of the day. A second's
-fraction is no part of it: behind the seconds, after a point, a comma or a colon, it is read whatever the
+fraction is not part of it: behind the seconds, after a point, a comma or a colon, it is read whatever the
 pattern.
 """
 
@@ -21,13 +21,13 @@ __all__ = ["DAY", "HOURS", "OF_THE_DAY", "epoch", "patterns"]
 DAY = 86_400.0
 HOURS = ("%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p", "%H%M%S")
 DATES = (
-    *("%d.%m.%Y", "%d.%m.%y"),  # nobody writes the month first with dots
+    *("%d.%m.%Y", "%d.%m.%y"),  # with dots, the day comes first
     *(f"%{day}{sign}%{month}{sign}%{year}" for year in "Yy" for sign in "/-" for day, month in ("dm", "md")),
     *("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%Y-%j", "%d-%b-%Y", "%d %b %Y"),
     *("%Y%m%d", "%d%m%y", "%y%m%d", "%m%d%y"),
 )
 WHOLE = ("%a %b %d %H:%M:%S %Y", "%Y%m%d%H%M%S", "%Y %m %d %H %M %S", "%Y %j %H %M %S")
-"""Of the moment at once; the last are columns of numbers, joined."""
+"""Patterns of date and time together; the last are columns of numbers, joined."""
 OF_THE_DAY = " s"
 YEAR_1900 = -2_208_988_800.0
 """s since 1970 of the year that times of day without a date are given; no log is older."""
@@ -91,6 +91,6 @@ def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray
     if zone is not None and stamps.dt.tz is None:
         stamps = stamps.dt.tz_localize(zone, ambiguous="NaT", nonexistent="NaT")
     counts = stamps.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy("datetime64[us]")
-    whole = counts.astype("datetime64[s]")  # apart, so that no digit is lost
+    whole = counts.astype("datetime64[s]")  # separately, so that no digit is lost
     times = whole.astype(np.int64) + ((counts - whole).astype(np.int64) * 1e-6 + seconds)
     return np.asarray(np.where(np.isnat(counts), np.nan, times), np.float64)

@@ -1,4 +1,4 @@
-"""Lines of a text file into columns of numbers; what is none is dropped, counted and named."""
+"""Lines of a text file into columns of numbers; other cells are dropped, counted and named."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from magbridge.wording import counted
 __all__ = ["Table"]
 
 NOTHING = "-", "--", "*", "---"
-"""What means 'no value', beside what pandas knows (an empty field, NaN, NA, null ...)."""
+"""Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
 
 
 class Table:
@@ -35,11 +35,11 @@ class Table:
     Attributes
     ----------
     guesses : list of str
-        What was taken for granted of the times.
+        Assumptions about the times.
     attrs : dict
         What that means for the deployment.
     faults : Faults
-        What was dropped.
+        Rows and values that were dropped.
     """
 
     def __init__(self, path: Path, layout: Layout, first_lines: Sequence[str], *, strict: bool) -> None:
@@ -288,7 +288,7 @@ class Table:
         return values if source is None else np.asarray(values * source.scale + source.offset, np.float64)
 
     def _flags(self, column: pd.Series, numbers: Sequence[int]) -> FloatArray:
-        """Return the bits of named flags; FormatError: a name that is none, for a doubt is never dropped."""
+        """Return the bits of named flags; FormatError: an unknown name, since a flag is never dropped."""
         known: dict[str, float] = {}
         texts = column.fillna("").tolist()
         for row, text in zip(numbers, texts, strict=True):
@@ -302,7 +302,7 @@ class Table:
 
 
 def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray:
-    """Return what texts (n,) mean, also 1.5D+03, 18.300,25 and 52.7 W; NaN for what is no number."""
+    """Return what texts (n,) mean, also 1.5D+03, 18.300,25 and 52.7 W; NaN for other texts."""
     group = re.escape("." if decimal == "," else ",")
     grouped = rf"^([-+]?\d{{1,3}}(?:{group}\d{{3}})+)(?=\D|$)"
     texts = texts.str.replace(grouped, lambda match: re.sub(r"[.,]", "", match[1]), regex=True)

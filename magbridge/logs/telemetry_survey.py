@@ -1,4 +1,4 @@
-"""The first pass through a telemetry log: what it holds."""
+"""The first pass through a telemetry log: its contents."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ class Survey:
             self.attrs["notes"] = "\n".join(notes)
 
     def _read(self, path: Path) -> None:
-        """Read every record, but decode only those that may add to what is known."""
+        """Read every record, but decode only those that may add information."""
         settled: set[int] = set()
         with path.open("rb") as file:
             for block in blocks(file):
@@ -178,7 +178,7 @@ class Survey:
                 if self.ours:
                     self._tuned(block)
                 which = np.arange(len(block.number))
-                if self.ours:  # the bridge's own messages are no telemetry
+                if self.ours:  # the bridge's own messages are not telemetry
                     which = which[(block.channel != Channel.SENT) | np.isin(block.number, (RAW, FIELD))]
                 codes = block.number[which] << 16 | block.system[which] << 8 | block.component[which]
                 for code in np.unique(codes).tolist():
@@ -202,7 +202,7 @@ class Survey:
                 self.attrs[CHANGES] = self.attrs.get(CHANGES, 0) + aligns
 
     def _look(self, block: Block, number: int, which: IndexArray) -> bool:
-        """Note what is new in messages of one kind; return whether further ones can add nothing."""
+        """Record new facts in messages of one kind; return whether further ones can add nothing."""
         system, component = int(block.system[which[0]]), int(block.component[which[0]])
         if number in TELEMETRY:
             return self._values((system, component, number), block.payloads(which))

@@ -6,13 +6,13 @@ are converted. Before the header there may be lines such as ``# heading_referenc
 ``# fill_value = -9999`` where that number stands for a missing value. ``quality`` holds the names of the
 flags, separated by spaces. Numbers are written with as many digits as it takes to read back the same float64.
 
-What is written begins with the header, as other programs expect; attributes stand beside it, in the file that
+A written file begins with the header, as other programs expect; attributes stand next to it, in the file that
 W3C's *Metadata Vocabulary for Tabular Data* gives to ``NAME.csv``: ``NAME.csv-metadata.json``. What would
 change a value's meaning stands in the file itself: ``heading [deg magnetic]``.
 
-Files of others are read by :mod:`.layout` (separator, decimal commas, headings, units) and :mod:`.clocks`
-(times); what other programs capture without headings by :mod:`.captures`. What was guessed is told by the
-attributes ``guessed`` and ``history``; :class:`~magbridge.logs.options.Options` declare instead.
+Files of other programs are read by :mod:`.layout` (separator, decimal commas, headings, units) and
+:mod:`.clocks` (times); what other programs capture without headings by :mod:`.captures`. Assumptions are in
+the attributes ``guessed`` and ``history``; :class:`~magbridge.logs.options.Options` declare instead.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ LOOKED_AT, LINE = 1 << 16, 256
 
 
 class Metadata(msgspec.Struct):
-    """Of a table, by W3C's vocabulary, what is read again: its notes."""
+    """Notes of a table, by W3C's vocabulary, which are read again."""
 
     notes: list[dict[str, str | float]]
 
@@ -146,7 +146,7 @@ class FileWriter:
     Attributes
     ----------
     metadata : bytes
-        What belongs beside the file.
+        Text of the file to write next to it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -189,7 +189,7 @@ def _metadata(dataset: xr.Dataset, headings: Sequence[str]) -> bytes:
 
 
 def _attributes(path: Path) -> dict[str, str | float]:
-    """Return what stands beside the file."""
+    """Return the attributes in the file next to it."""
     sidecar = metadata_path(path)
     if not sidecar.is_file():
         return {}

@@ -63,7 +63,7 @@ BAD = re.compile(r"bad|fail|missing|reject|erroneous|not_used")
 BAD_CODES = (3, 4, 9)
 """Flags of a bad or missing value where the file does not say what they mean (OceanSITES, Argo, IODE)."""
 GENERATED = ("Conventions", "featureType", "title", "start_date", "time_coverage_start", "time_coverage_end")
-"""Attributes of a file that are made anew for each."""
+"""Attributes of a file that are written again for each."""
 
 
 class _Column(NamedTuple):

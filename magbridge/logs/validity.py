@@ -31,7 +31,7 @@ MAX_FLAGGED = 0.2
 
 
 class Validity(NamedTuple):
-    """What a column states of others."""
+    """Statement of a column about other columns."""
 
     column: str
     targets: tuple[str, ...]

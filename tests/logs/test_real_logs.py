@@ -90,7 +90,7 @@ def test_slocum_science_file_alone(real_data: Path, tmp_path: Path) -> None:
 def test_slocum_without_its_list_of_sensors(real_data: Path, tmp_path: Path) -> None:
     shutil.copy(real_data / "slocum_comet" / "comet-2016-174-05-001.dbd", tmp_path)
     with pytest.raises(
-        FormatError, match=r"001\.dbd: expected 11d38bfd\.cac, the list of its sensors, beside it or in"
+        FormatError, match=r"001\.dbd: expected 11d38bfd\.cac, the list of its sensors, next to it or in"
     ):
         logs.read(tmp_path / "comet-2016-174-05-001.dbd")
     assert len(list(tmp_path.iterdir())) == 1

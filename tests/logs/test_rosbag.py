@@ -133,7 +133,7 @@ def test_a_driver_that_does_not_publish_tesla_is_told_of(unit: str, per_tesla: f
     np.testing.assert_allclose(back["mag_x"], 1e9 * FIELD[:, 0], rtol=1e-9)
     (note,) = noted(back.attrs)
     assert note.endswith(f" {unit}")
-    assert "is no field on Earth" in note
+    assert "is not a field on Earth" in note
     assert note in back.attrs["history"]
 
 
