@@ -48,11 +48,13 @@ def by_pymavlink(paths: list[Path]) -> None:
     from pymavlink import mavutil  # noqa: PLC0415
 
     from magbridge.logs.ardupilot_fields import WANTED  # noqa: PLC0415
-    from magbridge.logs.telemetry_fields import FIELDS  # noqa: PLC0415
+    from magbridge.logs.telemetry_fields import MAVLINK_FIELDS  # noqa: PLC0415
 
     for path in paths:
         connection: Any = mavutil.mavlink_connection(str(path))
-        kinds = [*WANTED] if format_of(path) is FORMATS["ardupilot"] else [*FIELDS, "NAMED_VALUE_FLOAT"]
+        kinds = (
+            [*WANTED] if format_of(path) is FORMATS["ardupilot"] else [*MAVLINK_FIELDS, "NAMED_VALUE_FLOAT"]
+        )
         while connection.recv_match(type=kinds) is not None:
             pass
 
@@ -61,10 +63,10 @@ def by_pyulog(paths: list[Path]) -> None:
     """Read the topics that magbridge reads."""
     from pyulog import ULog  # noqa: PLC0415
 
-    from magbridge.logs.px4 import FIELDS, NEEDED  # noqa: PLC0415
+    from magbridge.logs.px4 import NEEDED, PX4_FIELDS  # noqa: PLC0415
 
     for path in paths:
-        ULog(str(path), [*FIELDS, *NEEDED])
+        ULog(str(path), [*PX4_FIELDS, *NEEDED])
 
 
 def by_rosbags(paths: list[Path]) -> None:

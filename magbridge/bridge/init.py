@@ -9,7 +9,7 @@ from typing import Any
 
 from magbridge.calibration.model import Calibration
 from magbridge.correction import TEMPERATURE
-from magbridge.logs.telemetry_fields import FIELDS, Value
+from magbridge.logs.telemetry_fields import MAVLINK_FIELDS, Value
 from magbridge.sensors.options import options_of
 
 __all__ = ["Answers", "bridge_toml"]
@@ -134,7 +134,7 @@ def _source(name: str, unit: str) -> list[str]:
     The columns that magbridge reads from a telemetry log are named in
     :mod:`magbridge.logs.telemetry_fields`; a calibration that was fitted to such a log has these names.
     """
-    for message, columns in FIELDS.items():
+    for message, columns in MAVLINK_FIELDS.items():
         if name in columns:
             value = Value(name, message, columns[name])
             if unit in ("", value.unit):

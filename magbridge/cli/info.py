@@ -58,12 +58,12 @@ def _show(file: str, facts: dict[str, Any]) -> None:
     from msgspec import convert
     from rich.console import Console
 
-    from magbridge.logs.compasses import Compass
+    from magbridge.logs.compasses import LogCompass
 
     console = Console(highlight=False, soft_wrap=False)
     console.print(f"[bold]{_plain(file)}[/bold]: {_plain(summary(facts))}", soft_wrap=True)
     for compass in facts["compasses"]:
-        one = convert(compass, Compass)
+        one = convert(compass, LogCompass)
         console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
     console.print(_columns(facts, meanings=console.width >= WIDE))
     console.print(_uses(facts))

@@ -29,7 +29,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError
 from magbridge.logs.ardupilot_fields import (
-    FIELDS,
+    ARDUPILOT_FIELDS,
     INSTANCE,
     SURVEY,
     SURVEY_AXES,
@@ -38,8 +38,8 @@ from magbridge.logs.ardupilot_fields import (
     in_declared_units,
     in_hundredths,
 )
-from magbridge.logs.autopilot import Fields, Magnetometer, Run, Series, pieces, values_of
-from magbridge.logs.compasses import Compass, rate
+from magbridge.logs.autopilot import BootRun, Fields, Magnetometer, Series, pieces, values_of
+from magbridge.logs.compasses import LogCompass, rate
 from magbridge.logs.dataflash import Records, read_binary
 from magbridge.logs.dataflash_text import read_text
 from magbridge.logs.deployment import NOTES
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 __all__ = ["chunks"]
 
-FIX = 3
+MIN_GPS_STATUS = 3
 """Least ``GPS.Status`` of a fix in three dimensions."""
 TABLES = 8
 """Highest number in the name of a kind, as ``ESC8``."""
@@ -78,7 +78,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     yield from pieces(path, rows, runs, attrs, options.compass if options else None)
 
 
-def _run(fields: Fields, records: dict[str, Records]) -> Run:
+def _run(fields: Fields, records: dict[str, Records]) -> BootRun:
     parameters = _parameters(records.get("PARM"))
     chosen = _estimators(records.get("XKFS"))
     mags = [
@@ -87,7 +87,7 @@ def _run(fields: Fields, records: dict[str, Records]) -> Run:
         if {"MagX", "MagY", "MagZ"} <= records_of.fields.keys()
     ]
     mags += _survey_magnetometers(records.get(SURVEY), len(mags))
-    return Run(mags, _telemetry(fields, records), _utc_offset(records))
+    return BootRun(mags, _telemetry(fields, records), _utc_offset(records))
 
 
 def _in_microseconds(name: str, records: Records) -> Records:
@@ -161,7 +161,7 @@ def _magnetometer(
     device = next((parameters[name] for name in names if parameters.get(name)), 0.0)
     use = parameters.get(f"COMPASS_USE{_numbered(number)}")
     health = fields.get("Health")
-    compass = Compass(
+    compass = LogCompass(
         number,
         len(time),
         rate(time),
@@ -186,7 +186,7 @@ def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetome
         here = np.all([part == number for part, number in zip(parts, numbers, strict=True)], axis=0)
         time = fields["TimeUS"][here] * 1e-6
         device = f"{SURVEY} {':'.join(f'{number:g}' for number in numbers)}"
-        compass = Compass(first + len(found), len(time), rate(time), device)
+        compass = LogCompass(first + len(found), len(time), rate(time), device)
         axes = [NT_PER_UNIT["G"] * fields[name][here] for name in SURVEY_AXES]
         found.append(Magnetometer(compass, time, dict(zip("xyz", axes, strict=True))))
     return found
@@ -207,11 +207,11 @@ def _soft_iron(parameters: Mapping[str, float], number: str) -> FloatArray | Non
 
 def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
     """Yield everything but the magnetometers."""
-    for record in FIELDS:
+    for record in ARDUPILOT_FIELDS:
         for number, found in _instances(records, record).items():
             time, table = found.fields["TimeUS"] * 1e-6, dict(found.fields)
             if record == "GPS" and "Status" in table:
-                fixed = table["Status"] >= FIX
+                fixed = table["Status"] >= MIN_GPS_STATUS
                 table |= {key: np.where(fixed, table[key], np.nan) for key in ("Lat", "Lng") if key in table}
             for column, unit, values in values_of(fields, record, number, table):
                 if np.any(values) or not column.startswith("servo"):  # an output that is 0 is not in use
@@ -240,7 +240,9 @@ def _utc_offset(records: dict[str, Records]) -> float | None:
     offsets = []
     for gps in (one.fields for one in _instances(records, "GPS").values()):
         if {"GWk", "GMS"} <= gps.keys():
-            fixed = (gps["GWk"] > 0) & (gps.get("Status", np.full(len(gps["GWk"]), FIX)) >= FIX)
+            fixed = (gps["GWk"] > 0) & (
+                gps.get("Status", np.full(len(gps["GWk"]), MIN_GPS_STATUS)) >= MIN_GPS_STATUS
+            )
             ahead = GPS_EPOCH + gps["GWk"] * WEEK + gps["GMS"] * 1e-3 - gps["TimeUS"] * 1e-6
             offsets.append(ahead[fixed])
     known = np.concatenate(offsets) if offsets else np.empty(0)

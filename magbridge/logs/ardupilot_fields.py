@@ -12,11 +12,11 @@ from magbridge.logs.autopilot import Fields
 from magbridge.logs.dataflash import OWN_SCALE, Flash
 
 __all__ = [
-    "FIELDS", "INSTANCE", "SURVEY", "SURVEY_AXES", "SURVEY_ID", "WANTED", "in_declared_units",
+    "ARDUPILOT_FIELDS", "INSTANCE", "SURVEY", "SURVEY_AXES", "SURVEY_ID", "WANTED", "in_declared_units",
     "in_hundredths",
 ]  # fmt: skip
 
-FIELDS: Fields = {
+ARDUPILOT_FIELDS: Fields = {
     "ATT": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
     "AHR2": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
     "POS": (
@@ -50,7 +50,7 @@ FIELDS: Fields = {
 """Of records with one column, the first that the log has is taken. Sub's and Copter's CTUN have height and
 throttle, Rover's throttle is in THR, that of all motors together in MOTB."""
 INSTANCE = ("I", "Instance", "Inst")
-TIMES = ("TimeUS", "TimeMS")
+TIME_FIELDS = ("TimeUS", "TimeMS")
 """s since the boot in µs, or in ms up to ArduPilot 3.2."""
 SURVEY, SURVEY_ID, SURVEY_AXES = "MAGH", ("Node", "Sensor", "Bus"), ("Mx", "My", "Mz")
 """Record of a survey magnetometer, what distinguishes several, and their axes in G."""
@@ -61,11 +61,14 @@ NUMBERED = 8
 MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health", *INSTANCE}
 WANTED: dict[str, set[str]] = {
     **{
-        f"{name}{k}": {*TIMES, *INSTANCE, *(field for _, field, _, _ in fields)}
-        for name, fields in {**FIELDS, "MAG": tuple(("", field, "", 1.0) for field in sorted(MAG))}.items()
+        f"{name}{k}": {*TIME_FIELDS, *INSTANCE, *(field for _, field, _, _ in fields)}
+        for name, fields in {
+            **ARDUPILOT_FIELDS,
+            "MAG": tuple(("", field, "", 1.0) for field in sorted(MAG)),
+        }.items()
         for k in ("", *range(2, NUMBERED + 1))
     },
-    SURVEY: {*TIMES, *SURVEY_ID, *SURVEY_AXES},
+    SURVEY: {*TIME_FIELDS, *SURVEY_ID, *SURVEY_AXES},
     "PARM": {"TimeUS", "Name", "Value"},
     "XKFS": {"TimeUS", "MI"},
     "FMT": {"Type", "Name", "Columns"},
@@ -92,11 +95,11 @@ OURS = {
 
 
 def in_declared_units(flash: Flash) -> Fields:
-    """Return :data:`FIELDS` with the units and factors that the log itself declares."""
+    """Return :data:`ARDUPILOT_FIELDS` with the units and factors that the log itself declares."""
     declared = _declared(flash)
     return {
         kind: tuple(_converted(row, declared.get((kind, row[1]))) for row in rows)
-        for kind, rows in FIELDS.items()
+        for kind, rows in ARDUPILOT_FIELDS.items()
     }
 
 

@@ -16,14 +16,14 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.logs.compasses import Compass, choose, compass_notes, listed
+from magbridge.logs.compasses import LogCompass, choose, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sliced, uncounted
 from magbridge.logs.order import in_order
 from magbridge.logs.resample import latest
 
-__all__ = ["Fields", "Magnetometer", "Run", "Series", "pieces", "values_of"]
+__all__ = ["BootRun", "Fields", "Magnetometer", "Series", "pieces", "values_of"]
 
-Table = Mapping[str, FloatArray]
+FieldTable = Mapping[str, FloatArray]
 Fields = dict[str, tuple[tuple[str, str, str, float], ...]]
 """Record: (column, field, unit, factor); ``#`` is the number of the instance where it is not the first."""
 Series = tuple[FloatArray, str, str, FloatArray]
@@ -35,14 +35,14 @@ BETWEEN = 60.0
 class Magnetometer(NamedTuple):
     """The samples of a magnetometer."""
 
-    compass: Compass
+    compass: LogCompass
     time: FloatArray
     """(n,), s of the log."""
-    field: Table
+    field: FieldTable
     """(n,) each, nT, by axis (``x``, ``y``, ``z``)."""
 
 
-class Run(NamedTuple):
+class BootRun(NamedTuple):
     """The records between one boot and the next."""
 
     magnetometers: list[Magnetometer]
@@ -54,7 +54,7 @@ class Run(NamedTuple):
 
 
 def values_of(
-    fields: Fields, record: str, number: int, table: Table
+    fields: Fields, record: str, number: int, table: FieldTable
 ) -> Iterator[tuple[str, str, FloatArray]]:
     """Yield column, unit and values (m,) of each of `fields` that an instance (from 0) of a record holds."""
     for column, field, unit, factor in fields[record]:
@@ -63,7 +63,7 @@ def values_of(
 
 
 def pieces(
-    path: Path, rows: int, runs: Sequence[Run], attrs: Mapping[str, Any], compass: str | None = None
+    path: Path, rows: int, runs: Sequence[BootRun], attrs: Mapping[str, Any], compass: str | None = None
 ) -> Iterator[xr.Dataset]:
     """Yield the log in pieces of at most `rows` rows, run by run.
 
@@ -91,7 +91,7 @@ def pieces(
         yield from sliced(uncounted(whole) if k else whole, rows)
 
 
-def _assembled(path: Path, run: Run, wanted: Compass) -> xr.Dataset:
+def _assembled(path: Path, run: BootRun, wanted: LogCompass) -> xr.Dataset:
     """Return a run on the times of a compass, or where the run lacks it, of its own choice."""
     there = [one.compass for one in run.magnetometers]
     same = [one for one in there if (one.id, one.number) == (wanted.id, wanted.number)]

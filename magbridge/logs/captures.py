@@ -35,7 +35,7 @@ __all__ = ["as_table", "reader"]
 RATE = 100.0
 """Lines a second that MotionCal's senders write."""
 LINE = re.compile(r"(Raw|Uni):\s*(" + r",\s*".join([r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"] * 9) + r")\s*")
-OTHERS = "Uni:", "Ori:", "Cal1:", "Cal2:"
+OTHER_PREFIXES = "Uni:", "Ori:", "Cal1:", "Cal2:"
 """What else these senders write."""
 COUNT = {"Raw": 0.1 * NT_PER_UNIT["uT"], "Uni": NT_PER_UNIT["uT"]}
 """nT in one unit of the magnetometer's numbers."""
@@ -118,7 +118,7 @@ def _motioncal(path: Path, lines: Iterator[str], rows: int, kind: str) -> Pieces
             match = LINE.fullmatch(line.strip())
             if match and match[1] == kind:
                 yield number, match[2]
-            elif not match and line.strip() and not line.startswith(OTHERS):
+            elif not match and line.strip() and not line.startswith(OTHER_PREFIXES):
                 damaged += 1
 
     note = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {RATE:g} lines a second"

@@ -28,23 +28,27 @@ Piece = tuple[xr.Dataset, Sequence[int]]
 """Rows of a deployment, and their numbers in the file."""
 YEAR_10000 = 253_402_300_800.0
 """s since 1970: a later time is in another unit, and no calendar goes beyond it."""
-MOST = {"latitude": 90.0, **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0), "depth": 1e5}
+MAX_MAGNITUDE = {
+    "latitude": 90.0,
+    **dict.fromkeys(("longitude", "roll", "pitch", "heading"), 540.0),
+    "depth": 1e5,
+}
 """Largest magnitude, deg or m, of these columns; 4952.3 is degrees and minutes written together."""
-LEAST = {
+MIN_VALUE = {
     "degC": -273.15, "K": 0.0, "Pa": -101325.0, "hPa": -1013.25, "mbar": -1013.25, "kPa": -101.325,
     "bar": -1.01325, "dbar": -10.1325,
 }  # fmt: skip
 """Lowest temperatures and pressures, also of a pressure relative to the surface's: -9999 is a code for
 "not known"."""
-FIELDS = 1e3, 1e6
+REFERENCE_FIELD_RANGE_NT = 1e3, 1e6
 """nT, between which every reference field lies: 5e-05 is in tesla, and -9999 a code for "not known"."""
-APART = 60.0
+MAX_CHANNEL_DELAY_S = 60.0
 """s by which a channel's sampling time may differ from its row's time."""
-ALONE, FAR = 3, 30 * 86_400.0
+MIN_GROUP_ROWS, MAX_ISOLATION_S = 3, 30 * 86_400.0
 """Fewer rows than this, farther than this (s) from all others, are stamped wrong: no log of their own."""
-MANY = 10
+MIN_ROWS_FOR_ISOLATION = 10
 """Rows from which on some can be called alone."""
-AHEAD = 64
+LOOKAHEAD_ROWS = 64
 """Rows looked at beyond the end of a piece: whether its last was stamped too late, they tell."""
 
 
@@ -125,10 +129,10 @@ class _Checks:
     def _times(self, time: FloatArray, rows: Sequence[int], ahead: FloatArray) -> tuple[IndexArray, int]:
         """Return the indices of the rows to keep, and how many of these have the time of the one before."""
         self._faults.count("time", len(time))
-        whole = np.concatenate([time, ahead[:AHEAD]])
-        if not len(_wrong(whole, self._last)) and not (np.diff(whole) > FAR).any():
+        whole = np.concatenate([time, ahead[:LOOKAHEAD_ROWS]])
+        if not len(_wrong(whole, self._last)) and not (np.diff(whole) > MAX_ISOLATION_S).any():
             return np.arange(len(time)), 0
-        index = _kept(whole, self._last)
+        index = _rows_to_keep(whole, self._last)
         then = [*whole[index].tolist(), np.inf]
         index = index[index < len(time)]
         repeated = index[1:][np.diff(time[index]) == 0]
@@ -162,16 +166,19 @@ class _Checks:
 def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:
     """Return which `values` (n,) of a column cannot be, and the expectation; "" where anything can be."""
     unit = usual(unit)
-    if name in MOST:
-        return np.abs(values) > MOST[name], f"expected {unit}, at most {MOST[name]:g}"
+    if name in MAX_MAGNITUDE:
+        return np.abs(values) > MAX_MAGNITUDE[name], f"expected {unit}, at most {MAX_MAGNITUDE[name]:g}"
     if name == "reference_field":
-        expected = f"expected {FIELDS[0]:g} to {FIELDS[1]:g} nT, or nothing where it is not known"
-        return (values < FIELDS[0]) | (values > FIELDS[1]), expected
+        low, high = REFERENCE_FIELD_RANGE_NT
+        expected = f"expected {low:g} to {high:g} nT, or nothing where it is not known"
+        return (values < REFERENCE_FIELD_RANGE_NT[0]) | (values > REFERENCE_FIELD_RANGE_NT[1]), expected
     if name in CHANNEL_TIMES:
-        return np.abs(values - time) > APART, f"expected a time within {APART:g} s of the row's"
-    if unit in LEAST:
-        expected = f"expected at least {LEAST[unit]:g} {unit}, or nothing where it is not known"
-        return values < LEAST[unit], expected
+        return np.abs(
+            values - time
+        ) > MAX_CHANNEL_DELAY_S, f"expected a time within {MAX_CHANNEL_DELAY_S:g} s of the row's"
+    if unit in MIN_VALUE:
+        expected = f"expected at least {MIN_VALUE[unit]:g} {unit}, or nothing where it is not known"
+        return values < MIN_VALUE[unit], expected
     return np.zeros(len(values), bool), ""
 
 
@@ -203,7 +210,7 @@ def _expected(time: float, before: float, then: float = np.inf) -> str:
     return f"expected a {f'time after {before!r}' if np.isfinite(before) else 'finite time'}, not {time!r}"
 
 
-def _kept(time: FloatArray, after: float) -> IndexArray:
+def _rows_to_keep(time: FloatArray, after: float) -> IndexArray:
     """Return the indices of the rows to keep of `time` (n,), s, in which rows at one time may remain.
 
     They are the longest series that does not decrease, all of it after `after`, without the few rows that
@@ -212,8 +219,8 @@ def _kept(time: FloatArray, after: float) -> IndexArray:
     index = np.flatnonzero((time > after) & (np.abs(time) < YEAR_10000))
     if (np.diff(time[index]) < 0).any():
         index = index[in_order(time[index], strictly=False)]
-    apart = np.flatnonzero(np.diff(time[index]) > FAR) + 1
-    if len(index) >= MANY and len(apart):
-        groups = [group for group in np.split(index, apart) if len(group) >= ALONE]
+    apart = np.flatnonzero(np.diff(time[index]) > MAX_ISOLATION_S) + 1
+    if len(index) >= MIN_ROWS_FOR_ISOLATION and len(apart):
+        groups = [group for group in np.split(index, apart) if len(group) >= MIN_GROUP_ROWS]
         index = np.concatenate(groups) if groups else index
     return index

@@ -17,10 +17,10 @@ import pandas as pd
 
 from magbridge.arrays import FloatArray
 from magbridge.logs.gps_time import GPS_EPOCH, WEEK, leap_seconds
-from magbridge.logs.order import AROUND, boots
-from magbridge.logs.stamps import DAY, HOURS, OF_THE_DAY, epoch, patterns
+from magbridge.logs.order import MEDIAN_ROWS, boots
+from magbridge.logs.stamps import DAY, HOURS, SECONDS_SUFFIX, epoch, patterns
 
-__all__ = ["SECONDS_OF_DAY", "Clock", "Counter", "clock_of", "date_order", "seconds"]
+__all__ = ["SECONDS_OF_DAY", "CountState", "TimeFormat", "clock_of", "date_order", "seconds"]
 
 EPOCHS = {
     "s": (0.0, 1.0),
@@ -50,7 +50,7 @@ SIZES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e
 STEP, CERTAIN = 5e-4, 1e-4
 """Largest median step, in days (43 s, 9 s), by which a count of days is known: the seconds since a boot have
 larger ones; and by which it is under our own name, where they would be 10,000 a second."""
-SINCE_1980 = 3e8, 4.2e9
+UNIX_TIME_RANGE_S = 3e8, 4.2e9
 """s since 1970 of 1979 and 2103, between which a count is known by its size."""
 YEAR_1980 = 315_532_800.0
 SLOW = 10.0
@@ -65,7 +65,7 @@ BETWEEN_RUNS_S = 60.0
 OF_A_DAY = "times of day, of a day that the file does not tell"
 
 
-class Clock(NamedTuple):
+class TimeFormat(NamedTuple):
     """How a column's times are read."""
 
     kind: str
@@ -88,7 +88,7 @@ class Clock(NamedTuple):
         return f"a time as {self.kind}" if self.is_text and self.kind != "iso" else "a time"
 
 
-class Counter(NamedTuple):
+class CountState(NamedTuple):
     """The state of a count of ms or us, or of any count from a boot, in the course of a file."""
 
     shift_s: float
@@ -98,7 +98,7 @@ class Counter(NamedTuple):
     end_s: float
     """The last time, s, after the shift."""
 
-    def go_on(self, times: FloatArray, kind: str) -> tuple[Counter, int]:
+    def go_on(self, times: FloatArray, kind: str) -> tuple[CountState, int]:
         """Add the shift to the next times (n,), s, in place; return the new state and the number of boots.
 
         A count of 32 bits that wraps around goes on. Where it begins again, a run of its own begins, some
@@ -126,7 +126,7 @@ class Counter(NamedTuple):
                 boots_found += 1
             done = row
         times[done - before :] += shift
-        return Counter(shift, whole[known[-AROUND:]] if len(known) else self.last, end), boots_found
+        return CountState(shift, whole[known[-MEDIAN_ROWS:]] if len(known) else self.last, end), boots_found
 
 
 def date_order(headings: Sequence[str]) -> str:
@@ -134,21 +134,21 @@ def date_order(headings: Sequence[str]) -> str:
     return next((heading for heading in headings if ORDER.search(heading)), "")
 
 
-def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) -> Clock:
+def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) -> TimeFormat:
     """Return the clock of a column of times, from its heading, its unit and its first cells.
 
     ValueError: dates that can be read in two ways; says what to declare.
     """
     unit = {"seconds": "s", "sec": "s", "hours": "h"}.get(unit, unit)
     if "%" in unit:
-        return Clock(unit, boot="%d" not in unit and "%j" not in unit)
+        return TimeFormat(unit, boot="%d" not in unit and "%j" not in unit)
     if unit == "iso" or unit in SUMS:
-        return Clock(unit, unit if unit in SUMS else "")
+        return TimeFormat(unit, unit if unit in SUMS else "")
     of_day, unit = unit == SECONDS_OF_DAY, unit if unit in EPOCHS else ""
     present = [text.strip() for text in texts if text.strip()]
     numbers = _numbers(pd.Series(present, dtype="str"))
     if not unit and _on_a_clock(heading, present):
-        return Clock("%H%M%S", OF_A_DAY, boot=True)
+        return TimeFormat("%H%M%S", OF_A_DAY, boot=True)
     digits = (
         not unit and bool(present) and all(re.fullmatch(r"(19|20)\d{12}(\.\d+)?", one) for one in present)
     )
@@ -166,7 +166,7 @@ def _on_a_clock(heading: str, texts: Sequence[str]) -> bool:
     return bool(named) or texts[0].startswith("0") or len({text[2:4] for text in texts}) > 1
 
 
-def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> Clock:
+def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> TimeFormat:
     if unit and unit != "s":
         kind, assumed = unit, ""
     else:
@@ -180,14 +180,14 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> Cl
         and not unit
         and whole
         and step >= SLOW
-        and not (dated and since < SINCE_1980[1] and step < DAY)
+        and not (dated and since < UNIX_TIME_RANGE_S[1] and step < DAY)
     ):
         ways = " or ".join(f'--column time="{heading} [{one}]"' for one in ("ms", "us", "ns", "s"))
         raise ValueError(f"a count with steps of {step:g}, in a unit that the file does not tell: {ways}")
     boot = bool(len(numbers)) and abs(since) < YEAR_1980 and heading != "time"
     if boot:
         assumed = f"{assumed or f'in {kind}'}, from a start that the file does not tell"
-    return Clock(kind, assumed, boot)
+    return TimeFormat(kind, assumed, boot)
 
 
 def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, str]:
@@ -205,7 +205,7 @@ def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, st
         return "s", ""
     middle = float(np.median(numbers))
     for kind in ("ms", "us", "ns"):
-        if SINCE_1980[0] <= middle * EPOCHS[kind][1] < SINCE_1980[1] and not declared:
+        if UNIX_TIME_RANGE_S[0] <= middle * EPOCHS[kind][1] < UNIX_TIME_RANGE_S[1] and not declared:
             return kind, f"{kind} since 1970, by its size"
     step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
     for kind, low, high in SIZES:
@@ -214,34 +214,34 @@ def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, st
     return "s", "" if ours else "seconds"
 
 
-def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bool) -> Clock:
+def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bool) -> TimeFormat:
     times = pd.Series(list(texts), dtype=object)
     zoned = all(re.search(r"(Z|UTC|GMT|[+-]\d\d:?\d\d)$", text) for text in texts)
     zone_note = "" if zoned else f"times in {zone}" if zone else "times in UTC"
     dated = all(re.match(r"\d{4}\D|\d{8}\D", text) for text in texts)
     if dated and pd.to_datetime(times, format="ISO8601", utc=True, errors="coerce").notna().all():
-        return Clock("iso", zone_note)
-    fit = [pattern for pattern in patterns(texts) if pattern.endswith(OF_THE_DAY) == of_day]
+        return TimeFormat("iso", zone_note)
+    fit = [pattern for pattern in patterns(texts) if pattern.endswith(SECONDS_SUFFIX) == of_day]
     if order := ORDER.search(heading):
         letters = [part[0].lower() for part in order.groups()]
         fit = [pattern for pattern in fit if re.findall("%([ymd])", pattern.lower())[:3] == letters] or fit
     if not fit:
-        return Clock("iso")  # each cell will be refused with its row
+        return TimeFormat("iso")  # each cell will be refused with its row
     if len(fit) > 1:
         which = " or ".join(f'--column time="{heading} [{pattern}]"' for pattern in fit)
         first = "day or month" if len({pattern.lower().find("%y") for pattern in fit}) == 1 else "day or year"
         raise ValueError(f"{first} first? {texts[0]!r} can be both: {which}")
     if fit[0] in HOURS:
-        return Clock(fit[0], OF_A_DAY, boot=True)
-    return Clock(fit[0], f"{fit[0]}, {zone_note}" if zone_note else fit[0])
+        return TimeFormat(fit[0], OF_A_DAY, boot=True)
+    return TimeFormat(fit[0], f"{fit[0]}, {zone_note}" if zone_note else fit[0])
 
 
-def seconds(clock: Clock, cells: pd.Series, zone: str | None) -> FloatArray:
+def seconds(clock: TimeFormat, cells: pd.Series, zone: str | None) -> FloatArray:
     """Return the cells in s since 1970-01-01 UTC, (n,); NaN where one is empty or cannot be read.
 
     Parameters
     ----------
-    clock : Clock
+    clock : TimeFormat
         As :func:`clock_of` returns it.
     cells : (n,) Series
         Numbers or texts.

@@ -21,7 +21,7 @@ from magbridge.errors import FormatError
 from magbridge.wording import counted
 
 __all__ = [
-    "ATTRIBUTE", "HEALTHY", "Compass", "by_columns", "choose", "compass_notes", "compasses_in",
+    "COMPASSES_ATTRIBUTE", "HEALTHY", "LogCompass", "by_columns", "choose", "compass_notes", "compasses_in",
     "compasses_of", "further", "listed", "rate",
 ]  # fmt: skip
 
@@ -31,10 +31,10 @@ AXIS = re.compile(r"mag([1-9]\d*)?_[xyz]$")
 """Name of an axis of any compass."""
 HEALTHY = 0.5
 """Least share of its samples in which a compass in use is healthy."""
-ATTRIBUTE = "compasses"
+COMPASSES_ATTRIBUTE = "compasses"
 
 
-class Compass(msgspec.Struct, frozen=True, omit_defaults=True):
+class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
     """One compass of a log."""
 
     number: int
@@ -79,14 +79,14 @@ def rate(time: Sequence[float] | np.ndarray[Any, Any]) -> float:
     return float(1 / np.median(steps)) if len(steps) else 0.0
 
 
-def choose(path: Path, found: Sequence[Compass], wanted: str | None) -> list[Compass]:
+def choose(path: Path, found: Sequence[LogCompass], wanted: str | None) -> list[LogCompass]:
     """Return the compasses with one marked as chosen.
 
     Parameters
     ----------
     path : path
         Named in the error.
-    found : sequence of Compass
+    found : sequence of LogCompass
         At least one.
     wanted : str or None
         A number or an id; None: the one in use, else the first that is enabled and healthy.
@@ -107,7 +107,7 @@ def choose(path: Path, found: Sequence[Compass], wanted: str | None) -> list[Com
     return [msgspec.structs.replace(one, chosen=one is best) for one in found]
 
 
-def compass_notes(found: Sequence[Compass], wanted: str | None) -> list[str]:
+def compass_notes(found: Sequence[LogCompass], wanted: str | None) -> list[str]:
     """Return notes on the choice: which compass was chosen of which, and reasons against it."""
     best = next(one for one in found if one.chosen)
     words = []
@@ -119,9 +119,9 @@ def compass_notes(found: Sequence[Compass], wanted: str | None) -> list[str]:
     return words
 
 
-def listed(found: Sequence[Compass]) -> dict[str, str]:
+def listed(found: Sequence[LogCompass]) -> dict[str, str]:
     """Return the attribute of a deployment that holds its compasses; none where there is only one unnamed."""
-    return {ATTRIBUTE: msgspec.json.encode(found).decode()}
+    return {COMPASSES_ATTRIBUTE: msgspec.json.encode(found).decode()}
 
 
 def by_columns(deployment: xr.Dataset, wanted: str | None) -> xr.Dataset:
@@ -155,12 +155,12 @@ def further(deployment: xr.Dataset) -> xr.Dataset:
     return deployment.rename({name: f"mag{highest + 1}_{name[-1]}" for name in CHANNELS if name in found})
 
 
-def compasses_in(log: xr.Dataset) -> list[Compass]:
+def compasses_in(log: xr.Dataset) -> list[LogCompass]:
     """Return the compasses of a deployment: those that it lists, or those that its columns are."""
     return compasses_of(log.attrs) or _by_names(log)
 
 
-def _by_names(log: xr.Dataset) -> list[Compass]:
+def _by_names(log: xr.Dataset) -> list[LogCompass]:
     """Return a compass for ``mag_x mag_y mag_z``, and for each ``mag2_x ...`` that is there."""
     others = [str(name) for name in log.data_vars if OTHER.match(str(name))]
     prefixes = {0: "mag", **{int(name[3:-2]) - 1: name[:-2] for name in others}}
@@ -169,14 +169,14 @@ def _by_names(log: xr.Dataset) -> list[Compass]:
         names = [f"{prefix}_{axis}" for axis in "xyz"]
         if all(name in log for name in names):
             known = log["time"].to_numpy()[log[names[0]].notnull().to_numpy()]
-            found.append(Compass(number, len(known), rate(known), chosen=not number))
+            found.append(LogCompass(number, len(known), rate(known), chosen=not number))
     return found
 
 
-def compasses_of(attrs: Mapping[Any, Any]) -> list[Compass]:
+def compasses_of(attrs: Mapping[Any, Any]) -> list[LogCompass]:
     """Return the compasses that the attributes of a deployment list; none where they do not.
 
     A log of several boots lists those of its first.
     """
-    text = attrs.get(ATTRIBUTE)
-    return msgspec.json.decode(text, type=list[Compass]) if isinstance(text, str) else []
+    text = attrs.get(COMPASSES_ATTRIBUTE)
+    return msgspec.json.decode(text, type=list[LogCompass]) if isinstance(text, str) else []

@@ -32,7 +32,7 @@ __all__ = ["OWN_SCALE", "Flash", "Records", "number_of", "read_binary"]
 Bytes = NDArray[np.uint8]
 
 FMT = 128
-HEADER = 3
+RECORD_HEADER_BYTES = 3
 PASS = 1 << 24
 """Bytes in which headers are searched at once."""
 LETTERS = {
@@ -42,7 +42,7 @@ LETTERS = {
 }  # fmt: skip
 OWN_SCALE = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 """Letters of fields that hold the value times this."""
-LAYOUT = np.dtype([("", "u1", HEADER), *zip(("type", "length", "name", "letters", "columns"),
+LAYOUT = np.dtype([("", "u1", RECORD_HEADER_BYTES), *zip(("type", "length", "name", "letters", "columns"),
                                            ("u1", "u1", "S4", "S16", "S64"), strict=True)])  # fmt: skip
 
 
@@ -124,9 +124,11 @@ def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
         name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
         known = all(letter in LETTERS for letter in letters)
         size = (
-            HEADER + sum(np.dtype(LETTERS[letter]).itemsize for letter in letters) if known else one["length"]
+            RECORD_HEADER_BYTES + sum(np.dtype(LETTERS[letter]).itemsize for letter in letters)
+            if known
+            else one["length"]
         )
-        if size == one["length"] > HEADER and name.isalnum():
+        if size == one["length"] > RECORD_HEADER_BYTES and name.isalnum():
             kinds.append(
                 _Kind(int(start), int(one["type"]), int(size), name, letters, tuple(columns.split(",")))
             )
@@ -197,7 +199,7 @@ def _gather(data: Bytes, at: IndexArray, layout: np.dtype[Any], offset: int = 0)
 
 
 def _decoded(data: Bytes, kind: _Kind, at: IndexArray, wanted: Collection[str]) -> Records:
-    fields, texts, offset = {}, {}, HEADER
+    fields, texts, offset = {}, {}, RECORD_HEADER_BYTES
     for name, letter in zip(kind.columns, kind.letters, strict=False):
         layout = np.dtype(LETTERS.get(letter, "V1"))
         if letter not in LETTERS or offset + layout.itemsize > kind.length:

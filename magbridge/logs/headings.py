@@ -14,7 +14,7 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
 WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)) ?([a-zA-Z°µ%/]+)")
 """A cell that is a number with its unit."""
-UNITS = {
+KNOWN_UNITS = {
     *NT_PER_UNIT,
     *(column.units for column in COLUMNS.values() if column.units != "1"),
     *("ms", "us", "ns", "min", "h", "UTC", "iso", "deg/s", "rad/s", "rad", "cm", "km", "mm", "in", "cm3"),
@@ -23,7 +23,7 @@ UNITS = {
 }
 """Units by which a row of units under the headings is known."""
 AXES = "x", "y", "z"
-PLACES = "latitude", "longitude", "roll", "pitch", "heading", "depth"
+PREFIXED_COLUMNS = "latitude", "longitude", "roll", "pitch", "heading", "depth"
 VECTORS = (
     "mag{}", "magnetometer{}", "magneticfield{}", "magfield{}", "magnetic{}", "fluxgate{}", "flux{}", "b{}",
     "m{}", "h{}", "{}mag", "b1{}", "mag1{}", "rawmag{}", "magraw{}", "magn{}", "compass{}", "fgm{}",
@@ -71,7 +71,7 @@ ALIASES = {
 """Our name -> names in other programs, the surest first."""
 TOWED = "magnetometer", "mag", "sensor", "towfish", "fish", "tow", "layback"
 """Words before a position that say that it is the towed sensor's, not the ship's."""
-AROUND = re.compile(
+PREFIXED_NAME = re.compile(
     rf"(gps|gnss|location|position|pos|nav|ins|ship|vessel|{'|'.join(TOWED)})?(.+?)(deg|degrees|dd|wgs84|mag1)?"
 )
 """Words that may stand before and behind the names of a place and an attitude."""
@@ -105,7 +105,7 @@ def bare(name: str) -> str:
 
 def is_unit(text: str) -> bool:
     """Whether a cell under the headings is a unit: of a row of them at least one must be."""
-    return usual(text.strip().strip("[]()")) in UNITS
+    return usual(text.strip().strip("[]()")) in KNOWN_UNITS
 
 
 def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str]:
@@ -138,13 +138,13 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
     pair = _position(words)
     if any(names[k] != name for k, name in pair.items()):
         found |= pair
-    inner = [match[2] if (match := AROUND.fullmatch(word)) else "" for word in words]
+    inner = [match[2] if (match := PREFIXED_NAME.fullmatch(word)) else "" for word in words]
     for name in COLUMNS:
         if name in names or name in pair.values() or name == "quality":  # a foreign one is not our flags
             continue
         aliases_of = (name.replace("_", ""), *ALIASES.get(name, ()))
         places = [only(word) for word in aliases_of]
-        if name in PLACES:
+        if name in PREFIXED_COLUMNS:
             places += [only(word, inner) for word in aliases_of]
         there = [place for place in places if place is not None and place not in found]
         if there:
@@ -159,7 +159,7 @@ def _position(words: Sequence[str]) -> dict[int, str]:
     """
     pairs: dict[tuple[str, str], dict[str, int]] = {}
     for k, word in enumerate(words):
-        match = AROUND.fullmatch(word)
+        match = PREFIXED_NAME.fullmatch(word)
         for name in ("latitude", "longitude"):
             if match and match[2] in (name, *ALIASES[name]):
                 pairs.setdefault((match[1] or "", match[3] or ""), {}).setdefault(name, k)

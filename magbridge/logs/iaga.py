@@ -24,7 +24,7 @@ from magbridge.logs.packed import opened
 
 __all__ = ["chunks"]
 
-UNKNOWN = 88_888.0
+MIN_CODE_NT = 88_888.0
 """nT; this, and 99,999, stand for values that were not recorded, or not observed."""
 TOTALS = (("f",), ("s",), ("x", "y", "z"), ("h", "z"))
 """Elements whose length is the total field, the surest first."""
@@ -45,7 +45,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
         raise FormatError(path, "expected rows, there are none", row=first + 2)
     time, *values = np.array(whole).T
     by_element = {
-        name: np.where(np.abs(value) >= UNKNOWN, np.nan, value)
+        name: np.where(np.abs(value) >= MIN_CODE_NT, np.nan, value)
         for name, value in zip(elements, values, strict=True)
     }
     columns = {f"observatory_{name}": value for name, value in by_element.items()}

@@ -17,7 +17,7 @@ from magbridge.logs.magnetic import EARTHS
 
 __all__ = ["GAP", "USES", "info", "lacking", "movers", "telemetry"]
 
-POSITION = ("latitude", "longitude")
+HORIZONTAL_POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")
 RECKONING: tuple[tuple[str, ...], ...] = (
     ("velocity_north", "velocity_east"),
@@ -27,16 +27,16 @@ RECKONING: tuple[tuple[str, ...], ...] = (
     ("depth", "pitch", "heading"),
 )
 Needs = tuple[tuple[tuple[str, ...], ...], ...]
-REFERENCE: tuple[tuple[str, ...], ...] = (("reference_field",), POSITION)
+REFERENCE: tuple[tuple[str, ...], ...] = (("reference_field",), HORIZONTAL_POSITION)
 USES: dict[str, Needs] = {
     "calibrate": ((CHANNELS,), REFERENCE),
     "correct": ((CHANNELS,),),
     "diagnose": ((CHANNELS,), REFERENCE),
     "navigate": ((CHANNELS,), RECKONING),
-    "survey": ((CHANNELS, ("total_field",), ("anomaly",)), (POSITION,)),
-    "plan --mission": ((ATTITUDE,), (POSITION,)),
+    "survey": ((CHANNELS, ("total_field",), ("anomaly",)), (HORIZONTAL_POSITION,)),
+    "plan --mission": ((ATTITUDE,), (HORIZONTAL_POSITION,)),
     "replay": ((CHANNELS,),),
-    "simulate --trajectory-from": ((ATTITUDE,), (POSITION,)),
+    "simulate --trajectory-from": ((ATTITUDE,), (HORIZONTAL_POSITION,)),
 }
 """Command -> its needs: of each group, one of the alternatives, each a set of columns."""
 GAP = 2.5

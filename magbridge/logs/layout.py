@@ -22,18 +22,18 @@ from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.headings import NUMBER, is_unit
 from magbridge.logs.magnetic import units_of_angles
 from magbridge.logs.makers import declared_by_maker
-from magbridge.logs.mapping import Declared
+from magbridge.logs.mapping import ColumnMapping
 from magbridge.logs.naming import name_columns
 from magbridge.logs.validity import Validity, validity_of
 from magbridge.wording import counted
 
-__all__ = ["BLANKS", "HEADER", "Layout", "cells", "is_remark", "layout_of"]
+__all__ = ["BLANKS", "LAYOUT_LINES", "Layout", "cells", "is_remark", "layout_of"]
 
-HEADER = 200
+LAYOUT_LINES = 200
 """Lines at the start of a file by which its layout is found."""
 MAX_COLUMNS = 4_096
 """Largest number of columns that is read."""
-ATTRIBUTE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
+ATTRIBUTE_LINE = re.compile(r"[#%]\s*([\w.-]+)\s*=\s*(.*?)\s*")
 is_remark = re.compile(r"[#%/]|\s*(?:line|tie)[\s:]*[\w.:]+\s*$", re.IGNORECASE).match
 """Return a match if a line is not a row: a comment, or what Geosoft and others write between the lines of a
 survey."""
@@ -59,7 +59,7 @@ class Layout:
     """Name -> unit, where one is declared."""
     headings: list[str] = field(default_factory=list)
     """As the file has them."""
-    declared: Declared = field(default_factory=Declared)
+    declared: ColumnMapping = field(default_factory=ColumnMapping)
     """What the user says of the columns, or their maker."""
     stamp: list[int] = field(default_factory=list)
     """Which fields are the time, joined by blanks: one, or date and time of day ..."""
@@ -101,7 +101,7 @@ def cells(line: str, separator: str) -> list[str]:
 def layout_of(
     path: Path,
     lines: Sequence[str],
-    declared: Declared,
+    declared: ColumnMapping,
     *,
     foreign: bool = True,
     further: Sequence[str] = (),
@@ -163,7 +163,7 @@ def _comments(path: Path, lines: Sequence[str], found: Layout) -> int:
     for k, line in enumerate(lines):
         if not is_remark(line):
             return k
-        if match := ATTRIBUTE.fullmatch(line.strip()):
+        if match := ATTRIBUTE_LINE.fullmatch(line.strip()):
             name, text = match.groups()
             if name == "fill_value":
                 found.fill = _declared_number(path, name, text, k + 1)
@@ -214,14 +214,14 @@ def _preamble(lines: Sequence[str], found: Layout) -> int:
 
 
 def _headings_elsewhere(
-    path: Path, lines: Sequence[str], comments: int, start: int, declared: Declared, found: Layout
+    path: Path, lines: Sequence[str], comments: int, start: int, declared: ColumnMapping, found: Layout
 ) -> tuple[int, list[str]]:
     """Return where the headings of rows without any are, and they: in a comment above, or as declared."""
     width = _count(lines[start], found.separator)
     for k in reversed(range(comments)):
         headings = cells(lines[k].lstrip("#%/ "), found.separator)
         named = all(any(map(str.isalpha, cell)) for cell in headings)
-        if len(headings) == width and named and not ATTRIBUTE.fullmatch(lines[k].strip()):
+        if len(headings) == width and named and not ATTRIBUTE_LINE.fullmatch(lines[k].strip()):
             found.first = start
             found.guesses.append(f"headings from the comment in line {k + 1}")
             return k, headings

@@ -20,14 +20,14 @@ __all__ = ["EARTHS", "find_total", "units_of_axes"]
 
 EARTHS = 15_000.0, 90_000.0
 """nT, within which the Earth's field lies, with a vehicle's own."""
-TOTAL = re.compile(
+TOTAL_NAME = re.compile(
     "f|nt|mag|tm[fi]|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?(field|intensity)|magneticfield"
     "|reading1|scalar.*|magnitude"
 )
 """What the one column of a scalar magnetometer is called, with neither capitals nor punctuation."""
 
 
-SCALAR = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")
+SCALAR_NAME = re.compile("tm[fi]|total(magnetic)?intensity|scalar.*")
 """Names of a scalar sensor next to a vector, whose length may be there under the other names."""
 ANGLES = "roll", "pitch", "heading"
 NEAR_HALF_TURN_RAD = 0.1
@@ -87,7 +87,7 @@ def find_total(found: Layout, rows: Sequence[Sequence[str]]) -> None:
     if not found.foreign or "total_field" in found.names:
         return
     has_vector = set(CHANNELS) <= set(found.names)
-    pattern = SCALAR if has_vector else TOTAL
+    pattern = SCALAR_NAME if has_vector else TOTAL_NAME
     fields = [
         k for k, name in enumerate(found.names) if pattern.fullmatch(bare(name)) and name not in COLUMNS
     ]

@@ -17,10 +17,10 @@ from magbridge.toml import Table, check_entries, convert, load_toml
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Declared", "Source", "declared", "renamed"]
+__all__ = ["ColumnMapping", "ColumnSource", "declared", "renamed"]
 
 
-class Source(Table, frozen=True, rename={"heading": "from"}):
+class ColumnSource(Table, frozen=True, rename={"heading": "from"}):
     """``[columns.NAME]`` of a mapping file: where the column NAME comes from.
 
     The value is ``scale * theirs + offset``, in `unit`.
@@ -42,11 +42,11 @@ class Source(Table, frozen=True, rename={"heading": "from"}):
             raise ValueError("expected a scale other than 0, and numbers")
 
 
-class Declared(Table, frozen=True):
+class ColumnMapping(Table, frozen=True):
     """A mapping file, ``columns.toml``, whole."""
 
-    columns: dict[str, Source] = msgspec.field(default_factory=dict)
-    """Our name of a column -> its :class:`Source`."""
+    columns: dict[str, ColumnSource] = msgspec.field(default_factory=dict)
+    """Our name of a column -> its :class:`ColumnSource`."""
     heading_reference: Literal["true", "magnetic"] | None = None
     """What headings refer to."""
     fill_value: float | None = None
@@ -67,7 +67,7 @@ class Declared(Table, frozen=True):
             raise ValueError(f"zone: expected a time zone as Europe/Berlin, got {self.zone!r}") from None
 
 
-def declared(column: Sequence[str], file: Path | None) -> Declared:
+def declared(column: Sequence[str], file: Path | None) -> ColumnMapping:
     """Return what a mapping file and the texts of ``--column`` say together.
 
     Parameters
@@ -84,24 +84,24 @@ def declared(column: Sequence[str], file: Path | None) -> Declared:
     WrongUse
         A text without its name.
     """
-    declaration = _load(file) if file else Declared()
+    declaration = _load(file) if file else ColumnMapping()
     return msgspec.structs.replace(declaration, columns={**declaration.columns, **dict(map(_named, column))})
 
 
-def _load(path: Path) -> Declared:
+def _load(path: Path) -> ColumnMapping:
     table = load_toml(path)
-    check_entries(table, "columns", Source, path)
-    return convert(table, Declared, path)
+    check_entries(table, "columns", ColumnSource, path)
+    return convert(table, ColumnMapping, path)
 
 
-def _named(text: str) -> tuple[str, Source]:
+def _named(text: str) -> tuple[str, ColumnSource]:
     name, equals, heading = (part.strip() for part in text.partition("="))
     if not (name and equals and heading):
         raise WrongUse(f'--column {text}: expected NAME="THEIRS [unit]", as mag_x="Bx [uT]"')
-    return name, Source(heading=heading)
+    return name, ColumnSource(heading=heading)
 
 
-def renamed(dataset: xr.Dataset, declaration: Declared) -> xr.Dataset:
+def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
     """Return a deployment of a format that names its columns itself with the columns as declared.
 
     FormatError: a column that is not there, or a unit that does not fit ours.
@@ -124,7 +124,7 @@ def renamed(dataset: xr.Dataset, declaration: Declared) -> xr.Dataset:
     )
 
 
-def _column(dataset: xr.Dataset, name: str, source: Source) -> tuple[str, str]:
+def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, str]:
     """Return the name of the column that `source` means, and the unit that is declared for it."""
     theirs = source.heading or name
     if theirs in dataset:

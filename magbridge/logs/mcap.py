@@ -40,21 +40,21 @@ __all__ = ["FileWriter", "chunks"]
 
 PROFILE = "magbridge"
 """By which a file is known to be of this form."""
-RAW, FIELD, FLAGS, VEHICLE, OTHERS = "/magnetometer", "/field", "/quality", "/vehicle", "/telemetry"
-POSITION = "/position"
+RAW, FIELD, FLAGS, VEHICLE, OTHER_TOPIC = "/magnetometer", "/field", "/quality", "/vehicle", "/telemetry"
+POSITION_TOPIC = "/position"
 WHEN = {
     "type": "object",
     "title": "time",
     "properties": {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0}},
 }
-NUMBER = {"type": "number"}
+NUMBER_SCHEMA = {"type": "number"}
 LOCATION = {
     "timestamp": WHEN,
     "frame_id": {"type": "string"},
-    "latitude": {**NUMBER, "description": "deg, north positive"},
-    "longitude": {**NUMBER, "description": "deg, east positive"},
-    "altitude": {**NUMBER, "description": "m, the depth's negative; 0 where that is not known"},
-    "position_covariance": {"type": "array", "items": NUMBER, "minItems": 9, "maxItems": 9},
+    "latitude": {**NUMBER_SCHEMA, "description": "deg, north positive"},
+    "longitude": {**NUMBER_SCHEMA, "description": "deg, east positive"},
+    "altitude": {**NUMBER_SCHEMA, "description": "m, the depth's negative; 0 where that is not known"},
+    "position_covariance": {"type": "array", "items": NUMBER_SCHEMA, "minItems": 9, "maxItems": 9},
     "position_covariance_type": {"title": "foxglove.PositionCovarianceType", "oneOf": [{"const": 0}]},
 }
 """A fix whose covariance is not known."""
@@ -67,7 +67,7 @@ def topic_of(name: str) -> str:
     if name == "sensor_temperature" or name.startswith("mag"):
         return RAW
     if name not in COLUMNS:
-        return OTHERS
+        return OTHER_TOPIC
     return FIELD if COLUMNS[name].units == "nT" else VEHICLE
 
 
@@ -148,13 +148,13 @@ class FileWriter:
 
     def _announce(self, columns: Mapping[str, Mapping[str, Any]]) -> None:
         """Register each topic that has columns, with its schema."""
-        for topic in (RAW, FIELD, FLAGS, VEHICLE, OTHERS):
+        for topic in (RAW, FIELD, FLAGS, VEHICLE, OTHER_TOPIC):
             names = [name for name in columns if topic_of(name) == topic]
             if names:
                 described = {name: {key: str(columns[name][key]) for key in ("units", "long_name")}
                         for name in names}  # fmt: skip
                 properties = {
-                    name: {**NUMBER, "description": f"{one['units']}, {one['long_name']}"}
+                    name: {**NUMBER_SCHEMA, "description": f"{one['units']}, {one['long_name']}"}
                     for name, one in described.items()
                 }
                 if topic == FLAGS:
@@ -162,7 +162,7 @@ class FileWriter:
                 title = f"{PROFILE}.{topic[1:].title()}"
                 self._register(topic, title, {"timestamp": WHEN, **properties}, names, described)
         if {"latitude", "longitude"} <= columns.keys():
-            self._register(POSITION, "foxglove.LocationFix", LOCATION, [], {})
+            self._register(POSITION_TOPIC, "foxglove.LocationFix", LOCATION, [], {})
 
     def _register(
         self,

@@ -41,7 +41,7 @@ CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
 """A cell that is a time of day."""
 HOUR_AND_MINUTE = re.compile(r"([01]?\d|2[0-3])?[0-5]?\d(\.\d+)?")
 """A cell that is a time of day as HHMM.mmm, as in the exchange format MGD77T."""
-OF_THE_DAY = re.compile("day|sod|utc|midnight", re.IGNORECASE)
+SECONDS_HEADING = re.compile("day|sod|utc|midnight", re.IGNORECASE)
 """What in a heading says that seconds count from midnight, next to a date."""
 JOINED = {
     "seconds and nanoseconds": ("(.*stamp)?(secs?|seconds)", "(.*stamp)?(nanosecs?|nsecs?|nanoseconds)"),
@@ -184,7 +184,7 @@ def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
         found.stamp = [] if place is None else [place]
         if place is not None and len(dates) == 1 and dates != [place]:
             cells = [row[place] for row in rows if len(row) > place]
-            counted = OF_THE_DAY.search(found.headings[place]) and all(map(_in_a_day, cells))
+            counted = SECONDS_HEADING.search(found.headings[place]) and all(map(_in_a_day, cells))
             undated = "%" in (unit := found.units.get("time", "")) and not {"%d", "%j"} & {
                 *re.findall("%.", unit)
             }

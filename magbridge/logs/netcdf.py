@@ -42,7 +42,7 @@ __all__ = ["FileWriter", "chunks"]
 OG1_DIMENSION = "N_MEASUREMENTS"
 OG1_NAMES = {"water_temperature": "TEMP", "water_pressure": "PRES"}
 """Columns whose OG1.0 name is not simply our name in capitals."""
-ATTRIBUTES: dict[str, dict[str, Any]] = {
+CF_ATTRIBUTES: dict[str, dict[str, Any]] = {
     "time": {"standard_name": "time", "calendar": "gregorian", "units": EPOCH},
     "latitude": {"standard_name": "latitude", "units": "degrees_north"},
     "longitude": {"standard_name": "longitude", "units": "degrees_east"},
@@ -145,7 +145,7 @@ class FileWriter:
             while written in taken:
                 written += "_"
             taken.add(written)
-            attrs = dict(dataset[name].attrs) | ATTRIBUTES.get(name, {})
+            attrs = dict(dataset[name].attrs) | CF_ATTRIBUTES.get(name, {})
             flags = name == "quality"  # CF: flags have the type of their masks
             # a coordinate of CF has no fill value: a time is never missing
             fill = {"time": None, "quality": NO_FLAGS}.get(name, np.nan)

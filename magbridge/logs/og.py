@@ -21,10 +21,10 @@ from magbridge.errors import ConfigError, FormatError
 from magbridge.logs.cf import EPOCH, floats
 from magbridge.toml import Table, convert, load_toml
 
-__all__ = ["Metadata", "complete", "read_metadata"]
+__all__ = ["OgMetadata", "complete", "read_metadata"]
 
 TIME_FORMAT = "%Y%m%dT%H%M%S"
-ATTRIBUTES = (
+MANDATORY_ATTRIBUTES = (
     *("title", "contributor_name", "contributor_email", "contributor_role", "contributor_role_vocabulary"),
     *("contributing_institutions", "contributing_institutions_role"),
     *("contributing_institutions_role_vocabulary", "rtqc_method"),
@@ -36,13 +36,18 @@ PLATFORM = {
     "WMO_IDENTIFIER": "wmo id",
 }
 """Mandatory variables of the platform, and their long names."""
-SENSOR = "sensor_model", "sensor_model_vocabulary", "sensor_type_vocabulary", "sensor_serial_number"
+SENSOR_ATTRIBUTES = (
+    "sensor_model",
+    "sensor_model_vocabulary",
+    "sensor_type_vocabulary",
+    "sensor_serial_number",
+)
 """Mandatory attributes of the sensor's variable, and the serial number that is part of its name."""
 GLIDERS = {
     "platform": "sub-surface gliders",
     "platform_vocabulary": "https://vocab.nerc.ac.uk/collection/L06/current/27/",
 }
-PLACES = {
+OG1_POSITIONS = {
     "TIME": {"valid_min": 1e9, "valid_max": 4e9, "vocabulary": "TIME"},
     "LATITUDE": {"valid_min": -90.0, "valid_max": 90.0, "vocabulary": "LAT"},
     "LONGITUDE": {"valid_min": -180.0, "valid_max": 180.0, "vocabulary": "LON"},
@@ -51,10 +56,10 @@ PLACES = {
 MEASURED = ("MAG_X", "MAG_Y", "MAG_Z", "TOTAL_FIELD", "FIELD_X", "FIELD_Y", "FIELD_Z", "ANOMALY")
 """Variables that the magnetometer gives."""
 FIXES = {"LATITUDE": "gps_latitude", "LONGITUDE": "gps_longitude"}
-UNKNOWN = "the log does not say which positions are fixes"
+NO_FIXES = "the log does not say which positions are fixes"
 
 
-class Metadata(Table, frozen=True):
+class OgMetadata(Table, frozen=True):
     """A ``metadata.toml``."""
 
     attributes: dict[str, str]
@@ -65,10 +70,10 @@ class Metadata(Table, frozen=True):
     """Attributes of the magnetometer's variable, as ``sensor_model``."""
 
 
-def read_metadata(path: Path) -> Metadata:
+def read_metadata(path: Path) -> OgMetadata:
     """Read a ``metadata.toml``; ConfigError: missing, not TOML, or without a key that OG1.0 demands."""
-    found = convert(load_toml(path), Metadata, path)
-    demanded = {"attributes": ATTRIBUTES, "platform": PLATFORM, "sensor": SENSOR}
+    found = convert(load_toml(path), OgMetadata, path)
+    demanded = {"attributes": MANDATORY_ATTRIBUTES, "platform": PLATFORM, "sensor": SENSOR_ATTRIBUTES}
     for table, keys in demanded.items():
         for key in keys:
             if not getattr(found, table).get(key):
@@ -76,16 +81,16 @@ def read_metadata(path: Path) -> Metadata:
     return found
 
 
-def complete(path: Path, metadata: Metadata) -> None:
+def complete(path: Path, metadata: OgMetadata) -> None:
     """Add to a trajectory that :mod:`.netcdf` has written what makes it a file of OG1.0.
 
     FormatError: it has no positions and depths.
     """
     with netCDF4.Dataset(path, "a") as file:
-        for name in PLACES:
+        for name in OG1_POSITIONS:
             if name not in file.variables:
                 raise FormatError(path, "expected this column: OG1.0 demands it", column=name.lower())
-        known = {name: floats(file[name]) for name in PLACES}
+        known = {name: floats(file[name]) for name in OG1_POSITIONS}
         _deployed(file, known)
         start = datetime.fromtimestamp(float(file["DEPLOYMENT_TIME"][...]), UTC).strftime(TIME_FORMAT)
         trajectory = f"{metadata.platform['PLATFORM_SERIAL_NUMBER']}_{start}"
@@ -99,7 +104,7 @@ def complete(path: Path, metadata: Metadata) -> None:
         )
         for name, text in metadata.platform.items():
             _scalar(file, name, str, text, long_name=PLATFORM.get(name, name.replace("_", " ").lower()))
-        for name, attributes in PLACES.items():
+        for name, attributes in OG1_POSITIONS.items():
             term = attributes["vocabulary"]
             attached = {key: value for key, value in attributes.items() if key != "vocabulary"}
             vocabulary = f"https://vocab.nerc.ac.uk/collection/OG1/current/{term}/"
@@ -139,7 +144,7 @@ def _fixes(file: Any, known: dict[str, Any]) -> None:
         variable.setncatts({key: file[name].getncattr(key) for key in kept if key in file[name].ncattrs()})
         variable.long_name = f"{name.lower()} of each GPS location"
         if None in there.values():
-            variable.comment = UNKNOWN
+            variable.comment = NO_FIXES
         variable[:] = values
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from magbridge.logs.mapping import Declared, declared
+from magbridge.logs.mapping import ColumnMapping, declared
 
 __all__ = ["Options"]
 
@@ -28,9 +28,9 @@ class Options:
     column: tuple[str, ...] = ()
     """Columns under our names, each ``NAME="THEIRS [unit]"``."""
     columns: Path | None = None
-    """A mapping file (:class:`magbridge.logs.mapping.Declared`), which does so for a whole file."""
+    """A mapping file (:class:`magbridge.logs.mapping.ColumnMapping`), which does so for a whole file."""
 
     @cached_property
-    def declared(self) -> Declared:
+    def declared(self) -> ColumnMapping:
         """What `columns` and `column` say together; ConfigError, WrongUse: one is wrong."""
         return declared(self.column, self.columns)

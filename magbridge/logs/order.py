@@ -14,7 +14,7 @@ __all__ = ["boots", "in_order"]
 BACK = 1.0
 """s by which times are set back where a vehicle was switched on again: records of one moment, which tasks of
 their own write, differ by less."""
-AROUND = 5
+MEDIAN_ROWS = 5
 """Times before and after, whose median is compared: fewer than half of them may be damaged."""
 
 
@@ -73,7 +73,7 @@ def boots(time: FloatArray) -> IndexArray:
     """
     found = [0]
     for k in (1 + np.flatnonzero(np.diff(time) < -BACK)).tolist():
-        before, after = time[max(found[-1], k - AROUND) : k], time[k : k + AROUND]
+        before, after = time[max(found[-1], k - MEDIAN_ROWS) : k], time[k : k + MEDIAN_ROWS]
         if np.median(after) < np.median(before) - BACK:
             found.append(k)
     return np.array(found, dtype=np.intp)

@@ -9,11 +9,11 @@ import zlib
 from pathlib import Path
 from typing import IO, Any
 
-__all__ = ["DAMAGE", "is_packed", "opened"]
+__all__ = ["DECOMPRESSION_ERRORS", "is_packed", "opened"]
 
 PACKERS: dict[bytes, Any] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\0": lzma.open}
 """First bytes -> how it is unpacked."""
-DAMAGE = EOFError, zlib.error, lzma.LZMAError
+DECOMPRESSION_ERRORS = EOFError, zlib.error, lzma.LZMAError
 """Errors of damaged ones, in addition to OSError."""
 
 

@@ -16,9 +16,9 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.clocks import Clock, clock_of, seconds
+from magbridge.logs.clocks import TimeFormat, clock_of, seconds
 from magbridge.logs.deployment import GUESSED, HISTORY, deployment, plain_attrs
-from magbridge.logs.layout import HEADER, Layout
+from magbridge.logs.layout import LAYOUT_LINES, Layout
 from magbridge.logs.naming import name_columns, on_side
 from magbridge.logs.unknown import known
 
@@ -78,10 +78,10 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
         row = numbers.stop
 
 
-def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, Clock | None]:
+def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TimeFormat | None]:
     """Return what the columns are, by names and first rows; and how times that are not stamps are read."""
     schema = file.schema_arrow
-    first = next(file.iter_batches(batch_size=HEADER), None)
+    first = next(file.iter_batches(batch_size=LAYOUT_LINES), None)
     if first is None:
         raise FormatError(path, "expected rows, there are none")
     cells = [["" if one is None else str(one) for one in column.to_pylist()] for column in first.columns]
@@ -106,7 +106,7 @@ def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, Clock | No
     return layout, clock
 
 
-def _times(batch: Any, layout: Layout, clock: Clock | None) -> FloatArray:
+def _times(batch: Any, layout: Layout, clock: TimeFormat | None) -> FloatArray:
     """Return the times (n,) of a batch, s since 1970."""
     columns = [batch.column(k) for k in layout.stamp]
     if clock is None:

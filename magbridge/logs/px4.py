@@ -28,8 +28,8 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import Fields, Magnetometer, Run, Series, pieces, values_of
-from magbridge.logs.compasses import Compass, rate
+from magbridge.logs.autopilot import BootRun, Fields, Magnetometer, Series, pieces, values_of
+from magbridge.logs.compasses import LogCompass, rate
 
 try:
     from pyulog import ULog
@@ -46,7 +46,7 @@ Table = dict[str, FloatArray]
 Topics = dict[str, dict[int, Table]]
 Parameters = Mapping[str, float]
 
-FIELDS: Fields = {
+PX4_FIELDS: Fields = {
     "vehicle_global_position": (
         *(("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
         ("depth", "alt", "m", -1.0),
@@ -78,9 +78,9 @@ FIELDS: Fields = {
     ),
 }
 """Topic to columns; of topics with one column, the first that the log has is taken."""
-FIELDS["vehicle_gps_position"] = FIELDS["sensor_gps"]
+PX4_FIELDS["vehicle_gps_position"] = PX4_FIELDS["sensor_gps"]
 # heights are above the sea; that of the local position is above the start, and the last choice
-FIELDS["vehicle_local_position"] = (("depth", "z", "m", 1.0),)
+PX4_FIELDS["vehicle_local_position"] = (("depth", "z", "m", 1.0),)
 GAUSS = tuple(f"magnetometer_ga[{k}]" for k in range(3))
 """The three axes in ``vehicle_magnetometer`` and ``sensor_combined``."""
 NEEDED = {
@@ -93,7 +93,7 @@ NEEDED = {
 UNUSED = ("servo", "esc", "motor")
 """Outputs that a log lists in the largest possible number; those that are always 0 are not in use."""
 GPS = ("vehicle_gps_position", "sensor_gps")
-FIX = 3
+MIN_FIX_TYPE = 3
 """Least ``fix_type`` of a fix in three dimensions."""
 CALIBRATIONS = 4
 FASTER = 1.5
@@ -107,7 +107,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     """
     try:
         with path.open("rb") as file, redirect_stdout(None):  # pyulog prints a line for each damage
-            log = ULog(file, [*FIELDS, *NEEDED])
+            log = ULog(file, [*PX4_FIELDS, *NEEDED])
     except (ULogException, ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(path, f"expected a PX4 log: {error}") from None
     topics: Topics = {}
@@ -120,7 +120,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
         raise FormatError(path, "expected a PX4 log with a magnetometer")
     # pyulog tells that there is damage, not in how many places
     lost = {"dropouts": len(log.dropouts), "damages": int(log.file_corruption)}
-    run = Run(mags, _telemetry(topics), _utc_offset(topics))
+    run = BootRun(mags, _telemetry(topics), _utc_offset(topics))
     yield from pieces(path, rows, [run], lost, options.compass if options else None)
 
 
@@ -179,7 +179,7 @@ def _magnetometer(
     slot = _calibration(device, parameters)
     priority = parameters.get(f"CAL_MAG{slot}_PRIO") if slot is not None else None
     known = priority is not None and priority >= 0
-    compass = Compass(
+    compass = LogCompass(
         number,
         len(time),
         rate(time),
@@ -226,10 +226,10 @@ def _telemetry(topics: Topics) -> Iterator[Series]:
     for attitude in topics.get("vehicle_attitude", {}).values():
         for column, values in zip(("roll", "pitch", "heading"), _angles(attitude), strict=True):
             yield _time(attitude), column, "deg", values
-    for topic in FIELDS:
+    for topic in PX4_FIELDS:
         for number, table in topics.get(topic, {}).items():
-            fixed = table.get("fix_type", np.full(len(table["timestamp"]), FIX)) >= FIX
-            for column, unit, values in values_of(FIELDS, topic, number, _known(table)):
+            fixed = table.get("fix_type", np.full(len(table["timestamp"]), MIN_FIX_TYPE)) >= MIN_FIX_TYPE
+            for column, unit, values in values_of(PX4_FIELDS, topic, number, _known(table)):
                 if np.any(np.nan_to_num(values)) or not column.startswith(UNUSED):
                     yield _time(table), column, unit, np.where(fixed, values, np.nan)
     for table in topics.get("debug_key_value", {}).values():

@@ -20,7 +20,7 @@ from magbridge.errors import FormatError
 from magbridge.files import existing
 from magbridge.guard import Guarded, Job, guarded
 from magbridge.logs.options import Options
-from magbridge.logs.packed import DAMAGE
+from magbridge.logs.packed import DECOMPRESSION_ERRORS
 from magbridge.logs.registry import LEADS, Format, format_of, is_bag
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["read", "read_chunks", "read_each"]
 
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-WHOLE = 1 << 40
+ALL_ROWS = 1 << 40
 """Rows: more than any file has."""
 SMALL = 4_000_000
 """Bytes of a file below which one child process reads several."""
@@ -92,7 +92,7 @@ def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
     files = _Files(_paths(paths, options), options)
     whole, named = [], []
     for k in range(len(files.paths)):
-        parts = list(files.pieces(k, WHOLE))
+        parts = list(files.pieces(k, ALL_ROWS))
         whole += parts
         named += [files.is_sensor_log(k)] * len(parts)
     combined = combine(whole, named, options.clock_offset_s)
@@ -231,7 +231,7 @@ def _chunks(
             yield _dated(part.assign_attrs(source=source), options.date)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except DAMAGE as error:
+    except DECOMPRESSION_ERRORS as error:
         raise FormatError(path, f"expected a whole compressed file: {error}") from None
     if part is None:
         raise FormatError(path, "expected rows, there are none")

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from magbridge.errors import FormatError, PluginError
-from magbridge.logs.packed import DAMAGE, is_packed, opened
+from magbridge.logs.packed import DECOMPRESSION_ERRORS, is_packed, opened
 from magbridge.plugins import blamed, load, plugins
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ LEADS = {**FLIGHT, ".log": ".eng"}
 """Suffix of a file that is read with another of its name, to that of the other."""
 PACKED = ".gz", ".bz2", ".xz"
 """Suffixes before which another tells what the file is."""
-HEADER = 4096
+SIGNATURE_BYTES = 4096
 """Bytes at the beginning of a file by which it is recognised."""
 
 
@@ -117,7 +117,7 @@ FORMATS: dict[str, Format] = {
     ),
 }
 """Name to format; the first whose signature matches reads the file."""
-OTHERS = {
+UNREADABLE = {
     rb"PK\x03\x04|\xd0\xcf\x11\xe0": "a spreadsheet, or an archive: save it as CSV, or unpack it",
     rb"\x28\xb5\x2f\xfd|7z\xbc\xaf|\x1f\x9d|\x1f\x8b|BZh|\xfd7zXZ": "it is compressed: unpack it first",
     rb"MATLAB 5\.0": "a .mat of MATLAB: save it as CSV (writetable)",
@@ -164,7 +164,7 @@ def format_of(path: Path, *, write: bool = False) -> Format:
     found = FORMATS["ros"] if is_bag(path) else _recognised(start)
     packed = not write and path.is_file() and is_packed(path)
     if found is None and (
-        other := next((text for mark, text in OTHERS.items() if re.match(mark, start)), None)
+        other := next((text for mark, text in UNREADABLE.items() if re.match(mark, start)), None)
     ):
         raise FormatError(path, f"expected a log, found {other}")
     if found is None:
@@ -188,10 +188,10 @@ def _start(path: Path) -> bytes:
     """Return the first bytes of a file, unpacked."""
     try:
         with opened(path) as file:
-            return file.read(HEADER)
+            return file.read(SIGNATURE_BYTES)
     except OSError as error:
         raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
-    except DAMAGE as error:
+    except DECOMPRESSION_ERRORS as error:
         raise FormatError(path, f"expected a whole compressed file: {error}") from None
 
 

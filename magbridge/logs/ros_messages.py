@@ -20,10 +20,12 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["HISTORY", "KINDS", "MAGNETIC", "Kind"]
+__all__ = ["FRAMES_HISTORY", "KINDS", "MAGNETIC_FIELD", "MessageKind"]
 
-HISTORY = "ROS frames turned: ENU to NED, FLU to FRD; BatteryState.current counted positive when discharging"
-MAGNETIC = "sensor_msgs/MagneticField"
+FRAMES_HISTORY = (
+    "ROS frames turned: ENU to NED, FLU to FRD; BatteryState.current counted positive when discharging"
+)
+MAGNETIC_FIELD = "sensor_msgs/MagneticField"
 ABSOLUTE = ("map", "earth", "utm", "enu")
 """Names of frames whose x axis points east."""
 
@@ -31,7 +33,7 @@ Values = Mapping[str, FloatArray]
 Columns = Iterator[tuple[str, str, FloatArray]]
 
 
-class Kind(NamedTuple):
+class MessageKind(NamedTuple):
     """A type of message."""
 
     name: str
@@ -153,29 +155,29 @@ def _nothing(_: str, __: int, ___: Values) -> Columns:
 KINDS = {
     kind.name: kind
     for kind in (
-        Kind(MAGNETIC, lambda m: _axes("", m.magnetic_field), _nothing, doubles=12),
-        Kind("sensor_msgs/Imu", _imu_row, lambda _, __, v: _angles(v), doubles=37),
-        Kind("sensor_msgs/NavSatFix", _fix_row, _fix),
-        Kind("nav_msgs/Odometry", _odometry_row, _odometry),
-        Kind(
+        MessageKind(MAGNETIC_FIELD, lambda m: _axes("", m.magnetic_field), _nothing, doubles=12),
+        MessageKind("sensor_msgs/Imu", _imu_row, lambda _, __, v: _angles(v), doubles=37),
+        MessageKind("sensor_msgs/NavSatFix", _fix_row, _fix),
+        MessageKind("nav_msgs/Odometry", _odometry_row, _odometry),
+        MessageKind(
             "sensor_msgs/BatteryState",
             lambda m: {"current": float(m.current), "voltage": float(m.voltage)},
             _battery,
         ),
-        Kind(
+        MessageKind(
             "sensor_msgs/JointState",
             lambda m: dict(zip(m.name, map(float, m.position), strict=False)),
             _joints,
         ),
-        Kind("sensor_msgs/Temperature", lambda m: {"temperature": float(m.temperature)}, _temperature),
-        Kind("sensor_msgs/FluidPressure", lambda m: {"pressure": float(m.fluid_pressure)}, _pressure),
-        Kind(
+        MessageKind("sensor_msgs/Temperature", lambda m: {"temperature": float(m.temperature)}, _temperature),
+        MessageKind("sensor_msgs/FluidPressure", lambda m: {"pressure": float(m.fluid_pressure)}, _pressure),
+        MessageKind(
             "mavros_msgs/RCOut",
             lambda m: {f"servo{k}": float(value) for k, value in enumerate(m.channels, 1)},
             _channels,
         ),
         *(
-            Kind(f"std_msgs/{name}", lambda m: {"data": float(m.data)}, _by_topic("1"), header=False)
+            MessageKind(f"std_msgs/{name}", lambda m: {"data": float(m.data)}, _by_topic("1"), header=False)
             for name in ("Float32", "Float64")
         ),
     )

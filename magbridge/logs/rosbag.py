@@ -25,10 +25,10 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import Magnetometer, Run, Series, pieces
-from magbridge.logs.compasses import Compass, rate
+from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
+from magbridge.logs.compasses import LogCompass, rate
 from magbridge.logs.deployment import NOTES, noted
-from magbridge.logs.ros_messages import HISTORY, KINDS, MAGNETIC, Kind
+from magbridge.logs.ros_messages import FRAMES_HISTORY, KINDS, MAGNETIC_FIELD, MessageKind
 
 try:
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -48,24 +48,24 @@ __all__ = ["chunks"]
 
 STORAGES = {".mcap": McapReader, ".db3": Sqlite3Reader}
 """Readers of one file of a ROS 2 bag, without its folder."""
-DAMAGE = (AnyReaderError, ReaderError, SerdeError, TypesysError, sqlite3.Error)
+ROSBAG_ERRORS = (AnyReaderError, ReaderError, SerdeError, TypesysError, sqlite3.Error)
 STAMP = np.dtype([("", "V4"), ("s", "<i4"), ("ns", "<u4")])
 """Where both ROS 1 (after the sequence number) and ROS 2 (after the encapsulation) have a header's stamp."""
 LITTLE = b"\x00\x01"
-SINCE_1980 = 315_532_800.0
+MIN_REAL_TIME_S = 315_532_800.0
 """s: earlier stamps are those of a simulation, which begins at 0."""
 EARTH = 15e3, 150e3
 """nT: a median length within is the Earth's field with a vehicle's; a factor of ten, so one unit fits."""
 TESLA = 1e-6, 1e-2
 """T: a median length within is believed to be in tesla."""
-UNITS = ("G", "uT", "mG", "mT", "nT")
+FIELD_UNITS = ("G", "uT", "mG", "mT", "nT")
 
 
 class _Stream(NamedTuple):
     """The messages of a topic: times (n,), s, and values (n,) by name."""
 
     topic: str
-    kind: Kind
+    kind: MessageKind
     time: FloatArray
     values: dict[str, FloatArray]
 
@@ -78,22 +78,22 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     try:
         with _opened(path) as bag:
             streams, lost = _streams(bag)
-    except DAMAGE as error:
+    except ROSBAG_ERRORS as error:
         raise FormatError(path, f"expected a ROS bag: {error}") from None
     except (OSError, EOFError, KeyError, IndexError, ValueError, AssertionError) as error:
         # what rosbags raises where the file, not a message, is damaged
         raise FormatError(
             path, f"expected a ROS bag; it is damaged: {str(error) or type(error).__name__}"
         ) from None
-    fields = [stream for stream in streams if stream.kind is KINDS[MAGNETIC]]
+    fields = [stream for stream in streams if stream.kind is KINDS[MAGNETIC_FIELD]]
     if not fields:
         topics = " ".join(stream.topic for stream in streams) or "nothing that is read"
         raise FormatError(path, f"expected sensor_msgs/MagneticField; there is: {topics}")
     notes: list[str] = []
     mags = [_magnetometer(number, stream, notes) for number, stream in enumerate(fields)]
-    boot = float(np.median(mags[0].time)) < SINCE_1980
-    run = Run(mags, _telemetry(streams), None if boot else 0.0)
-    attrs = {"values_dropped": lost, "history": "\n".join([HISTORY, *notes])}
+    boot = float(np.median(mags[0].time)) < MIN_REAL_TIME_S
+    run = BootRun(mags, _telemetry(streams), None if boot else 0.0)
+    attrs = {"values_dropped": lost, "history": "\n".join([FRAMES_HISTORY, *notes])}
     for part in pieces(path, rows, [run], attrs, options.compass if options else None):
         yield part.assign_attrs({NOTES: "\n".join([*notes, *noted(part.attrs)])}) if notes else part
         notes = []
@@ -107,7 +107,7 @@ def _magnetometer(number: int, stream: _Stream, notes: list[str]) -> Magnetomete
         notes.append(f"{stream.topic}: {length:.3g} T is not a field on Earth: read as {length:.3g} {unit}")
     x, y, z = NT_PER_UNIT[unit] * tesla
     time = stream.time
-    compass = Compass(number, len(time), rate(time), stream.topic)
+    compass = LogCompass(number, len(time), rate(time), stream.topic)
     return Magnetometer(compass, time, {"x": x, "y": -y, "z": -z})
 
 
@@ -115,13 +115,13 @@ def _unit(length: float) -> str:
     """Return the unit in which a median length is one of the Earth's; T where it is, or where none fits."""
     if TESLA[0] <= length <= TESLA[1]:
         return "T"
-    return next((unit for unit in UNITS if EARTH[0] <= NT_PER_UNIT[unit] * length < EARTH[1]), "T")
+    return next((unit for unit in FIELD_UNITS if EARTH[0] <= NT_PER_UNIT[unit] * length < EARTH[1]), "T")
 
 
 def _telemetry(streams: Sequence[_Stream]) -> Iterator[Series]:
     seen: dict[str, int] = {}
     for stream in streams:
-        if stream.kind is not KINDS[MAGNETIC]:
+        if stream.kind is not KINDS[MAGNETIC_FIELD]:
             number = seen.setdefault(stream.kind.name, 0)
             seen[stream.kind.name] += 1
             for column, unit, values in stream.kind.columns(stream.topic, number, stream.values):
@@ -185,7 +185,7 @@ def _short(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def _times(kind: Kind, recorded: FloatArray, messages: Sequence[bytes]) -> FloatArray:
+def _times(kind: MessageKind, recorded: FloatArray, messages: Sequence[bytes]) -> FloatArray:
     """Return the stamps of the headers, s; the recorder's without a header, or where it is empty."""
     if not kind.header:
         return recorded
@@ -195,7 +195,7 @@ def _times(kind: Kind, recorded: FloatArray, messages: Sequence[bytes]) -> Float
 
 
 def _decoded(
-    bag: _Bag, name: str, kind: Kind, messages: Sequence[bytes]
+    bag: _Bag, name: str, kind: MessageKind, messages: Sequence[bytes]
 ) -> tuple[Sequence[int], dict[str, FloatArray]]:
     """Return which messages could be read, and their values (n,) by name."""
     if (table := _doubles(bag, name, kind, messages)) is not None:
@@ -205,13 +205,15 @@ def _decoded(
         try:
             rows.append(kind.row(bag.deserialize(data, name)))
             good.append(k)
-        except (*DAMAGE, ValueError, IndexError, AssertionError):  # a damaged message
+        except (*ROSBAG_ERRORS, ValueError, IndexError, AssertionError):  # a damaged message
             continue
     names = dict.fromkeys(name for row in rows for name in row)
     return good, {name: np.array([row.get(name, np.nan) for row in rows]) for name in names}
 
 
-def _doubles(bag: _Bag, name: str, kind: Kind, messages: Sequence[bytes]) -> dict[str, FloatArray] | None:
+def _doubles(
+    bag: _Bag, name: str, kind: MessageKind, messages: Sequence[bytes]
+) -> dict[str, FloatArray] | None:
     """Return the values of messages that end with doubles only, read at once; None where they are not such.
 
     What stands before them is of any length (the frame's name). The first and the last message as rosbags

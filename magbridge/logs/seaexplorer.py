@@ -36,14 +36,14 @@ __all__ = ["chunks"]
 
 PAYLOAD = re.compile(r"(?P<mission>.+)\.pld\d?\.\w+\.(?P<dive>\d+)(\.gz)?")
 """Name of a payload's file: sea035.12.pld1.raw.36.gz. That of the navigation is sea035.12.gli.sub.36.gz."""
-MAX_GAP = 120.0
+MAX_NAVIGATION_GAP_S = 120.0
 """s between two samples of the navigation, between which it is interpolated: it writes each 10 to 30 s."""
-CLOCKS = "Timestamp", "PLD_REALTIMECLOCK"
+CLOCK_COLUMNS = "Timestamp", "PLD_REALTIMECLOCK"
 DATE = "%d/%m/%Y %H:%M:%S"
-UNKNOWN = 9999.0
+UNKNOWN_CODE = 9999.0
 """A code for "not known"."""
-PLACES = "Lat", "Lon", "NAV_LATITUDE", "NAV_LONGITUDE"
-NAMES = {
+DEGREE_MINUTE_COLUMNS = "Lat", "Lon", "NAV_LATITUDE", "NAV_LONGITUDE"
+SEAEXPLORER_COLUMNS = {
     # theirs: (ours, unit, factor)
     "Lat": ("latitude", "deg", 1.0),
     "Lon": ("longitude", "deg", 1.0),
@@ -97,12 +97,12 @@ def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) ->
     """Return the payload's rows with the columns that only the navigation has."""
     order = np.argsort(navigation["time"].to_numpy(), kind="stable")
     time, at = navigation["time"].to_numpy()[order], payload["time"].to_numpy()
-    taken = {
-        str(name): ("time", linear(at, time, column.to_numpy()[order], MAX_GAP, *CIRCLES.get(str(name), ())),
-                    column.attrs)
-        for name, column in navigation.data_vars.items()
-        if name not in payload
-    }  # fmt: skip
+    taken = {}
+    for name, column in navigation.data_vars.items():
+        if name not in payload:
+            circle = CIRCLES.get(str(name), ())
+            values = linear(at, time, column.to_numpy()[order], MAX_NAVIGATION_GAP_S, *circle)
+            taken[str(name)] = ("time", values, column.attrs)
     note = f"{' '.join(taken)} between the samples of {path.name}"
     remarks = [line for line in named_losses(navigation.attrs) if "heading" in line]
     return with_losses(payload.assign(taken).assign_attrs({HISTORY: note}), {}, remarks)
@@ -111,9 +111,9 @@ def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) ->
 def _read(path: Path) -> xr.Dataset:
     """Return one file."""
     table, lost = _table(path)
-    clock = next((name for name in CLOCKS if name in table), None)
+    clock = next((name for name in CLOCK_COLUMNS if name in table), None)
     if clock is None:
-        raise FormatError(path, f"expected a SeaExplorer's file, with a column {' or '.join(CLOCKS)}")
+        raise FormatError(path, f"expected a SeaExplorer's file, with a column {' or '.join(CLOCK_COLUMNS)}")
     time = epoch(table.pop(clock), DATE)
     numbers = table.apply(pd.to_numeric, errors="coerce").dropna(axis="columns", how="all")
     columns: dict[str, FloatArray] = {}
@@ -122,10 +122,10 @@ def _read(path: Path) -> xr.Dataset:
     for k, theirs in enumerate(numbers):
         if theirs in NAV_ONLY:
             continue
-        name, unit, scale = NAMES.get(str(theirs), (known.get(k, str(theirs).lower()), "", 1.0))
+        name, unit, scale = SEAEXPLORER_COLUMNS.get(str(theirs), (known.get(k, str(theirs).lower()), "", 1.0))
         values = numbers[theirs].to_numpy(float)
-        values = np.where(np.abs(values) == UNKNOWN, np.nan, values)
-        columns.setdefault(name, degrees(values) if theirs in PLACES else values * scale)
+        values = np.where(np.abs(values) == UNKNOWN_CODE, np.nan, values)
+        columns.setdefault(name, degrees(values) if theirs in DEGREE_MINUTE_COLUMNS else values * scale)
         units[name] = unit
     whole = deployment(path, time, columns, units)
     remarks = (

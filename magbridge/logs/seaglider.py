@@ -45,8 +45,8 @@ NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
 """nT in a count, by the type of the compass: ``COMPASS_DEVICE`` is 16 times the type, and the port."""
 SECOND = 2048
 """Bit of ``COMPASS_USE``: the second compass is in use."""
-MAX_GAP = 120.0
-"""s between CTD samples across which nothing is interpolated."""
+MAX_CTD_GAP_S = 120.0
+"""s between CTD_COLUMNS samples across which nothing is interpolated."""
 SAMPLED = {
     # ours: (theirs, unit); the channels are in counts
     "mag_x": ("mag_x", "nT"),
@@ -59,7 +59,7 @@ SAMPLED = {
     "rollCtl": ("rollCtl", "deg"),
     "vbdCC": ("vbdCC", "cc"),
 }
-CTD = {
+CTD_COLUMNS = {
     "latitude": ("latitude", "deg"),
     "longitude": ("longitude", "deg"),
     "water_temperature": ("temperature", "degC"),
@@ -84,8 +84,8 @@ class Dive:
     """(m,) each: ``st_secs`` and ``end_secs``, s since 1970, and the values logged of each, as ``pitch_ctl``.
     """
     elsewhere: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    """(k,) each: Times, s, and values of what has its own times: positions, CTD."""
-    max_gap: float = MAX_GAP
+    """(k,) each: Times, s, and values of what has its own times: positions, CTD_COLUMNS."""
+    max_gap: float = MAX_CTD_GAP_S
     """s between two of those times across which nothing is interpolated."""
 
 
@@ -106,7 +106,7 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
     units = {ours: unit for ours, (_, unit) in SAMPLED.items()}
     if "depth" in known.sampled:
         columns["depth"], units["depth"] = known.sampled["depth"], "m"
-    for ours, (theirs, unit) in CTD.items():
+    for ours, (theirs, unit) in CTD_COLUMNS.items():
         if theirs in known.elsewhere:
             columns[ours] = linear(
                 known.time, *known.elsewhere[theirs], known.max_gap, *CIRCLES.get(ours, ())
@@ -226,7 +226,7 @@ def read_netcdf(path: Path, file: Any) -> Dive:
         ctd_time = floats(file["ctd_time"])
         elsewhere = {
             theirs: (ctd_time, values)
-            for theirs, _ in CTD.values()
+            for theirs, _ in CTD_COLUMNS.values()
             if (values := _numbers(file, theirs, ctd_time.size)) is not None
         }
     return Dive(time, sampled, settings, manoeuvres, elsewhere)

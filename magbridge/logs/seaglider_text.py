@@ -21,8 +21,8 @@ from magbridge.logs.seaglider import Dive, dive
 
 __all__ = ["chunks"]
 
-HEADER = re.compile(r"%?(\w+):\s*(.*)")
-FIX = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
+HEADER_LINE = re.compile(r"%?(\w+):\s*(.*)")
+GPS_LINE = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
 
 
 def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
@@ -71,7 +71,7 @@ def _add_log(known: Dive, path: Path) -> None:
             names = values
         elif name == "GC" and len(values) == len(names):
             manoeuvres.append([_number(value) for value in values])
-        elif found := FIX.match(line):
+        elif found := GPS_LINE.match(line):
             when = datetime.strptime(found[1] + found[2], "%d%m%y%H%M%S").replace(tzinfo=UTC).timestamp()
             fixes.append((when, *degrees([found[3], found[4]])))
         elif len(values) in (1, 2):  # a canonical log also has the default
@@ -88,7 +88,7 @@ def _split(path: Path) -> tuple[dict[str, str], list[str]]:
     """Return the header of a file, and the lines after it."""
     lines = path.read_text(encoding="ascii", errors="replace").splitlines()
     ends = next((k for k, line in enumerate(lines) if line.lstrip("%").startswith("data:")), len(lines))
-    header = {found[1]: found[2] for line in lines[:ends] if (found := HEADER.match(line))}
+    header = {found[1]: found[2] for line in lines[:ends] if (found := HEADER_LINE.match(line))}
     return header, lines[ends + 1 :]
 
 

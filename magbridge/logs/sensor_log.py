@@ -23,7 +23,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import CHANNEL_TIMES, CHANNELS, COLUMNS, counts_from_boot
 from magbridge.errors import FormatError, WrongUse
-from magbridge.logs.compasses import ATTRIBUTE, further
+from magbridge.logs.compasses import COMPASSES_ATTRIBUTE, further
 from magbridge.logs.deployment import NOTES, join, join_attrs, noted, uncounted, with_losses
 from magbridge.logs.resample import CIRCLES, latest, linear
 
@@ -35,8 +35,8 @@ GAP_INTERVALS = 4.0
 """Shortest gap in median intervals of the column, for columns that are updated rarely."""
 MAX_STATES = 8
 """Largest number of different integers in a column that is taken for a switch, and held."""
-SCALAR = "total_field"
-MAGNETIC = {name for name, column in COLUMNS.items() if column.units == "nT"}
+SCALAR_COLUMN = "total_field"
+MAGNETIC_COLUMNS = {name for name, column in COLUMNS.items() if column.units == "nT"}
 
 
 def sensor_logs(logs: Sequence[xr.Dataset], named: Sequence[bool]) -> tuple[list[int], list[int]]:
@@ -69,13 +69,13 @@ def sensor_logs(logs: Sequence[xr.Dataset], named: Sequence[bool]) -> tuple[list
                 raise FormatError(source, "expected mag_x mag_y mag_z, or total_field, in a sensor's log")
     else:
         sensors = [k for k, log in enumerate(logs) if _has_field(log) and not _is_placed(log)]
-        vehicles = [k for k, log in enumerate(logs) if not MAGNETIC & set(log.data_vars)]
+        vehicles = [k for k, log in enumerate(logs) if not MAGNETIC_COLUMNS & set(log.data_vars)]
     return (sensors, vehicles) if sensors and vehicles else ([], [])
 
 
 def _has_field(log: xr.Dataset) -> bool:
     vector = all(name in log for name in CHANNELS)
-    return (vector or SCALAR in log) and "observatory" not in log.attrs
+    return (vector or SCALAR_COLUMN in log) and "observatory" not in log.attrs
 
 
 def _is_placed(log: xr.Dataset) -> bool:
@@ -118,7 +118,11 @@ class VehicleTelemetry:
         time = sensor["time"].to_numpy()
         vehicle = further(self._vehicle) if set(CHANNELS) <= set(sensor.data_vars) else self._vehicle
         columns = {
-            str(name): ("time", _at(time, self._time, str(name), column.to_numpy()), dict(column.attrs))
+            str(name): (
+                "time",
+                _interpolated(time, self._time, str(name), column.to_numpy()),
+                dict(column.attrs),
+            )
             for name, column in vehicle.data_vars.items()
             if name not in sensor and name not in CHANNEL_TIMES
         }
@@ -130,7 +134,7 @@ class VehicleTelemetry:
         if len(covered):
             self._start, self._end = min(self._start, covered[0]), max(self._end, covered[-1])
         attrs = join_attrs([sensor, vehicle if is_first else uncounted(vehicle)])
-        attrs.pop(ATTRIBUTE, None)
+        attrs.pop(COMPASSES_ATTRIBUTE, None)
         counts = {"rows_outside": int(outside.sum()), "rows_in_gaps": int(in_gaps.sum())}
         combined = sensor.assign(columns)
         combined.attrs = attrs
@@ -235,7 +239,7 @@ def with_note(log: xr.Dataset, note: str) -> xr.Dataset:
     return log.assign_attrs({NOTES: "\n".join([*noted(log.attrs), note])})
 
 
-def _at(at: FloatArray, time: FloatArray, name: str, values: FloatArray) -> FloatArray:
+def _interpolated(at: FloatArray, time: FloatArray, name: str, values: FloatArray) -> FloatArray:
     """Return a column (m,), known at `time` (m,), s, at the times `at` (n,), s, by the rule for its kind."""
     known = np.isfinite(values)
     time, values = time[known], values[known]

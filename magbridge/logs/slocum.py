@@ -34,14 +34,14 @@ from magbridge.logs.slocum_header import check_header
 
 __all__ = ["chunks"]
 
-MAX_GAP = 300.0
+MAX_SENSOR_GAP_S = 300.0
 """s between two updates of a sensor across which nothing is interpolated."""
 Tracks = dict[str, tuple[FloatArray, FloatArray]]
 """By sensor: times (m,), s, and values (m,)."""
-CTD = "sci_water_temp", "sci_water_pressure"
+CTD_SENSORS = "sci_water_temp", "sci_water_pressure"
 ASCII_HEADER = re.compile(rb"\w+:.*")
 """A line of the header of what ``dbd2asc`` wrote; below it are names, units, sizes, and a cycle a line."""
-CLOCKS = b"m_present_time", b"sci_m_present_time"
+CLOCK_SENSORS = b"m_present_time", b"sci_m_present_time"
 FILL = 69_696_969.0
 """deg and min, of a position that was never known."""
 SCIENCE = {flight: science for science, flight in FLIGHT.items()}
@@ -104,7 +104,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     for theirs, (ours, unit, factor) in SENSORS.items():
         if theirs in tracks and len(tracks[theirs][0]):
             when, what = tracks[theirs]
-            columns[ours] = linear(time, when, what * factor, MAX_GAP, *CIRCLES.get(ours, ()))
+            columns[ours] = linear(time, when, what * factor, MAX_SENSOR_GAP_S, *CIRCLES.get(ours, ()))
             units[ours] = unit
     dataset = deployment(path, time, columns, units, {"heading_reference": "magnetic"})
     yield from sliced(dataset, rows)
@@ -125,7 +125,7 @@ def _measured(tracks: Tracks) -> Tracks:
 
     As pyglider does: the sensors' values before their first sample are 0.
     """
-    ctd = {name: tracks[name] for name in CTD if name in tracks}
+    ctd = {name: tracks[name] for name in CTD_SENSORS if name in tracks}
     unset = [when[value == 0.0] for when, value in ctd.values()]
     if not unset:
         return tracks
@@ -176,7 +176,7 @@ def _read_ascii(path: Path) -> Tracks:
         names, units, _ = (line.split() for line in lines[start : start + 3])
         rows = [line.split() for line in lines[start + 3 :] if line.strip()]
         values = np.array([row for row in rows if len(row) == len(names)], float).reshape(-1, len(names)).T
-        clock = next(values[names.index(name)] for name in CLOCKS if name in names)
+        clock = next(values[names.index(name)] for name in CLOCK_SENSORS if name in names)
     except (ValueError, StopIteration):
         raise FormatError(
             path, "expected names, units, sizes and rows of numbers, as dbd2asc writes them"

@@ -14,9 +14,9 @@ from magbridge.errors import FormatError
 __all__ = ["check_header"]
 
 TAG = re.compile(rb"(\w+):\s*(.*)")
-SENSOR = re.compile(rb"s:\s+[TF]\s+-?\d+\s+-?\d+\s+[1248]\s+[!-~]+\s+[!-~]+\s*")
+SENSOR_LINE = re.compile(rb"s:\s+[TF]\s+-?\d+\s+-?\d+\s+[1248]\s+[!-~]+\s+[!-~]+\s*")
 """``s: T 0 0 4 m_roll rad``: whether it is logged, two indices, bytes, name, unit."""
-MOST = 1 << 16
+MAX_HEADER_BYTES = 1 << 16
 """Bytes, more than any header has."""
 CACHES = ".", "cac", "cache", "../cac", "../cache"
 """Folders, seen from a file's, in which its list of sensors may be."""
@@ -29,7 +29,7 @@ def check_header(path: Path) -> list[Path]:
     into.
     """
     with path.open("rb") as file:
-        lines = file.read(MOST).split(b"\n")
+        lines = file.read(MAX_HEADER_BYTES).split(b"\n")
     if not lines[0].startswith(b"dbd_label:"):
         return list(_caches(path))
     tags = {found[1]: found[2].strip() for line in lines[:40] if (found := TAG.fullmatch(line))}
@@ -52,6 +52,6 @@ def _caches(path: Path) -> Iterator[Path]:
 
 def _check_cache(cache: Path) -> None:
     for row, line in enumerate(cache.read_bytes().splitlines(), 1):
-        if not SENSOR.fullmatch(line) and line.strip():
+        if not SENSOR_LINE.fullmatch(line) and line.strip():
             what = line[:40].decode("ascii", "backslashreplace")
             raise FormatError(cache, f"expected a sensor, not {what!r}: damaged", row=row)

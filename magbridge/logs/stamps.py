@@ -16,7 +16,7 @@ import pandas as pd
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["DAY", "HOURS", "OF_THE_DAY", "epoch", "patterns"]
+__all__ = ["DAY", "HOURS", "SECONDS_SUFFIX", "epoch", "patterns"]
 
 DAY = 86_400.0
 HOURS = ("%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p", "%H%M%S")
@@ -26,9 +26,9 @@ DATES = (
     *("%Y-%m-%d", "%Y/%m/%d", "%Y.%m.%d", "%Y-%j", "%d-%b-%Y", "%d %b %Y"),
     *("%Y%m%d", "%d%m%y", "%y%m%d", "%m%d%y"),
 )
-WHOLE = ("%a %b %d %H:%M:%S %Y", "%Y%m%d%H%M%S", "%Y %m %d %H %M %S", "%Y %j %H %M %S")
+WHOLE_MOMENTS = ("%a %b %d %H:%M:%S %Y", "%Y%m%d%H%M%S", "%Y %m %d %H %M %S", "%Y %j %H %M %S")
 """Patterns of date and time together; the last are columns of numbers, joined."""
-OF_THE_DAY = " s"
+SECONDS_SUFFIX = " s"
 YEAR_1900 = -2_208_988_800.0
 """s since 1970 of the year that times of day without a date are given; no log is older."""
 FRACTION = r"(?:(?P<clock>\d:\d\d:\d\d)[.,:]|(?P<digits>\d{6}| \d\d?)\.)(?P<fraction>\d+)(?=(?: ?[AP]M)?$)"
@@ -37,7 +37,12 @@ FRACTION = r"(?:(?P<clock>\d:\d\d:\d\d)[.,:]|(?P<digits>\d{6}| \d\d?)\.)(?P<frac
 def patterns(texts: Sequence[str]) -> list[str]:
     """Return the patterns that fit all of these texts, one of those that mean the same."""
     whole, _ = _plain(pd.Series(list(texts), dtype="string"))
-    candidates = [*WHOLE, *map(" ".join, product(DATES, (*HOURS, OF_THE_DAY.strip()))), *DATES, *HOURS]
+    candidates = [
+        *WHOLE_MOMENTS,
+        *map(" ".join, product(DATES, (*HOURS, SECONDS_SUFFIX.strip()))),
+        *DATES,
+        *HOURS,
+    ]
     found: dict[tuple[float, ...], str] = {}
     for pattern in candidates:
         if _fits(whole.iloc[0], pattern):
@@ -49,8 +54,8 @@ def patterns(texts: Sequence[str]) -> list[str]:
 
 def _fits(text: str, pattern: str) -> bool:
     """Whether a text may have been written by a pattern; much faster than to read them all."""
-    if pattern.endswith(OF_THE_DAY):
-        text, pattern = text.rpartition(" ")[0], pattern.removesuffix(OF_THE_DAY)
+    if pattern.endswith(SECONDS_SUFFIX):
+        text, pattern = text.rpartition(" ")[0], pattern.removesuffix(SECONDS_SUFFIX)
     try:
         datetime.strptime(text, pattern)
     except ValueError:
@@ -82,9 +87,9 @@ def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray
     texts = texts.astype("string").str.strip()
     if pattern != "iso" and "%f" not in pattern:
         texts, seconds = _plain(texts)
-    if pattern.endswith(OF_THE_DAY):
+    if pattern.endswith(SECONDS_SUFFIX):
         parts = texts.str.rpartition(" ")
-        texts, pattern = parts[0], pattern.removesuffix(OF_THE_DAY)
+        texts, pattern = parts[0], pattern.removesuffix(SECONDS_SUFFIX)
         seconds = seconds + pd.to_numeric(parts[2], errors="coerce").to_numpy(np.float64, na_value=np.nan)
     form = "ISO8601" if pattern == "iso" else pattern
     stamps = pd.to_datetime(texts, format=form, errors="coerce", utc=zone is None)

@@ -14,22 +14,22 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
-from magbridge.logs.clocks import Clock, Counter, clock_of, date_order, seconds
+from magbridge.logs.clocks import CountState, TimeFormat, clock_of, date_order, seconds
 from magbridge.logs.faults import Faults
-from magbridge.logs.layout import BLANKS, HEADER, Layout, cells
+from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.logs.stamps import DAY
 from magbridge.logs.unknown import EXPECTED, unknown
 from magbridge.records import Quality
 from magbridge.wording import counted
 
-__all__ = ["Table"]
+__all__ = ["TextTable"]
 
 NOTHING = "-", "--", "*", "---"
 """Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
 
 
-class Table:
+class TextTable:
     """Reads lines of one layout into columns.
 
     Attributes
@@ -48,9 +48,9 @@ class Table:
         self._fill = layout.fill if self._declared.fill_value is None else self._declared.fill_value
         self.guesses: list[str] = []
         self._midnights, self._last = 0.0, 0.0
-        self._counter = Counter(0.0, np.empty(0), 0.0)
+        self._counter = CountState(0.0, np.empty(0), 0.0)
         if layout.rate:
-            self._clock = Clock("s", f"{layout.rate:g} rows a second", boot=True)
+            self._clock = TimeFormat("s", f"{layout.rate:g} rows a second", boot=True)
         elif layout.stamp:
             self._clock = self._clock_by(first_lines)
         else:
@@ -92,13 +92,13 @@ class Table:
         cut = 0.5 if len(np.unique(moments)) < len(moments) and (moments % 1.0 == 0.0).all() else 0.0
         return float(np.nanmedian(ahead)) + cut
 
-    def _clock_by(self, first_lines: Sequence[str]) -> Clock:
+    def _clock_by(self, first_lines: Sequence[str]) -> TimeFormat:
         """Return how the column of times is read, by its heading, its unit and its first cells."""
         layout = self._layout
         heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.pop("time", "")
         if order := date_order([layout.headings[k] for k in layout.stamp]):
             heading = order
-        lines = first_lines[layout.first : max(HEADER, layout.first + 1)]
+        lines = first_lines[layout.first : max(LAYOUT_LINES, layout.first + 1)]
         first = [cells(line, layout.separator) for line in lines if line.strip()]
         whole = [row for row in first if len(row) == len(layout.headings)] or first
         texts = [" ".join(row[k] for k in layout.stamp) for row in whole if max(layout.stamp) < len(row)]
@@ -116,7 +116,7 @@ class Table:
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
         """Return the times (n,), the values (n,) of each column, and the numbers of the rows' lines."""
         self.faults.rows += len(lines)
-        lines, kept = self._whole(lines, numbers)
+        lines, kept = self._complete_lines(lines, numbers)
         frame = self._frame(lines, kept)
         times, wrong = self._times(frame, kept)
         if wrong.any():
@@ -167,10 +167,10 @@ class Table:
             self._note(name, there, numbers, f"not valid by {by!r}", wrong=False)
             columns[name][there] = np.nan
 
-    def _whole(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
+    def _complete_lines(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
         """Return the lines that have as many fields as there are headings, and their numbers."""
         open_quotes = [line.count('"') % 2 == 1 for line in lines]
-        lines, numbers = self._without(
+        lines, numbers = self._dropping(
             open_quotes, lines, numbers, "expected every quote to be closed in its line"
         )
         separator, width = self._layout.separator, len(self._layout.headings)
@@ -183,9 +183,9 @@ class Table:
             counts = [min(count, width) for count in counts]
         wrong = [count != width for count in counts]
         other = next((count for count in counts if count != width), width)
-        return self._without(wrong, lines, numbers, f"expected {width} fields, not {other}")
+        return self._dropping(wrong, lines, numbers, f"expected {width} fields, not {other}")
 
-    def _without(
+    def _dropping(
         self, wrong: list[bool], lines: list[str], numbers: Sequence[int], text: str
     ) -> tuple[list[str], list[int]]:
         """Return the lines that are not wrong, and their numbers; the others are noted."""

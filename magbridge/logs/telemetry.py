@@ -33,12 +33,12 @@ import numpy as np
 import xarray as xr
 
 from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
-from magbridge.logs.compasses import Compass, by_columns, choose
+from magbridge.logs.compasses import LogCompass, by_columns, choose
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import MAX_AGE
-from magbridge.logs.telemetry_columns import whole
+from magbridge.logs.telemetry_columns import read_at_once
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction
-from magbridge.logs.telemetry_survey import AUTOPILOT, Survey, survey
+from magbridge.logs.telemetry_survey import AUTOPILOT, LogContents, survey
 from magbridge.logs.telemetry_writer import FileWriter
 from magbridge.mavlink import LogReader, Message, Record, Source, spec
 from magbridge.records import Channel
@@ -53,7 +53,7 @@ NEVER = -(1 << 62)
 SINGLE = 1e-7
 """Relative error of a float32; counts that differ from the channel by more belong to another sensor."""
 FIELD, STEP, NAMED = spec("MAG_FIELD").id, spec("MAG_CLOCK_STEP").id, spec("NAMED_VALUE_FLOAT")
-TIMES = ("time", *CHANNEL_TIMES)
+TIME_COLUMNS = ("time", *CHANNEL_TIMES)
 
 
 def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr.Dataset]:
@@ -65,9 +65,9 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     found = survey(path, status.st_mtime_ns, status.st_size)
     wanted = options.compass if options else None
     if found.plain:
-        yield from sliced(whole(path, *_of_compass(path, found, wanted), wanted), rows)
+        yield from sliced(read_at_once(path, *_of_compass(path, found, wanted), wanted), rows)
         return
-    pieces = Rows(path, found)
+    pieces = TelemetryRows(path, found)
     with path.open("rb") as file:
         pieces.reader = LogReader(file)
         for record in pieces.reader:
@@ -78,7 +78,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
             yield by_columns(pieces.pop_rows(len(pieces.rows)), wanted)
 
 
-def _of_compass(path: Path, found: Survey, wanted: str | None) -> tuple[Survey, list[Compass]]:
+def _of_compass(path: Path, found: LogContents, wanted: str | None) -> tuple[LogContents, list[LogCompass]]:
     """Return the survey with the compass that is wanted as the source of its rows, and all compasses."""
     if not (there := found.compasses):
         return found, []
@@ -87,12 +87,12 @@ def _of_compass(path: Path, found: Survey, wanted: str | None) -> tuple[Survey, 
     return found.of_compass(chosen.id), compasses
 
 
-class Rows:
+class TelemetryRows:
     """Turns messages into rows: keeps the last value of each column, and the rows not yet taken."""
 
     reader: LogReader
 
-    def __init__(self, path: Path, survey: Survey) -> None:
+    def __init__(self, path: Path, survey: LogContents) -> None:
         self.rows: list[list[float]] = []
         self._path, self._survey = path, survey
         self._source, self._make = spec(survey.source).id, SOURCES[survey.source]
@@ -172,7 +172,11 @@ class Rows:
     def _row(self, time_us: int, columns: Columns) -> None:
         columns.setdefault("time", (time_us + self._survey.stepped_us - self._to_step_us) / 1e6)
         if self._to_step_us:
-            later = {name: round(1e6 * columns[name]) + self._to_step_us for name in TIMES if name in columns}
+            later = {
+                name: round(1e6 * columns[name]) + self._to_step_us
+                for name in TIME_COLUMNS
+                if name in columns
+            }
             columns |= {name: at_us / 1e6 for name, at_us in later.items()}
         time = columns["time"]
         oldest = time_us - MAX_AGE_US

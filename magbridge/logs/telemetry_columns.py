@@ -1,7 +1,7 @@
 """An autopilot's telemetry log as columns: what a station recorded, which is all of one clock.
 
-The values are those of :class:`~magbridge.logs.telemetry.Rows`, which reads message by message what a bridge
-wrote; here each field of all messages is read at once.
+The values are those of :class:`~magbridge.logs.telemetry.TelemetryRows`, which reads a bridge's log message
+by message; here each field of all messages is read at once.
 """
 
 from __future__ import annotations
@@ -14,22 +14,24 @@ import xarray as xr
 from msgspec.structs import replace
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.logs.compasses import Compass, compass_notes, listed
+from magbridge.logs.compasses import LogCompass, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted
 from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import IMUS, TELEMETRY
-from magbridge.logs.telemetry_survey import Survey
+from magbridge.logs.telemetry_survey import LogContents
 from magbridge.mavlink import spec
 from magbridge.mavlink.blocks import Block, blocks
 
-__all__ = ["whole"]
+__all__ = ["read_at_once"]
 
 NAMED = spec("NAMED_VALUE_FLOAT")
 Part = tuple[IndexArray, IndexArray, FloatArray]
 """Places in the file (m,), µs (m,) and values (m,)."""
 
 
-def whole(path: Path, survey: Survey, compasses: Sequence[Compass], wanted: str | None) -> xr.Dataset:
+def read_at_once(
+    path: Path, survey: LogContents, compasses: Sequence[LogCompass], wanted: str | None
+) -> xr.Dataset:
     """Return the log as one deployment; of the file, one block at a time is held."""
     source = spec(survey.source).id
     own = IMUS.get(survey.source, [])
@@ -69,7 +71,7 @@ def whole(path: Path, survey: Survey, compasses: Sequence[Compass], wanted: str 
 
 
 def _telemetry(
-    block: Block, survey: Survey, sent: np.ndarray[tuple[int], np.dtype[np.bool_]], base: int
+    block: Block, survey: LogContents, sent: np.ndarray[tuple[int], np.dtype[np.bool_]], base: int
 ) -> list[tuple[str, Part]]:
     """Return the values in a block of each column that is not the source's own field."""
     found = []

@@ -16,13 +16,22 @@ from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import split_index
 
 __all__ = [
-    "FIELDS", "IMUS", "POWER_CYCLE", "SOURCES", "TELEMETRY", "UNKNOWN_INT", "Columns", "Declared", "Value",
-    "correction", "sample",
+    "IMUS",
+    "MAVLINK_FIELDS",
+    "POWER_CYCLE",
+    "SOURCES",
+    "TELEMETRY",
+    "UNKNOWN_INT",
+    "Columns",
+    "DeclaredField",
+    "Value",
+    "correction",
+    "sample",
 ]  # fmt: skip
 
 Columns = dict[str, float]
 
-FIELDS: dict[str, dict[str, str]] = {
+MAVLINK_FIELDS: dict[str, dict[str, str]] = {
     # message: {column: field}
     "ATTITUDE": {"roll": "roll", "pitch": "pitch", "heading": "yaw"},
     "GLOBAL_POSITION_INT": {"latitude": "lat", "longitude": "lon", "depth": "relative_alt"},
@@ -38,7 +47,7 @@ FIELDS: dict[str, dict[str, str]] = {
     "SCALED_IMU2": {"mag2_x": "xmag", "mag2_y": "ymag", "mag2_z": "zmag"},
     "SCALED_IMU3": {"mag3_x": "xmag", "mag3_y": "ymag", "mag3_z": "zmag"},
 }
-UNITS = {
+MAVLINK_UNITS = {
     # the dialect's: (ours, factor)
     "rad": ("deg", 57.29577951308232),
     "degE7": ("deg", 1e-7),
@@ -50,7 +59,7 @@ UNITS = {
     "mm": ("m", 1e-3),
 }
 UNKNOWN_INT = 0x7FFFFFFF
-UNKNOWN: dict[tuple[str, str], tuple[int, ...]] = {
+UNKNOWN_VALUES: dict[tuple[str, str], tuple[int, ...]] = {
     # what these fields hold when their sender does not know the value; the dialect does not declare it
     ("GLOBAL_POSITION_INT", "lat"): (0, UNKNOWN_INT),
     ("GLOBAL_POSITION_INT", "lon"): (0, UNKNOWN_INT),
@@ -67,9 +76,9 @@ class Value:
     def __init__(self, column: str, message: str, field: str) -> None:
         name, self._index = split_index(field)
         self._field = spec(message).fields[name]
-        self._unknown = UNKNOWN.get((message, name), ())
+        self._unknown = UNKNOWN_VALUES.get((message, name), ())
         self.column = column
-        self.unit, self.scale = UNITS.get(self._field.unit, (self._field.unit or "1", 1.0))
+        self.unit, self.scale = MAVLINK_UNITS.get(self._field.unit, (self._field.unit or "1", 1.0))
         if name == "relative_alt":
             self.scale = -self.scale  # depth
         self.offset = 0.0
@@ -92,7 +101,7 @@ class Value:
         return np.where(unknown, np.nan, raw.astype(np.float64) * self.scale + self.offset)
 
 
-class Declared(Value):
+class DeclaredField(Value):
     """A column that the log itself declares, by a ``MAG_COLUMN``.
 
     Attributes
@@ -128,7 +137,7 @@ class Declared(Value):
 
 TELEMETRY = {
     spec(message).id: [Value(column, message, field) for column, field in columns.items()]
-    for message, columns in FIELDS.items()
+    for message, columns in MAVLINK_FIELDS.items()
 }
 """Message id to the columns in the message."""
 
@@ -170,14 +179,14 @@ IMUS = {
 """Messages of an autopilot that hold its compass' field, the best first."""
 
 
-def _of(message: str) -> Callable[[bytes], Columns]:
+def _field_of(message: str) -> Callable[[bytes], Columns]:
     return lambda payload: {value.column: value.get(payload) for value in IMUS[message]}
 
 
 SOURCES: dict[str, Callable[[bytes], Columns]] = {
     "MAG_RAW": sample,
     "MAG_FIELD": correction,
-    **{message: _of(message) for message in IMUS},
+    **{message: _field_of(message) for message in IMUS},
     "ATTITUDE": lambda _: {},
     "GLOBAL_POSITION_INT": lambda _: {},
 }

@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 from magbridge.arrays import IndexArray
 from magbridge.columns import AGE, CHANNELS
 from magbridge.errors import FormatError
-from magbridge.logs.compasses import Compass
+from magbridge.logs.compasses import LogCompass
 from magbridge.logs.deployment import CHANGES
-from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Declared, Value, correction, sample
+from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, DeclaredField, Value, correction, sample
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.blocks import Block, blocks
 from magbridge.records import Channel
 
-__all__ = ["AUTOPILOT", "Survey", "survey"]
+__all__ = ["AUTOPILOT", "LogContents", "survey"]
 
 RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", "COLUMN", "CLOCK_STEP"))
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED = spec("NAMED_VALUE_FLOAT")
-UNITS = {"sensor_supply": "V"}
+BRIDGE_UNITS = {"sensor_supply": "V"}
 NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
 """Message to the number of the compass whose field it holds; of several for one, the first is read."""
 AUTOPILOT = 1
@@ -38,7 +38,7 @@ RESERVED = {"time", *CHANNELS}
 """Columns that a named value never is."""
 
 
-class Survey:
+class LogContents:
     """What a log holds: found in a first pass, so that every piece of a stream has the same columns.
 
     Attributes
@@ -59,7 +59,7 @@ class Survey:
         most.
     wanted : dict of str to int or None
         Each telemetry column, with the only component that it may come from, if there is one.
-    declared : list of Declared
+    declared : list of DeclaredField
         Columns that the log itself declares to be in other messages.
     attrs : dict
         Attributes that the log declares, and ``notes``.
@@ -77,7 +77,7 @@ class Survey:
         self._known: dict[tuple[int, int, int], dict[str, str]] = {}
         self._named: dict[int, dict[bytes, str]] = {}
         self._speakers: dict[tuple[int, bytes], Counter[int]] = {}
-        self._declared: dict[str, Declared] = {}
+        self._declared: dict[str, DeclaredField] = {}
         self._open: dict[tuple[int, int, int], list[Value]] = {}
         self._asked: dict[str, float] = {}
         self._read(path)
@@ -98,16 +98,16 @@ class Survey:
         raise FormatError(path, f"expected MAVLink records with one of {' '.join(SOURCES)}")
 
     @property
-    def compasses(self) -> list[Compass]:
+    def compasses(self) -> list[LogCompass]:
         """The compasses whose field messages of the sender hold: ``RAW_IMU`` has the first."""
         found = {}
         for message, number in NUMBERS.items():
             n = self._senders.get(spec(message).id, Counter())[self.system, self.component]
             if n and number not in found:
-                found[number] = Compass(number, n, 0.0, message)
+                found[number] = LogCompass(number, n, 0.0, message)
         return [found[number] for number in sorted(found)]
 
-    def of_compass(self, message: str) -> Survey:
+    def of_compass(self, message: str) -> LogContents:
         """Return the survey with the rows made by another message."""
         other = copy(self)
         other.source = message
@@ -142,7 +142,7 @@ class Survey:
             for (system, letters), senders in self._speakers.items()
             if system == self.system
         }
-        self.declared: list[Declared] = []
+        self.declared: list[DeclaredField] = []
         self.wanted: dict[str, int | None] = {}
         notes: list[str] = []
         for one in self._declared.values():
@@ -229,14 +229,14 @@ class Survey:
         if number in (RAW, FIELD):
             for column in (sample if number == RAW else correction)(message.payload):
                 if column != "time":
-                    known.setdefault(column, UNITS.get(column, ""))
+                    known.setdefault(column, BRIDGE_UNITS.get(column, ""))
         elif number == STEP:
             self.stepped_us += message["step"]
         elif not message["message"]:
             self.attrs[message["column"]] = message["unit"] or message["scale"]
         else:
             with suppress(KeyError, ValueError):  # of a dialect that we do not know
-                self._declared[message["column"]] = Declared(message)
+                self._declared[message["column"]] = DeclaredField(message)
 
     def _values(self, sender: tuple[int, int, int], payloads: NDArray[np.uint8]) -> bool:
         """Note which fields of a message have a value; return whether all have."""
@@ -249,6 +249,6 @@ class Survey:
 
 
 @lru_cache(maxsize=64)
-def survey(path: Path, mtime_ns: int, size: int) -> Survey:  # noqa: ARG001 - a log that changed is surveyed again
+def survey(path: Path, mtime_ns: int, size: int) -> LogContents:  # noqa: ARG001 - a log that changed is surveyed again
     """Return what a log holds; cached, so that a log is surveyed only once."""
-    return Survey(path)
+    return LogContents(path)

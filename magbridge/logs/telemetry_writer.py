@@ -31,9 +31,9 @@ __all__ = ["FileWriter", "short_name"]
 
 VEHICLE, AUTOPILOT, BRIDGE = 1, 1, 191
 ATTITUDE = ("roll", "pitch", "heading")
-POSITION = ("latitude", "longitude", "depth")
+POSITION_COLUMNS = ("latitude", "longitude", "depth")
 SAMPLE = (*CHANNELS, "sensor_temperature", "sensor_supply", "power_cycle")
-STANDARD = {*ATTITUDE, *POSITION, *SAMPLE, *CHANNEL_TIMES, *CORRECTED, "level_sigma"}
+STANDARD = {*ATTITUDE, *POSITION_COLUMNS, *SAMPLE, *CHANNEL_TIMES, *CORRECTED, "level_sigma"}
 """Columns that have a field of their own in one of these messages."""
 ATTITUDE_, POSITION_, NAMED_, RAW_, FIELD_ = (
     spec(name) for name in ("ATTITUDE", "GLOBAL_POSITION_INT", "NAMED_VALUE_FLOAT", "MAG_RAW", "MAG_FIELD")
@@ -63,7 +63,7 @@ class FileWriter:
             self._start_us = times[0] if times else 0
             self._declare(dataset)
         senders = [self._attitude] * any(name in columns for name in ATTITUDE)
-        senders += [self._position] * any(name in columns for name in POSITION)
+        senders += [self._position] * any(name in columns for name in POSITION_COLUMNS)
         senders += [self._telemetry, self._raw]
         senders += [self._field] * ("total_field" in columns)
         values = [_single(name, dataset[name].values).tolist() for name in columns]
@@ -150,7 +150,7 @@ def short_name(name: str, taken: Collection[str]) -> str:
 
 def _single(name: str, values: FloatArray) -> FloatArray:
     """Round to float32, so that packing cannot overflow; columns that are not sent as float32 stay."""
-    if name in (*POSITION, *CHANNEL_TIMES, "total_field"):
+    if name in (*POSITION_COLUMNS, *CHANNEL_TIMES, "total_field"):
         return values
     with np.errstate(over="ignore"):
         return values.astype(np.float32).astype(np.float64)

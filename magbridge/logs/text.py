@@ -7,7 +7,7 @@ are converted. Before the header there may be lines such as ``# heading_referenc
 flags, separated by spaces. Numbers are written with as many digits as it takes to read back the same float64.
 
 A written file begins with the header, as other programs expect; attributes stand next to it, in the file that
-W3C's *Metadata Vocabulary for Tabular Data* gives to ``NAME.csv``: ``NAME.csv-metadata.json``. What would
+W3C's *TableNotes Vocabulary for Tabular Data* gives to ``NAME.csv``: ``NAME.csv-metadata.json``. What would
 change a value's meaning stands in the file itself: ``heading [deg magnetic]``.
 
 Files of other programs are read by :mod:`.layout` (separator, decimal commas, headings, units) and
@@ -34,11 +34,11 @@ from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
 from magbridge.logs.deployment import GUESSED, HISTORY, deployment, lasting, with_losses
-from magbridge.logs.layout import HEADER, is_remark, layout_of
+from magbridge.logs.layout import LAYOUT_LINES, is_remark, layout_of
 from magbridge.logs.options import Options
 from magbridge.logs.packed import opened
 from magbridge.logs.registry import metadata_path
-from magbridge.logs.table import Table
+from magbridge.logs.table import TextTable
 from magbridge.records import Quality
 
 __all__ = ["FileWriter", "chunks"]
@@ -54,7 +54,7 @@ LOOKED_AT, LINE = 1 << 16, 256
 """Bytes by which the encoding is found, and of the first line, which holds no zero in a text."""
 
 
-class Metadata(msgspec.Struct):
+class TableNotes(msgspec.Struct):
     """Notes of a table, by W3C's vocabulary, which are read again."""
 
     notes: list[dict[str, str | float]]
@@ -99,20 +99,20 @@ def _chunks(
 ) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
     """Yield the rows, each piece with the numbers of its lines."""
     lines = _lines(file)
-    header = list(islice(lines, HEADER))
+    header = list(islice(lines, LAYOUT_LINES))
     if reader := captures.reader(header):
         yield from reader(path, chain(header, lines), rows)
         return
     added = 0
     if convert := captures.as_table(header):
         lines, added = convert(chain(header, lines)), 1
-        header = list(islice(lines, HEADER))
+        header = list(islice(lines, LAYOUT_LINES))
     further = list(islice(lines, FURTHER))
     beside = _attributes(path)
     layout = layout_of(
         path, header, options.declared, foreign=not metadata_path(path).is_file(), further=further
     )
-    table = Table(path, layout, [*header, *further], strict=options.strict)
+    table = TextTable(path, layout, [*header, *further], strict=options.strict)
     attrs = {**beside, **layout.attrs, **table.attrs}
     if guesses := [*guess, *layout.guesses, *table.guesses]:
         note = "; ".join(guesses)
@@ -194,7 +194,7 @@ def _attributes(path: Path) -> dict[str, str | float]:
     if not sidecar.is_file():
         return {}
     try:
-        return msgspec.json.decode(sidecar.read_bytes(), type=Metadata).notes[0]
+        return msgspec.json.decode(sidecar.read_bytes(), type=TableNotes).notes[0]
     except (msgspec.MsgspecError, IndexError):
         raise FormatError(sidecar, "expected the metadata of a CSV file, with one note") from None
 

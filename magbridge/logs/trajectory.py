@@ -55,7 +55,7 @@ MEANINGS = {
     "sea_water_temperature": ("water_temperature", 1.0),
     "sea_water_pressure": ("water_pressure", 1.0),
 }
-NAMES = {"temp": "water_temperature", "pres": "water_pressure"}
+OG1_COLUMNS = {"temp": "water_temperature", "pres": "water_pressure"}
 """OG1.0's names, in small letters, of columns whose name is not simply ours in capitals."""
 FLAGS = re.compile(r"(.+)_(?:qc|qartod_\w*|flag)", re.IGNORECASE)
 """Name of a variable with the flags of another."""
@@ -180,7 +180,7 @@ def _meaning(variable: Any, called: str) -> tuple[str, float]:
     if hasattr(variable, "column"):
         return str(variable.column), 1.0
     standard = str(getattr(variable, "standard_name", ""))
-    column, sign = MEANINGS.get(standard, (NAMES.get(called, called), 1.0))
+    column, sign = MEANINGS.get(standard, (OG1_COLUMNS.get(called, called), 1.0))
     if _is_ours(variable):
         column = variable.name.lower()
     if column == "depth" and str(getattr(variable, "positive", "down")).lower() == "up":

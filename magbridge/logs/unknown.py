@@ -33,7 +33,7 @@ def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
     They are huge, or one of :data:`CODES` that lies beyond all others by half their range. A field whose
     three axes are 0, or the same code, is none, nor is a place at 0, 0: a receiver without a fix writes it.
     """
-    found = {name: _beyond(values) for name, values in columns.items() if name not in {"time", "quality"}}
+    found = {name: _is_code(values) for name, values in columns.items() if name not in {"time", "quality"}}
     for together in (CHANNELS, ("latitude", "longitude")):
         if set(together) <= set(columns):
             first, *others = (columns[name] for name in together)
@@ -43,7 +43,7 @@ def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
     return {name: wrong for name, wrong in found.items() if wrong.any()}
 
 
-def _beyond(values: FloatArray) -> BoolArray:
+def _is_code(values: FloatArray) -> BoolArray:
     wrong: BoolArray = np.abs(values) > HUGE
     codes = np.isin(values, CODES)
     others = values[np.isfinite(values) & ~codes & ~wrong]

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.columns import CHANNEL_TIMES, COLUMNS
-from magbridge.logs.checks import APART, FIELDS, LEAST, MOST
+from magbridge.logs.checks import MAX_CHANNEL_DELAY_S, MAX_MAGNITUDE, MIN_VALUE, REFERENCE_FIELD_RANGE_NT
 from magbridge.logs.deployment import deployment
 
 EXACT = [".csv", ".nc", ".parquet", ".mcap"]
@@ -47,13 +47,13 @@ def deployments(draw: st.DrawFn, width: Literal[32, 64]) -> xr.Dataset:
     units = draw(others)
     columns = {}
     for name in [*draw(known), *units]:
-        most = MOST.get(name, APART / 2 if name in CHANNEL_TIMES else None)
-        least = LEAST.get(COLUMNS[name].units if name in COLUMNS else units[name])
+        most = MAX_MAGNITUDE.get(name, MAX_CHANNEL_DELAY_S / 2 if name in CHANNEL_TIMES else None)
+        least = MIN_VALUE.get(COLUMNS[name].units if name in COLUMNS else units[name])
         bounds = (
             {"min_value": least and int(least)} if most is None else {"min_value": -most, "max_value": most}
         )
         if name == "reference_field":
-            bounds = {"min_value": FIELDS[0], "max_value": FIELDS[1]}
+            bounds = {"min_value": REFERENCE_FIELD_RANGE_NT[0], "max_value": REFERENCE_FIELD_RANGE_NT[1]}
         value = st.floats(**bounds, allow_infinity=False, width=width) | st.just(np.nan)
         column = np.array(draw(st.lists(value, min_size=len(time), max_size=len(time))), dtype=float)
         columns[name] = time + column if name in CHANNEL_TIMES else column

@@ -13,7 +13,7 @@ from magbridge.logs import telemetry
 from magbridge.logs.compasses import compasses_of
 from magbridge.logs.deployment import noted
 from magbridge.logs.options import Options
-from magbridge.logs.telemetry_survey import Survey
+from magbridge.logs.telemetry_survey import LogContents
 from magbridge.mavlink import Codec, LogReader, pack_record
 
 T0, S = 1_700_000_000_000_000, 1_000_000
@@ -38,7 +38,7 @@ class Log:
 
 def one_by_one(path: Path) -> Any:
     """Return the log as it is read message by message."""
-    rows = telemetry.Rows(path, Survey(path))
+    rows = telemetry.TelemetryRows(path, LogContents(path))
     with path.open("rb") as file:
         rows.reader = LogReader(file)
         for record in rows.reader:
