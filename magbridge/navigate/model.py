@@ -28,7 +28,8 @@ from magbridge.navigate.deadreckoning import MotionNoise
 from magbridge.navigate.options import Options
 
 __all__ = [
-    "N_STATES", "Block", "average", "block_length", "measurement_row", "prior", "resolution", "transition",
+    "NO_MOTION_NOISE", "N_STATES", "Block", "average", "block_length", "measurement_row", "prior",
+    "resolution", "transition",
 ]  # fmt: skip
 
 N_STATES = 6

@@ -70,6 +70,15 @@ def test_a_receiver_that_is_led_away_is_rejected() -> None:
     assert (run.error[wrong] < 60.0).all()
 
 
+def test_a_receiver_that_is_led_away_slowly_is_noticed_by_the_field() -> None:
+    """1 m/s is within what the wind may change by; on this map the field tells it before 100 m."""
+    run = fly(carried_off(BEGIN, 0.7, 0.7))
+    noticed = run.seconds[(run.gnss >= GnssState.SUSPECT) & (run.seconds >= BEGIN)]
+    assert noticed.size
+    assert noticed[0] - BEGIN < 100.0
+    assert (run.gnss[run.seconds >= noticed[0]] != GnssState.GOOD).all()
+
+
 def test_a_jump_of_5_km_is_rejected_at_once_and_the_return_accepted() -> None:
     run = fly(jumped(BEGIN, END, 4000.0, 3000.0))
     assert first(run, GnssState.REJECTED, BEGIN) <= 1.0
