@@ -1,9 +1,9 @@
-"""The other end of every line: a simulated world, and emulated devices that speak real protocols.
+"""The other end of every line: a simulated world, and emulated devices with real protocols.
 
-A :mod:`.scenario` says what is simulated. In its :mod:`.world` a vehicle (:mod:`.platform`) with an
+A :mod:`.scenario` describes the simulation. In its :mod:`.world` a vehicle (:mod:`.platform`) with an
 :mod:`.instrument` flies a :mod:`.mission` along a :mod:`.trajectory`; the :mod:`.twin` is all of them
 together, and its log a :mod:`.dataset`. :mod:`.like` flies the way of a real log instead, and :mod:`.inject`
-hides effects. :mod:`.fluxgate` speaks the sensors' protocols, and :mod:`.replay` plays deployments to the
+hides effects. :mod:`.fluxgate` emulates the sensors' protocols, and :mod:`.replay` plays deployments to the
 bridge. :mod:`.demo` does the main job.
 """
 

@@ -81,9 +81,9 @@ def demo(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> 
 
 
 def _align(field: dict[str, FloatArray], survey: xr.Dataset) -> xr.Dataset:
-    """Return what was heard, on the times at which it was measured, with the truth at those times.
+    """Return the received values, on the times at which it was measured, with the truth at those times.
 
-    ``flagged`` is true where a flag speaks against the total field, which needs no boresight.
+    ``flagged`` is true where a flag concerns the total field, which needs no boresight.
     """
     times = survey["time"].to_numpy()
     truth = np.interp(field["time"], times, survey["truth_total_field"].to_numpy())

@@ -26,8 +26,8 @@ RAW, NOMINAL, CORRECTED, TRUE, FLAGGED = "#b0b0b0", "#d1793b", "#1f6fb4", "#1111
 def draw(survey: xr.Dataset, nominal: FloatArray, samples: xr.Dataset, path: Path) -> None:
     """Draw the survey: masses, raw and true field, corrected and true field, errors.
 
-    `nominal` (n,) is the total field (nT) of the survey's samples as one ellipsoid corrects it; `samples` is
-    what came over the link.
+    `nominal` (n,) is the total field (nT) of the survey's samples as one ellipsoid corrects it; `samples` are
+    the values received over the link.
     """
     hours = _hours(survey["time"], survey)
     received = _hours(samples["time"], survey)

@@ -23,7 +23,7 @@ class Instrument(Table, frozen=True):
     """``[instrument]``: a three-axis fluxgate and its digitiser."""
 
     rate: Positive = 0.25
-    """Hz, triples a second."""
+    """Rate of the readings, Hz."""
     scale: Vector = (1.0, 1.0, 1.0)
     offset: Vector = (0.0, 0.0, 0.0)
     """`scale`, `offset`: Gain of each axis, and nT."""
@@ -32,7 +32,7 @@ class Instrument(Table, frozen=True):
     mounting: Vector = (0.0, 0.0, 0.0)
     """deg roll, pitch, heading of the sensor in the body."""
     turn_on_sigma: NotNegative = 0.0
-    """nT an axis; the offset settles anew at every power-on."""
+    """nT an axis; the offset changes at every power-on."""
     power_on: tuple[float, ...] = ()
     """s after the start at which the instrument is powered on again."""
     offset_per_degree: Vector = (0.0, 0.0, 0.0)
@@ -41,7 +41,7 @@ class Instrument(Table, frozen=True):
     reference_temperature: float = 2.0
     """degC at which offset and scale are as given."""
     start_temperature: float | None = None
-    """degC of the fluxgate at the start; None has it settled in the water."""
+    """degC of the fluxgate at the start; None: the temperature of the water."""
     thermal_lag: NotNegative = 3600.0
     """s, time constant with which the fluxgate's temperature follows the water's."""
     corner: NotNegative = 0.33

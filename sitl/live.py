@@ -55,7 +55,7 @@ ENDING = 10.0
 
 @contextmanager
 def flying(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> Iterator[str]:
-    """Fly the glider of a seed while the context lasts; give the link at which a ground station hears it.
+    """Fly the glider of a seed while the context lasts; give the link at which a ground station receives it.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def flying(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -
     seed : int
         Which random glider.
     notify : callable
-        Takes a line about what is being done.
+        Called with a line about the present step.
     """
     notify("simulating a glider and fitting its calibration to the spirals")
     survey = _prepare(folder, seed)
@@ -125,7 +125,7 @@ def _play(survey: xr.Dataset, config: Path, master: int, router: _Router, stop: 
     for event in emulate(survey, load_config(config)):
         if stop.wait(max(0.0, event.time_us * 1e-6 - time.time())):
             return
-        with suppress(OSError):  # what nobody reads is lost, as on a wire
+        with suppress(OSError):  # unread bytes are lost, as on a wire
             if event.channel is Channel.SENSOR:
                 os.write(master, event.data)
             elif event.channel is Channel.LINK:
@@ -156,7 +156,7 @@ class _Router:
         self.bridge_port, self.station_port = (one.getsockname()[1] for one in self._sockets)
 
     def run(self, stop: Stop) -> None:
-        """Pass on what comes, until told to stop."""
+        """Forward received bytes, until stopped."""
         while not stop.is_set():
             ready, _, _ = select.select(self._sockets, [], [], 0.2)
             for one in ready:

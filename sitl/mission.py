@@ -90,7 +90,7 @@ class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
     segment: str = "calibration"
 
     def legs(self, rng: np.random.Generator, limits: Mapping[str, Limit]) -> list[Leg]:
-        """Return a leg for each run; masses that a run does not name are drawn anew for each."""
+        """Return a leg for each run; masses that a run does not name are drawn for each."""
         legs = []
         for run in self.runs or _table_1(self.trial):
             bank = float(rng.normal(*self.roll))

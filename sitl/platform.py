@@ -98,7 +98,7 @@ class Vehicle(Table, frozen=True):
     """``[vehicle]``: a vehicle whose magnetism is known."""
 
     hard_iron: Vector = (0.0, 0.0, 0.0)
-    """nT, of all that does not move."""
+    """Field of all parts that do not move, nT."""
     soft_iron: Matrix = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """Field that fixed iron adds per unit of the Earth's field, body axes."""
     mass: dict[str, Mass] = msgspec.field(default_factory=dict)

@@ -25,7 +25,7 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 
 
 class Place(Table, frozen=True):
-    """``[world]``: where, with the rock and the water.
+    """``[world]``: where, with the crustal field and the water.
 
     A scenario that is driven by a log takes the place from the log.
     """

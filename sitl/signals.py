@@ -22,7 +22,7 @@ def first_order(
     step, time_constant : float
         s. A time constant of 0 passes the input through.
     start : array (k,) or float, optional
-        Output at the first point; without it the lag has settled at ``u[0]``.
+        Output at the first point; without it the lag begins at ``u[0]``.
 
     Returns
     -------

@@ -120,7 +120,7 @@ def fly(
     leg_of = np.searchsorted(ends, t, side="right")
     memory = motion.wander_memory / step
     # a vehicle has inertia: the wander is smoothed. A lag of time constant T leaves 1 / (1 + T / tau) of the
-    # variance of noise with memory tau, 3/4 for T = tau / 3, and what it takes is given back
+    # variance of noise with memory tau, 3/4 for T = tau / 3, and its offset is given back
     wander = first_order(autoregressive(rng, (len(t), 3), 1.0, memory), step, motion.wander_memory / 3)
     wander *= np.sqrt(4 / 3) * np.asarray(motion.wander)
 

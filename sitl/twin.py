@@ -63,7 +63,7 @@ class Twin:
         """Draw what the scenario leaves open.
 
         World, vehicle, mission, instrument and telemetry each have a stream of their own, so that a change to
-        one does not draw the others anew.
+        one does not change the others.
         """
         place = scenario.world
         world = World.draw(
@@ -227,8 +227,8 @@ def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
     Returns
     -------
     Dataset (time)
-        Columns as in any deployment, ``truth_*`` beside them. ``attrs["segments"]`` lists the parts of the
-        mission (JSON: name, first and last time in s since 1970); :func:`sitl.segments` takes them apart.
+        Columns as in any deployment, ``truth_*`` in addition. ``attrs["segments"]`` lists the parts of the
+        mission (JSON: name, first and last time in s since 1970); :func:`sitl.segments` splits them.
     """
     twin = Twin.draw(scenario, seed)
     track = twin.fly()

@@ -1,4 +1,4 @@
-"""The simulated world: main field, magnetised rock below the sea floor, water with a temperature."""
+"""The simulated world: main field, magnetised bodies below the sea floor, water with a temperature."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def dipole_field(r: FloatArray, m: FloatArray) -> FloatArray:
 
 
 class Geology(Table, frozen=True):
-    """``[world.geology]``: how rough the rock is."""
+    """``[world.geology]``: how rough the crustal field is."""
 
     sources: int = 600
     """How many magnetised bodies; 0 leaves the Earth's main field alone."""
@@ -87,7 +87,7 @@ class Rock:
     def draw(cls, geology: Geology, main_field: FloatArray, rng: np.random.Generator) -> Rock:
         """Draw bodies that give the anomaly `geology` asks for in a `main_field` (3,) nT.
 
-        A body's moment grows as the cube of its depth, so that each depth contributes alike; half of it is
+        A body's moment grows as the cube of its depth, so that each depth contributes equally; half of it is
         induced, along the main field, and half remanence in any direction, of either sign.
         """
         n = geology.sources
@@ -139,7 +139,7 @@ class World:
         water: Water,
         rng: np.random.Generator,
     ) -> World:
-        """Draw the rock about `origin`; `time` (s since 1970) is that of the main field magnetising it."""
+        """Draw magnetised bodies about `origin`; `time` (s since 1970) is that of the magnetising field."""
         latitude, longitude, depth, when = np.array([[origin[0]], [origin[1]], [0.0], [time]])
         return cls(origin, Rock.draw(geology, igrf(longitude, latitude, depth, when)[0], rng), water)
 
@@ -155,7 +155,7 @@ class World:
     ) -> AnomalyGrid:
         """Return the map an aeromagnetic survey would have made, upward-continued to `altitude`.
 
-        The same bodies seen from higher up, without the fine structure that a vehicle under water meets.
+        Bodies of this world seen from higher up, without the fine structure that a vehicle under water meets.
 
         Parameters
         ----------

@@ -1,6 +1,6 @@
 """Fleets: many vehicles, many logs, one memory.
 
-:mod:`.catalogue` is what is known, in a folder of Parquet files (:mod:`.folder`) or in a database
+:mod:`.catalogue` is the catalogue, in a folder of Parquet files (:mod:`.folder`) or in a database
 (:mod:`.postgres`); :mod:`.register` and :mod:`.given` put vehicles, logs and calibrations there.
 :mod:`.job` is what there is to do, and :mod:`.process` runs :mod:`.work` on each, in parallel.
 :mod:`.hierarchy` is the statistics of coefficients over vehicles, refits and power-ups (:mod:`.variances`,

@@ -1,6 +1,6 @@
 """The catalogue: tables to which rows are only ever added, in a folder or on a server.
 
-A row's key is the SHA-256 of its content, so a row is there once, whoever writes it and how often. No row
+A row's key is the SHA-256 of its content, so a row is there once, by any writer, however often. No row
 holds the time at which it was written: a catalogue made in one go, and one whose making was killed and begun
 again, are the same.
 """
@@ -23,7 +23,7 @@ __all__ = ["FORMAT", "TABLES", "TEXT", "Catalogue", "Row", "open_catalogue"]
 
 Row = dict[str, Any]
 FORMAT = 1
-"""Of the catalogues that are written; newer ones are refused."""
+"""Version of the written catalogues; newer ones are refused."""
 SERVERS = ("postgresql://", "postgres://")
 TEXT, NUMBER, COUNT, TEXTS, NUMBERS, PACKED = (
     pl.String(), pl.Float64(), pl.Int64(), pl.List(pl.String()), pl.List(pl.Float64()), pl.Binary(),
@@ -97,7 +97,7 @@ class Catalogue(ABC):
         """Add rows, unless they are there; return how many were not.
 
         WriteError: the disk is full, or the folder may not be written to. PortError: the server does not
-        answer, or lets nobody write.
+        answer, or refuses to write.
         """
         keyed = {_key(row): {name: row[name] for name in TABLES[table]} for row in rows}
         return self._insert(table, dict(sorted(keyed.items()))) if keyed else 0

@@ -1,13 +1,13 @@
 r"""What changed on a vehicle, and when.
 
-Each deployment is compared with what its vehicle's earlier ones, and the fleet, let expect: a Gaussian
+Each deployment is compared with what its vehicle's earlier ones, and the fleet, predict: a Gaussian
 :math:`N(m, S)` that is wider where the vehicle was refitted. With its own data the coefficients move to
 :math:`N(m', P)`, and under the model the move has the covariance
 
 .. math:: \mathrm{Cov}(m' - m) = S - P,
 
 so each coefficient's move over its own sigma is a standard normal number, whatever the runs determine. A
-change is told where one is beyond :data:`ALARM` for as many coefficients as are looked at.
+change is reported where one exceeds :data:`ALARM` for as many coefficients as are looked at.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Change:
     what: str
     """As a technician would say it."""
     by: float
-    """nT."""
+    """Change of the coefficient, nT."""
     sigmas: float
-    """Of the move."""
+    """Change divided by its standard deviation."""
     chance: float
     """Of one as large in any coefficient of a deployment like the others."""
     cause: str
@@ -50,12 +50,12 @@ class History:
     """A vehicle's coefficients from deployment to deployment."""
 
     names: tuple[str, ...]
-    """Of the k that are looked at: hard iron, and what each mass changes over half its range."""
+    """The k quantities: hard iron, and what each mass changes over half its range."""
     lessons: tuple[Lesson, ...]
     """In the order of time."""
     expected: FloatArray
     expected_sigma: FloatArray
-    """`expected`, `expected_sigma`, (n, k), nT, from what was before."""
+    """`expected`, `expected_sigma`, (n, k), nT, from the earlier value."""
     found: FloatArray
     found_sigma: FloatArray
     """`found`, `found_sigma`, (n, k), nT, with its own data."""
@@ -128,7 +128,7 @@ def _cause(name: str, refitted: bool) -> str:
     """Return what a technician should look for."""
     mass, _, _ = name.rpartition(",")
     what = (
-        "iron that was magnetised, fitted or taken off"
+        "iron that was magnetised, fitted or removed"
         if mass == FIXED
         else f"another pack, moment or place of what {mass} moves"
     )

@@ -58,7 +58,7 @@ class FolderCatalogue(Catalogue):
     def compact(self) -> None:
         """Make one file of each table's many small ones.
 
-        What is removed is what is in the file just written, so rows are never lost, whoever else does so.
+        The removed rows are in the file just written, so rows are never lost, even if others do so.
         """
         for table in TABLES:
             with suppress(FileNotFoundError):  # another writer does the same

@@ -1,4 +1,4 @@
-r"""A calibration that was made elsewhere, put on record and learnt from.
+r"""A calibration that was made elsewhere, put on record and used.
 
 A cal.json holds a posterior N(c, P), not what the data alone say. Its prior is taken to have been the
 physical one, N(0, W) (:mod:`magbridge.estimation.priors`), and only directions that the data have
@@ -47,7 +47,7 @@ def add_calibration(
     start : float
         s since 1970, when that began.
     calibration : Calibration
-        What was made of it.
+        The calibration of it.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def _row(
 
 
 def _information(calibration: Calibration, order: int) -> GaussianInformation | None:
-    """Return what its data have determined; None where it is no polynomial of that order alone."""
+    """Return what its data have determined; None unless it is a polynomial of that order alone."""
     term, *others = calibration.terms
     if others or not isinstance(term, Polynomial) or max(map(sum, term.exponents)) != order:
         return None

@@ -9,7 +9,7 @@ A tree of Gaussian random effects over the coefficients z (K of them, in units o
     r_{ij} \sim N(v_i, V_2),\quad
     z_{ijk} \sim N(r_{ij}, V_3)
 
-with diagonal V_l, one variance for each group of alike coefficients. Where it is known how a refit moves a
+with diagonal V_l, one variance for each group of similar coefficients. Where it is known how a refit moves a
 vehicle's coefficients together, :math:`r_{ij} \sim N(v_i, V_2 + D_i U D_i^T)`: the columns of D_i are such
 shapes, and U holds a variance for each group of them. A deployment says of its z what its own
 data say, a Gaussian likelihood of precision J and vector h, which may be singular: two runs determine few
@@ -65,11 +65,11 @@ class Population:
     """A fleet's variances, and what all but each vehicle say of the fleet's mean."""
 
     variances: Variances
-    """Of the differences at each of :data:`.LEVELS`."""
+    """Variances of the differences at each of :data:`.LEVELS`."""
     shapes: Shapes
     """How refits move the coefficients of each vehicle."""
     total: GaussianInformation
-    """Of the fleet's mean, its prior included."""
+    """Posterior of the fleet's mean, its prior included."""
     each: dict[str, GaussianInformation]
     """Vehicle -> its part of that."""
     log_likelihood: float
@@ -211,7 +211,7 @@ def _down(
 def _updated(
     mean: FloatArray, P: FloatArray, evidence: Sequence[GaussianInformation]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a Gaussian with what is told of it."""
+    """Return a Gaussian with the message about it."""
     if not evidence:
         return mean, P
     J = np.asarray(np.linalg.inv(P), float)

@@ -95,7 +95,7 @@ def new_jobs(catalogue: Catalogue, every: list[Job], *, retry: bool = False) -> 
 
 
 def last_attempts(done: Iterable[Row]) -> dict[str, int]:
-    """Return the last attempt at each job, from the rows of what is done."""
+    """Return the last attempt at each job, from the rows of finished jobs."""
     last: dict[str, int] = {}
     for row in done:
         last[row["job"]] = max(row["attempt"], last.get(row["job"], 0))

@@ -96,10 +96,10 @@ class Fleet:
     lessons: tuple[Lesson, ...]
     """In the order of time."""
     observed: tuple[Observed, ...]
-    """The same, of z."""
+    """Information of z."""
 
     def known(self, vehicle: str, refit: str, before: float = np.inf) -> Known:
-        """Return what is expected of a vehicle's next deployment.
+        """Return the prediction of a vehicle's next deployment.
 
         Parameters
         ----------
@@ -164,7 +164,7 @@ def _shapes(
     parameters: tuple[Parameter, ...],
     basis: FloatArray,
 ) -> Shapes:
-    """Return how refits move z, about where each vehicle is before anything is learnt of the variances."""
+    """Return how refits move z, about where each vehicle is before the variances are estimated."""
     names = {one.name for one in parameters}
     whole = {vehicle: where for vehicle, where in mounted.items() if where.keys() == names}
     if not whole:

@@ -1,4 +1,4 @@
-"""What a catalogue's deployments have taught, and what it expects of the next."""
+"""What a catalogue's deployments have taught, and its prediction of the next."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Taught(NamedTuple):
 def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> list[Row]:
     """Return the rows of a table of results that are made of what the catalogue's logs are now.
 
-    Of a deployment that was tried again, those of the last attempt; and all that was made elsewhere.
+    Rows of a deployment that was tried again, those of the last attempt; and all that was made elsewhere.
     """
     names = {job.name for job in jobs(catalogue)}
     last = last_attempts(catalogue.rows("done"))
@@ -49,7 +49,7 @@ def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> 
 def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> list[Lesson]:
     """Return what deployments of vehicles with the masses of one, `like`, have taught.
 
-    What has been learnt from logs of these SHA-256, `without`, is left out. So is a calibration made
+    The estimates from logs of these SHA-256, `without`, is left out. So is a calibration made
     elsewhere from logs that were calibrated here, too.
 
     WrongUse: there is no such vehicle.
@@ -112,7 +112,7 @@ def fleets(catalogue: Catalogue, names: Iterable[str]) -> dict[str, Fleet | Data
 
 
 def remember(catalogue: Catalogue) -> None:
-    """Put on record how the coefficients of the catalogue's fleets vary, so that it is learnt once."""
+    """Put on record how the coefficients of the catalogue's fleets vary, so that it is estimated once."""
     for fleet in fleets(catalogue, vehicles(catalogue)).values():
         if isinstance(fleet, Fleet):
             own, shaped = (one.ravel().tolist() for one in fleet.population.variances)
@@ -121,7 +121,7 @@ def remember(catalogue: Catalogue) -> None:
 
 
 def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
-    """Return what was found in each vehicle's deployments, with their names, in the order of these."""
+    """Return the results of each vehicle's deployments, with their names, in the order of these."""
     of = {job.name: job for job in jobs(catalogue)}
     found: dict[str, list[Row]] = {}
     for row in current(catalogue, "findings"):
@@ -150,7 +150,7 @@ def _kind(vehicle: Row) -> tuple[tuple[str, ...], int]:
 
 
 def _name(lessons: Iterable[Lesson], mounted: Mapping[str, Mapping[str, Mounting]]) -> str:
-    """Return the name of what has been learnt: from other lessons, another name."""
+    """Return the name of the estimates: from other lessons, another name."""
     each = sorted(
         (one.vehicle, one.refit, one.deployment, one.time, one.information.vector.tolist()) for one in lessons
     )

@@ -48,7 +48,7 @@ td.words {white-space: normal; min-width: 14rem}
 .number {text-align: right; font-variant-numeric: tabular-nums}
 """
 Findings = Mapping[str, Sequence[Mapping[str, Any]]]
-"""Vehicle -> rows of what was found in its deployments."""
+"""Vehicle -> rows of the findings in its deployments."""
 
 
 def write_pages(histories: Mapping[str, History], folder: Path, findings: Findings) -> None:

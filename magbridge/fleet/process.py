@@ -27,7 +27,7 @@ PATIENCE = "20s"
 
 
 class Outcome(NamedTuple):
-    """What came of a deployment: rows added, failures in a line each."""
+    """Result of a deployment: rows added, failures in a line each."""
 
     job: Job
     added: int
@@ -77,9 +77,9 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
 
 
 def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[Outcome]:
-    """Process deployments; yield what came of each as it is done.
+    """Process deployments; yield each result as it is finished.
 
-    A task whose worker is lost is given to another; one that is killed leaves nothing but what is done.
+    A task whose worker is lost is given to another; one that is killed leaves nothing but finished work.
 
     PortError: the scheduler was lost.
     """

@@ -3,7 +3,7 @@
 ::
 
     [vehicle.comet]
-    serial = "U-213"                        # tells two vehicles of one name apart
+    serial = "U-213"                        # distinguishes two vehicles of one name
     sensor = "HMR2300 0153"                 # refuses another sensor's logs
     parameters = ["battpos", "ballast"]
 
@@ -44,7 +44,7 @@ SAME = "serial", "parameters"
 
 
 class Deployment(Table, frozen=True):
-    """``[[vehicle.NAME.deployment]]``: a deployment, what it flew with, patterns of its logs."""
+    """``[[vehicle.NAME.deployment]]``: a deployment, its equipment, patterns of its logs."""
 
     name: str
     logs: tuple[str, ...]
@@ -106,9 +106,9 @@ def vehicle_named(catalogue: Catalogue, name: str) -> Row:
 
 
 def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
-    """Put a vehicle, or what is new about it, on record; return how many were added or changed.
+    """Put a vehicle, or its new properties, on record; return how many were added or changed.
 
-    WrongUse: another has that name, it can be no folder's, or only of some masses it is said where they sit.
+    WrongUse: another has that name, it can be no folder's, or only some masses have a position.
     """
     _check_name(name, "a vehicle")
     if vehicle.mass and (odd := sorted(vehicle.mass.keys() ^ set(vehicle.parameters))):
@@ -170,7 +170,7 @@ def current_files(rows: Iterable[Row]) -> list[Row]:
 
 
 def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
-    """Return the logs that a deployment's patterns name, beside the fleet.toml.
+    """Return the logs that a deployment's patterns name, relative to the fleet.toml.
 
     ConfigError: a pattern names none.
     """

@@ -6,7 +6,7 @@ needs the moment: so a dipole is first fitted to what the vehicle's deployments 
 
 .. math:: l = \arg\min\ (c(l) - m)^T P^{-1} (c(l) - m) + l^T W^{-1} l,
 
-with W the dipole's usual widths, linearised anew in each of :data:`ROUNDS`.
+with W the dipole's usual widths, linearised again in each of :data:`ROUNDS`.
 """
 
 from __future__ import annotations

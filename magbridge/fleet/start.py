@@ -1,4 +1,4 @@
-"""Where a new calibration starts: what a vehicle's past and its fleet let expect; and what that is worth."""
+"""Where a new calibration starts: what a vehicle's past and its fleet predict; and the value of that."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from magbridge.wording import counted
 __all__ = ["UNLIKE", "Start", "gained", "start"]
 
 UNLIKE = 3.0
-"""Times as wide as expected, from which on a deployment is not as its vehicle's past lets expect."""
+"""Times as wide as expected, from which on a deployment is not as its vehicle's past predicts."""
 
 
 class Start(NamedTuple):
-    """What is known before; of how many deployments of the vehicle itself, and of others."""
+    """The prior; of how many deployments of the vehicle itself, and of other vehicles."""
 
     known: Known
     vehicle: str
@@ -34,7 +34,7 @@ class Start(NamedTuple):
 
 
 def start(where: str | Path, member: str, refit: str, digests: Collection[str]) -> Start:
-    """Return what a catalogue lets expect of logs.
+    """Return the prediction of a catalogue for logs.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def start(where: str | Path, member: str, refit: str, digests: Collection[str]) 
     member, refit : str
         The logs' vehicle, and which refit it flew with; empty: as the catalogue has them.
     digests : collection of str
-        SHA-256 of the logs: what was learnt from them does not count.
+        SHA-256 of the logs: estimates from them do not count.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What is catalogued, what is done, what failed: from light columns only, so that it is quick."""
+"""Catalogued, finished and failed deployments: from light columns only, so that it is quick."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A calibration from what a fleet lets expect, before any run is flown."""
+"""A calibration from the prediction of a fleet, before any run."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ __all__ = ["unflown"]
 
 
 def unflown(fleet: Fleet, vehicle: str, refit: str = "") -> Calibration:
-    """Return what is expected of a vehicle's next deployment as a calibration.
+    """Return the prediction of a vehicle's next deployment as a calibration.
 
     Its noise is what that of its deployments was in the mean (of power), or of its fleet's, if it has none.
 
     Parameters
     ----------
     fleet : Fleet
-        What has been learnt.
+        The estimates.
     vehicle, refit : str
         As for :meth:`Fleet.known`.
     """

@@ -1,4 +1,4 @@
-"""How far a fleet's members differ: variances, shapes of refits, and what is counted to learn them.
+"""How far a fleet's members differ: variances, shapes of refits, and the statistics to estimate them.
 
 The equations are those of :mod:`.hierarchy`.
 """
@@ -46,11 +46,11 @@ class Variances(NamedTuple):
     own: FloatArray
     """(3, K): Of each coefficient, at each of :data:`LEVELS`."""
     shaped: FloatArray
-    """(s,): Of the size of each shape, from refit to refit."""
+    """(s,): Variances of the amplitude of each shape, from refit to refit."""
 
     @classmethod
     def expected(cls, K: int, shapes: Shapes) -> Variances:
-        """Return what is expected before any fleet is seen."""
+        """Return the prediction before any fleet is seen."""
         return cls(np.square(shapes.expected(K)), np.full(len(shapes.groups), EXPECTED[1] ** 2))
 
 

@@ -1,8 +1,8 @@
 """One deployment, from its logs to rows of the catalogue: what a worker does.
 
-A worker writes corrected logs and maps, nothing else; the rows are written by the one who asked. What is
-wrong with a log is a failure on record, and the deployment's others go on. What is wrong with the moment (a
-file that is gone or has changed, a full disk) is told, not recorded, and the deployment is tried again.
+A worker writes corrected logs and maps, nothing else; the rows are written by the one who asked. A fault
+of a log is a failure on record, and the deployment's others go on. A fault of the moment (a
+file that is gone or has changed, a full disk) is reported, not recorded, and the deployment is tried again.
 """
 
 from __future__ import annotations

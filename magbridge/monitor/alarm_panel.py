@@ -68,7 +68,7 @@ class AlarmPanel:
 
     @property
     def sound(self) -> bool:
-        """Whether this browser is to sound."""
+        """True if this browser sounds."""
         return bool(self._sound.value)
 
     def show(self, state: State, now: float) -> None:

@@ -17,7 +17,7 @@ class Alarm:
 
     key: str
     text: str
-    """`key`, `text`: What it is, for us and for a reader."""
+    """`key`, `text`: Identifier, and text for a reader."""
     since: float
     last: float
     """`since`, `last`: When it last began, and when it was last so."""
@@ -41,11 +41,11 @@ class Alarms:
 
     @property
     def unseen(self) -> int:
-        """Number of alarms that nobody has acknowledged."""
+        """Number of alarms that have not been acknowledged."""
         return sum(not alarm.acknowledged for alarm in self._alarms.values())
 
     def update(self, conditions: Mapping[str, str], now: float) -> None:
-        """Take all that is wrong at `now`, its keys and its words; the other conditions are over."""
+        """Update with all faults at `now`, its keys and its words; the other conditions are over."""
         for key, alarm in self._alarms.items():
             alarm.active = alarm.active and key in conditions
         for key, text in conditions.items():
@@ -56,7 +56,7 @@ class Alarms:
                 known.text, known.last = text, now
 
     def announce(self, key: str, text: str, now: float, *, active: bool = False) -> None:
-        """Begin an alarm, or begin it anew; one that is not `active` is an event, over at once."""
+        """Begin an alarm, or restart it; one that is not `active` is an event, over at once."""
         count = self._alarms.pop(key).count + 1 if key in self._alarms else 1
         self._alarms[key] = Alarm(key, text, now, now, active, count)
         while len(self._alarms) > MOST:

@@ -19,9 +19,9 @@ ROOM, TAIL = 3.0, 0.02
 """The axis holds all but the share `TAIL` of the points at either end, and `ROOM` times their range beyond. A
 step of the field is more than that share within seconds; a spike never is."""
 LEAST = 1e-5
-"""Of the value: an axis is not shorter."""
+"""Smallest range of the value: an axis is not shorter."""
 ROUND = {"showMinLabel": False, "showMaxLabel": False, "color": GREY}
-"""No labels at the ends of an axis: they would be written over the round numbers beside them."""
+"""No labels at the ends of an axis: they would be written over the round numbers next to them."""
 APART = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
 """Separates thousands, as everywhere on the page."""
 TOOLTIP = """seen => {
@@ -45,7 +45,7 @@ TOOLS: dict[str, Any] = {
         "saveAsImage": {"title": "Save as PNG", "pixelRatio": 2},
     },
 }
-"""What every chart offers beside the wheel with Ctrl, two fingers, and dragging."""
+"""Controls of every chart in addition to the wheel with Ctrl, two fingers, and dragging."""
 INSIDE = {"type": "inside", "zoomOnMouseWheel": "ctrl", "preventDefaultMouseMove": False}
 
 
@@ -55,7 +55,7 @@ def options(name: str, unit: str, *, small: bool = False) -> dict[str, Any]:
     Parameters
     ----------
     name, unit : str
-        What it shows, for the name of the picture that is saved; and in what.
+        Quantity shown, for the name of the picture that is saved; and in what.
     small : bool
         One of many, without a slider.
     """
@@ -124,7 +124,7 @@ def axis_range(points: Sequence[Point]) -> dict[str, float]:
     within = inner[0] - room, inner[-1] + room
     low = max(within[0], min(point.low for point in points))
     high = min(within[1], max(point.high for point in points))
-    if high - low < LEAST * abs(low):  # what does not change is no mountain range
+    if high - low < LEAST * abs(low):  # a constant is not magnified
         low, high = within
     step = 10.0 ** floor(log10(max(high - low, 1e-6)) - 0.5)
     return {"min": floor(low / step) * step, "max": ceil(high / step) * step}

@@ -1,4 +1,4 @@
-"""All vehicles that a ground station hears, each with its own state."""
+"""All vehicles that a ground station receives, each with its own state."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ BRIDGES = {spec(name).id for name in ("MAG_RAW", "MAG_FIELD", "MAG_STATUS")}
 MOST, AWAY = 8, 30.0
 """Bridges that are kept at most, and s of silence after which one makes room for another."""
 CHECK = 0.5
-"""s between looks at what is wrong."""
+"""s between checks for faults."""
 
 
 class Fleet:
-    """The bridges heard, and what is to be sent to them.
+    """The bridges received, and the data to send to them.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Fleet:
         self._beat = self._checked = -inf
 
     def receive(self, message: Message, now: float) -> None:
-        """Take a message that came at `now`, s of a clock that nobody sets."""
+        """Take a message that came at `now`, s of a monotonic clock."""
         if not message.known:
             return
         sender = message.system, message.component
@@ -48,7 +48,7 @@ class Fleet:
                 state.receive_other(message, now)
 
     def _room(self, now: float) -> bool:
-        """Make room for one more bridge; False where all that are known still speak."""
+        """Make room for one more bridge; False where all known ones still send."""
         if len(self.states) < MOST:
             return True
         silent, state = min(self.states.items(), key=lambda item: item[1].received_at)

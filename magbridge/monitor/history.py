@@ -1,4 +1,4 @@
-"""What was measured, over minutes and over a day, in memory that does not grow.
+"""Measurements, over minutes and over a day, in memory that does not grow.
 
 A series is kept at several resolutions at once: each *tier* covers a window with points of one width, and
 each point keeps the outline of what fell into it, so that a spike of one sample is still there a day later.
@@ -16,9 +16,9 @@ __all__ = ["LARGEST", "TIERS", "Point", "Series", "TrackPoint", "Trail"]
 TIERS = {"10 min": (600.0, 1.0), "2 h": (7_200.0, 10.0), "24 h": (86_400.0, 120.0)}
 """Window and width of a point, in s, by the name that the page gives the window."""
 LARGEST = 1e12
-"""What is larger is kept as this: no field, and no sum of them overflows."""
+"""Larger values are kept as this: no field, and no sum of them overflows."""
 LAST_YEAR = 4.1e9
-"""s since 1970: a later time (in 2100) is no time."""
+"""s since 1970: a later time (in 2100) is invalid."""
 TRAIL = 2000
 """Places that a trail keeps at most."""
 
@@ -65,9 +65,9 @@ class Series:
         }
 
     def add(self, time: float, value: float, two_sigma: float = 0.0) -> None:
-        """Add a value at `time`, s since 1970, with its 2-sigma; what is no number or no time is passed over.
+        """Add a value at `time`, s since 1970, with its 2-sigma; invalid numbers and times are ignored.
 
-        Where the clock was set back, what it had counted beyond is dropped.
+        Where the clock was set back, later times are dropped.
         """
         if not (isfinite(value + two_sigma) and 0.0 <= time < LAST_YEAR):
             return
@@ -107,7 +107,7 @@ class Trail:
         self.added = 0
 
     def add(self, place: TrackPoint) -> None:
-        """Add a place; what is on no Earth is passed over."""
+        """Add a place; invalid places are ignored."""
         if not (abs(place.latitude) <= 90.0 and abs(place.longitude) <= 180.0):
             return
         self.latest, self.added = place, self.added + 1

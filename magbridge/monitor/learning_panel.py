@@ -1,4 +1,4 @@
-"""The panel of what a bridge learns: two predictions, its doubts, and buttons to accept and forget."""
+"""The panel of what a bridge learns: two predictions, its alarms, and buttons to accept and forget."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ ASLEEP = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def now() -> float:
-    """Return s of a clock that nobody sets."""
+    """Return s of a monotonic clock."""
     return time.monotonic() if ASLEEP is None else time.clock_gettime(ASLEEP)
 
 
@@ -29,7 +29,7 @@ class StationLink:
     ----------
     port : Port
     key : bytes or None
-        32 bytes: what is sent is signed, and what is not signed with it is refused.
+        32 bytes: sent frames are signed, and frames not signed with it are refused.
 
     Attributes
     ----------

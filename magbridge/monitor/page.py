@@ -1,4 +1,4 @@
-"""The page itself: its frame, which vehicle it shows, and when it is drawn anew."""
+"""The page itself: its frame, which vehicle it shows, and when it is drawn again."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["Page"]
 
 SCRIPT = files("magbridge.monitor").joinpath("page.js").read_text(encoding="utf-8")
 PERIOD = 0.5
-"""s between two looks at what was heard."""
+"""s between two checks of received data."""
 BUTTON = "flat dense no-caps color=white size=md padding='4px 10px'"
 
 Bridge = tuple[int, int]
@@ -64,7 +64,7 @@ class Page:
             )
 
     def _choose(self, bridge: Bridge | None) -> None:
-        """Show another vehicle: everything is made anew."""
+        """Show another vehicle: everything is made again."""
         self._bridge = bridge
         self._state = self._station.fleet.states.get(bridge) or State() if bridge else State()
         moment, state = now(), self._state
@@ -113,7 +113,7 @@ class Page:
         self._track.show(state)
 
     def _offer(self, bridges: list[Bridge]) -> None:
-        """Offer the vehicles where there are several, with the number of alarms that nobody has seen."""
+        """Offer the vehicles where there are several, with the number of unseen alarms."""
         states = self._station.fleet.states
         unseen = [states[bridge].alarms.unseen for bridge in bridges]
         if (
@@ -156,7 +156,7 @@ class Page:
         return f"magbridge{vehicle}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
 
     def _snapshot(self) -> None:
-        """Have the browser draw one PNG of what it shows."""
+        """Have the browser draw one PNG of all charts."""
         with self._station.lock:
             figures = [f"{name}: {' '.join(texts)} nT" for name, texts in measured(self._state).items()]
             flags = ", ".join(self._state.flags) or "none"

@@ -1,10 +1,10 @@
 """Who may see the page, and set parameters from it: a guard before every request and every websocket.
 
-A page on a loopback address is reached by whoever sits at the computer, but also by any website that they
+A page on a loopback address is reached by users of the computer, but also by any website that they
 have open: it can send requests to ``localhost``, open a websocket to it (which no browser forbids), show the
 page in a frame, or have its own name resolve to 127.0.0.1 (DNS rebinding). The ``Host`` that a browser asks
-for and the ``Origin`` that asks tell these apart. On any other address, everybody in the network comes that
-far, so there a token is required as well.
+for and the ``Origin`` of a request distinguishes these. On any other address, everybody in the network
+comes that far, so there a token is required as well.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""With every answer: nothing from elsewhere is loaded, and nobody frames the page."""
+"""With every answer: nothing from elsewhere is loaded, and no site frames the page."""
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 LONGEST = 4096
 """Characters of a cookie header that are looked at."""
 
 
 def is_loopback(host: str) -> bool:
-    """Say whether an address to serve at is reached from this computer alone."""
+    """Return True if an address to serve at is reached from this computer alone."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -130,7 +130,7 @@ class Guard:
         return None
 
     def _ours(self, host: str) -> bool:
-        """Say whether a Host header names this page."""
+        """Return True if a Host header names this page."""
         parts = _parts(f"//{host}")
         if parts is None:
             return False

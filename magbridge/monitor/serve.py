@@ -42,7 +42,7 @@ def serve(
     host, port
         Where to serve the page.
     key : bytes, optional
-        32 bytes: sign, and refuse what is not signed.
+        32 bytes: sign, and refuse unsigned frames.
     grid : path, optional
         An anomaly grid to be shown beneath the track.
     show : bool
@@ -51,7 +51,7 @@ def serve(
     Raises
     ------
     ConfigError, PortError
-        `link` is no address, or it or the page's own port cannot be opened.
+        `link` is not an address, or it or the page's own port cannot be opened.
     FormatError
         `grid` is none.
     """

@@ -25,11 +25,11 @@ SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
 """States of the position filter in which it says where the vehicle is."""
 ORDERS = {"MB_LEARN_CMD"}
-"""Parameters that go back to 0 once what was asked is done."""
+"""Parameters that go back to 0 once the request is done."""
 FIX_2D = 2
 """GPS_FIX_TYPE from which a receiver knows its place."""
 TEMPERATURE = "Temperature, °C"
-"""The series of the fluxgate's temperature, beside those of the telemetry."""
+"""The series of the fluxgate's temperature, in addition to the telemetry."""
 
 
 class Text(NamedTuple):
@@ -54,7 +54,7 @@ class Parameter:
 class State:
     """All that a page shows of one bridge.
 
-    Times are the receiver's, s of a clock that nobody sets.
+    Times are the receiver's, s of a monotonic clock.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ class State:
             self.parameters.clear()
             self.learning = {}
             self._count = 0
-            self.lost = self._lost_before  # its sequence numbers began anew
+            self.lost = self._lost_before  # its sequence numbers restarted
         self._lost_before = self.lost
 
     def _navigation(self, message: Message, now: float) -> None:

@@ -23,9 +23,9 @@ ASPECT = 4.0 / 3.0
 LEAST = 200.0
 """m across that the map shows at least."""
 PIXELS = 600
-"""Of the picture of a grid along its longer side, at most."""
+"""Pixels of the picture of a grid along its longer side, at most."""
 SIDES = 48
-"""Of the polygon that is drawn for an ellipse."""
+"""Corners of the polygon that is drawn for an ellipse."""
 PICTURE = """(params, api) => {
     const a = api.coord([api.value(0), api.value(3)]), b = api.coord([api.value(2), api.value(1)])
     return {type: 'image', silent: true, style: {image: magbridge.map, x: a[0], y: a[1],
@@ -48,7 +48,7 @@ class Background:
 def read_background(path: Path) -> Background:
     """Return the anomaly grid of a file as a picture.
 
-    FormatError: it is no grid. MissingExtra: the analysis extra is not installed.
+    FormatError: it is not a grid. MissingExtra: the analysis extra is not installed.
     """
     try:
         import numpy as np  # noqa: PLC0415 - most pages show no grid

@@ -17,14 +17,14 @@ __all__ = [
 ]  # fmt: skip
 
 STYLE = """
-:root, .q-header {--ink: #1e293b; --good: #15803d; --doubt: #b45309; --bad: #b91c1c; --faded: #64748b}
-body.body--dark {--ink: #e2e8f0; --good: #4ade80; --doubt: #fbbf24; --bad: #f87171; --faded: #94a3b8}
+:root, .q-header {--ink: #1e293b; --good: #15803d; --suspect: #b45309; --bad: #b91c1c; --faded: #64748b}
+body.body--dark {--ink: #e2e8f0; --good: #4ade80; --suspect: #fbbf24; --bad: #f87171; --faded: #94a3b8}
 body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
 [data-chart]:focus-visible {outline: 2px solid #3b82f6; outline-offset: 2px; border-radius: 4px}
 .q-header .q-btn, .q-header .q-toggle {color: white}
 """
 """Colours by day and, where the browser asks for it, by night; the header is the same at both."""
-INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--doubt)", "var(--bad)"
+INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--suspect)", "var(--bad)"
 FADED = "var(--faded)"
 """Of figures that are not the present ones, which are also slanted; they stay legible."""
 MUTED = "text-slate-600 dark:text-slate-400"
@@ -32,7 +32,7 @@ GRID = "w-full grid gap-4 grid-cols-1"
 
 
 class Changes:
-    """What one browser was shown, so that only what is new is sent to it."""
+    """What one browser was shown, so that only new data are sent to it."""
 
     def __init__(self) -> None:
         self._shown: dict[str, Any] = {}
@@ -52,7 +52,7 @@ class Changes:
 
 @contextmanager
 def card(title: str) -> Iterator[ui.card]:
-    """Make a card under a heading; what is made within is in it."""
+    """Make a card under a heading; elements made within are in it."""
     with ui.card().classes("w-full gap-2 p-4 shadow-sm rounded-lg dark:bg-slate-800") as made:
         ui.label(title).classes(f"text-sm font-semibold {MUTED}").props("role=heading aria-level=2")
         yield made
@@ -71,7 +71,7 @@ def slanted(old: bool) -> str:
 
 
 def nothing(text: str = "None yet") -> ui.label:
-    """Say that there is nothing to show."""
+    """Show a placeholder for missing data."""
     return ui.label(text).classes(f"text-sm {MUTED}")
 
 

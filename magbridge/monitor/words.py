@@ -35,13 +35,13 @@ FLAGS = {
     "unexplained": "The calibration no longer explains the field",
 }
 ROUTINE = {"moving", "no_boresight", "late_join"}
-"""Flags that come and go, or stay, in a mission where nothing is wrong: they are shown, and alarm nobody."""
+"""Flags that come and go, or stay, in a mission without faults: they are shown, and raise no alarm."""
 STARTING = 15.0
 """s after its first message in which a bridge may still be waiting for its sensor and its autopilot."""
 LAST = 4_102_444_800
-"""s since 1970: no bridge began to doubt after 2099."""
+"""s since 1970: no alarm began after 2099."""
 HUGE = 1e9
-"""No figure of the page is as large: what is, is written with its power of ten."""
+"""No figure of the page is as large: larger ones are written with a power of ten."""
 LOSSES = {
     "Samples lost at the sensor": "samples_lost",
     "Bad frames from the sensor": "sensor_frames_bad",
@@ -60,7 +60,7 @@ def ago(seconds: float) -> str:
 
 
 def silence(state: State, now: float) -> str:
-    """Return what is wrong with the stream; an empty text while messages, field and status come."""
+    """Return the fault of the stream; an empty text while messages, field and status come."""
     if _late(state.received_at, 0.0, now):
         return _unheard("nothing", state.received_at, now)
     missing = []
@@ -72,7 +72,7 @@ def silence(state: State, now: float) -> str:
 
 
 def _late(when: float, interval: float, now: float) -> bool:
-    """Say whether more than a message or two of such an interval (s) have not come."""
+    """Return True if more than a message or two of such an interval (s) have not come."""
     return now - when > max(SILENT, min(3 * interval, SLOW))
 
 

@@ -1,8 +1,8 @@
 """Emulated instruments: the inverse of each driver, in the instrument's own bytes.
 
 An encoder quantises and saturates as the instrument does, counts its readings, and answers what the driver
-sends, so that a program behind a pty cannot tell it from the real one. Other packages add theirs by an entry
-point in the group ``magbridge.encoders``: the driver's name, and a class like :class:`Encoder`.
+sends, so that a program behind a pty cannot distinguish it from the real one. Other packages add theirs by
+an entry point in the group ``magbridge.encoders``: the driver's name, and a class like :class:`Encoder`.
 """
 
 from __future__ import annotations

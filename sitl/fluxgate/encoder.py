@@ -52,7 +52,7 @@ class Encoder(ABC):
         """
 
     def feed(self, data: bytes) -> bytes:  # noqa: ARG002 - most do not listen
-        """Take bytes that were sent to the instrument; return its answers."""
+        """Receive bytes that were sent to the instrument; return its answers."""
         return b""
 
 

@@ -31,7 +31,7 @@ def heat_scale(scene: Scene, size: float, rng: Generator) -> None:
 
 
 def jump(scene: Scene, size: float, rng: Generator) -> None:
-    """A shock: the offset jumps and settles within a minute; size in nT."""
+    """A shock: the offset jumps and relaxes within a minute; amplitude in nT."""
     t0 = rng.uniform(0.15, 0.85) * scene.t[-1]
     settled = np.where(scene.t > t0, 1.0 - 0.15 * np.exp(-np.maximum(scene.t - t0, 0.0) / 20.0), 0.0)
     vector = size * direction(rng)

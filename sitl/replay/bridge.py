@@ -53,7 +53,7 @@ class ScriptedEdge:
         self.flush()
 
     def _wait_for_times(self) -> bytes:
-        self.flush()  # in a paced replay, what was published must be seen before the next event
+        self.flush()  # in a paced replay, published messages must be seen before the next event
         return os.read(self._timetable, 65536)
 
     def _read(self, channel: Channel, size: int) -> bytes:

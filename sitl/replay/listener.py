@@ -24,7 +24,7 @@ COLUMNS = {
     "field_z": "z",
     "quality": "flags",
 }
-"""What is kept of every MAG_FIELD, by the message's names."""
+"""Values kept of every MAG_FIELD, by the message's names."""
 
 
 class Listener:
@@ -54,7 +54,7 @@ class Listener:
         return {spec(number).name: count for number, count in self._counts.items()}
 
     def receive(self, data: bytes) -> None:
-        """Take bytes as they come."""
+        """Receive bytes in any pieces."""
         for message in self._codec.parse(data):
             self._counts[message.id] += 1
             if message.id == FIELD.id:

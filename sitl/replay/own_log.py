@@ -53,13 +53,13 @@ class Recorded:
     start : Start
         What the run started from.
     late : float
-        s of the run before the log begins; above 0 if the log was begun anew after a loss. The bridge's
+        s of the run before the log begins; above 0 if the log was restarted after a loss. The bridge's
         state at that time is not in the log, so the replay starts without it, at a multiple of the time
         synchronisation's interval: its requests to the autopilot are then those that the log answers.
     config_digest : str
         Digest of the configuration that it ran with.
     published : bytearray
-        What it published, as far as :meth:`events` has been read.
+        Bytes that it published, as far as :meth:`events` has been read.
 
     Raises
     ------

@@ -46,7 +46,7 @@ def replay(
     ----------
     files : sequence of path
         A bridge's own log (all its files, in order), which is published again bit for bit; or any other logs,
-        whose magnetometer and telemetry two emulated devices speak.
+        whose magnetometer and telemetry two emulated devices send.
     config : path, optional
         The ``bridge.toml``; without one, a nominal calibration is fitted on all but the last file.
     speed : float
@@ -87,7 +87,7 @@ def replay(
 
 
 def _republished(files: Sequence[Path], config: Path, speed: float, log: Path | None) -> Result:
-    """Replay a bridge's own log, and compare what is published now with what was published then."""
+    """Replay a bridge's own log, and compare the output with the logged output."""
     recorded = Recorded(files)
     published = bytearray()
     stage = Stage(config, published.extend, log)
@@ -143,7 +143,7 @@ def _first_difference(one: bytearray, other: bytearray) -> int | None:
 def _play(
     deployment: xr.Dataset, config: Path, parts: Sequence[Part], speed: float, log: Path | None
 ) -> Result:
-    """Replay a deployment that two emulated devices speak, and compare the field with the reference."""
+    """Replay a deployment that two emulated devices send, and compare the field with the reference."""
     if deployment.sizes["time"] < 2:
         raise DataError(f"{deployment.attrs['source']}: one row: at least 2 needed")
     listener = Listener()

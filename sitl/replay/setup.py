@@ -66,7 +66,7 @@ def prepare(files: Sequence[Path], folder: Path, options: Options) -> ReplaySetu
     Raises
     ------
     FormatError
-        A file cannot be read, or holds neither a magnetic field nor what is needed to simulate one.
+        A file cannot be read, or holds neither a magnetic field nor the columns to simulate one.
     """
     deployment = read(files, options=options)
     simulated = not set(CHANNELS) <= set(deployment)
@@ -94,7 +94,7 @@ def _parts(files: Sequence[Path], deployment: xr.Dataset, options: Options) -> l
     few = deployment.sizes["time"] / len(stems) / 10
     for stem in stems:
         own = read([file for file in files if file.stem == stem], options=options)["time"].to_numpy()
-        if spans and len(own) < few:  # a few rows at the surface are no part of their own
+        if spans and len(own) < few:  # a few rows at the surface are not a part of their own
             spans[-1] = spans[-1]._replace(end=float(own[-1]))
         else:
             spans.append(Part(stem, float(own[0]), float(own[-1])))

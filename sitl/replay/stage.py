@@ -1,6 +1,6 @@
-"""The stage of a replay: a pty and a socket, and the two devices that speak on them.
+"""The stage of a replay: a pty and a socket, and the two devices that use them.
 
-An emulated fluxgate speaks its real protocol into a pty, an emulated autopilot speaks MAVLink on a real
+An emulated fluxgate sends its real protocol into a pty, an emulated autopilot sends MAVLink on a real
 socket. Between them stands the bridge, unmodified, in a process of its own.
 """
 
@@ -57,7 +57,7 @@ class Stage:
             opened.callback(os.close, self._master)
             opened.callback(os.close, slave)
             os.set_blocking(self._master, False)
-            # what is written before the bridge opens it must not be edited as a terminal would
+            # bytes written before the bridge opens it must not be edited as a terminal would
             tty.setraw(slave)
             times_out, times = os.pipe()
             command = [
@@ -119,7 +119,7 @@ class Stage:
         start : Start
             The bridge's own.
         events : iterable of Event
-            What came from sensor and link, in order of time.
+            Input from sensor and link, in order of time.
         speed : float
             How many times faster than they happened.
 
@@ -158,7 +158,7 @@ class Stage:
         self._flush()
 
     def _flush(self) -> None:
-        """Write what is due: the timetable first, by which the bridge reads what is more than a pty holds.
+        """Write the due bytes: the timetable first, by which the bridge reads more than a pty holds.
 
         The sensor's bytes come last, so that the bridge never waits for the link's while the pty is full.
         """

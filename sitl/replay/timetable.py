@@ -1,7 +1,7 @@
 """The timetable of a replay: which bytes came through the pty and the socket, and when.
 
 The bytes themselves go through the pty and the socket, as real devices would send them. *When* they came
-cannot: a pty keeps no time. So the times go beside them, through a pipe, as the timetable: one entry per
+cannot: a pty keeps no time. So the times go separately, through a pipe, as the timetable: one entry per
 event, which channel, how many bytes, at what time. The bridge under replay reads its ports in that order and
 takes those times for its clock; everything behind its ports is the same code as at sea.
 """

@@ -167,7 +167,7 @@ def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.
     reported = capsys.readouterr().out.splitlines()
     assert reported[0] == "comet: 5 deployments, 1 change"
     assert "d4 (refit spring): hard iron, y moved by +" in reported[1]
-    assert reported[1].endswith("iron that was magnetised, fitted or taken off, and no refit is on record")
+    assert reported[1].endswith("iron that was magnetised, fitted or removed, and no refit is on record")
     pages = tmp_path / "pages"
     assert main(["fleet", "show", "--catalogue", place, "--html", str(pages)]) == 0
     assert {path.name for path in pages.iterdir()} == {"index.html", "comet.html", "fleet.json"}
