@@ -9,8 +9,6 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from magbridge.errors import FormatError
 
 if TYPE_CHECKING:
@@ -146,6 +144,8 @@ def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
 
     Times that are neither numbers nor datetime64 are a :class:`~magbridge.errors.FormatError`.
     """
+    import numpy as np  # noqa: PLC0415 - drivers need the units without numpy
+
     if "time" not in deployment.coords and "time" in deployment:
         deployment = deployment.set_coords("time")
     times = {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
@@ -171,6 +171,8 @@ def decoded(deployment: xr.Dataset) -> xr.Dataset:
 
     Times that count from a boot are counted from 1970.
     """
+    import numpy as np  # noqa: PLC0415 - drivers need the units without numpy
+
     for name in ("time", *CHANNEL_TIMES):
         if name in deployment.variables and deployment[name].dtype.kind != "M":
             time = deployment[name]

@@ -26,7 +26,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     and `path` is as it was. The partial file of a process that was killed is removed at the next write. The
     suffix is kept, because some writers choose the format by it.
 
-    WriteError: the operating system does not let the file be written: no folder, no permission, no room.
+    WriteError: the operating system does not let the file be written: no folder, no permission, a full disk.
     """
     target = Path(path)
     temporary = target.with_name(f".{target.stem}.{os.getpid()}.partial{target.suffix}")

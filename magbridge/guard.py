@@ -46,7 +46,7 @@ WAIT = 10.0
 
 
 class Raised(NamedTuple):
-    """An error on its way to the parent: what makes it anew, from what."""
+    """An error on its way to the parent: what builds it again, from what."""
 
     rebuild: Callable[..., BaseException]
     arguments: tuple[Any, ...]
@@ -86,7 +86,7 @@ def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     Raises
     ------
     FormatError
-        The file makes its reader fail in a way that nobody foresaw, crash, need more than 8 s of processor
+        The file makes its reader fail in an unexpected way, crash, need more than 8 s of processor
         time and 0.2 s a MB, or more than 500 MB of memory and 50 times its size.
     MagbridgeError, OSError
         As `read` raises them.
@@ -196,7 +196,7 @@ def _end(process: BaseProcess, pieces: Connection) -> None:
 
 
 def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
-    """Yield what ``read()`` yields; what nobody foresaw that it might raise becomes a FormatError."""
+    """Yield what ``read()`` yields; any unexpected exception becomes a FormatError."""
     try:
         yield from read()
     except (MagbridgeError, OSError):

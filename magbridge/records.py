@@ -1,4 +1,4 @@
-"""The records that rooms hand to each other, and the flags that go with a corrected sample.
+"""The records that packages pass to each other, and the flags that go with a corrected sample.
 
 Units and frames as everywhere: fields in nT, sensor axes x forward, y starboard, z down.
 """
@@ -16,7 +16,7 @@ __all__ = ["BEYOND", "MAX_DEVICE_TIME_S", "Channel", "Corrected", "Quality", "Re
 Vector = tuple[float, float, float]
 
 BEYOND: Final = 1e9
-"""nT (1 T): a field or a sigma above it is no measurement, but garbage that happens to be a number."""
+"""nT (1 T): a field or a sigma above it is not a measurement, but garbage that happens to be a number."""
 MAX_DEVICE_TIME_S: Final = 1e11
 """s: no instrument counts more than 3,000 years; such a time is an error of transmission."""
 

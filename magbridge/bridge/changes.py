@@ -8,7 +8,7 @@ from magbridge.link.output import Announcer
 from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.enums import MAG_LOG_STATE, MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
 
-__all__ = ["Changes"]
+__all__ = ["StateChanges"]
 
 INTERLEAVED = spec("MAG_INTERLEAVED").id
 CLOCK_STEP, NOTICE, PORT, STANDSTILL = (
@@ -20,7 +20,7 @@ NOTICE_US = 1_000_000
 """µs from which on a standstill is announced."""
 
 
-class Changes:
+class StateChanges:
     """Takes note of the changes that the frames of :mod:`.states` report, and announces them.
 
     Parameters

@@ -26,14 +26,14 @@ from magbridge.mavlink import load_key
 from magbridge.sensors import open_driver
 from magbridge.toml import convert, load_toml
 
-__all__ = ["Finding", "access", "findings"]
+__all__ = ["ConfigFault", "access", "findings"]
 
 CALIBRATIONS = ("calibration.file", "learning.prior")
 ROOM = 100e6
 """Bytes that a log's disk should have."""
 
 
-class Finding(NamedTuple):
+class ConfigFault(NamedTuple):
     """Something that would go wrong."""
 
     fatal: bool
@@ -42,7 +42,7 @@ class Finding(NamedTuple):
     """One line with the file, the key, and what was expected."""
 
 
-def findings(path: Path) -> list[Finding]:
+def findings(path: Path) -> list[ConfigFault]:
     """Return all that would go wrong with a configuration; nothing is opened but the files that it names.
 
     Parameters
@@ -53,10 +53,11 @@ def findings(path: Path) -> list[Finding]:
     try:
         table = load_toml(path)
     except ConfigError as error:
-        return [Finding(fatal=True, text=str(error))]
+        return [ConfigFault(fatal=True, text=str(error))]
     left = deepcopy(table)
     found = [
-        Finding(fatal=True, text=str(error)) for error in _errors(left, lambda: convert(left, Config, path))
+        ConfigFault(fatal=True, text=str(error))
+        for error in _errors(left, lambda: convert(left, Config, path))
     ]
     try:
         config = msgspec.structs.replace(convert(left, Config, path), path=path)
@@ -68,7 +69,7 @@ def findings(path: Path) -> list[Finding]:
         load(path)
     except ConfigError as error:
         if not any(one.fatal for one in found):
-            found.append(Finding(fatal=True, text=str(error)))
+            found.append(ConfigFault(fatal=True, text=str(error)))
     return found
 
 
@@ -92,7 +93,7 @@ def _without(table: dict[str, Any], key: str) -> bool:
     return table.pop(first, None) is not None
 
 
-def _contents(config: Config) -> Iterator[Finding]:
+def _contents(config: Config) -> Iterator[ConfigFault]:
     """Yield what is wrong with what the keys say, each looked at on its own."""
     path = config.path
     yield from _files(config)
@@ -102,7 +103,7 @@ def _contents(config: Config) -> Iterator[Finding]:
         try:
             calibration = first_calibration(config)
         except MagbridgeError as error:
-            yield Finding(fatal=True, text=str(error))
+            yield ConfigFault(fatal=True, text=str(error))
     yield from _driver(config)
     yield from _tried(
         lambda: serial_line(config.sensor.port, config.sensor.baudrate, str(path), "sensor.port")
@@ -126,38 +127,40 @@ def _contents(config: Config) -> Iterator[Finding]:
     yield from _log(config)
 
 
-def _files(config: Config) -> Iterator[Finding]:
+def _files(config: Config) -> Iterator[ConfigFault]:
     """Yield each file that the configuration names and that is not there."""
     for key, name in config.files.items():
         if name is not None and not (file := config.resolve(name)).exists():
-            yield Finding(fatal=True, text=str(ConfigError(config.path, key, f"no such file: {file}")))
+            yield ConfigFault(fatal=True, text=str(ConfigError(config.path, key, f"no such file: {file}")))
 
 
-def _driver(config: Config) -> Iterator[Finding]:
+def _driver(config: Config) -> Iterator[ConfigFault]:
     """Yield what is wrong with the driver and its options."""
     options, sensor = deepcopy(config.sensor.options), config.sensor.driver
     left = {"sensor": {"options": options}}
     for error in _errors(left, lambda: open_driver(sensor, options, config.path)):
-        yield Finding(fatal=True, text=str(error))
+        yield ConfigFault(fatal=True, text=str(error))
 
 
-def _tried(attempt: Callable[[], object]) -> Iterator[Finding]:
+def _tried(attempt: Callable[[], object]) -> Iterator[ConfigFault]:
     try:
         attempt()
     except MagbridgeError as error:
-        yield Finding(fatal=True, text=str(error))
+        yield ConfigFault(fatal=True, text=str(error))
 
 
-def _device(config: Config, key: str, name: str) -> Iterator[Finding]:
+def _device(config: Config, key: str, name: str) -> Iterator[ConfigFault]:
     """Yield why a serial device could not be opened now."""
     if "://" in name or not name.startswith("/"):
         return
     there = sorted(glob.glob(name))  # noqa: PTH207 - it may be absolute, which pathlib does not glob
     if not there:
-        yield Finding(fatal=False, text=f"{config.path}: {key}: no {name} now: the bridge would wait for it")
+        yield ConfigFault(
+            fatal=False, text=f"{config.path}: {key}: no {name} now: the bridge would wait for it"
+        )
     for device in there:
         if reason := access(device):
-            yield Finding(fatal=False, text=f"{config.path}: {key}: {reason}")
+            yield ConfigFault(fatal=False, text=f"{config.path}: {key}: {reason}")
 
 
 def access(device: str) -> str:
@@ -180,22 +183,22 @@ def _group(device: str) -> str:
         return ""
 
 
-def _parameters(config: Config, calibration: Calibration) -> Iterator[Finding]:
+def _parameters(config: Config, calibration: Calibration) -> Iterator[ConfigFault]:
     """Yield each parameter that the calibration needs and the link would not provide."""
     if not calibration.sensor.may_be(config.sensor.driver):
         text = (
             f"{config.path}: sensor.driver: the calibration is of {calibration.sensor.name!r}: every sample "
         )
-        yield Finding(fatal=False, text=text + "would be uncalibrated")
+        yield ConfigFault(fatal=False, text=text + "would be uncalibrated")
         return
     for error in unmet(calibration, config):
-        yield Finding(fatal=True, text=str(error))
+        yield ConfigFault(fatal=True, text=str(error))
     key = "calibration.file" if config.calibration else "learning.prior"
     for doubt in calibration.warnings:
-        yield Finding(fatal=False, text=f"{config.path}: {key}: {doubt}")
+        yield ConfigFault(fatal=False, text=f"{config.path}: {key}: {doubt}")
 
 
-def _map(config: Config, calibration: Calibration | None) -> Iterator[Finding]:
+def _map(config: Config, calibration: Calibration | None) -> Iterator[ConfigFault]:
     from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
 
     assert config.navigation is not None
@@ -203,12 +206,12 @@ def _map(config: Config, calibration: Calibration | None) -> Iterator[Finding]:
         open_navigation(config, config.navigation, calibration)
     except MagbridgeError as error:
         if isinstance(error, ConfigError) or config.resolve(config.navigation.map).exists():
-            yield Finding(fatal=True, text=str(error))
+            yield ConfigFault(fatal=True, text=str(error))
 
 
-def _log(config: Config) -> Iterator[Finding]:
+def _log(config: Config) -> Iterator[ConfigFault]:
     if config.log is None:
-        yield Finding(
+        yield ConfigFault(
             fatal=False, text=f"{config.path}: log: none is kept: nothing can be replayed or calibrated"
         )
         return
@@ -216,8 +219,8 @@ def _log(config: Config) -> Iterator[Finding]:
     there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
     key = f"{config.path}: log.directory"
     if not there.is_dir():
-        yield Finding(fatal=False, text=f"{key}: {there} is a file")
+        yield ConfigFault(fatal=False, text=f"{key}: {there} is a file")
     elif not os.access(there, os.W_OK):
-        yield Finding(fatal=False, text=f"{key}: {there} cannot be written to")
+        yield ConfigFault(fatal=False, text=f"{key}: {there} cannot be written to")
     elif (free := shutil.disk_usage(there).free) < ROOM:
-        yield Finding(fatal=False, text=f"{key}: {free / 1e6:.0f} MB are free")
+        yield ConfigFault(fatal=False, text=f"{key}: {free / 1e6:.0f} MB are free")

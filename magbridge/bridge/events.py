@@ -9,7 +9,7 @@ import msgspec
 from magbridge.mavlink import Stream
 from magbridge.records import Channel
 
-__all__ = ["Clock", "Event", "Start"]
+__all__ = ["Event", "HostClock", "Start"]
 
 
 class Start(msgspec.Struct, frozen=True):
@@ -36,7 +36,7 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     data: bytes
 
 
-class Clock:
+class HostClock:
     """The bridge's only clock: begins at the host's UTC and then follows the host's monotonic clock.
 
     A step of the host's UTC does not change it but is reported separately (:meth:`step_us`), so that no

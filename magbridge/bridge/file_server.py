@@ -1,4 +1,4 @@
-"""Files for stations, read by a thread of its own and sent beside what the bridge measures.
+"""Files for stations, read by a thread of its own and sent between the bridge's measurements.
 
 The live thread hands on requests and takes replies, a few messages at a time; it never waits for the disk.
 Replies are not in the log, which would grow by what is read of it: it gets their number, so that a replay

@@ -19,7 +19,7 @@ NEEDED = "FILL IN"
 
 @dataclass(frozen=True)
 class Answers:
-    """What a vehicle's bridge must be told."""
+    """The settings of a vehicle's bridge that have no default."""
 
     driver: str
     port: str

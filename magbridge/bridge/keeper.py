@@ -32,13 +32,13 @@ class Keeper:
 
     def __init__(self, config: Config) -> None:
         self._notify: Callable[[bytes], None] = lambda _: None
-        # named after the configuration: there may be another bridge's beside it
+        # named after the configuration: the folder may hold another bridge's file
         self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
         self._spoilt = False
         try:
             self._kept = store.load(self._path)
         except (FormatError, OSError):  # no reason to keep a vehicle ashore
-            self._kept, self._spoilt = store.Kept(), True
+            self._kept, self._spoilt = store.StoredState(), True
         self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
         self._saved_us = self._retry_us = self._revision = 0
         self._learned = kept_path(config)
@@ -78,10 +78,10 @@ class Keeper:
 
         At the `last` saving of a run, no stamp need be reserved for what it will yet send.
         """
-        kept = store.Kept(pipeline.component.parameters.changed())
+        kept = store.StoredState(pipeline.component.parameters.changed())
         if signing := pipeline.signing:
             stamp = signing.last if last else signing.reserved(pipeline.component.codec.utc_us, self.AHEAD)
-            kept = store.Kept(kept.parameters, stamp, signing.streams)
+            kept = store.StoredState(kept.parameters, stamp, signing.streams)
         if kept == self._kept:
             return True
         try:

@@ -29,7 +29,7 @@ KEEP_US = 600_000_000
 def first_calibration(config: Config) -> Calibration | None:
     """Return the calibration that a bridge begins with, or what ``[learning]`` expects; None without either.
 
-    FormatError, CalibrationError: a file is no calibration.
+    FormatError, CalibrationError: a file is not a calibration.
     """
     settings = config.learning
     if config.calibration is not None:
@@ -65,7 +65,7 @@ def open_learner(
     ConfigError
         The calibration is none that can be learned.
     FormatError, OutOfRange
-        ``learning.reference`` is no grid.
+        ``learning.reference`` is not a grid.
     """
     if currents is None:
         currents = tuple(name for name, one in config.telemetry.items() if one.unit == "A")

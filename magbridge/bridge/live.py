@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 
 from magbridge.bridge import states
-from magbridge.bridge.events import Clock, Event
+from magbridge.bridge.events import Event, HostClock
 from magbridge.bridge.port import Port
 from magbridge.errors import PortError
 from magbridge.records import Channel
@@ -42,10 +42,10 @@ class LiveEdge:
     ----------
     ports : dict of Channel to Port
         The sensor's and the link's; opened here, in their order.
-    clock : Clock
+    clock : HostClock
     """
 
-    def __init__(self, ports: dict[Channel, Port], clock: Clock) -> None:
+    def __init__(self, ports: dict[Channel, Port], clock: HostClock) -> None:
         self._ports = ports
         self._clock = clock
         self._changes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -107,7 +107,7 @@ class LiveEdge:
     def send(self, channel: Channel, data: bytes) -> None:
         """Send to a port; while the port is down, data are dropped and counted."""
         port = self._ports[channel]
-        if not port.up:
+        if not port.is_open:
             port.dropped += len(data)
             return
         try:
@@ -119,7 +119,7 @@ class LiveEdge:
         """Send over the link what only one system and component wants."""
         link = self._ports[Channel.LINK]
         try:
-            if link.up:
+            if link.is_open:
                 link.write_to(sender, data)
         except PortError as error:
             self._lost(Channel.LINK, error)
@@ -179,7 +179,7 @@ class LiveEdge:
         return data
 
     def _too_slow(self, now_us: int) -> bool:
-        """Say whether to report now that the link has dropped data for lack of room."""
+        """Say whether to report now that the link has dropped data because its buffer was full."""
         overrun = self._ports[Channel.LINK].overrun
         if overrun == self._overrun or now_us < self._slow_us:
             return False
@@ -193,7 +193,7 @@ class LiveEdge:
         """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
         reported: str | None = None
         while not self._stopping:
-            if port.up:
+            if port.is_open:
                 port.tend()
             else:
                 try:

@@ -1,4 +1,4 @@
-"""What a calibration needs of the link, beside what the configuration will provide."""
+"""What a calibration needs of the link, compared with what the configuration will provide."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 Each peer has a parser of its own, so that what one sends never swallows what another does: the bridge gets
 whole frames, and after them the bytes that belong to none. A peer is answered once it has sent something
-valid, signed where the link is signed; who speaks as the autopilot is answered first and is never left out
+valid, signed where the link is signed; a peer with the autopilot's id is answered first and is never left out
 for the others.
 """
 
@@ -66,10 +66,10 @@ class Peers:
     Attributes
     ----------
     ignored, withheld : int
-        Bytes that nobody looked at, because their sender had used up its share; and that others than the
+        Bytes that were not parsed, because their sender had used up its share; and that others than the
         autopilot did not get, because the budget was used up.
     notices : deque of str
-        What is to be told about them, each once.
+        Texts about the peers to announce, each once.
     """
 
     def __init__(

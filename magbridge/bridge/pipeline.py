@@ -9,7 +9,7 @@ from math import nan
 from typing import TYPE_CHECKING, Final
 
 from magbridge.bridge import states
-from magbridge.bridge.changes import Changes
+from magbridge.bridge.changes import StateChanges
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.learning import Learning, open_learner
 from magbridge.bridge.log_header import beginning, declarations
@@ -69,7 +69,7 @@ class Pipeline:
     key : bytes or None
         The signing key.
     navigate : callable or None
-        Makes the navigation of ``[navigation]`` for the component that it is to speak through.
+        Makes the navigation of ``[navigation]`` for the component that sends its messages.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class Pipeline:
             self.component.announcer, self.component.timers, start.time_us,
             searching=has_magic(config.sensor.port),
         )  # fmt: skip
-        self._changes = Changes(self.component.codec, self.component.announcer, self.sensor)
+        self._changes = StateChanges(self.component.codec, self.component.announcer, self.sensor)
         self.recorder = Recorder(config.link.system, config.link.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None
         self.learning = Learning(learner, self.component) if learner is not None else None
@@ -204,7 +204,7 @@ class Pipeline:
         return due + answers if due else answers
 
     def interleaved(self, messages: Sequence[tuple[Spec, bytes]]) -> bytes:
-        """Return the frames of messages that are sent beside those of :meth:`feed` and are not logged."""
+        """Return the frames of messages that are sent besides those of :meth:`feed` and are not logged."""
         codec = self.component.codec
         self.recorder.state(codec.now_us, states.interleaved(len(messages)))
         return b"".join([codec.frame(layout, payload) for layout, payload in messages])
@@ -285,7 +285,7 @@ class Pipeline:
             )
 
     def _turn(self, message: Message, time_us: int) -> None:
-        """Take the vehicle's attitude, beside which the vector's direction is judged."""
+        """Take the vehicle's attitude, with which the vector's direction is compared."""
         if self._direction is not None:
             utc_us = time_us + self.component.codec.utc_offset_us
             self._direction.expect(*self._position.direction(time_us, utc_us))

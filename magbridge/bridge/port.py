@@ -29,7 +29,7 @@ class Port(ABC):
 
     @property
     @abstractmethod
-    def up(self) -> bool:
+    def is_open(self) -> bool:
         """Whether bytes can come and go."""
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""What speaks on a serial line: a fluxgate, an autopilot, a GPS, or something that nobody here knows."""
+"""Recognise the device on a serial line: a fluxgate, an autopilot, a GPS, or an unknown one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from magbridge.bridge.check import access
 from magbridge.mavlink import BAD_DATA, Codec
 from magbridge.sensors import DRIVERS, driver_class
 
-__all__ = ["BAUDRATES", "Port", "Recognised", "listen", "ports", "recognise"]
+__all__ = ["BAUDRATES", "Recognised", "SerialDevice", "listen", "ports", "recognise"]
 
 BAUDRATES = (115_200, 57_600, 9_600, 38_400, 230_400, 19_200, 921_600)
 """Bit/s at which a line is listened to, the most usual first."""
@@ -22,7 +22,7 @@ SENTENCE = re.compile(rb"[$!][A-Z]{5},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
 LINE = re.compile(rb"[^\r\n]+[\r\n]")
 NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
 SHOWN = 60
-"""Characters of a line that nobody understands which are shown."""
+"""Characters shown of a line that is not understood."""
 ENOUGH = 3
 """Readings or frames by which a sender is known."""
 
@@ -36,7 +36,7 @@ class Recognised(NamedTuple):
     """More of it, for people: rates, systems, the first line that cannot be parsed."""
 
 
-class Port(NamedTuple):
+class SerialDevice(NamedTuple):
     """A serial port of this computer."""
 
     device: str
@@ -44,10 +44,10 @@ class Port(NamedTuple):
     """What the USB says of it."""
 
 
-def ports() -> list[Port]:
+def ports() -> list[SerialDevice]:
     """Return the serial ports that there are, those without hardware left out."""
     found = [one for one in list_ports.comports() if one.hwid != "n/a" or one.vid is not None]
-    return [Port(one.device, _described(one)) for one in sorted(found)]
+    return [SerialDevice(one.device, _described(one)) for one in sorted(found)]
 
 
 def _described(one: Any) -> str:
@@ -58,7 +58,7 @@ def _described(one: Any) -> str:
 def listen(
     device: str, baudrates: Sequence[int] = BAUDRATES, seconds: float = 1.5
 ) -> tuple[Recognised, int | None, bytes]:
-    """Return what speaks on a device, at which baud rate, and what came; nothing is sent.
+    """Recognise the sender on a device, at which baud rate, and what came; nothing is sent.
 
     Parameters
     ----------

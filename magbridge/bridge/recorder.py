@@ -24,7 +24,7 @@ class Recorder:
     Attributes
     ----------
     active : bool
-        Whether records are collected and counted; False where there is no log.
+        Whether records are collected and counted; False without a log.
     count : int
         Records collected since the start.
     """

@@ -14,7 +14,7 @@ from threading import Thread
 
 from magbridge.bridge import states
 from magbridge.bridge.drive import drive, set_up
-from magbridge.bridge.events import Clock
+from magbridge.bridge.events import HostClock
 from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.keeper import Keeper
 from magbridge.bridge.links import open_link
@@ -53,7 +53,7 @@ def run(path: Path) -> None:
     """
     config = load(path)
     keeper = Keeper(config)
-    clock = Clock()
+    clock = HostClock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
     sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
     own = config.link
@@ -72,7 +72,7 @@ def run(path: Path) -> None:
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
     log = _open_log(config, edge, pipeline)
     _stop_on_signals(edge)
-    # not before a signal would end the bridge in good order: who hears it may send one
+    # not before a signal would end the bridge in good order: a program that reads the first text may send one
     Thread(
         target=_print_statustexts, args=(pipeline.component.announcer.texts,), name="voice", daemon=True
     ).start()
@@ -129,7 +129,7 @@ def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
         while texts:
             severity, text = texts.popleft()
             prefix = f"<{severity:d}>" if to_journal else "magbridge: "
-            with suppress(OSError):  # nobody reads it, or a full disk
+            with suppress(OSError):  # stderr is closed, or the disk is full
                 os.write(stderr, f"{prefix}{text}\n".encode())
         time.sleep(NOTICE_PAUSE)
 

@@ -138,7 +138,7 @@ class SensorLine:
         self._wake(time_us)
 
     def _unparsed(self) -> str:
-        """Say what comes instead of readings: at a wrong baud rate, bytes that are no text."""
+        """Say what comes instead of readings: at a wrong baud rate, bytes that are not text."""
         if not TEXT.fullmatch(self._tail):
             return "sends, but no readings: baud rate?"
         if NOT_A_NUMBER.search(self._tail):

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 import serial
 
 from magbridge.bridge.port import CHUNK
-from magbridge.bridge.stream import Stream
+from magbridge.bridge.stream import PacedPort
 from magbridge.errors import ConfigError, PortError
 
 __all__ = ["SerialPort", "may_be_device", "serial_line"]
@@ -34,7 +34,7 @@ HELD = 20_000
 """Bytes that a line which does not say how much waits in it holds when it is full: a pseudo-terminal does."""
 
 
-class SerialPort(Stream):
+class SerialPort(PacedPort):
     """A serial line by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
 
     def __init__(self, name: str, baudrate: int) -> None:
@@ -47,7 +47,7 @@ class SerialPort(Stream):
         self._pump: _Pump | None = None
 
     @property
-    def up(self) -> bool:
+    def is_open(self) -> bool:
         """Whether the device is open."""
         return self._serial is not None
 

@@ -13,11 +13,11 @@ from magbridge.link.message_rates import LIMITS
 from magbridge.mavlink import spec
 from magbridge.mavlink.framing import SIGNATURE, V2, is_signed
 
-__all__ = ["LATE", "MOST", "Stream", "cut"]
+__all__ = ["MAX_WAITING_MESSAGES", "MAX_WAIT_S", "PacedPort", "cut"]
 
-LATE = 0.1
+MAX_WAIT_S = 0.1
 """s after which a message that waits is dropped, if a newer one of its kind waits as well."""
-MOST = 512
+MAX_WAITING_MESSAGES = 512
 """Messages that may wait."""
 RENEWED = {spec(name).id for name in LIMITS}
 """Messages that are sent again and again: a newer one makes an older one worthless."""
@@ -27,7 +27,7 @@ HEADER, CHECKSUM = 10, 2
 """Bytes of a frame before its payload, and after it."""
 
 
-class Stream(Port):
+class PacedPort(Port):
     """A port whose line may carry less than is to be sent.
 
     What the line has no room for waits here, where it can still be dropped, and not in the system's buffers,
@@ -47,7 +47,7 @@ class Stream(Port):
         self._begun = bytearray()
 
     def write(self, data: bytes) -> None:
-        """Send messages, each whole or not at all; those for which there is no room wait."""
+        """Send messages, each whole or not at all; the others wait until the line takes them."""
         free = not self.waiting and len(data) <= self._piece
         if free and self._room():  # as on most lines at most times: nothing need be cut into messages
             self._begun += data[self._put(data) :]
@@ -55,9 +55,9 @@ class Stream(Port):
         now = time.monotonic()
         self._waiting.extend(_Waiting(now, _kind(frame), frame) for frame in cut(data))
         self.flush()
-        if len(self._waiting) > MOST:
+        if len(self._waiting) > MAX_WAITING_MESSAGES:
             self._thin(now)
-            while len(self._waiting) > MOST // 2:
+            while len(self._waiting) > MAX_WAITING_MESSAGES // 2:
                 self.overran(self._waiting.popleft().frame)
 
     @property
@@ -91,7 +91,7 @@ class Stream(Port):
 
     def _begin(self) -> None:
         """Take the next piece of what waits."""
-        late = time.monotonic() - LATE
+        late = time.monotonic() - MAX_WAIT_S
         if self._waiting[0].since < late:
             self._thin(late)
         while self._waiting and len(self._begun) < self._piece:

@@ -12,7 +12,7 @@ from typing import cast
 from magbridge.bridge.address import resolve
 from magbridge.bridge.peers import Peer, Peers
 from magbridge.bridge.port import Port
-from magbridge.bridge.stream import Stream
+from magbridge.bridge.stream import PacedPort
 from magbridge.errors import PortError
 
 __all__ = ["TcpClient", "TcpServer"]
@@ -29,7 +29,7 @@ ACCEPTED = 4
 """Most clients that are accepted before the sensor's turn."""
 
 
-class _Connection(Stream):
+class _Connection(PacedPort):
     """One TCP connection."""
 
     def __init__(self, name: str) -> None:
@@ -88,7 +88,7 @@ class _Connection(Stream):
         self._connection = connection
 
     @property
-    def up(self) -> bool:
+    def is_open(self) -> bool:
         """Whether there is a connection."""
         return self._connection is not None
 
@@ -142,7 +142,7 @@ class TcpServer(Port):
         self._clients: dict[int, _Client] = {}
 
     @property
-    def up(self) -> bool:
+    def is_open(self) -> bool:
         """Whether it listens."""
         return self._listener is not None
 

@@ -19,13 +19,13 @@ from magbridge.errors import PortError
 __all__ = ["UdpPort"]
 
 PEER_TIMEOUT = 30.0
-"""s without a packet after which the peer of ``udpout`` is connected anew."""
+"""s without a packet after which the peer of ``udpout`` is connected again."""
 DATAGRAM = 1400
 """Bytes that a packet carries on any usual network: more is split on the way, and 64 kB are refused."""
 DATAGRAMS = 512
 """Most that are read before the sensor's turn: empty ones could keep it waiting for ever."""
 AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
-"""What a UDP socket reports when nobody listens (yet): no fault of the port."""
+"""What a UDP socket reports when no program listens (yet): not a fault of the port."""
 
 
 class UdpPort(Port):
@@ -38,7 +38,7 @@ class UdpPort(Port):
         self._received = 0.0
 
     @property
-    def up(self) -> bool:
+    def is_open(self) -> bool:
         """Whether the socket is open."""
         return self._socket is not None
 
@@ -51,7 +51,7 @@ class UdpPort(Port):
         self._socket, self._received = opened, time.monotonic()
 
     def tend(self) -> None:
-        """Connect anew if nothing has come for long, and the host, or we, have another address by now."""
+        """Connect again if nothing has come for long, and the host, or we, have another address by now."""
         opened, now = self._socket, time.monotonic()
         if opened is None or self._peers is not None or now - self._received < PEER_TIMEOUT:
             return

@@ -164,11 +164,11 @@ def ports(
     seconds
         How long to listen at each baud rate.
     """
-    from magbridge.bridge.ports import BAUDRATES, Port, listen
+    from magbridge.bridge.ports import BAUDRATES, SerialDevice, listen
     from magbridge.bridge.ports import ports as there
     from magbridge.progress import track
 
-    asked = [Port(name, "") for name in names] or there()
+    asked = [SerialDevice(name, "") for name in names] or there()
     found = []
     for port in track(asked, "listening", len(asked)):
         recognised, at, _ = listen(port.device, baudrate or BAUDRATES, seconds)

@@ -16,7 +16,7 @@ REMEMBERED = 64
 
 
 class Authority:
-    """Lets the autopilot and ground stations change parameters and rates, and nobody else.
+    """Lets the autopilot and ground stations change parameters and rates, and no other component.
 
     A station is whoever says so in its heartbeat. A sender of another system that has sent no heartbeat is
     taken for one, because small programs send none; another component of our own vehicle is not.

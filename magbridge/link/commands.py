@@ -16,7 +16,7 @@ OURS = 60100
 """The first message id of our dialect: no other component of the vehicle has these messages."""
 CALIBRATES = {MAV_CMD.PREFLIGHT_CALIBRATION, *(one for one in MAV_CMD if "MAG_CAL" in one.name)}
 ABOUT_MESSAGES = MAV_CMD.REQUEST_MESSAGE, MAV_CMD.SET_MESSAGE_INTERVAL, MAV_CMD.GET_MESSAGE_INTERVAL
-MOST = 100
+MAX_COMMAND_RATE = 100
 """Commands of one sender that are executed within a second; more are rejected for the time being."""
 SENDERS = 64
 """Senders that are counted; in a second with more of them, the others count as one."""
@@ -78,7 +78,7 @@ class Commands:
             return
         command = self._commands.get(number)
         if self._is_flood(message.system, message.component):
-            text = f"more than {MOST} commands a second from {message.system}:{message.component}"
+            text = f"more than {MAX_COMMAND_RATE} commands a second from {message.system}:{message.component}"
             self._announcer.state("flood", text, MAV_SEVERITY.WARNING)
             result = MAV_RESULT.TEMPORARILY_REJECTED
         elif number == MAV_CMD.SET_MESSAGE_INTERVAL and not self._authority.may_change(message):
@@ -105,7 +105,7 @@ class Commands:
         if len(self._asked) < SENDERS:
             who = system, component
         self._asked[who] = self._asked.get(who, 0) + 1
-        return self._asked[who] > MOST
+        return self._asked[who] > MAX_COMMAND_RATE
 
     def _unsupported(self, number: int) -> MAV_RESULT:
         if number in CALIBRATES:

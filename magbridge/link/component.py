@@ -17,7 +17,7 @@ from magbridge.link.parameters import Parameters, Tunable, rates
 from magbridge.link.publish import PUBLISHED, Publisher
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.requests import StreamRequests
-from magbridge.link.vehicle import Vehicle
+from magbridge.link.vehicle import VehicleState
 from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.mavlink.framing import is_signed
@@ -29,7 +29,7 @@ TIMESYNC = spec("TIMESYNC")
 SETUP_SIGNING = spec("SETUP_SIGNING").id.to_bytes(3, "little")
 TIMESYNC_US = 1_000_000
 MOST_REQUESTS = 64
-"""Requests for files that are kept while nobody takes them."""
+"""Requests for files that are kept while no station collects them."""
 FILE_REQUESTS = ("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "LOG_REQUEST_END")
 
 
@@ -99,7 +99,7 @@ class Component:
         self._whole = link.shared
         self._refusals_reported = 0
         self.announcer = Announcer(self.outbox, self.timers)
-        self.vehicle = Vehicle(link.system, link.component, link.autopilot, self.announcer, self.timers)
+        self.vehicle = VehicleState(link.system, link.component, link.autopilot, self.announcer, self.timers)
         self.streams = StreamRequests(
             (link.system, link.autopilot), streams or {}, self.outbox, self.timers, self.announcer
         )
@@ -162,7 +162,7 @@ class Component:
         return self.timers.next_deadline
 
     def advance(self, t_us: int) -> None:
-        """Let time pass until `t_us`; everything sent carries the time at which it was due."""
+        """Advance the time to `t_us`; everything sent carries the time at which it was due."""
         if self.timers.next_deadline <= t_us:
             self.timers.advance(t_us, self._begin)
         self.codec.now_us = t_us

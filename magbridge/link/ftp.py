@@ -74,7 +74,7 @@ class Refused(Exception):
 
 
 class Request(NamedTuple):
-    """A request, taken apart."""
+    """A parsed request."""
 
     sequence: int
     session: int
@@ -85,7 +85,7 @@ class Request(NamedTuple):
 
     @classmethod
     def of(cls, payload: bytes) -> Request:
-        """Take apart the payload of a FILE_TRANSFER_PROTOCOL."""
+        """Parse the payload of a FILE_TRANSFER_PROTOCOL."""
         sequence, session, opcode, size, _, _, offset = HEADER.unpack_from(payload)
         return cls(sequence, session, opcode, size, offset, payload[HEADER.size : HEADER.size + DATA])
 
@@ -125,7 +125,7 @@ class FtpServer:
     ----------
     tree : Tree
     now : callable
-        A clock in s, for sessions that nobody uses any more.
+        A clock in s, for sessions that are no longer used.
     """
 
     def __init__(self, tree: Tree, now: Callable[[], float]) -> None:
@@ -269,7 +269,7 @@ class FtpServer:
         return session
 
     def _free(self, sender: Sender, wanted: int) -> int:
-        """Return the number of a new session, the `wanted` one if it is free; make room if need be."""
+        """Return the number of a new session, `wanted` if it is free; close the oldest if necessary."""
         own = [key for key in self._sessions if key[0] == sender]
         crowd = own if len(own) >= EACH else list(self._sessions) if len(self._sessions) >= SESSIONS else []
         if crowd:

@@ -15,7 +15,7 @@ ALL: Final = (1 << WINDOW) - 1
 LOOK_US = 10_000_000
 """µs over which a share is computed."""
 MANY, LEAST = 0.01, 3
-"""The share, and the number, of lost frames from which on it is told."""
+"""The share, and the number, of lost frames above which it is announced."""
 WATCHED: Final = 16
 """Components that are watched."""
 

@@ -1,4 +1,4 @@
-"""What a ground station shows beside a parameter: its text, unit, range and default, as MAVLink metadata.
+"""What a ground station shows next to a parameter: its text, unit, range and default, as MAVLink metadata.
 
 A station asks for COMPONENT_METADATA, reads the general file that it names by MAVLink FTP, and from there the
 file of the parameters (MAVLink guide, 'Component Metadata Protocol').

@@ -13,7 +13,7 @@ __all__ = ["ParameterService"]
 PACE_US = 20_000
 """µs between the values of a list: 50 a second, which a slow radio can carry."""
 REPEAT_US = 10_000_000
-"""µs between two lists that nobody asked for."""
+"""µs between two lists that no station requested."""
 FORGOTTEN_US = 60_000_000
 """µs without a heartbeat after which a station is new again."""
 STATIONS = 16

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from magbridge.link.metadata import GENERAL, crc32, uri
 from magbridge.link.output import Outbox
-from magbridge.link.vehicle import Vehicle
+from magbridge.link.vehicle import VehicleState
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import (
     FIRMWARE_VERSION_TYPE,
@@ -63,7 +63,7 @@ class Reports:
     Parameters
     ----------
     outbox : Outbox
-    vehicle : Vehicle
+    vehicle : VehicleState
     start_us : int
         µs, when the bridge started.
     version : str
@@ -80,7 +80,7 @@ class Reports:
     def __init__(
         self,
         outbox: Outbox,
-        vehicle: Vehicle,
+        vehicle: VehicleState,
         start_us: int,
         version: str,
         calibration_id: int,

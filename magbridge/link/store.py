@@ -11,13 +11,13 @@ from msgspec import Meta
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
 
-__all__ = ["Kept", "load", "save"]
+__all__ = ["StoredState", "load", "save"]
 
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
 
 
-class Kept(msgspec.Struct, frozen=True):
+class StoredState(msgspec.Struct, frozen=True):
     """The contents of the file."""
 
     parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
@@ -28,20 +28,20 @@ class Kept(msgspec.Struct, frozen=True):
     """The last time stamp accepted of each stream."""
 
 
-def load(path: str | Path) -> Kept:
+def load(path: str | Path) -> StoredState:
     """Read the file; one that does not exist yet keeps nothing.
 
     FormatError: it is not what :func:`save` wrote.
     """
     try:
-        return msgspec.json.decode(Path(path).read_bytes(), type=Kept)
+        return msgspec.json.decode(Path(path).read_bytes(), type=StoredState)
     except FileNotFoundError:
-        return Kept()
+        return StoredState()
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise FormatError(path, f"kept parameters as JSON: {error}") from error
 
 
-def save(path: str | Path, kept: Kept) -> None:
+def save(path: str | Path, kept: StoredState) -> None:
     """Write the file, whole or not at all, and sync it to the disk: power may be cut at any moment."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=2))

@@ -12,7 +12,7 @@ from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_AUTOPILOT, MAV_SEVERITY, MAV_TYPE
 from magbridge.mavlink.messages import MESSAGES
 
-__all__ = ["Vehicle"]
+__all__ = ["VehicleState"]
 
 HEARTBEAT: Final = spec("HEARTBEAT").id
 ABSENT_US = 5_000_000
@@ -33,7 +33,7 @@ BOOT_TIMES: Final = {
 }
 
 
-class Vehicle:
+class VehicleState:
     """Watches what the configured system says of itself.
 
     Attributes

@@ -1,4 +1,4 @@
-"""The records of a telemetry log as arrays: many at once, for whoever reads logs ashore.
+"""The records of a telemetry log as arrays: many at once, for programs that read logs ashore.
 
 The same records as :class:`~magbridge.mavlink.tlog.LogReader` finds, by the same rules: every place where a
 record may begin is tried at once, and of those with a right checksum the first that begins after the last is

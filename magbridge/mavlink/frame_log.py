@@ -2,7 +2,7 @@
 
 A log must be readable by any MAVLink tool and still hold every byte received: frames are logged as they are,
 bytes that belong to none are wrapped in MAG_LINK_BYTES. Where the parser needed bytes beyond the frame that
-it returned, to see that something before it was no frame, these bytes are logged as well, marked *ahead*:
+it returned, to see that something before it was not a frame, these bytes are logged as well, marked *ahead*:
 with them, a replay's parser returns the same messages at the same time.
 """
 

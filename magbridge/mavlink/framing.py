@@ -101,7 +101,7 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
 
 
 def message(frame: bytes) -> Message:
-    """Take apart a frame that :func:`frame_end` has accepted."""
+    """Parse a frame that :func:`frame_end` has accepted."""
     header = 10 if frame[0] == V2 else 6
     number = frame[5] if header == 6 else _number(frame, 0)
     payload = frame[header : header + frame[1]]

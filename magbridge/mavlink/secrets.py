@@ -33,7 +33,7 @@ def without_secret(frame: bytes) -> bytes:
 
 
 def without_secrets(data: bytes) -> bytes:
-    """Return bytes that are no whole frame, with zeros wherever the payload of such a message may be."""
+    """Return bytes that are not a whole frame, with zeros wherever the payload of such a message may be."""
     for match in HEADER.finditer(data):
         begin = match.end()
         end = min(begin + data[match.start() + 1], len(data))

@@ -71,7 +71,7 @@ def load_key(path: str | Path) -> bytes:
 
 
 def readable_by_all(path: str | Path) -> bool:
-    """Say whether every user of this computer may read the key; raises OSError where there is no file."""
+    """Say whether every user of this computer may read the key; raises OSError where the file is missing."""
     return bool(Path(path).stat().st_mode & 0o004)
 
 
@@ -150,7 +150,7 @@ class Signing(MAVLinkSigning):
         return not why
 
     def _doubt(self, frame: bytes, stream: tuple[int, int], t_us: int) -> str:
-        """Return what is wrong with a signature; nothing where it is genuine and new."""
+        """Return the fault of a signature; empty where it is genuine and new."""
         if sha256(self._key + frame[:-6]).digest()[:6] != frame[-6:]:
             return "signed with another key"
         stamp, now = int.from_bytes(frame[-12:-6], "little"), timestamp(t_us)

@@ -33,7 +33,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def message(self) -> Message:
-        """The frame, taken apart."""
+        """The parsed frame."""
         return message(self.frame)
 
 

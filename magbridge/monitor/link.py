@@ -57,7 +57,7 @@ class StationLink:
     def _listen(self) -> None:
         while True:
             try:
-                if not self.port.up:
+                if not self.port.is_open:
                     self.port.open()
                 self._turn()
                 self.trouble = ""

@@ -102,7 +102,7 @@ class Floor:
         return 0.0
 
     def _thin(self, duration: float) -> None:
-        """Make room: join short blocks in pairs; once they last `SPAN`, drop the oldest instead."""
+        """Shorten the list: join short blocks in pairs; once they last `SPAN`, drop the oldest instead."""
         if duration >= SPAN:
             del self._points[0]
             return

@@ -9,7 +9,7 @@ CRC32_RESIDUE = 0x2144DF1C
 
 
 class Framer:
-    """Cuts a byte stream at a delimiter; what is longer than `limit` bytes is skipped, not kept.
+    """Cuts a byte stream at a delimiter; a frame longer than `limit` bytes is skipped, not kept.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Framer:
         self.skipped = 0
 
     def begin(self, *, inside: bool) -> None:
-        """Begin anew: what waits for its delimiter is skipped.
+        """Restart: bytes that wait for their delimiter are skipped.
 
         Parameters
         ----------

@@ -48,7 +48,7 @@ class Hmr2300Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     rate: Literal[10, 20, 25, 30, 40, 50, 60, 100, 123, 154] = 20
     """Readings per second; only the device's own rates."""
     device: Annotated[int, Meta(ge=0, le=99)] = 99
-    """Number of the device on an RS-485 line; 99 speaks to all."""
+    """Number of the device on an RS-485 line; 99 addresses all."""
 
 
 class Hmr2300:

@@ -1,4 +1,4 @@
-"""The options of a driver, told from its own struct: for help, and for a commented configuration."""
+"""The options of a driver, read from its own struct: for help, and for a commented configuration."""
 
 from __future__ import annotations
 

@@ -20,7 +20,16 @@ from typing import NamedTuple
 from zlib import crc32
 
 __all__ = [
-    "Column", "Segment", "Stream", "column", "pack", "request", "segment", "slip", "source", "stream",
+    "Segment",
+    "StreamColumn",
+    "StreamLayout",
+    "column",
+    "pack",
+    "request",
+    "segment",
+    "slip",
+    "source",
+    "stream",
     "unslip",
 ]  # fmt: skip
 
@@ -62,7 +71,7 @@ COLUMN_HEADER = Struct("<BBBBBBB")
 """Length, stream, index, type, lengths of name, unit and description."""
 
 
-class Column(NamedTuple):
+class StreamColumn(NamedTuple):
     """One number of a sample; `type` from :data:`FORMATS`."""
 
     name: str
@@ -70,7 +79,7 @@ class Column(NamedTuple):
     type: int
 
 
-class Stream(NamedTuple):
+class StreamLayout(NamedTuple):
     """What a sample holds.
 
     `parts` are generation 1's sources in order, or, in generation 2, the numbers of the columns. `period` is
@@ -119,27 +128,27 @@ def timebase(payload: bytes) -> tuple[int, float]:
     return number, 1e-6 * numerator / (denominator or 1)
 
 
-def source(payload: bytes) -> tuple[int, tuple[Column, ...]]:
+def source(payload: bytes) -> tuple[int, tuple[StreamColumn, ...]]:
     """Read a source: its number and its columns, named ``source.column``."""
     number, _, _, _, _, _, channels, kind = SOURCE_HEADER.unpack_from(payload)
     texts = [*payload[SOURCE_HEADER.size :].decode("utf-8", "replace").split("\t"), "", "", ""]
     name, unit, names = texts[0], texts[3], texts[1].split(",")
     if channels == 1 or len(names) != channels:
-        return number, (Column(name, unit, kind),) * min(channels, 128)
-    return number, tuple(Column(f"{name}.{column}", unit, kind) for column in names)
+        return number, (StreamColumn(name, unit, kind),) * min(channels, 128)
+    return number, tuple(StreamColumn(f"{name}.{column}", unit, kind) for column in names)
 
 
-def stream(payload: bytes) -> tuple[int, Stream]:
+def stream(payload: bytes) -> tuple[int, StreamLayout]:
     """Read a stream of generation 1."""
     number, timebase, period, _, _, count, _ = STREAM_HEADER.unpack_from(payload)
     parts = [COMPONENT.unpack_from(payload, STREAM_HEADER.size + COMPONENT.size * k)[0] for k in range(count)]
-    return number, Stream(tuple(parts), timebase, period)
+    return number, StreamLayout(tuple(parts), timebase, period)
 
 
-def stream_record(record: bytes) -> tuple[int, Stream]:
+def stream_record(record: bytes) -> tuple[int, StreamLayout]:
     """Read a stream of generation 2."""
     _, number, columns, _, _, _, _ = STREAM_RECORD_HEADER.unpack_from(record)
-    return number, Stream(tuple(range(columns)))
+    return number, StreamLayout(tuple(range(columns)))
 
 
 def segment(record: bytes) -> tuple[tuple[int, int], Segment]:
@@ -148,9 +157,9 @@ def segment(record: bytes) -> tuple[tuple[int, int], Segment]:
     return (header[1], header[2]), Segment(header[7], header[8] or 1, header[9] or 1)
 
 
-def column(record: bytes) -> tuple[tuple[int, int], Column]:
+def column(record: bytes) -> tuple[tuple[int, int], StreamColumn]:
     """Read a column: the numbers of its stream and of itself, and its description."""
     size, number, index, kind, name, unit, _ = COLUMN_HEADER.unpack_from(record)
     text = record[size:]
     words = text[:name].decode("utf-8", "replace"), text[name : name + unit].decode("utf-8", "replace")
-    return (number, index), Column(*words, kind)
+    return (number, index), StreamColumn(*words, kind)

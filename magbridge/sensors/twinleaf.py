@@ -1,4 +1,4 @@
-"""``twinleaf``: vector magnetometers that speak TIO (the packets: :mod:`magbridge.sensors.tio`)."""
+"""``twinleaf``: vector magnetometers that send TIO (the packets: :mod:`magbridge.sensors.tio`)."""
 
 from __future__ import annotations
 
@@ -87,9 +87,9 @@ class Twinleaf:
         self.frames_bad = 0
         self._session: int | None = None
         self._timebases: dict[int, float] = {}
-        self._sources: dict[int, tuple[tio.Column, ...]] = {}
-        self._streams: dict[int, tio.Stream] = {}
-        self._columns: dict[tuple[int, int], tio.Column] = {}
+        self._sources: dict[int, tuple[tio.StreamColumn, ...]] = {}
+        self._streams: dict[int, tio.StreamLayout] = {}
+        self._columns: dict[tuple[int, int], tio.StreamColumn] = {}
         self._segments: dict[tuple[int, int], tio.Segment] = {}
         self._rows: dict[int, _Row | None] = {}
         self._last: tuple[int, int, int] = (0, 0, 0)
@@ -240,7 +240,7 @@ class Twinleaf:
         self._last = key, number, turns
         return number + turns * wrap
 
-    def _described(self, number: int) -> list[tuple[tio.Column, ...]] | None:
+    def _described(self, number: int) -> list[tuple[tio.StreamColumn, ...]] | None:
         """Return the parts of a stream's samples, each with its columns; None where not all are known yet."""
         stream = self._streams.get(number)
         if stream is None or (number == 0 and stream.timebase not in self._timebases):
@@ -251,7 +251,7 @@ class Twinleaf:
         columns = [self._columns.get((number, part)) for part in stream.parts]
         return [(column,) for column in columns if column is not None] if all(columns) else None
 
-    def _compile(self, parts: list[tuple[tio.Column, ...]]) -> _Row | None:
+    def _compile(self, parts: list[tuple[tio.StreamColumn, ...]]) -> _Row | None:
         """Return how to read samples of these parts; None where our channels are not among them."""
         columns = [column for part in parts for column in part]
         names = [column.name for column in columns]

@@ -72,7 +72,7 @@ def test_everything_is_said_at_once(config: Path) -> None:
         "sensor.options.rate: invalid enum value 21",
         "sensor.options.speed: unknown key",
         "link.url: expected udpin, udpout",
-        "telemetry.battpos.message: 'NAMED_VALUE' is no message",
+        "telemetry.battpos.message: unknown MAVLink message 'NAMED_VALUE'",
         "calibration.file: no such file",
         "publish.MAG_FELD: expected one of",
         "publish.MAG_RAW: expected a rate from",

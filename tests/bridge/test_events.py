@@ -10,11 +10,11 @@ import time
 
 import pytest
 
-from magbridge.bridge.events import Clock
+from magbridge.bridge.events import HostClock
 
 LOOKS = """
-from magbridge.bridge.events import Clock
-clock = Clock()
+from magbridge.bridge.events import HostClock
+clock = HostClock()
 print("begun", flush=True)
 end_us = clock.now_us() + 2_300_000
 steps = []
@@ -32,7 +32,7 @@ def test_a_process_that_is_held_up_tells_no_step() -> None:
         assert process.stdout.readline() == "begun\n"
         for _ in range(25):
             os.kill(process.pid, signal.SIGSTOP)
-            time.sleep(1.4e-6 * Clock.THRESHOLD_US)
+            time.sleep(1.4e-6 * HostClock.THRESHOLD_US)
             os.kill(process.pid, signal.SIGCONT)
             time.sleep(0.005)
         assert process.stdout.readline() == "[]\n"
@@ -40,8 +40,8 @@ def test_a_process_that_is_held_up_tells_no_step() -> None:
 
 @pytest.mark.parametrize("held", ["before", "after"])
 def test_held_up_beside_a_look_at_utc(monkeypatch: pytest.MonkeyPatch, held: str) -> None:
-    clock, host, offset_us = Clock(), time.time_ns, [0]
-    waits = [1.4e-6 * Clock.THRESHOLD_US, 0.0]
+    clock, host, offset_us = HostClock(), time.time_ns, [0]
+    waits = [1.4e-6 * HostClock.THRESHOLD_US, 0.0]
 
     def slow() -> int:
         wait = waits.pop(0) if waits else 0.0
@@ -53,8 +53,8 @@ def test_held_up_beside_a_look_at_utc(monkeypatch: pytest.MonkeyPatch, held: str
         return utc
 
     for offset_us[0], expected in ((0, 0), (-3_600_000_000, -3_600_000_000), (-3_600_000_000, 0)):
-        waits[:] = [1.4e-6 * Clock.THRESHOLD_US, 0.0]
+        waits[:] = [1.4e-6 * HostClock.THRESHOLD_US, 0.0]
         monkeypatch.setattr(time, "time_ns", slow)
-        assert clock.step_us() == pytest.approx(expected, abs=Clock.AT_ONCE_US)
+        assert clock.step_us() == pytest.approx(expected, abs=HostClock.AT_ONCE_US)
         assert not waits
         monkeypatch.undo()

@@ -19,12 +19,12 @@ import pytest
 from checks import soon
 from standstill import standstill
 
-from magbridge.bridge.events import Clock
+from magbridge.bridge.events import HostClock
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.peers import Peers
 from magbridge.bridge.serial_port import SerialPort
-from magbridge.bridge.stream import LATE, MOST
+from magbridge.bridge.stream import MAX_WAIT_S, MAX_WAITING_MESSAGES
 from magbridge.bridge.tcp import TcpServer
 from magbridge.errors import ConfigError, PortError
 from magbridge.mavlink import Codec, Message, Signing
@@ -82,7 +82,7 @@ def test_a_slow_line_loses_whole_messages() -> None:
     tty.setraw(slave)
     port = open_link(f"serial:{os.ttyname(slave)}", 4_000_000)
     port.open()
-    frames = [b"%04d" % number * 175 for number in range(2 * MOST)]
+    frames = [b"%04d" % number * 175 for number in range(2 * MAX_WAITING_MESSAGES)]
     for frame in frames:
         port.write(frame)
     received = b""
@@ -92,7 +92,7 @@ def test_a_slow_line_loses_whole_messages() -> None:
     port.close()
     os.close(master)
     os.close(slave)
-    assert 0 < port.dropped < 700 * MOST * 1.5
+    assert 0 < port.dropped < 700 * MAX_WAITING_MESSAGES * 1.5
     pieces = [received[i : i + 700] for i in range(0, len(received), 700)]
     assert pieces == [frame for frame in frames if frame in set(pieces)]
     assert pieces[-1] == frames[-1]
@@ -155,7 +155,7 @@ def test_what_waits_for_a_slow_reader(key: bytes | None) -> None:
     while not port.overrun:
         codec.now_us = time.time_ns() // 1000
         port.write(sample(codec, count := count + 1))
-    time.sleep(2 * LATE)
+    time.sleep(2 * MAX_WAIT_S)
     reported = count
     while count < reported + 5 or count % 100 == 0:  # no text at the end
         port.write(sample(codec, count := count + 1))
@@ -238,9 +238,9 @@ def test_a_server_takes_the_next_client() -> None:
                 received += port.read()
             port.write(b"answer")
             assert drained(client, 6) == b"answer"
-        assert port.up
+        assert port.is_open
     port.close()
-    assert not port.up
+    assert not port.is_open
 
 
 @pytest.mark.parametrize("kinds", [("udpin", "udpout"), ("tcpin", "tcp")])
@@ -324,20 +324,20 @@ class Unresolved(TcpServer):
 def test_a_link_that_takes_its_time_to_open_holds_up_neither_the_sensor_nor_the_end() -> None:
     master, slave = pty.openpty()
     link, sensor = Unresolved("tcpin:", ("", 0), Peers()), SerialPort(os.ttyname(slave), 9600)
-    edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, Clock())
+    edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, HostClock())
     deadline = time.monotonic() + 10.0
-    while not sensor.up:
+    while not sensor.is_open:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     edge.close()
-    assert (link.asked, sensor.up) == (1, False)
+    assert (link.asked, sensor.is_open) == (1, False)
     os.close(slave)
     os.close(master)
 
 
 def test_an_impatient_user_stops_it_twice() -> None:
     """The second Ctrl-C may come while the log is being closed."""
-    edge = LiveEdge({}, Clock())
+    edge = LiveEdge({}, HostClock())
     edge.stop()
     assert list(edge.events(lambda: 0)) == []
     edge.close()

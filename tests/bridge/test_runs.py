@@ -12,7 +12,7 @@ from checks import Row, replays, soon
 from devices import open_line
 from rig import Rig
 
-from magbridge.bridge.events import Clock
+from magbridge.bridge.events import HostClock
 from magbridge.mavlink import Codec, LogReader, Signing
 
 MakeRig = Callable[..., Rig]
@@ -158,7 +158,7 @@ def test_host_clock_set_forward_and_back(make_rig: MakeRig, table: Row) -> None:
         noticed = rig.until_reported("clock was set by", seen)
         # less than the threshold is slewing, and so may a late look at one of two clocks be off
         (reported,) = [float(text.split()[-2]) for text in rig.texts(seen) if "clock was set by" in text]
-        assert reported == pytest.approx(step, abs=Clock.THRESHOLD_US * 1e-6)
+        assert reported == pytest.approx(step, abs=HostClock.THRESHOLD_US * 1e-6)
         rig.run(0.2)
         after = rig.of("MAG_FIELD")[-1]
         elapsed = (after["time_usec"] - before["time_usec"]) * 1e-6

@@ -22,7 +22,7 @@ def test_a_udp_peer_that_is_not_there_is_no_fault() -> None:
         port.write(b"x")
     assert port.dropped > 0
     assert port.read() == b""
-    assert port.up
+    assert port.is_open
     port.close()
 
 
@@ -87,7 +87,7 @@ def test_what_is_sent_at_once_after_a_standstill_goes_in_datagrams_that_a_networ
         datagrams: list[bytes] = []
         while sum(map(len, datagrams)) < len(data):
             datagrams.append(peer.recv(1 << 16))
-        assert (port.up, port.dropped) == (True, 0)
+        assert (port.is_open, port.dropped) == (True, 0)
         port.close()
     assert b"".join(datagrams) == data
     assert max(map(len, datagrams)) <= 1400

@@ -17,7 +17,7 @@ from magbridge.errors import FormatError
 from magbridge.link import Parameters, alignment, telemetry_ages
 from magbridge.link.message_rates import LIMITS
 from magbridge.link.parameters import Tunable, rates, real32
-from magbridge.link.store import Kept, load, save
+from magbridge.link.store import StoredState, load, save
 
 
 def write(link: Line, name: str, value: float, kind: int = 9) -> list[Any]:
@@ -152,8 +152,8 @@ def test_a_default_read_and_written_back_stays_exact() -> None:
 
 def test_store(tmp_path: Path) -> None:
     path = tmp_path / "parameters.json"
-    assert load(path) == Kept()
-    kept = Kept({"MB_GAP_FACTOR": real32(0.1)}, 12345678901234)
+    assert load(path) == StoredState()
+    kept = StoredState({"MB_GAP_FACTOR": real32(0.1)}, 12345678901234)
     save(path, kept)
     assert load(path) == kept
     assert [one.name for one in tmp_path.iterdir()] == ["parameters.json"]
