@@ -36,7 +36,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.fitting.offered import best_parameters
+from magbridge.calibration.fitting.parameter_choice import best_parameters
 from magbridge.calibration.fitting.validate import in_sensor_units
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.run import diagnose

@@ -134,7 +134,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     from magbridge.calibration.fitting.lowpass import unfiltered
     from magbridge.calibration.fitting.mounted_masses import read_vehicle
     from magbridge.calibration.fitting.observe import observations
-    from magbridge.calibration.fitting.offered import AUTO
+    from magbridge.calibration.fitting.parameter_choice import AUTO
     from magbridge.calibration.fitting.sources import unused_logs
     from magbridge.columns import CHANNELS, require
     from magbridge.field.declination import with_true_heading

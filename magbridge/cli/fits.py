@@ -85,7 +85,7 @@ def undeclared_columns(deployment: xr.Dataset, data: Observations, found: Fit) -
     """Return a line for each column of the log that moves the field and is no parameter."""
     import numpy as np
 
-    from magbridge.calibration.fitting.hints import undeclared
+    from magbridge.calibration.fitting.parameter_choice import undeclared
     from magbridge.logs.info import telemetry
 
     rows = np.searchsorted(deployment["time"].to_numpy(), data.time)

@@ -77,11 +77,11 @@ def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: A
     """Return the parameters of a fit: those that are named, or for ``auto`` the columns that are worth it.
 
     What each that was tried buys on parts left out is told on stderr. `options` are of
-    :func:`~magbridge.calibration.fitting.offered.best_parameters`.
+    :func:`~magbridge.calibration.fitting.parameter_choice.best_parameters`.
 
     WrongUse: ``auto`` among names.
     """
-    from magbridge.calibration.fitting.offered import AUTO, best_parameters, lines
+    from magbridge.calibration.fitting.parameter_choice import AUTO, best_parameters, lines
     from magbridge.logs.info import movers
 
     if AUTO not in named:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magbridge.calibration.fitting.ends import flown
+from magbridge.calibration.fitting.auto import flown
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.validate import in_sensor_units

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.hints import undeclared
 from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.fitting.parameter_choice import undeclared
 from sitl import load, simulate
 
 

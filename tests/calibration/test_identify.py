@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from gliders import Gliders
 
+from magbridge.calibration.fitting.checks import combinations
 from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.identify import combinations
 from magbridge.calibration.fitting.observations import polynomial_samples
 from magbridge.calibration.terms import full_order
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.fitting.offered import best_parameters, lines
+from magbridge.calibration.fitting.parameter_choice import best_parameters, lines
 from magbridge.logs import write
 from magbridge.logs.deployment import deployment
 from magbridge.logs.info import movers

@@ -20,8 +20,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.climb import Climbed, climb, thinned
-from magbridge.calibration.fitting.ends import flown
 from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.left_out import carried_forward, leave_out, refitted
 from magbridge.calibration.fitting.nominal import check_scales, fit_nominal, nominal, nominal_samples, starts
@@ -31,12 +31,43 @@ from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.hyperparameters import is_maximum
 from magbridge.estimation.information import covariance_of
-from magbridge.estimation.noise import NoiseModel, fit_slow_and_white
+from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, fit_slow_and_white
 from magbridge.estimation.priors import PriorFamily
-from magbridge.estimation.residual import Samples, residuals_of
+from magbridge.estimation.residual import Samples, residuals_of, robust_scale
 
-__all__ = ["fit_auto"]
+__all__ = ["fit_auto", "flown"]
 
+# ---- The ends of a log that are not its flight ----
+
+SHORTEST = 20
+"""Samples: fewer outliers at an end are outliers as any others."""
+MOSTLY = 0.7
+"""Share of an end's samples that are outliers."""
+
+
+def flown(residual: FloatArray) -> BoolArray:
+    """Return which samples (n,) are not part of an end of the log that the others contradict.
+
+    Parameters
+    ----------
+    residual : (n,) array
+        Of a robust fit, in the order of the log, nT.
+    """
+    off = np.abs(residual) > OUTLIER_SIGMA * robust_scale(residual)
+    kept = np.ones(len(off), bool)
+    kept[: _end(off)] = False
+    kept[len(off) - _end(off[::-1]) :] = False
+    return kept if kept.sum() > len(kept) / 2 else np.ones(len(off), bool)
+
+
+def _end(off: BoolArray) -> int:
+    """Return how many samples of the start are mostly outliers; 0 if those are few."""
+    share = np.cumsum(off) / np.arange(1, len(off) + 1)
+    until = np.flatnonzero((share > MOSTLY) & off)
+    return int(until[-1]) + 1 if until.size and until[-1] + 1 >= SHORTEST else 0
+
+
+# ---- The fit ----
 
 SHRUNK = 0.15
 """Departure of the middle scale from 1 that no magnetometer has."""

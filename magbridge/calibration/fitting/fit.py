@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from magbridge.calibration.fitting.checks import judged
 from magbridge.calibration.fitting.crossings import far_off, jumped, left_open, tells_rock
-from magbridge.calibration.fitting.judged import judged
 from magbridge.calibration.fitting.level import with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit
@@ -26,9 +26,9 @@ METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.auto:fit_auto",
     "survey": "magbridge.calibration.fitting.in_place:fit_in_place",
     "nominal": "magbridge.calibration.fitting.nominal:fit_nominal",
-    "cubic": "magbridge.calibration.fitting.cubic:fit_cubic",
-    "runs": "magbridge.calibration.fitting.per_run:fit_per_run",
-    "horizontal": "magbridge.calibration.fitting.horizontal:fit_horizontal",
+    "cubic": "magbridge.calibration.fitting.paper_methods:fit_cubic",
+    "runs": "magbridge.calibration.fitting.paper_methods:fit_per_run",
+    "horizontal": "magbridge.calibration.fitting.paper_methods:fit_horizontal",
 }
 """Name -> ``module:function``, each ``(observations, order, **options) -> Fit``."""
 

@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 
-from magbridge.calibration.fitting.answer import Answer
 from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder
 from magbridge.calibration.fitting.known import Known
@@ -38,7 +37,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep, offered, with_creep, with_temperature
 from magbridge.calibration.fitting.pose import Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.fitting.rounds import SEARCHED, SETTLED, WIDE, Rounds
+from magbridge.calibration.fitting.rounds import SEARCHED, SETTLED, WIDE, Answer, Rounds
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.blocks import ParameterBlock, slow_functions

@@ -3,10 +3,10 @@ r"""A prior from where the masses sit: the polynomials that dipoles there would 
 Notes
 -----
 Latent numbers of each mass: permanent moment (3), induced moment (3), error of its measured place (3) and
-of its measured travel (3). The free polynomials of :mod:`.prior` remain, with far smaller widths, for what
-dipoles do not describe (extended masses, a sensor a degree out of alignment). The coefficients are linear
-in the moments. In the errors of place and travel they are linearised, anew in each round of the fit, so
-that no place is held more certain than `at_sigma`.
+of its measured travel (3). The free polynomials of :mod:`magbridge.estimation.priors` remain, with far
+smaller widths, for what dipoles do not describe (extended masses, a sensor a degree out of alignment). The
+coefficients are linear in the moments. In the errors of place and travel they are linearised, anew in each
+round of the fit, so that no place is held more certain than `at_sigma`.
 """
 
 from __future__ import annotations

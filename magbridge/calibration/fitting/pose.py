@@ -1,7 +1,7 @@
 """What is fitted: the samples with their monomials, and the prior of the coefficients.
 
-The prior is one of physical widths (:mod:`.prior`), of dipoles at measured places (:mod:`.mounted_masses`),
-or what is known of this vehicle from before (:mod:`.known`).
+The prior is one of physical widths (:mod:`magbridge.estimation.priors`), of dipoles at measured places
+(:mod:`.mounted_masses`), or what is known of this vehicle from before (:mod:`.known`).
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class Fit:
     """Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
     each estimable combination from the data alone (nT)."""
     samples: Samples
-    """The data as fitted, for :mod:`.identify`."""
+    """The data as fitted, for :mod:`.checks`."""
     open: tuple[str, ...] = ()
     """What the track leaves open, which is a reason for an error that is large."""
     information: GaussianInformation | None = None
