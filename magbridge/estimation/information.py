@@ -146,7 +146,7 @@ class GaussianInformation:
         return np.asarray(covariance @ self.vector), covariance
 
     def log_evidence(self, prior_precision: FloatArray) -> float:
-        """Return the logarithm of the likelihood integrated over a prior N(0, `prior_precision`^-1).
+        """Return the logarithm of the likelihood integrated over a prior N(0, `prior_precision`^-1), (q, q).
 
         Notes
         -----

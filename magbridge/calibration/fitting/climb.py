@@ -35,7 +35,7 @@ class Climbed:
 
 
 def thinned_rows(n: int) -> IndexArray:
-    """Return the rows of blocks of neighbours, spread evenly over n samples; all rows if these are few."""
+    """Return the rows (k,) of blocks of neighbours, spread evenly over n samples; all rows if n is small."""
     if n <= ENOUGH:
         return np.arange(n)
     first = np.linspace(0, n // BLOCK - 1, ENOUGH // BLOCK).astype(int) * BLOCK

@@ -82,7 +82,9 @@ def fit_in_place(
     Raises
     ------
     CalibrationError
-        There are no positions, or the fit collapsed or did not settle.
+        There are no positions.
+    NoSolutionError
+        The fit collapsed or did not converge.
     """
     if data.place is None:
         raise CalibrationError(

@@ -162,7 +162,7 @@ class Rounds:
         self.choice = same_noise(self._sums(field), self.choice, weighed)
 
     def settle(self) -> Answer:
-        """Return the answer; CalibrationError: the rounds do not come to rest."""
+        """Return the answer; NoSolutionError: the iterations do not converge."""
         survey, moved = self.survey, np.inf
         for turn in range(ROUNDS):
             if self.own.renew is not None and turn:
