@@ -29,7 +29,7 @@ def transitions(nuisance: Nuisance, log: xr.Dataset) -> list[tuple[FloatArray, F
     latitude, longitude = (log[name].to_numpy() for name in ("latitude", "longitude"))
     north, east = separation(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:])
     metres, seconds = np.hypot(north, east), np.diff(log["time"].to_numpy())
-    return [nuisance.over(0.0, 0.0), *map(nuisance.over, metres.tolist(), seconds.tolist())]
+    return [nuisance.transition(0.0, 0.0), *map(nuisance.transition, metres.tolist(), seconds.tolist())]
 
 
 def best_delay(
@@ -48,7 +48,7 @@ def best_delay(
     for k, (F, Q) in enumerate(transitions(nuisance, log)):
         P, m = F @ P @ F.T + Q, F @ m
         if rest[k]:
-            S = float(h @ P @ h) + nuisance.white
+            S = float(h @ P @ h) + nuisance.white_variance
             v, gain = float(effect[k] - h @ m), P @ h / S
             energy += 0.5 * v * v / S
             m, P, count = m + gain * v, P - np.outer(gain, h @ P), count + (k >= since)
@@ -79,7 +79,7 @@ def best_field(
         P[3:, 3:] += Q
         best[k] -= by_change[k] @ x[:3]
         if rest[k]:
-            S = float(h @ P @ h) + nuisance.white
+            S = float(h @ P @ h) + nuisance.white_variance
             gain = P @ h / S
             x, P = x + gain * (total[k] - reference[k] - h @ x), P - np.outer(gain, h @ P)
     return best

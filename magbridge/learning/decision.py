@@ -83,7 +83,7 @@ class Decision:
         first, published = (
             knowledge.observe(sample.field, nine, sample.reference) for nine in publication.nine(sample.phi)
         )
-        rock = knowledge.believed.over(*way)
+        rock = knowledge.believed.transition(*way)
         publication.judge.judge(*rock, first.e, first.s, best.residual, best.variance)
         apart = published.e - now.e
         if knowledge.start is None:

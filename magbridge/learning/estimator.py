@@ -179,7 +179,7 @@ class Estimator:
     def propagate(self, metres: float, seconds: float) -> FloatArray:
         """Move on by a way and a time; return the transition (4, 4) of what is not the calibration's."""
         P = self._P
-        F, Q = self._nuisance.over(metres, seconds)
+        F, Q = self._nuisance.transition(metres, seconds)
         self.advance(self._x, F, seconds)
         self.advance(P, F, seconds)
         self.advance(P.T, F, seconds)
@@ -203,7 +203,7 @@ class Estimator:
         else:
             self._near += (1.0 - self._stay) * (by_coefficients - self._near)
         self._Ph = self._P @ h
-        self.variance = float(h @ self._Ph) + self._nuisance.white
+        self.variance = float(h @ self._Ph) + self._nuisance.white_variance
         self.residual = e + float(h[-STATES:] @ self._x[-STATES:])
         varying = by_coefficients - self._near
         self.telling = float(varying @ self._P[:K, :K] @ varying) > TELLING * self.variance

@@ -75,7 +75,7 @@ class Judge:
         Parameters
         ----------
         F, Q : (4, 4) arrays
-            Of :meth:`.Nuisance.over`.
+            Of :meth:`.Nuisance.transition`.
         e, s : float
             nT, residual of the first calibration, and its scale.
         innovation, variance : float
@@ -85,7 +85,7 @@ class Judge:
         self._P = F @ self._P @ F.T + Q
         self._m = F @ self._m
         Ph = self._P @ h
-        S = float(h @ Ph) + self._nuisance.white
+        S = float(h @ Ph) + self._nuisance.white_variance
         v = e + float(h @ self._m)
         self.last = v, S
         self._m -= Ph * (v / S)

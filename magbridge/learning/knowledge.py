@@ -164,7 +164,7 @@ class Knowledge:
             return False
         fitted = self.start.fit(quiet.coefficients, self.nuisance)
         self.noise = msgspec.structs.replace(self.noise, sensor=fitted.noise)
-        self.nuisance = Nuisance(self.noise, self.nuisance.spread, self.nuisance.level)
+        self.nuisance = Nuisance(self.noise, self.nuisance.spread, self.nuisance.constant)
         quiet.know(fitted.coefficients, fitted.nuisances, fitted.covariance, self.nuisance)
         return True
 

@@ -134,7 +134,7 @@ class Start:
             if float(np.abs(z - before).max()) < SMALL:
                 break
         rms = float(np.sqrt(np.mean(r * r)))
-        noise = float(np.sqrt(nuisance.white)) * (rms if len(r) >= ENOUGH else 1.0)
+        noise = float(np.sqrt(nuisance.white_variance)) * (rms if len(r) >= ENOUGH else 1.0)
         both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
         covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
         covariance[-STATES:, -STATES:] += Pb
@@ -149,13 +149,13 @@ class Start:
         out = np.empty((n, K + 1))
         states, P = np.zeros((STATES, K + 1)), nuisance.initial.copy()
         for k, (field, phi, reference, metres, seconds) in enumerate(self._samples):
-            F, Q = nuisance.over(metres, seconds)
+            F, Q = nuisance.transition(metres, seconds)
             one: Observation = observe(field, phi @ weights, self._field, reference)
             row = np.concatenate([[one.e], self._model.derivative(phi, one.by_nine)])
             h = nuisance.row(one.s)
             P, states = F @ P @ F.T + Q, F @ states
             Ph = P @ h
-            S = float(h @ Ph) + nuisance.white
+            S = float(h @ Ph) + nuisance.white_variance
             row += h @ states
             states -= np.outer(Ph / S, row)
             P -= np.outer(Ph / S, Ph)

@@ -13,10 +13,10 @@ def judged(error: float, samples: int) -> Judge:
     """Return it after so many samples that the first predicts by ± `error` (sigmas) worse than the other."""
     rng = np.random.default_rng(5)
     nuisance = Nuisance(Noise(1.0), 1e-3)
-    judge, still = Judge(nuisance), nuisance.over(0.0, 0.0)
+    judge, still = Judge(nuisance), nuisance.transition(0.0, 0.0)
     for k in range(samples):
         noise = float(rng.normal())
-        judge.judge(*still, noise + error * (-1) ** k, 1.0, noise, nuisance.white)
+        judge.judge(*still, noise + error * (-1) ** k, 1.0, noise, nuisance.white_variance)
     return judge
 
 
@@ -30,10 +30,10 @@ def test_it_is_rolled_back_without_a_margin() -> None:
     """The first calibration need only predict better beyond chance, and not in a few samples."""
     rng = np.random.default_rng(6)
     nuisance = Nuisance(Noise(1.0), 1e-3)
-    judge, still = Judge(nuisance), nuisance.over(0.0, 0.0)
+    judge, still = Judge(nuisance), nuisance.transition(0.0, 0.0)
     for k in range(10_000):
         noise = float(rng.normal())
-        judge.judge(*still, noise, 1.0, noise + 0.1 * (-1) ** k, nuisance.white)
+        judge.judge(*still, noise, 1.0, noise + 0.1 * (-1) ** k, nuisance.white_variance)
         if k == 100:
             assert not judge.roll_back
     assert judge.roll_back

@@ -34,13 +34,13 @@ def test_one_sample_is_the_fits_own_residual() -> None:
 def test_rock_and_noise_are_stationary_along_the_track() -> None:
     """Whatever the steps: the covariance stays, and far away nothing is known."""
     nuisance = Nuisance(Noise(2.0, autocorrelation=0.9, interval=4.0, white=0.25), 100.0, 50.0, 800.0)
-    F, Q = nuisance.over(70.0, 12.0)
+    F, Q = nuisance.transition(70.0, 12.0)
     np.testing.assert_allclose(F @ nuisance.initial @ F.T + Q, nuisance.initial, atol=1e-9)
-    first, second = nuisance.over(30.0, 5.0)[0], nuisance.over(40.0, 7.0)[0]
+    first, second = nuisance.transition(30.0, 5.0)[0], nuisance.transition(40.0, 7.0)[0]
     np.testing.assert_allclose(second @ first, F, atol=1e-12)
-    far = nuisance.over(1e6, 1e6)[0]
+    far = nuisance.transition(1e6, 1e6)[0]
     np.testing.assert_allclose(far, np.diag([0.0, 0.0, 0.0, 1.0]), atol=1e-9)  # but the level
-    assert nuisance.initial[2, 2] + nuisance.white == pytest.approx(4.0)
+    assert nuisance.initial[2, 2] + nuisance.white_variance == pytest.approx(4.0)
     # the slow part forgets as the fit's noise does
     assert F[2, 2] == pytest.approx(0.9 ** (12.0 / 4.0))
     assert np.isfinite(whiten(np.ones(3), np.ones(3), 0.9, 0.25)).all()
