@@ -67,7 +67,7 @@ STRAIGHT: Final = 0.05
 MIN_STRAIGHT_SAMPLES: Final = 8
 """Samples of one attitude from which the roughness is known."""
 ADAPTATION: Final = 0.02
-MAX_SQUARE: Final = 16.0
+MAX_SQUARE: Final = 4.0
 MAX_LOG_ROUGHNESS: Final = 5.0
 """How the logarithm of the crust's roughness follows a normalised squared innovation; its bounds."""
 KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")

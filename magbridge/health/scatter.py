@@ -63,8 +63,9 @@ CRUST_NT: Final = 2.2
 """Median of second differences that a crustal field of 145 nT and 500 m makes within that distance."""
 MAX_LAG_US: Final = 32_000_000
 """Longest lag: a vehicle that does not move is passed by the field's variations."""
+FIRST_INTERVAL_US: Final = 8_000_000
 SPEED_INTERVAL_US: Final = 60_000_000
-"""Time over which the speed is measured, at least."""
+"""Time over which the speed is measured, at least: for the first time, and later."""
 
 
 class MedianDifference:
@@ -158,7 +159,8 @@ class Scatter:
     def set_position(self, time_us: int, latitude: float, longitude: float) -> bool:
         """Record the position, deg; return True if it has told the speed, which limits the lags."""
         step_us = time_us - self._position_us
-        if 0 <= step_us < SPEED_INTERVAL_US or (latitude == self._latitude and longitude == self._longitude):
+        interval_us = SPEED_INTERVAL_US if self.speed == self.speed else FIRST_INTERVAL_US
+        if 0 <= step_us < interval_us or (latitude == self._latitude and longitude == self._longitude):
             return False
         north, east = separation(self._latitude, self._longitude, latitude, longitude)
         speed = (north * north + east * east) ** 0.5 / (1e-6 * step_us)
