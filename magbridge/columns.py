@@ -67,11 +67,19 @@ COLUMNS: dict[str, Column] = {
     "field_x": Column("nT", "corrected magnetic field, body x (forward)"),
     "field_y": Column("nT", "corrected magnetic field, body y (starboard)"),
     "field_z": Column("nT", "corrected magnetic field, body z (down)"),
+    "magnetic_heading": Column("deg", "heading by the corrected field, clockwise from magnetic north"),
+    "heading_sigma": Column("deg", "1-sigma of heading"),
+    "declination": Column("deg", "declination of the main-field model, east positive"),
+    "declination_sigma": Column("deg", "1-sigma of declination"),
+    "vehicle_heading": Column("deg", "the vehicle's own heading, clockwise from north"),
     "anomaly": Column("nT", "corrected total field minus the reference model"),
     "quality": Column("1", "flags of a doubtful sample"),
 }
 CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
 """What ``magbridge correct`` writes in addition to ``time``."""
+
+HEADINGS = ("magnetic_heading", "heading", "heading_sigma", "declination", "declination_sigma")
+"""Written by ``magbridge correct`` if the log has roll and pitch, and the calibration a boresight."""
 
 NT_PER_UNIT = {
     "fT": 1e-6, "pT": 1e-3, "nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9,

@@ -82,6 +82,11 @@ class Correction:
         self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
         self._was_moving = False
 
+    @property
+    def calibration(self) -> Calibration:
+        """The calibration that is in use."""
+        return self._corrector.calibration
+
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
 

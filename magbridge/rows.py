@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, require
+from magbridge.calibration.correct import vector_covariance
+from magbridge.calibration.heading import heading, model_declination_sigma
+from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, require
 from magbridge.correction import Correction
 from magbridge.field.igrf import magnitude
 from magbridge.field.nearby import HeldField
@@ -19,6 +21,8 @@ from magbridge.records import Quality, Reading
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from magbridge.calibration.model import Calibration
 
 __all__ = ["correct_rows"]
 
@@ -43,7 +47,9 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     Dataset (time)
         ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
         The field is in body axes. The anomaly is the total field minus the IGRF, NaN where there is no
-        position or no date. ``level_sigma`` is there where the calibration states one. All in nT, but for
+        position or no date. With roll and pitch, and a boresight in the calibration, the columns of
+        :data:`~magbridge.columns.HEADINGS` (deg) are added. ``level_sigma`` is there where the calibration
+        states one. All other columns are in nT, except
         ``quality``, the bits of :class:`~magbridge.records.Quality`. A row without any channel is not a
         sample but telemetry: NaN there, with ``gap``.
 
@@ -66,13 +72,17 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
         main_fields = magnitude(vectors)
     else:
         main_fields = _as_live(correction.held_field, deployment)
-    known = main_fields.tolist()
+    known, tilt = main_fields.tolist(), _tilt(deployment)
+    fields, values = np.full((len(results), 3), nan), np.full((len(results), len(correction.names)), nan)
+    added = np.zeros(len(results))
     for row, reading, stamp in _readings(correction, deployment):
         if correction.direction is not None and attitudes is not None:
             correction.direction.expect(*vectors[row].tolist())
             correction.direction.attitude(stamp, *attitudes[row])
         sample, one = correction.reading(reading, stamp, main_field=known[row], where=places[row])
         level[row], age[row] = correction.level(sample, one), sample.age
+        fields[row], values[row] = sample.field, sample.values[: values.shape[1]]
+        added[row] = one.field_sigma[0] ** 2 + one.field_sigma[1] ** 2 + one.field_sigma[2] ** 2
         results[row] = one.total_field, one.total_field_sigma, *one.field, nan, one.quality
     _keep_late_joins(results, deployment)
     _flag_onsets(results, age)
@@ -80,11 +90,72 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     if np.isfinite(level).any():
         columns["level_sigma"] = level
     columns["anomaly"] = columns["total_field"] - main_fields
+    calibration, sigma = correction.calibration, correction.aligner.settings.reference_sigma
+    if tilt is not None and calibration.boresight is not None:
+        samples = fields, values, added
+        columns |= _headings(calibration, samples, results[:, 2:5], tilt, vectors, sigma, deployment)
     return xr.Dataset(
         {name: ("time", column, COLUMNS[name]._asdict()) for name, column in columns.items()},
         coords={"time": deployment["time"]},
         attrs={"source": deployment.attrs.get("source", "")},
     )
+
+
+def _tilt(deployment: xr.Dataset) -> FloatArray | None:
+    """Return roll and pitch of every row, (n, 2) rad; None if the log lacks one."""
+    if not {"roll", "pitch"} <= set(deployment):
+        return None
+    columns = [deployment[name].to_numpy().astype(float) for name in ("roll", "pitch")]
+    return np.asarray(np.radians(np.stack(columns, axis=1)))
+
+
+def _headings(
+    calibration: Calibration,
+    samples: tuple[FloatArray, FloatArray, FloatArray],
+    vector: FloatArray,
+    tilt: FloatArray,
+    main: FloatArray,
+    crustal_sigma: float,
+    deployment: xr.Dataset,
+) -> dict[str, FloatArray]:
+    """Return the columns of :data:`~magbridge.columns.HEADINGS`.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With a boresight.
+    samples : tuple of (n, 3), (n, k) and (n,) array
+        Aligned field (nT) and channels, and the sum of the three components' variances (nT^2) as published.
+    vector : (n, 3) array
+        nT, corrected field in body axes.
+    tilt : (n, 2) array
+        rad, roll and pitch.
+    main : (n, 3) array
+        nT, main field, north-east-down; NaN where unknown.
+    crustal_sigma : float
+        nT, 1-sigma of the crustal field that the main-field model lacks.
+    deployment : Dataset
+        For its time.
+    """
+    field, channels, published = samples
+    time = np.asarray(deployment["time"].to_numpy(), float)
+    assert calibration.boresight is not None
+    turn = np.array(calibration.boresight.covariance)
+    covariance = vector_covariance(calibration, field, channels, time)
+    # What checks and moving masses add to the published sigmas has no direction of its own.
+    length = np.einsum("ni,ni->n", vector, vector)
+    stated = np.trace(covariance, axis1=1, axis2=2)
+    stated += np.trace(turn) * length - np.einsum("ni,ij,nj->n", vector, turn, vector)
+    more = np.nan_to_num(np.maximum(published - stated, 0.0) / 3.0, posinf=1e12)
+    covariance += more[:, None, None] * np.eye(3)
+    declination = np.degrees(np.arctan2(main[:, 1], main[:, 0]))
+    uncertain = model_declination_sigma(np.hypot(main[:, 0], main[:, 1]), crustal_sigma)
+    found = heading(
+        vector, tilt[:, 0], tilt[:, 1], declination, covariance=covariance, boresight_covariance=turn,
+        declination_sigma_deg=uncertain,
+    )  # fmt: skip
+    columns = found.magnetic, found.true, found.sigma, declination, uncertain
+    return dict(zip(HEADINGS, columns, strict=True))
 
 
 def _places(deployment: xr.Dataset) -> list[tuple[float, float] | None]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.arithmetic import for_arrays
+from magbridge.calibration.arithmetic import PAIRS, for_arrays
 from magbridge.calibration.corrector import (
     EXTRAPOLATED,
     GAP,
@@ -24,7 +24,7 @@ from magbridge.calibration.terms import Series, Step
 from magbridge.errors import CalibrationError
 from magbridge.records import BEYOND
 
-__all__ = ["CorrectedArrays", "correct", "regressors"]
+__all__ = ["CorrectedArrays", "correct", "regressors", "vector_covariance"]
 
 CHUNK = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
@@ -97,6 +97,32 @@ def correct(
     out[np.ix_([0, 2, 3, 4], lost)] = np.nan
     out[np.ix_([1, 5, 6, 7], lost)] = inf
     return CorrectedArrays(out[0], out[1], out[2:5].T, out[5:8].T, quality)
+
+
+def vector_covariance(
+    calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
+) -> FloatArray:
+    """Return the covariance of the corrected vector, without the boresight's part, (n, 3, 3) nT^2.
+
+    Arguments as for :func:`correct`.
+
+    Notes
+    -----
+    ``V_ij = Q_ij . (d d^T) + L_ij . d + O_ij`` with ``d = H_r - T`` (:mod:`.arithmetic`).
+    """
+    kernel, steps, out = calibration.kernel, begun(calibration), np.empty((len(field), 3, 3))
+    with np.errstate(all="ignore"):
+        for start in range(0, len(field), CHUNK):
+            part = slice(start, start + CHUNK)
+            phi = _regressors(kernel, steps, field[part], channels[part], time[part])
+            linear, V = _prepare_many(kernel, phi)
+            d = field[part].T - np.stack(linear[9:12])
+            products = np.stack([d[i] * d[j] for i, j in PAIRS])
+            for (i, j), entry in zip(PAIRS, V, strict=True):
+                value = sum(q * e for q, e in zip(entry[:6], products, strict=True))
+                value = value + sum(q * x for q, x in zip(entry[6:9], d, strict=True)) + entry[9]
+                out[part, i, j] = out[part, j, i] = value
+    return out
 
 
 def _regressors(

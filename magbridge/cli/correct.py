@@ -237,4 +237,8 @@ def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Pa
     history = [*str(log.attrs.get(HISTORY, "")).splitlines(), made]
     attrs = {"calibration_id": f"{calibration_id(known):08x}", HISTORY: "\n".join(history)}
     meaning = {name: value for name, value in lasting(log.attrs).items() if name in MEANING}
-    return corrected.assign({name: log[name] for name in names}).assign_attrs(meaning | attrs)
+    kept = {name: log[name] for name in names}
+    if "heading" in corrected and "heading" in log:
+        kept["vehicle_heading"] = log["heading"]
+        meaning = {name: value for name, value in meaning.items() if name != "heading_reference"}
+    return corrected.assign(kept).assign_attrs(meaning | attrs)
