@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.arithmetic import PAIRS, for_arrays
+from magbridge.calibration.arithmetic import for_arrays
 from magbridge.calibration.corrector import (
     EXTRAPOLATED,
     GAP,
@@ -22,6 +22,7 @@ from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Series, Step
 from magbridge.errors import CalibrationError
+from magbridge.estimation.residual import PAIRS
 from magbridge.records import BEYOND
 
 __all__ = ["CorrectedArrays", "correct", "regressors", "vector_covariance"]

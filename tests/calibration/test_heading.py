@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import magbridge as mb
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.tilt_boresight import TiltBoresight, boresight_from_tilt
 from magbridge.calibration.heading import heading, level_vector, model_declination_sigma
 from magbridge.errors import CalibrationError
+from sitl import load, simulate
 
 NED = np.array([16e3, -5e3, 49e3])
 TOTAL = float(np.linalg.norm(NED))
@@ -131,6 +133,24 @@ def test_a_sensor_mounted_upside_down_is_found() -> None:
         np.full(600, INCLINATION), np.arange(600) // 100,
     )  # fmt: skip
     assert np.degrees((true * Rotation.from_rotvec(found.rotation).inv()).magnitude()) < 0.02
+
+
+def test_correct_writes_the_heading_of_a_log_and_states_its_error() -> None:
+    """The log's own headings are not used: they may come from the very compass that is calibrated."""
+    log = simulate(load("demo"), 4)
+    true = log["heading"].to_numpy()
+    without = log.drop_vars("heading")
+    runs = mb.observations(without.isel(time=slice(0, 2250)), ("battpos", "ballast"))
+    found = mb.fit(runs)
+    assert found.calibration.boresight is not None
+    corrected = mb.correct_rows(mb.Correction(found.calibration), without)
+    good = corrected["quality"].to_numpy() == 0
+    error = difference_deg(corrected["heading"].to_numpy(), true)[good]
+    sigma = corrected["heading_sigma"].to_numpy()[good]
+    assert np.sqrt(np.mean(error**2)) < 2.0
+    assert 0.3 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.6
+    shift = difference_deg(corrected["heading"].to_numpy(), corrected["magnetic_heading"].to_numpy())
+    np.testing.assert_allclose(shift[good], corrected["declination"].to_numpy()[good], atol=1e-9)
 
 
 def test_too_few_samples_have_no_boresight() -> None:

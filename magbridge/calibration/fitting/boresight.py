@@ -20,11 +20,14 @@ from scipy.spatial.transform import Rotation
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.observations import Observations
+from magbridge.calibration.fitting.tilt_boresight import boresight_from_tilt
 from magbridge.calibration.model import Boresight, Calibration
 from magbridge.errors import CalibrationError
 
-__all__ = ["field_body", "find_boresight", "magnetic_headings"]
+__all__ = ["choose_boresight", "field_body", "find_boresight", "magnetic_headings"]
 
+MAX_OPEN_ANGLE_DEG = 2.0
+"""deg, 1-sigma of the angle that roll and pitch determine least, above which headings are used."""
 FEWEST = 30
 """Samples with attitude and direction that a boresight takes."""
 MISMATCH = 10.0
@@ -92,6 +95,38 @@ def magnetic_headings(calibration: Calibration, data: Observations) -> str:
         f"by {rest_turn:.1f} degrees and not by {turn:.1f}, and {rest:.1f} not {left:.1f} are left "
         "(--heading-reference magnetic)"
     )
+
+
+def choose_boresight(calibration: Calibration, data: Observations) -> Boresight | None:
+    """Return the boresight from roll and pitch alone where they determine it, else one that uses headings.
+
+    A heading that comes from the magnetometer itself contains the error that the boresight is to remove.
+
+    Raises
+    ------
+    CalibrationError
+        As :func:`find_boresight`: headings are used to notice a reversed channel or angle in any case.
+    """
+    with_headings = find_boresight(calibration, data)
+    if data.attitude is None or data.reference_ned is None or calibration.effects:
+        return with_headings
+    known = np.asarray(np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1))
+    if known.sum() < FEWEST:
+        return with_headings
+    part = data.part(known)
+    assert part.attitude is not None
+    assert part.reference_ned is not None
+    total = np.linalg.norm(part.reference_ned, axis=1)
+    inclination = np.arcsin(part.reference_ned[:, 2] / total)
+    _, runs = np.unique(part.runs, return_inverse=True)
+    found = boresight_from_tilt(
+        _vectors(calibration, part), part.attitude[:, 0], part.attitude[:, 1], total, inclination, runs
+    )
+    if found.open_angle[1] > MAX_OPEN_ANGLE_DEG:
+        return with_headings
+    x, y, z = found.rotation.tolist()
+    first, second, third = ((x, y, z) for x, y, z in found.covariance.tolist())
+    return Boresight((x, y, z), (first, second, third))
 
 
 def find_boresight(calibration: Calibration, data: Observations) -> Boresight | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.boresight import find_boresight, magnetic_headings
+from magbridge.calibration.fitting.boresight import choose_boresight, magnetic_headings
 from magbridge.calibration.fitting.crossings import rough_rock
 from magbridge.calibration.fitting.level import apart_from_level
 from magbridge.calibration.fitting.mission import expected_error, nearby_mission
@@ -219,7 +219,7 @@ def judged(found: Fit, data: Observations) -> Fit:
         data = replace(data, field=found.samples.field)
     if calibration.boresight is None:
         try:
-            calibration = replace(calibration, boresight=find_boresight(calibration, data))
+            calibration = replace(calibration, boresight=choose_boresight(calibration, data))
         except CalibrationError as error:
             mismatch.append(str(error))
             data = replace(data, attitude=None)

@@ -65,9 +65,10 @@ def observations(
     if "daily_variation" in ds:
         total = total + _column(ds, "daily_variation")
     ds = with_true_heading(ds)
-    attitude = None
-    if all(name in ds for name in ("roll", "pitch", "heading")):
-        attitude = np.radians(np.stack([_column(ds, name) for name in ("roll", "pitch", "heading")], axis=1))
+    attitude, unknown = None, np.full(ds.sizes["time"], np.nan)
+    if "roll" in ds and "pitch" in ds:  # a boresight needs no heading
+        angles = [_column(ds, name) if name in ds else unknown for name in ("roll", "pitch", "heading")]
+        attitude = np.radians(np.stack(angles, axis=1))
     time = np.asarray(ds["time"].values, float)
     place, unmapped, origin = _places(ds)
     return Observations(
