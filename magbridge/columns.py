@@ -15,10 +15,25 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "AGE", "CHANNELS", "CHANNEL_TIMES", "COLUMNS", "CORRECTED", "FURTHER_AXIS", "NT_PER_UNIT", "Column",
-    "absent", "counts_from_boot", "decoded", "factor", "in_seconds", "may_be", "require",
-    "require_units", "usual",
-]  # fmt: skip
+    "AGE",
+    "CHANNELS",
+    "CHANNEL_TIMES",
+    "COLUMNS",
+    "CORRECTED",
+    "FURTHER_AXIS",
+    "HEADINGS",
+    "NT_PER_UNIT",
+    "Column",
+    "absent",
+    "counts_from_boot",
+    "decoded",
+    "factor",
+    "in_seconds",
+    "may_be",
+    "require",
+    "require_units",
+    "usual",
+]
 
 
 class Column(NamedTuple):

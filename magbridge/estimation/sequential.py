@@ -36,7 +36,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.estimation.kalman import KalmanFilter
 
-__all__ = ["ALARM_LOG_RATIO", "SequentialTest"]
+__all__ = ["ALARM_LOG_RATIO", "RESTART_PERIODS", "SequentialTest"]
 
 ALARM_LOG_RATIO: Final = 18.0
 """h, threshold of L. Eight kinds of change have 2.7 onsets a measurement: by chance an alarm in ``e^18 /

@@ -31,7 +31,7 @@ from magbridge.estimation.sequential import RESTART_PERIODS, SequentialTest
 from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
 from magbridge.health.messages import Messages
 
-__all__ = ["ConsistencyCheck"]
+__all__ = ["MASS_FRACTION", "ConsistencyCheck", "Sample"]
 
 MIN_INTERVAL_S: Final = 1.0
 MAX_INTERVAL_S: Final = 4.0

@@ -16,7 +16,7 @@ from magbridge.logs.headings import bare
 if TYPE_CHECKING:
     from magbridge.logs.layout import Layout
 
-__all__ = ["EARTHS", "find_total", "units_of_axes"]
+__all__ = ["EARTHS", "find_total", "units_of_angles", "units_of_axes"]
 
 EARTHS = 15_000.0, 90_000.0
 """nT, within which the Earth's field lies, with a vehicle's own."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray, IndexArray
 
-__all__ = ["boots", "in_order"]
+__all__ = ["MEDIAN_ROWS", "boots", "in_order"]
 
 BACK = 1.0
 """s by which times are set back where a vehicle was switched on again: records of one moment, which tasks of

@@ -26,7 +26,7 @@ from magbridge.errors import ConfigError
 from magbridge.mavlink.dialect import MAVLinkSigning
 from magbridge.mavlink.framing import is_signed
 
-__all__ = ["Signing", "Stream", "load_key", "readable_by_all", "timestamp"]
+__all__ = ["NOT_SIGNED", "Signing", "Stream", "load_key", "readable_by_all", "timestamp"]
 
 EPOCH_US = 1_420_070_400_000_000
 """2015-01-01 in µs of UNIX time."""
