@@ -44,19 +44,22 @@ def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
     return deployment.assign_coords(time=("time", seconds, {"units": "s", "long_name": "time"}))
 
 
-def observations(deployment: xr.Dataset, parameters: Sequence[str] = (), **options: Any) -> Observations:
+def observations(
+    deployment: xr.Dataset, parameters: str | Sequence[str] = (), **options: Any
+) -> Observations:
     """Return the complete rows of a log for a fit.
 
     Parameters
     ----------
     deployment : Dataset
         On ``time``, with ``mag_x mag_y mag_z`` (nT).
-    parameters : sequence of str
+    parameters : str or sequence of str
         Columns that move masses.
     **options
         Further arguments of :func:`magbridge.calibration.fitting.observe.observations`.
     """
-    return observe.observations(in_seconds(deployment), tuple(parameters), **options)
+    names = (parameters,) if isinstance(parameters, str) else tuple(parameters)
+    return observe.observations(in_seconds(deployment), names, **options)
 
 
 def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> FloatArray:
