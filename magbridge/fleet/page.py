@@ -16,8 +16,10 @@ from matplotlib import rc_context
 from matplotlib.dates import ConciseDateFormatter
 from matplotlib.figure import Figure
 
+from magbridge.errors import WriteError
 from magbridge.files import atomic_path, new_folder
 from magbridge.fleet.drift import History, facts
+from magbridge.fleet.register import is_file_name
 from magbridge.pictures import literal
 
 __all__ = ["write_page", "write_pages"]
@@ -66,8 +68,13 @@ def write_pages(histories: Mapping[str, History], folder: Path, findings: Findin
     Raises
     ------
     WriteError
-        They cannot be written.
+        A vehicle's name is not a file name, or the pages cannot be written.
     """
+    for name in histories:
+        if not is_file_name(name):
+            raise WriteError(
+                folder, f"vehicle {name!r}: expected a name without slashes, not beginning with a dot"
+            )
     with new_folder(folder):
         numbers = {"vehicles": {name: facts(one) for name, one in histories.items()}}
         with atomic_path(folder / "fleet.json") as temporary:

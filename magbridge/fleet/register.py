@@ -182,9 +182,16 @@ def logs_of(fleet: Path, deployment: Deployment) -> list[Path]:
     return found
 
 
+def is_file_name(name: str) -> bool:
+    """Return True if a name can be that of a file or folder: it names no other folder."""
+    return (
+        bool(name.strip()) and not name.startswith(".") and not set(name) & set("/\\") and name.isprintable()
+    )
+
+
 def _check_name(name: str, of: str) -> None:
     """Refuse names that cannot be a folder's: results are kept by them."""
-    if not name.strip() or name.startswith(".") or "/" in name or "\\" in name or not name.isprintable():
+    if not is_file_name(name):
         raise WrongUse(f"{name!r}: expected {of}'s name without slashes, not beginning with a dot")
 
 

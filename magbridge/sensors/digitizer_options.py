@@ -11,7 +11,8 @@ __all__ = ["FULL_SCALE", "DigitizerOptions"]
 
 FULL_SCALE = 1 << 23
 """Counts at which the converter is at its reference voltage."""
-Positive = Annotated[float, Meta(gt=0)]
+Positive = Annotated[float, Meta(ge=1e-12, le=1e9)]
+"""Bounded, because TOML allows ``inf``, but limits are converted to integer counts."""
 
 
 class DigitizerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

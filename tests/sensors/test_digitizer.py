@@ -9,6 +9,7 @@ from zlib import crc32
 
 import pytest
 
+from magbridge.errors import MagbridgeError
 from magbridge.records import Reading
 from magbridge.sensors import open_driver
 from magbridge.sensors.digitizer import EXAMPLE
@@ -92,3 +93,10 @@ def test_later_firmware_may_say_more() -> None:
     assert driver.frames_bad == 1  # the status says 12 bytes and has 36
     assert driver.feed(framed(bytes([2, 36]) + bytes(30))) == []
     assert driver.frames_bad == 1
+
+
+@pytest.mark.parametrize("value", [float("inf"), 5e-324, 1e308])
+@pytest.mark.parametrize("option", ["full_scale", "reference_voltage", "gain", "sensitivity"])
+def test_options_without_finite_counts_are_refused(option: str, value: float) -> None:
+    with pytest.raises(MagbridgeError, match=option):
+        open_driver("digitizer", OPTIONS | {option: value})
