@@ -1,8 +1,8 @@
-"""The bridge learns: the calibration's coefficients as a state, and doubt in what they no longer explain.
+"""Learn the calibration's coefficients on board, and detect changes that the model does not explain.
 
-:class:`Learner` takes the samples that the bridge corrects. An :mod:`.estimator` learns coefficients from
-them, a :mod:`.judge` compares what the calibrations predict, and :mod:`.doubt` says when none explains the
-data.
+:class:`Learner` receives the samples that the bridge corrects. An :mod:`.estimator` learns the coefficients
+from them, a :mod:`.judge` compares the predictions of the calibrations, and :mod:`.doubt` raises an alarm if
+no calibration explains the data.
 """
 
 from magbridge.learning.learner import Learner

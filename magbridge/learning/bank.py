@@ -1,16 +1,17 @@
-r"""Estimators that suppose different changes, side by side: the one that predicts best lately is believed.
+r"""Estimators under different hypotheses, run in parallel: the best recent predictor is selected.
 
-A change that nobody supposed is learned only once it is beyond chance, and what was mistaken for it until
-then is hard to undo: a warming passes for the offset of this power-on, a drift for a step. So beside the
-estimator that supposes nothing, and that doubt tests, others suppose from the start that
+Without a hypothesis, a change is learned only once its test is significant. Until then, the estimator
+attributes the change to the wrong coefficients, which is hard to undo: for example a change of temperature to
+the turn-on offset, or a drift to a step. The baseline estimator assumes no change, and the change detector
+tests it. Further estimators assume from the start that
 
 - the offset follows the sensor's temperature;
 - the offset drifts, at a rate that changes within hours;
-- the map, where there is one, shows nothing of the rock. An error no larger than rock moves single samples
-  by next to nothing, so no test of innovations shows it; but once this one predicts better beyond chance, the
-  map is doubted, and this one believed until it does not predict better any more.
+- the map, if there is one, does not show the crustal field. A map error no larger than the crustal field
+  hardly moves single samples, so no test of innovations shows it. If this estimator predicts significantly
+  better, the bank raises a map alarm and selects this estimator until its lead is lost.
 
-Which to believe is dynamic model selection (Raftery, Karny & Ettler 2010, Technometrics 52:52): with each
+The selection is dynamic model selection (Raftery, Karny & Ettler 2010, Technometrics 52:52): with each
 innovation v of variance S,
 
 .. math:: \log w \leftarrow \alpha \log w - \tfrac12 (v^2 / S + \log S)
@@ -33,41 +34,41 @@ from magbridge.learning.nuisance import Nuisance
 __all__ = ["Bank"]
 
 MEMORY: Final = 2000.0
-"""Samples over which predictions count."""
+"""Samples over which predictions are weighted (exponential forgetting)."""
 AHEAD: Final = 3.0
-"""By which log w has to be ahead to change whom to believe. To leave the quiet one, :data:`BEYOND_CHANCE`:
-what no change is seen of, as the level, is at the mercy of what is supposed."""
+"""Lead in log w that changes the selected estimator. To leave the baseline estimator the lead has to reach
+:data:`BEYOND_CHANCE`, because quantities that no test observes, as the level, depend on the hypothesis."""
 MOST: Final = 25.0
-"""v²/S of one sample at most: an outlier says nothing of which is better."""
+"""Largest v²/S that one sample contributes: an outlier does not distinguish the estimators."""
 CLOSE: Final = 10.0
-"""How far its log w may be behind a doubt's, which is the best of dozens of onsets and causes."""
+"""Largest deficit in log w against an alarm's, which is the best of dozens of onsets and causes."""
 PER_DEGREE: Final = 2.0
-"""nT/degC, 1-sigma, by which an axis's offset may follow the temperature."""
+"""Prior 1-sigma of the offset's change with temperature, nT/degC an axis."""
 RATE: Final = 5.0 / 3600.0
-"""nT/s, 1-sigma, by which it may drift."""
+"""Prior 1-sigma of the offset's drift, nT/s an axis."""
 CHANGES: Final = 2.0 * 3600.0
-"""s over which that rate is forgotten."""
+"""Correlation time of the drift rate, s."""
 
 
 class Bank:
-    """What is learned, by each supposition.
+    """Estimators of the coefficients, one for each hypothesis.
 
     Parameters
     ----------
     model : Model
     quiet : Estimator
-        The one that supposes nothing.
+        Baseline estimator, which assumes no change.
     mapless : Nuisance, optional
-        Rock without the map, where there is one.
+        Nuisance of the crustal field without the map, if the reference is a map.
 
     Attributes
     ----------
     all : list of Estimator
-        That one first.
+        All estimators; the baseline is the first.
     without_map : Estimator or None
-        The last of them.
+        Estimator that does not use the map; the last of `all`.
     map_doubted : bool
-        Whether that one is to be believed.
+        True if the bank has raised a map alarm and selects `without_map`.
     """
 
     def __init__(self, model: Model, quiet: Estimator, mapless: Nuisance | None = None) -> None:
@@ -78,18 +79,18 @@ class Bank:
 
     @property
     def quiet(self) -> Estimator:
-        """The one that supposes nothing."""
+        """Baseline estimator, which assumes no change."""
         return self.all[0]
 
     @property
     def best(self) -> Estimator:
-        """The one to believe."""
+        """Selected estimator: the one with the highest recent predictive likelihood."""
         if self.map_doubted and self.without_map is not None:
             return self.without_map
         return self.all[self._best]
 
     def suppose(self) -> None:
-        """Let the others begin at what the quiet one knows."""
+        """Add the other hypotheses, each starting from the baseline's state."""
         slots = self._model.slots(TEMPERATURE)
         if TEMPERATURE in self._model.further and slots is not None:
             warm = deepcopy(self.quiet)
@@ -106,12 +107,12 @@ class Bank:
         self._weights = [0.0] * len(self.all)
 
     def open(self, variance: float) -> None:
-        """Let the offsets be unknown by a further `variance` (nT²) an axis."""
+        """Increase the variance of the offsets of all estimators by `variance` (nT²) an axis."""
         for one in self.all:
             one.open(variance)
 
     def judge(self, time: float) -> Alarm | None:
-        """Take note of what each has predicted at a time (s); return a doubt in the map, if there is one."""
+        """Score each estimator's prediction at a time (s); return the map alarm, if there is one."""
         for k, one in enumerate(self.all):
             S = one.variance
             self._weights[k] *= 1.0 - 1.0 / MEMORY
@@ -132,10 +133,10 @@ class Bank:
         return Alarm(("map_error",), ("",), self._since, abs(without.rock), lead, mapless=True)
 
     def take_over(self, strength: float) -> bool:
-        """Let the quiet one go on from the one that follows the temperature; return whether it does.
+        """Replace the baseline by the estimator that follows the temperature; return True if it is replaced.
 
-        It does where that one has predicted better beyond chance, and hardly worse than what a doubt has
-        found, with a log-likelihood ratio `strength`. For what was supposed from the start is known better.
+        The replacement needs significantly better predictions, and a log-likelihood not much lower than an
+        alarm's, `strength`. An estimator that followed the temperature from the start knows it more exactly.
         """
         warm = self._warm
         if self._weights[warm] - self._weights[0] < max(BEYOND_CHANCE, strength - CLOSE):
@@ -144,9 +145,10 @@ class Bank:
         return True
 
     def explained(self, by: FloatArray, covariance: FloatArray, strength: float) -> None:
-        """Move the quiet one by `by` (n,), known to a further `covariance` (n, n), as a doubt has found.
+        """Move the baseline's state by `by` (n,), of additional covariance `covariance` (n, n).
 
-        Its log-likelihood ratio `strength` speaks for the quiet one from now on.
+        `by` and its log-likelihood ratio `strength` come from the alarm's cause; `strength` is added to the
+        baseline's score.
         """
         self.quiet.shift(by, covariance)
         self._weights[0] += strength

@@ -1,4 +1,4 @@
-"""What may be behind data that the model no longer explains."""
+"""Possible causes of data that the model no longer explains."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ CAUSES: Final = {
     "clock_offset": 2.0,
     "map_error": 50.0,
 }
-"""Cause -> the unit of its amplitude: nT, nT/h, nT/degC, nT a half range, nT/A, s, nT. A bit each in
-MAG_LEARNING."""
+"""Cause -> the unit of its amplitude: nT, nT/h, nT/degC, nT a half range, nT/A, s, nT. Each cause has a bit
+in MAG_LEARNING."""
 FROM_ZERO: Final = ("offset_step", "current_field", "clock_offset", "map_error")
-"""Causes that add as much as their regressor, not as much as it has changed since the onset."""
+"""Causes whose effect is proportional to their regressor, not to its change since the onset."""
 NO_COEFFICIENT: Final = frozenset(("clock_offset", "map_error"))
-"""Causes that no coefficient can take up."""
+"""Causes that no coefficient can represent."""
 
 
 def named(causes: Sequence[str]) -> str:
@@ -35,7 +35,7 @@ class Signs(NamedTuple):
     """What a sample's causes would do to its residual."""
 
     time: float
-    """s."""
+    """Time of the sample, s since 1970 UTC."""
     offset: FloatArray
     """(3,): Derivative of the residual by the offset of each axis."""
     positions: tuple[float, ...]
@@ -64,11 +64,11 @@ class Alarm(NamedTuple):
     channels: tuple[str, ...]
     """The telemetry that each follows; empty for none."""
     since: float
-    """s, when the likeliest began."""
+    """Onset of the likeliest cause, s since 1970 UTC."""
     size: float
-    """nT, root mean square of what it adds to the total field."""
+    """Root mean square of the likeliest cause's effect on the total field, nT."""
     strength: float
-    """L of the likeliest."""
+    """Log-likelihood ratio L of the likeliest cause."""
     mapless: bool = False
-    """It is only the map that is doubted, and rock that it does not show explains the data: what is corrected
-    is in no doubt, and the alarm stands as long as it is raised."""
+    """True for a map alarm: an unmapped crustal field explains the data. The corrected field is not affected,
+    and the alarm lasts as long as the bank raises it."""

@@ -1,4 +1,4 @@
-"""What becomes of what is learned: it is published, taken back, or ends a doubt."""
+"""Decide when to publish the learned calibration, when to roll it back, and when to close an alarm."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from magbridge.learning.standing import Standing
 __all__ = ["Decision"]
 
 GONE: Final = 9.0
-"""Log-likelihood ratio below which it is not learned any more, but gone."""
+"""Log-likelihood ratio below which an alarm's cause is closed as gone instead of learned."""
 
 
 class Decision:
-    """Judges and decides with every sample.
+    """Evaluates every sample and decides what to publish.
 
     Parameters
     ----------
     publication : Publication
     standing : Standing
-        The doubt's.
+        State of the alarm.
     notify : callable
-        Called with what to say of a change, and whether someone should look.
+        Called with the text of a notification, and True if its severity is WARNING.
 
     Attributes
     ----------
     samples : int
-        That coefficients were learned from.
+        Number of samples that coefficients were learned from.
     """
 
     def __init__(
@@ -47,16 +47,16 @@ class Decision:
         return self._publication.made(knowledge.bank.best, self.samples, knowledge.noise)
 
     def doubt(self, alarm: Alarm | None) -> None:
-        """Take note of a doubt that a test has raised, if it has."""
+        """Pass an alarm, if there is one, to the alarm's state, and send the notification that results."""
         if alarm is not None and (news := self._standing.raised(alarm)):
             self._notify(news, True)
 
     def publish(self, knowledge: Knowledge, how: str) -> None:
-        """Publish what is learned, and say `how` that came."""
+        """Publish the learned calibration; `how` is the reason in the notification."""
         self._notify(self._publication.publish(self.learned(knowledge), how), False)
 
     def settle(self, knowledge: Knowledge, how: str) -> None:
-        """End the doubt, if there is one, and say `how`."""
+        """Close the alarm, if there is one; `how` is the reason in the notification."""
         if self._standing.alarm is None:
             return
         self._standing.end()
@@ -65,14 +65,15 @@ class Decision:
         self._notify(f"explained again: {how}", False)
 
     def gone(self, knowledge: Knowledge) -> None:
-        """End a doubt that no coefficient took up; what was judged meanwhile was judged by its cause."""
+        """Close an alarm that no coefficient explained, and restart the judge, which its cause affected."""
         self._publication.judge.restart()
         self.settle(knowledge, "gone")
 
     def take(self, knowledge: Knowledge, sample: Sample, way: tuple[float, float], *, frozen: bool) -> bool:
-        """Predict a sample, judge by it, learn from it, and decide what becomes of that.
+        """Predict a sample, compare the calibrations, learn from it, and decide what to publish.
 
-        It is `way` (m and s) after the one before; return whether to learn anew from the first calibration.
+        `way` is the distance (m) and time (s) since the previous sample. Return True if learning has to
+        restart from the first calibration.
         """
         publication = self._publication
         now, signs = knowledge.predict(sample, *way)
@@ -98,7 +99,7 @@ class Decision:
         return self._decide(knowledge, apart * now.s, frozen=frozen)
 
     def _compare(self, knowledge: Knowledge, time: float, apart: float) -> None:
-        """Follow which estimator predicts best, and how well what is published does, `apart` (nT) from it."""
+        """Select the best estimator; `apart` (nT) is the published calibration's residual less the best's."""
         bank, publication = knowledge.bank, self._publication
         best, doubted = bank.best, bank.map_doubted
         seen = (best.residual + apart, best.variance) if publication.learned else publication.judge.last
@@ -108,14 +109,14 @@ class Decision:
             publication.judge.restart(knowledge.believed)
 
     def _begin(self, knowledge: Knowledge, sample: Sample, way: tuple[float, float]) -> None:
-        """Learn from a sample while next to nothing is known."""
+        """Learn from a sample while the batch fit runs, before a filter can be linearised."""
         if not knowledge.begin(sample, *way):
             self._count(learned=True)
             return
         self._publication.judge.restart(knowledge.nuisance)
         if self._publication.learned:
             self._publication.renew(self.learned(knowledge))
-            self._publication.renewed = False  # what jumped may have been the fit before
+            self._publication.renewed = False  # the previous fit may have caused the jump
         knowledge.go_on()
 
     def _count(self, *, learned: bool) -> None:
@@ -123,7 +124,7 @@ class Decision:
         self._publication.age += 1
 
     def _decide(self, knowledge: Knowledge, apart: float, *, frozen: bool) -> bool:
-        """Publish what predicts better, `apart` (nT) from what is published, or go back to what does."""
+        """Publish or roll back; `apart` is the difference of learned and published total field, nT."""
         publication = self._publication
         if not frozen:
             self._end(knowledge)
@@ -144,14 +145,14 @@ class Decision:
         return False
 
     def _trusted(self, knowledge: Knowledge) -> bool:
-        """Whether nothing is doubted, but perhaps what the best estimator has supposed from the start."""
+        """Return True without an alarm, or if the best estimator's hypothesis explains the alarm."""
         standing, bank = self._standing, knowledge.bank
         if standing.alarm is None or standing.mapless:
             return True
         return standing.learnable and not standing.relapses and bank.best is not bank.quiet
 
     def _end(self, knowledge: Knowledge) -> None:
-        """End a doubt that has been quiet for long, or learn what is behind one that is sure enough."""
+        """Close an alarm that has been silent for long, or learn the cause of one that is certain enough."""
         standing, publication = self._standing, self._publication
         if not standing.gone:
             if standing.ripe:
@@ -170,7 +171,7 @@ class Decision:
         return f"{causes}, learned {calibration_id(self._publication.calibration):08x}"
 
     def _take_up(self, knowledge: Knowledge) -> None:
-        """Learn what is behind the doubt, if coefficients can take it up."""
+        """Learn the cause of the alarm, if coefficients can represent it."""
         bank, alarm = knowledge.bank, self._standing.alarm
         strength = float(knowledge.doubt.statistic.max())
         if strength < GONE:

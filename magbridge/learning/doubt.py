@@ -1,8 +1,8 @@
-r"""Whether the model still explains the data, and which causes fit where it does not.
+r"""Test whether the model still explains the data, and which causes fit if it does not.
 
 The estimator's innovations r are white, of variance S, while the model holds. A cause of amplitude a adds
 :math:`\phi a` to them, :math:`\phi` its signature as the filter sees it: the signature f in the residual
-and what the filter has already taken in of it (Willsky & Jones 1976, IEEE Trans. Automatic Control 21:108)
+and the part that the filter has already absorbed (Willsky & Jones 1976, IEEE Trans. Automatic Control 21:108)
 
 .. math:: \phi = f + h \Xi, \qquad \Xi \leftarrow \Xi - k \phi
 
@@ -11,15 +11,15 @@ With :math:`a \sim N(0, I)` in the unit :math:`\tau` of each cause, the log-like
 .. math:: L = \tfrac12 y^T (I + M)^{-1} y - \tfrac12 \log \det(I + M), \quad
           M = \sum \phi \phi^T / S, \quad y = \sum \phi r / S
 
-a mixture over all sizes, so none needs to be known. Of each cause several onsets are tested, begun anew
-every 4, 16, 64 ... samples, and at the first sample that stands out. As L starts from 0, :math:`e^L` is a
+a mixture over all amplitudes, so none needs to be known. Several onsets are tested for each cause. They
+restart every 4, 16, 64 ... samples, and at the first outlying sample. As L starts from 0, :math:`e^L` is a
 martingale of mean 1 each time, and exceeds :math:`e^h` by chance with probability :math:`e^{-h}` at most.
 
-A cause is learned by giving the estimator what its test knows: the amplitude is
+A cause is learned by passing the result of its test to the estimator: the amplitude is
 :math:`\hat a = (I + M)^{-1} y`, of covariance :math:`(I + M)^{-1}`, and moves the state by
-:math:`-G \hat a`, G being what the filter has taken in, :math:`\Xi`, and the cause's own coefficients
-(Friedland 1969, IEEE Trans. Automatic Control 14:359). Of several causes that fit, each counts as much as
-:math:`e^L` says.
+:math:`-G \hat a`, where G contains the part that the filter has absorbed, :math:`\Xi`, and the cause's own
+coefficients (Friedland 1969, IEEE Trans. Automatic Control 14:359). If several causes fit, each has a weight
+proportional to :math:`e^L`.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from magbridge.learning.model import TEMPERATURE, Model
 __all__ = ["LEAST", "Doubt"]
 
 LEAST: Final = 18.0
-"""h, from which on the data are no longer explained. With eight causes there are 2.7 onsets a sample: by
-chance once in ``e^18 / 2.7`` samples at most, 3 years of 0.25 Hz, while the noise is as stated.
-``tools/live.py`` counts."""
+"""Alarm threshold h of the log-likelihood ratio. With eight causes there are 2.7 onsets a sample, so false
+alarms come at most once in ``e^18 / 2.7`` samples (3 years of 0.25 Hz) if the noise is as stated.
+``tools/live.py`` counts them."""
 PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
 """Samples after which an onset is replaced by a new one."""
 PROMISING: Final = 6.0
-"""L from which on it is not."""
+"""Log-likelihood ratio L from which on an onset is kept."""
 STANDS_OUT: Final = 3.0
-"""Sigmas of an innovation at which the first onset begins anew."""
+"""Size of an innovation, in sigma, at which the first onset restarts."""
 COMPETING: Final = log(20.0)
-"""How far behind the best a cause may be, and still fit."""
+"""Largest difference of L from the best cause at which another cause still fits."""
 NOISIER_OVER: Final = 3000
-"""Samples over which it is followed how much noisier the innovations are than their sigma."""
+"""Averaging length, in samples, of the ratio of the innovations' variance to the predicted one."""
 
 
 class Doubt:
@@ -59,7 +59,7 @@ class Doubt:
     ----------
     model : Model
     estimator : Estimator
-        Whose innovations are tested; it may be replaced by another one that learns the same.
+        Estimator whose innovations are tested; another that learns from the same samples may replace it.
     """
 
     def __init__(self, model: Model, estimator: Estimator) -> None:
@@ -83,7 +83,7 @@ class Doubt:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all evidence; what is known of the noise stays."""
+        """Discard all evidence, but keep the estimate of the noise."""
         many = len(self._causes)
         self._M = np.zeros((many, 3, 3))
         self._raw = np.zeros((many, 3, 3))
@@ -97,11 +97,11 @@ class Doubt:
         self._amplitude = np.zeros((many, 3))
 
     def propagate(self, estimator: Estimator, F: FloatArray, seconds: float) -> None:
-        """Move what the filter has taken in on, as :meth:`.Estimator.propagate`, which returned F (4, 4)."""
+        """Propagate the absorbed part by `F` (4, 4), the transition of :meth:`.Estimator.propagate`."""
         estimator.advance(self._state, F, seconds)
 
     def test(self, estimator: Estimator, signs: Signs) -> Alarm | None:
-        """Test the estimator's prediction; return what no longer fits, if anything."""
+        """Test the estimator's prediction; return an alarm if a cause exceeds the threshold."""
         S = estimator.variance
         u = estimator.residual / sqrt(S)
         f = self._signatures(signs, abs(u) > STANDS_OUT)
@@ -118,11 +118,11 @@ class Doubt:
         return self._alarm() if float(self.statistic.max()) > LEAST else None
 
     def updated(self, gain: FloatArray) -> None:
-        """Take note that the estimator was updated with `gain` (n,)."""
+        """Subtract the part that the estimator absorbed in its update with `gain` (n,)."""
         self._state -= gain[:, None, None] * self._phi[None]
 
     def _signatures(self, signs: Signs, stands_out: bool) -> FloatArray:
-        """(rows, 3) what one unit of each does to the residual; onsets whose time is over begin anew."""
+        """Return (rows, 3) residual of one unit of each cause; restart the onsets that have expired."""
         self._now = signs.time
         now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
         regressor = np.repeat(np.nan_to_num(np.array(now)), len(PERIODS))
@@ -162,9 +162,9 @@ class Doubt:
         )
 
     def learned(self) -> tuple[FloatArray, FloatArray] | None:
-        """Return what the causes that fit move the state by (n,), and its further covariance (n, n).
+        """Return the state's shift (n,) by the causes that fit, and its additional covariance (n, n).
 
-        None where no coefficient can take up the likeliest.
+        Return None if no coefficient can represent the likeliest cause.
         """
         fits = self._fitting
         if self._causes[fits[0]].states is None:

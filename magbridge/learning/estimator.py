@@ -1,14 +1,14 @@
-"""The calibration's coefficients as the state of a Kalman filter, beside what is not the calibration's.
+"""A Kalman filter whose state is the calibration's coefficients and the nuisance of the reference field.
 
-The state is the coefficients, the slope of the offset (nT/s, an axis), and those of :mod:`.nuisance`.
+The state is the coefficients, the slope of the offset (nT/s, an axis), and the states of :mod:`.nuisance`.
 
-Covariance form: the variance of every prediction, which judging and doubt need with each sample, is then a
-by-product, and a prior that is certain of some combinations (as a fit that could not estimate them, or an
-effect that nothing speaks for) needs no inverse; the state is relinearised at each sample.
+The filter uses the covariance form. The variance of every prediction, which comparison and alarm need with
+each sample, is then a by-product. A singular prior needs no inverse, for example after a fit that could not
+estimate some combinations. The state is relinearised at each sample.
 
-Where a sample says little about the coefficients that rock could not explain as well, they are
-*considered*, not learned: their gain is zero, and their uncertainty stays in the variance (Schmidt 1966;
-Joseph's form holds for any gain)::
+If the crustal field could explain a sample as well as the coefficients, the filter *considers* the
+coefficients and does not learn them: their gain is zero, and their uncertainty stays in the variance
+(Schmidt 1966; Joseph's form holds for any gain)::
 
     P <- P - k (h P) - (P h^T) k^T + k S k^T
 """
@@ -28,22 +28,22 @@ __all__ = ["BESIDE", "SLOPE", "Estimator"]
 SLOPE: Final = 3
 """States of the offset's slope."""
 BESIDE: Final = SLOPE + STATES
-"""States that are no coefficients."""
+"""Number of states that are not coefficients."""
 TELLING: Final = 0.01
-"""Share of a prediction's variance that comes from the coefficients and varies along the track: from here on
-the sample tells something of them."""
+"""Fraction of a prediction's variance that comes from the coefficients and varies along the track: from here
+on the sample is informative about the coefficients."""
 NEAR: Final = 250.0
-"""m over which the mean derivative is followed, a quarter of the rock's length: what varies within is not
-rock."""
+"""Averaging distance of the mean derivative, m: a quarter of the crustal field's correlation length. Faster
+variations are not attributed to the crustal field."""
 LONG: Final = 1000
-"""Samples over which the mean derivative of the total field is followed."""
+"""Samples over which the mean derivative of the total field is averaged."""
 CHANGED: Final = 2.0
-"""Sigmas by which the level has changed."""
+"""Change of the level, in sigma, from which on it counts as a change."""
 LASTING: Final = 24.0 * 3600.0
-"""s over which what is known of a drift's slope gets less certain by a factor of e in variance: a drift
-changes, but what was found to be none does not begin anew by itself."""
+"""Time in which the variance of a drift's slope grows by a factor of e, s. A drift changes, but a drift that
+was estimated as zero does not restart by itself."""
 STEEPEST: Final = 20.0 / 3600.0
-"""nT/s: no drift's slope gets less certain than that."""
+"""Largest 1-sigma of a drift's slope, nT/s."""
 
 
 class Estimator:
@@ -96,7 +96,7 @@ class Estimator:
     def know(
         self, coefficients: FloatArray, nuisances: FloatArray, covariance: FloatArray, nuisance: Nuisance
     ) -> None:
-        """Take what a fit says for all that is known of coefficients (K,) and nuisance (4,), jointly."""
+        """Set the state and covariance to a fit's joint result for coefficients (K,) and nuisance (4,)."""
         self._nuisance = nuisance
         both = np.r_[: self.size, self.states - STATES : self.states]
         self._x[both] = np.concatenate([coefficients, nuisances])
@@ -112,7 +112,7 @@ class Estimator:
     def covariance(self) -> FloatArray:
         """Their covariance (K, K), symmetric and positive semidefinite."""
         P = self._P[: self.size, : self.size]
-        kept = self._kept * float(self._mean @ P @ self._mean)  # what has not been learned since
+        kept = self._kept * float(self._mean @ P @ self._mean)  # the part not learned since keep_level
         P = P + np.outer(kept, kept)
         values, vectors = np.linalg.eigh(0.5 * (P + P.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -131,8 +131,8 @@ class Estimator:
     def at_level_of(self, published: FloatArray) -> FloatArray:
         """Return the likeliest coefficients (K,) whose mean field is that of those `published` (K,).
 
-        Rock and reference hide the level, so that what is learned of it is chance: what need not, shall not
-        change it.
+        The crustal field and the reference hide the level. A learned change of the level is therefore not
+        significant, and the published level is kept where the data allow it.
         """
         K = self.size
         toward = self._P[:K, :K] @ self._mean
@@ -142,9 +142,9 @@ class Estimator:
     def keep_level(self, published: FloatArray) -> None:
         """Move the state to where the mean field is that of the coefficients `published` (K,).
 
-        As :meth:`at_level_of`, with rock that takes up what the coefficients give; but not where the level
-        drifts, or has changed beyond chance. It may have changed by so much all the same: the covariance of
-        what is published says so, as far as that is not learned since; the filter is not let loose.
+        Unlike :meth:`at_level_of`, the nuisance states absorb the difference. The state is not moved if the
+        level drifts or has changed significantly. The covariance to publish includes the difference until
+        further samples reduce it; the filter's own covariance does not change.
         """
         K = self.size
         toward = self._P[:, :K] @ self._mean
@@ -154,12 +154,12 @@ class Estimator:
             self._kept = toward[:K] * (by / variance**2)
 
     def open(self, variance: float, which: IndexArray | None = None) -> None:
-        """Let coefficients `which` (3,), by default the offsets, be unknown by a further `variance` each."""
+        """Increase the variance of the coefficients `which` (3,), by default the offsets, by `variance`."""
         which = self.offsets if which is None else which
         self._P[which, which] += variance
 
     def drift(self, rate: float, lasting: float) -> None:
-        """Let the offsets drift by `rate` (nT/s, 1-sigma an axis), which changes within `lasting` (s)."""
+        """Add an offset drift of `rate` (nT/s, 1-sigma an axis) with correlation time `lasting` (s)."""
         self._P[self.slope, self.slope] += rate * rate
         self._sloping, self._lasting = True, lasting
 
@@ -177,7 +177,7 @@ class Estimator:
             state[self.offsets] += seconds * state[self.slope]
 
     def propagate(self, metres: float, seconds: float) -> FloatArray:
-        """Move on by a way and a time; return the transition (4, 4) of what is not the calibration's."""
+        """Propagate over a distance (m) and a time (s); return the transition (4, 4) of the nuisance."""
         P = self._P
         F, Q = self._nuisance.transition(metres, seconds)
         self.advance(self._x, F, seconds)
@@ -194,7 +194,7 @@ class Estimator:
         return F
 
     def predict(self, e: float, s: float, by_coefficients: FloatArray) -> None:
-        """Take a sample's residual at the present coefficients, its derivatives (K,): set the innovation."""
+        """Compute the innovation from a sample's residual and derivatives (K,) at these coefficients."""
         K, h = self.size, self._h
         h[:K] = by_coefficients
         h[-STATES:] = self._nuisance.row(s)
@@ -209,7 +209,7 @@ class Estimator:
         self.telling = float(varying @ self._P[:K, :K] @ varying) > TELLING * self.variance
 
     def update(self, *, learn: bool) -> FloatArray:
-        """Take the predicted sample in; return the gain (n,).
+        """Update the state with the predicted sample; return the gain (n,).
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Estimator:
         return np.asarray(gain)
 
     def leave_map(self, nuisance: Nuisance) -> None:
-        """Let rock be as `nuisance` says, which is without a map, and nothing be known of it."""
+        """Replace the nuisance by `nuisance`, of a reference without a map, in its initial state."""
         self._nuisance = nuisance
         P, states = self._P, slice(-STATES, None)
         self._x[states] = 0.0
@@ -237,12 +237,12 @@ class Estimator:
 
     @property
     def rock(self) -> float:
-        """The rock's field as learned, nT."""
+        """Crustal field as estimated, nT."""
         return float(self._x[-STATES])
 
     @property
     def expected(self) -> float:
-        """The residual, nT, that what is not the calibration's lets expect of a sample like the last one."""
+        """Expected residual of the last sample's successor from the nuisance states alone, nT."""
         return -float(self._h[-STATES:] @ self._x[-STATES:])
 
     def response(self, signature: FloatArray, state: FloatArray) -> FloatArray:

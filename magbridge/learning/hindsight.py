@@ -1,4 +1,4 @@
-r"""Whether the masses' telemetry is late: each sample against what is reported after it.
+r"""Test whether the telemetry of the masses is late, by comparing each sample with later reports.
 
 Late telemetry shows in the samples before a motion is reported: they fit the positions of a later report. A
 sample of innovation v (variance S) has the innovation v' at the positions that are reported a time d later.
@@ -8,8 +8,8 @@ the log-likelihood ratio of 'late by about d' over 'in time' is
 .. math:: L_d \leftarrow \max\left(0, L_d + \tfrac12 \left(
           \frac{v^2}{S} - \frac{v'^2}{S'} - \log \frac{S'}{S} \right)\right)
 
-(Page 1954, Biometrika 41:100). Masses at rest say nothing of it: v' = v. These samples are outliers to all
-else, so they are tested whether or not the sensor seems at fault.
+(Page 1954, Biometrika 41:100). With masses at rest v' = v, and the ratio does not change. Late samples look
+like outliers to the other tests, so this test uses them even if the sensor seems to be at fault.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Hindsight:
         return None
 
     def _reported_since(self, time_us: int, k: int) -> Kept | None:
-        """Return the sample kept for which what is reported now was late by the k-th d, if any."""
+        """Return the stored sample that the present report would match at the k-th d, or None."""
         late_us = LATE_US[k]
         one = min(self._kept, key=lambda one: abs(time_us - one.time_us - late_us), default=None)
         if one is None or abs(time_us - one.time_us - late_us) > NEAR * late_us:

@@ -14,7 +14,7 @@ __all__ = ["Intake", "Sample"]
 MOST_HELD: Final = 64
 """Samples that wait for newer telemetry, at most: the first are then left out."""
 SHORT_US: Final = 3_600_000_000
-"""µs without a sample to learn from after which that is told."""
+"""Time without a usable sample after which the bridge sends a notification, µs."""
 
 
 class Sample(NamedTuple):
@@ -54,7 +54,7 @@ class Intake:
         return not 0 <= time_us - (self._taken_us if fit else self._looked_us) < 0.99 * self._period_us
 
     def drop(self) -> None:
-        """Leave out what waits: a mass had begun to move, or the sensor has been powered anew."""
+        """Discard the waiting sample, because a mass had begun to move or the sensor was power-cycled."""
         self._held.clear()
 
     def confirmed(self, time_us: int, age: float) -> list[Sample]:
@@ -73,13 +73,13 @@ class Intake:
         self._newest = True
 
     def settle(self, field: Vector | None) -> None:
-        """Take what the next reading says of the field of the one before, nT, if that waits."""
+        """Correct the waiting sample's field (nT) from the next reading, if a sample waits."""
         if self._newest and self._held and field is not None:
             self._held[-1] = self._held[-1]._replace(field=field)
         self._newest = False
 
     def short(self, time_us: int) -> bool:
-        """Take note of a sample that is not fit; return whether it is to be told how long there was none."""
+        """Count an unusable sample; return True if a notification of the shortage is due."""
         self._last_us = self._last_us or time_us
         if time_us - self._last_us <= SHORT_US or self._reported_us == self._last_us:
             return False

@@ -1,7 +1,7 @@
-r"""Whether the first calibration or what is learned predicts better: each sample before it is learned from.
+r"""Compare the first and the learned calibration by their predictions of each sample before the update.
 
-Both predict the residual of the next sample, with the variance that they claim: the first calibration with
-a filter of its own for what is not the calibration's (:mod:`.nuisance`), what is learned with its own
+Both predict the residual of the next sample and its variance. The first calibration has a filter of its own
+for the nuisance (:mod:`.nuisance`); the learned calibration has its estimator's
 (:mod:`.estimator`). With errors v and variances S of these predictions,
 
 .. math:: 2 L = \sum \left( \frac{v_a^2}{c^2 S_a} - \frac{v_b^2}{c^2 S_b} + \log \frac{S_a}{S_b} \right)
@@ -28,27 +28,28 @@ FIRST, LEARNED = range(2)
 BEYOND_CHANCE: Final = 13.5
 """h: once in 30 days of 0.25 Hz."""
 MOST: Final = 4.0
-"""That one sample counts at most: an outlier says nothing of which is better."""
+"""Largest contribution of one sample: an outlier does not distinguish the calibrations."""
 MARGIN: Final = 0.01
-"""By which what is learned has to be better, a sample, to count at all: an error of 0.14 sigma that the first
-calibration makes and it does not. No calibration is exact: over thousands of like samples, less than that is
-beyond chance, but does not hold for others, and what predictions do not show, as the level, may get worse."""
+"""Least advantage of the learned calibration for each sample: an error of 0.14 sigma that only the first
+calibration makes. No calibration is exact. A smaller advantage becomes significant over thousands of similar
+samples, but does not hold for different ones, and quantities that predictions do not show, as the level, may
+get worse."""
 MEMORY: Final = 500
 """Samples over which mean squares are followed."""
 
 
 class Judge:
-    """Follows the predictions of both.
+    """Follows the predictions of the first and of the learned calibration.
 
     Attributes
     ----------
     better, worse : float
-        Log-likelihood ratio of what is learned over the first calibration, less the margin, and of that one
-        over it.
+        Log-likelihood ratio of the learned calibration over the first one, less the margin; and of the first
+        over the learned one.
     mean_square : (2,) array
-        nT², of the errors of prediction lately.
+        Recent mean square of the prediction errors of the first and the learned calibration, nT².
     last : tuple of 2 float
-        nT and nT², by how much the first calibration's last prediction was wrong, and expected to be.
+        Error of the first calibration's last prediction (nT), and its predicted variance (nT²).
     """
 
     def __init__(self, nuisance: Nuisance) -> None:
@@ -60,7 +61,7 @@ class Judge:
         self.restart()
 
     def restart(self, nuisance: Nuisance | None = None) -> None:
-        """Begin anew: there is another first calibration, or something else is known of the nuisance."""
+        """Restart the comparison, for another first calibration or another nuisance."""
         self._nuisance = nuisance or self._nuisance
         self._P = self._nuisance.initial.copy()
         self._m = np.zeros(STATES)
@@ -75,11 +76,11 @@ class Judge:
         Parameters
         ----------
         F, Q : (4, 4) arrays
-            Of :meth:`.Nuisance.transition`.
+            Transition and process noise of :meth:`.Nuisance.transition`.
         e, s : float
-            nT, residual of the first calibration, and its scale.
+            Residual of the first calibration (nT), and its scale.
         innovation, variance : float
-            nT and nT², what is learned has been wrong by, and expected to be.
+            Innovation of the learned calibration (nT), and its variance (nT²).
         """
         h = self._nuisance.row(s)
         self._P = F @ self._P @ F.T + Q
@@ -90,7 +91,7 @@ class Judge:
         self.last = v, S
         self._m -= Ph * (v / S)
         self._P -= np.outer(Ph / S, Ph)
-        if self._fresh:  # the first sample says only what the rock's level is
+        if self._fresh:  # the first sample only determines the level of the crustal field
             self._fresh = False
             return
         self._judged += 1
@@ -106,10 +107,10 @@ class Judge:
 
     @property
     def adopt(self) -> bool:
-        """Whether what is learned predicts better, beyond chance."""
+        """Return True if the learned calibration predicts significantly better, by its log ratio."""
         return self.better > BEYOND_CHANCE
 
     @property
     def roll_back(self) -> bool:
-        """Whether the first calibration predicts better, beyond chance."""
+        """Return True if the first calibration predicts significantly better (log ratio above the bound)."""
         return self.worse > BEYOND_CHANCE

@@ -1,4 +1,4 @@
-"""What is learned and doubted since the first calibration was begun with: estimators, and tests of them."""
+"""State of the learning since the first calibration: the estimators and the tests of their innovations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from magbridge.records import Vector
 __all__ = ["Knowledge"]
 
 LINEAR: Final = 300.0
-"""nT, 1-sigma of an axis's offset: from here on it is fitted anew as a whole."""
+"""Offset uncertainty from which on the batch fit repeats the whole estimate, nT, 1-sigma of an axis."""
 CREEP: Final = 3.0 / 86_400.0**0.5
 """nT per square root of a second: an offset walks by 3 nT a day."""
 OUTLIER: Final = 5.0
@@ -34,28 +34,30 @@ AGREE: Final = 3
 
 
 class Knowledge:
-    """What the samples since have taught.
+    """Estimators, change detector and batch fit of one learning period.
 
     Parameters
     ----------
     model : Model
     first : Calibration
-        The one to begin with; its offsets may have changed at this power-on.
+        Initial calibration; its offsets may have changed at this power-on.
     nuisance : Nuisance
-        About the reference.
+        Nuisance of the reference.
     mapless : Nuisance or None
-        About the main field, where the reference is a map.
+        Nuisance of the main field, if the reference is a map.
     turn_on : float
-        nT, 1-sigma of that change.
+        1-sigma of the offsets' change at this power-on, nT.
 
     Attributes
     ----------
-    bank, doubt
-        The estimators, and what the first of them does not explain.
+    bank : Bank
+        Estimators.
+    doubt : Doubt
+        Change detector of the baseline estimator.
     start : Start or None
-        While a filter cannot go on alone.
+        Batch fit, until a filter can continue without it.
     nuisance, noise
-        As found so far.
+        Estimates so far.
     """
 
     def __init__(
@@ -77,7 +79,7 @@ class Knowledge:
 
     @property
     def believed(self) -> Nuisance:
-        """Without the map, while that is doubted."""
+        """Nuisance in use: the one without the map during a map alarm."""
         return self._mapless if self.bank.map_doubted and self._mapless else self.nuisance
 
     def observe(self, field: Vector, nine: FloatArray, reference: float) -> Observation:
@@ -107,14 +109,14 @@ class Knowledge:
         self.keep(sample, now.e - quiet.expected)
 
     def predict(self, sample: Sample, metres: float, seconds: float) -> tuple[Observation, Signs]:
-        """Let all predict a sample, so far and so late after the one before.
+        """Predict a sample with every estimator, `metres` and `seconds` after the previous one.
 
         Returns
         -------
         Observation
-            What it is by the estimator to believe.
+            Residual and derivatives by the selected estimator.
         Signs
-            What would move it.
+            Regressors of the causes to test.
         """
         before, self._before = self._before, sample.phi
         quiet = self.bank.quiet
@@ -124,7 +126,7 @@ class Knowledge:
         live = {id(one): self._predict(one, sample) for one in self.bank.all}
         self.keep(sample, quiet.residual)
         now, clock = live[id(quiet)], 0.0
-        if before is not None and 0.0 < seconds < 30.0:  # what it would be, were telemetry a second late
+        if before is not None and 0.0 < seconds < 30.0:  # the residual if telemetry were a second late
             clock = (self._by(quiet)(sample.field, before, sample.reference).e - now.e) / seconds
         offset, level = now.by_nine[6:], -1.0 / now.s
         signs = Signs(sample.time_us * 1e-6, offset, tuple(sample.positions), sample.watched, clock, level)
@@ -137,7 +139,7 @@ class Knowledge:
         return live
 
     def outlying(self, *, learnable: bool) -> bool:
-        """Whether the sample is an outlier that no other agrees with, nor a `learnable` doubt explains."""
+        """Return True for an outlier that no estimator predicts and no `learnable` alarm explains."""
         if self.start is not None:
             return False
         best = self.bank.best
@@ -146,7 +148,7 @@ class Knowledge:
         return far and self._outliers < AGREE and not learnable
 
     def learn(self, signs: Signs, *, frozen: bool) -> tuple[Alarm | None, bool]:
-        """Doubt what was predicted, and learn from it; return a doubt, and whether it taught anything."""
+        """Test the prediction, then learn from it; return the alarm, and True if the sample was used."""
         quiet = self.bank.quiet
         alarm = self.doubt.test(quiet, signs)
         for other in self.bank.all[1:]:
@@ -156,7 +158,7 @@ class Knowledge:
         return alarm, learn
 
     def begin(self, sample: Sample, metres: float, seconds: float) -> bool:
-        """Learn from a sample while next to nothing is known; return whether all so far were fitted anew."""
+        """Add a sample to the batch fit; return True if the fit of all samples was repeated."""
         assert self.start is not None
         quiet = self.bank.quiet
         if not self.start.add(sample.field, sample.phi, sample.reference, metres, seconds):
@@ -169,7 +171,7 @@ class Knowledge:
         return True
 
     def go_on(self) -> None:
-        """Let the filters go on alone, if they can."""
+        """End the batch fit and continue with the filters, if they can be linearised."""
         if self.start is not None and self.start.over:
             self.start = None
             self.bank.suppose()

@@ -1,4 +1,4 @@
-"""A bridge's learning: what it takes from each sample."""
+"""Learn a calibration on board the bridge, sample by sample."""
 
 from __future__ import annotations
 
@@ -38,16 +38,16 @@ class Learner:
     Parameters
     ----------
     calibration : Calibration
-        The one to begin with.
+        Initial calibration.
     grid : AnomalyGrid, optional
-        What the field differs by from the main field, outside of which nothing is learned.
+        Anomaly map to add to the main field; outside of it no sample is used.
     spread : float
-        nT, 1-sigma of the Earth's field about its reference: the map, whose level is right, or the main
-        field, whose level is as uncertain.
+        1-sigma of the Earth's field about its reference, nT. A map has a known level; the level of the main
+        field is uncertain by `spread`.
     turn_on : float
-        nT, 1-sigma, by which offsets change at every power-on.
+        1-sigma of the offsets' change at every power-on, nT.
     max_rate : float
-        Hz: samples to learn from, at most.
+        Highest rate of samples to learn from, Hz.
     currents : tuple of str
         Names of telemetry in ampere.
 
@@ -56,9 +56,10 @@ class Learner:
     watched : tuple of str
         Telemetry that :meth:`sample` wants: the temperature, and the currents.
     notices : list of Notice
-        What has changed since the caller last emptied it.
+        Notifications since the caller last emptied the list.
     enabled, frozen : bool
-        Not enabled, nothing happens; frozen, it judges and doubts, but learns nothing.
+        If not enabled, samples are ignored. If frozen, calibrations are compared and alarms raised, but no
+        coefficient changes.
 
     Raises
     ------
@@ -95,17 +96,17 @@ class Learner:
 
     @property
     def calibration(self) -> Calibration:
-        """The one to publish."""
+        """Calibration to publish."""
         return self._publication.calibration
 
     @property
     def renewed(self) -> bool:
-        """Whether that has changed last by what was learned since, for no reason of its own."""
+        """Return True if the last change of the published calibration was a routine update."""
         return self._publication.renewed
 
     @property
     def flags(self) -> int:
-        """Of the last sample: ``unexplained``, or 0."""
+        """Quality flags of the last sample: ``unexplained``, or 0."""
         return self._standing.flags
 
     @property
@@ -134,14 +135,14 @@ class Learner:
         return self._decision.learned(self._knowledge)
 
     def accept(self) -> None:
-        """Let what is learned be the calibration that nothing rolls back, and the doubt be known."""
+        """Make the learned calibration the first one, which no rollback undoes, and close the alarm."""
         if self.samples:
-            self._decision.publish(self._knowledge, "accepted: what was learned")
+            self._decision.publish(self._knowledge, "accepted: learned calibration")
             self._publication.accept()
         self._decision.settle(self._knowledge, "acknowledged")
 
     def forget(self) -> None:
-        """Go back to the calibration that it began with, and learn anew from there."""
+        """Return to the initial calibration and restart learning from it."""
         self._decision.settle(self._knowledge, "forgotten")
         self._publication.forget(self._knowledge.nuisance)
         self._begin(self._knowledge.nuisance)
@@ -161,7 +162,7 @@ class Learner:
         self.notices.append(Notice(text, self._now_us * 1e-6, grave))
 
     def restarted(self) -> None:
-        """Take note that the sensor was powered anew: its offsets may have changed."""
+        """Allow for a power cycle of the sensor: its offsets may have changed."""
         self._intake.drop()
         self._knowledge.bank.open(self._turn_on**2)
 
@@ -180,34 +181,34 @@ class Learner:
         age: float = 0.0,
         settled: Vector | None = None,
     ) -> None:
-        """Take a sample that was corrected.
+        """Add a corrected sample.
 
-        It is judged once newer telemetry has come: had a mass begun to move meanwhile, it is left out.
+        The sample waits until newer telemetry arrives. If a mass had begun to move, it is discarded.
 
         Parameters
         ----------
         time_us : int
-            µs.
+            Time of the sample, µs since 1970 UTC.
         field : tuple of 3 float
-            nT, raw, sensor axes, all of one time.
+            Raw field of one time, nT, sensor axes.
         regressors : list of float
-            The calibration's, at that time.
+            Regressors of the calibration at that time.
         values : tuple of float
-            The calibration's channels.
+            Values of the calibration's channels.
         quality : int
-            Flags.
+            Quality flags.
         faulty : bool
-            The sensor is at fault, or the field is none of the Earth's.
+            True if the sensor is at fault, or the field cannot be the Earth's.
         reference : float
-            nT, H_e; NaN where the position is not known.
+            Reference field H_e, nT; NaN if the position is not known.
         where : tuple of 2 float or None
-            deg, latitude and longitude.
+            Latitude and longitude, deg.
         watched : sequence of float
-            As :attr:`watched`; NaN where unknown.
+            Values of the telemetry named by :attr:`watched`; NaN if unknown.
         age : float
-            s, of the parameters' oldest telemetry.
+            Age of the parameters' oldest telemetry, s.
         settled : tuple of 3 float or None
-            nT, the field of the sample before, if this one tells more of it.
+            Field of the previous sample, nT, if this sample makes it more exact.
         """
         self._intake.settle(settled)
         if not self.enabled:
@@ -238,7 +239,7 @@ class Learner:
         self._intake.wait(new)
 
     def _nothing(self, time_us: int) -> None:
-        """Say once an hour or more passes without a sample to learn from."""
+        """Send a notification after every hour without a usable sample."""
         if self._intake.short(time_us):
             self._notify("learning: an hour without a sample to learn from", True)
 

@@ -1,8 +1,8 @@
-"""What can be learned: a calibration's own terms, and offsets that follow temperature or a current.
+"""Terms to learn: a calibration's own, and offsets that follow the temperature or a current.
 
-The latter are terms of the same model (:class:`~magbridge.calibration.effects.ChannelEffect`), with zero
-coefficients of which nothing is unknown until something speaks for them. A learned calibration carries those
-that are not zero.
+The latter are terms of the same model (:class:`~magbridge.calibration.effects.ChannelEffect`). Their
+coefficients start at zero with zero variance; a hypothesis or an alarm gives them a variance. A learned
+calibration contains the terms with non-zero coefficients.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from magbridge.errors import CalibrationError
 __all__ = ["TEMPERATURE", "Model"]
 
 TEMPERATURE = "sensor_temperature"
-"""The one channel that comes with the reading itself, not as telemetry."""
+"""Name of the only channel that is part of the sensor's reading instead of telemetry."""
 
 
 class Model:
@@ -121,7 +121,7 @@ class Model:
         return None if row is None else self._offset_slots(row)
 
     def origin(self, name: str) -> float:
-        """Return at which value of a channel what follows it is zero; 0 for a parameter, which is scaled."""
+        """Return the value of a channel at which its term is zero; 0 for a parameter, which is scaled."""
         if name in self.watched and self.watched.index(name) in self._further:
             return self._origins[self.watched.index(name)]
         effects = [effect for effect in self._base.effects if isinstance(effect, ChannelEffect)]
@@ -132,7 +132,7 @@ class Model:
         return [(v - one.centre) / one.scale for v, one in zip(values, self._base.parameters, strict=False)]
 
     def regressors(self, own: Sequence[float], watched: Sequence[float]) -> FloatArray:
-        """Return all regressors (m,): the calibration's `own`, and those that follow what is `watched`."""
+        """Return all regressors (m,): the calibration's `own`, and those of the `watched` channels."""
         for place, k in enumerate(self._further):
             value = watched[k]
             if not isnan(value):  # while the value is unknown, the last one holds

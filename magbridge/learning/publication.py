@@ -1,4 +1,4 @@
-"""What is published: the first calibration, or what was learned since, while that predicts better."""
+"""Publish the first calibration, or the learned one while it predicts better."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["NONE", "Publication"]
 NONE: Final = "none"
 """The method of a calibration that is none."""
 APART: Final = 0.3
-"""Of the noise: the published total field is renewed when it is so far from what is learned."""
+"""Difference of learned and published total field that causes an update, as a fraction of the noise."""
 RENEW: Final = 32, 256
 """Samples after which it may be, and is in any case."""
 
@@ -33,20 +33,22 @@ class Publication:
     ----------
     model : Model
     first : Calibration
-        The one to begin with.
+        Initial calibration.
     nuisance : Nuisance
 
     Attributes
     ----------
-    first, calibration : Calibration
-        The one that it began with, or that was accepted; the one to publish.
+    first : Calibration
+        Initial or accepted calibration.
+    calibration : Calibration
+        Published calibration.
     coefficients : (K,) array
-        Of the one to publish.
+        Coefficients of the published calibration.
     judge : Judge
     renewed : bool
-        The one to publish has changed last by what was learned since, for no reason of its own.
+        True if the last change of the published calibration was a routine update.
     age : int
-        Samples learned from since it did.
+        Samples used since that change.
     """
 
     def __init__(self, model: Model, first: Calibration, nuisance: Nuisance) -> None:
@@ -61,7 +63,7 @@ class Publication:
 
     @property
     def learned(self) -> bool:
-        """Whether what was learned is published."""
+        """Return True if the learned calibration is published."""
         return self.calibration is not self.first
 
     def nine(self, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -91,13 +93,13 @@ class Publication:
         return replace(made, method=method, inputs=inputs, noise=noise, level=level, reference=reference)
 
     def stale(self, apart: float) -> bool:
-        """Whether what is learned is `apart` (nT, of the total field) from what is published of it."""
+        """Return True if `apart`, learned less published total field (nT), requires an update."""
         least, most = RENEW
         far = abs(apart) > APART * self.calibration.noise.sensor
         return self.learned and ((far and self.age >= least) or self.age >= most)
 
     def renew(self, calibration: Calibration) -> None:
-        """Publish what is learned so far."""
+        """Update the published calibration with the learned one, without a notification."""
         self.calibration = calibration
         self.coefficients = self._model.coefficients(calibration)[0]
         self._weights[LEARNED] = self._model.weights(self.coefficients)
@@ -111,7 +113,7 @@ class Publication:
         return self._change(how, before, LEARNED)
 
     def accept(self) -> None:
-        """Let what is published be the first, so that nothing takes it back."""
+        """Make the published calibration the first one, so that no rollback undoes it."""
         self.first = self.calibration
         self._weights[FIRST] = self._weights[LEARNED]
         self.judge.mean_square[FIRST] = self.judge.mean_square[LEARNED]

@@ -1,4 +1,4 @@
-"""How a doubt stands: when it is news, when what is behind it is learned, and when it is gone."""
+"""State of an alarm: when to announce it, when to learn its cause, and when it is cleared."""
 
 from __future__ import annotations
 
@@ -10,43 +10,43 @@ from magbridge.records import Quality
 __all__ = ["Standing"]
 
 SURE: Final = 6.0
-"""By which a doubt's log-likelihood ratio has to grow until it is learned what is behind it."""
+"""Least growth of an alarm's log-likelihood ratio before its cause is learned (6 = a factor of 400)."""
 COMPETING: Final = 3.0
-"""And by which more for each further cause that fits: a bit more evidence often leaves fewer of them, where
-sorting out what was learned of all takes hours."""
+"""Additional growth required for each further cause that fits: more evidence often excludes causes, whereas
+separating them after all were learned takes hours."""
 PATIENCE: Final = 128
-"""Telling samples for each cause that fits, after which that is decided at the latest."""
+"""Informative samples for each cause that fits, after which the decision is made at the latest."""
 MORE: Final = 2.0
-"""By which an alarm's log-likelihood ratio has to grow to be news."""
+"""Least growth of an alarm's log-likelihood ratio that updates the alarm."""
 QUIET: Final = 300
-"""Telling samples without an alarm after which its cause is gone."""
+"""Informative samples without an alarm after which its cause is cleared."""
 
 
 SLOWER: Final = 4
-"""How many times as much evidence and patience each relapse asks for."""
+"""Factor by which each relapse multiplies the evidence and the samples required."""
 SEEN: Final = 16.0
-"""Variances of a prediction from which on its error is more than chance."""
+"""Squared normalised error from which on a prediction error is significant."""
 
 
 class Standing:
-    """The alarm that stands, if any; `mapped` is whether the reference is a map.
+    """The current alarm, if any; `mapped` is True if the reference is a map.
 
-    What was learned was mistaken if the next alarm comes before it has explained :data:`QUIET` telling
-    samples: a relapse. From then on it is one doubt, whatever is learned meanwhile: it is announced once, and
-    ends once something has explained as many samples.
+    A relapse is an alarm that comes before the last learned cause has explained :data:`QUIET` informative
+    samples. Alarms after a relapse continue the first one: it is announced once, and ends once a learned
+    calibration has explained as many samples.
 
     Attributes
     ----------
     alarm : Alarm or None
-        As it was last news.
+        Alarm at its last update.
     flags : int
-        ``unexplained`` while it stands, or 0.
+        ``unexplained`` during an alarm, or 0.
     variance : float
-        nT², of what is not explained.
+        Variance of the unexplained residual, nT².
     relapses : int
-        How often what was learned was mistaken.
+        Number of relapses.
     tried : bool
-        What is behind the doubt was learned again, and has not been mistaken so far.
+        True if the cause was learned after a relapse and no relapse has followed.
     """
 
     def __init__(self, *, mapped: bool = False) -> None:
@@ -55,7 +55,7 @@ class Standing:
         self.end()
 
     def end(self) -> None:
-        """Let none stand."""
+        """Close the alarm."""
         self.alarm: Alarm | None = None
         self.flags, self.variance, self.relapses, self.tried = 0, 0.0, 0, False
         self._sure = 0.0
@@ -67,13 +67,13 @@ class Standing:
         return int(SLOWER**self.relapses)
 
     def raised(self, alarm: Alarm) -> str:
-        """Take an alarm that the doubt has raised; return what to say of it, if anything."""
+        """Update the state with an alarm of the change detector; return the notification, or ""."""
         before = self.alarm
         anew = before is None or self.tried
         if before is not None and (alarm.mapless or before.mapless):
             if alarm.mapless and before.causes == alarm.causes:
                 self.alarm, self._quiet = alarm, 0
-            return ""  # what else is doubted is doubted by a wrong map
+            return ""  # a map error explains every further alarm
         if before is not None and not anew and alarm.strength < before.strength + MORE:
             return ""
         if anew and self._explained <= QUIET:
@@ -89,7 +89,7 @@ class Standing:
         return f"unexplained{' still' * bool(self.relapses)}: {alarm.size:.0f} nT, {named(alarm.causes)}"
 
     def learned(self) -> bool:
-        """Take note that what is behind the alarm was learned; return whether that ends the doubt."""
+        """Record that the alarm's cause was learned; return True if the alarm is closed."""
         self.tried, self._quiet = self.relapses > 0, 0
         if not self.tried:
             self.end()
@@ -97,15 +97,15 @@ class Standing:
         return not self.tried
 
     def mistaken(self) -> None:
-        """Take note that what was learned is not published any more."""
+        """Record that the learned calibration was rolled back."""
         if self.alarm is not None:
             self.relapses, self.tried = max(1, self.relapses), True
             self._explained = self._quiet = 0
 
     def count(self, error: float, variance: float, *, telling: bool) -> None:
-        """Take note of the published calibration's error with a sample, nT, of a variance expected (nT²).
+        """Count a sample, with the published calibration's error (nT) and its predicted variance (nT²).
 
-        `telling` is whether the sample tells something of the coefficients.
+        `telling` is True if the sample is informative about the coefficients.
         """
         self._quiet += telling
         self._doubted += telling
@@ -117,28 +117,28 @@ class Standing:
         self._cover()
 
     def _cover(self) -> None:
-        """Let the variance cover the likeliest cause and, where that was mistaken, all that is seen."""
+        """Set the variance to the likeliest cause's and, after a relapse, at least to the errors observed."""
         size = 0.0 if self.alarm is None or self.tried or self.mapless else self.alarm.size
         self.variance = max(size * size, self._peak if self.relapses else 0.0)
 
     @property
     def mapless(self) -> bool:
-        """Whether only the map is doubted, and rock that it does not show explains the data."""
+        """True during a map alarm: an unmapped crustal field explains the data."""
         return self.alarm is not None and self.alarm.mapless
 
     @property
     def gone(self) -> bool:
-        """Whether the alarm has not been news for long."""
+        """True if the alarm has not been raised for :data:`QUIET` informative samples."""
         return self.alarm is not None and self._quiet > QUIET
 
     @property
     def learnable(self) -> bool:
-        """Whether there is a doubt, behind which may be something to learn."""
+        """True if there is an alarm whose cause coefficients can represent."""
         return self.alarm is not None and not NO_COEFFICIENT.issuperset(self.alarm.causes)
 
     @property
     def ripe(self) -> bool:
-        """Whether it is time to learn what is behind the alarm."""
+        """True if the evidence suffices to learn the alarm's cause."""
         if self.alarm is None or self.tried or not self.learnable:
             return False
         fit, slower = len(self.alarm.channels), self._slower

@@ -1,9 +1,9 @@
-r"""From nothing: all samples so far fitted at once, while a calibration is too unknown for a filter.
+r"""Batch fit of all samples so far, while the calibration is too uncertain for a filter.
 
 A vehicle's hard iron moves the reading by thousands of nanotesla, over which the field's magnitude is not
-linear: a Kalman filter that was linearised at a wrong guess stays wrong. So the samples since the start are
-kept, and fitted anew by Gauss-Newton when their number has doubled. Residuals and derivatives are whitened
-by the filter of :mod:`.nuisance`; with :math:`c = c_0 + L z, z \sim N(0, I)`, a step solves
+linear: a Kalman filter that was linearised at a wrong guess stays wrong. The samples since the start are
+therefore stored, and refitted by Gauss-Newton when their number has doubled. Residuals and derivatives are
+whitened by the filter of :mod:`.nuisance`; with :math:`c = c_0 + L z, z \sim N(0, I)`, a step solves
 
 .. math:: (I + L^T J^T J L)\, z = -L^T J^T (r + J (c_0 - c))
 """
@@ -39,16 +39,16 @@ ENOUGH: Final = 256
 
 
 def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, order: int = 3) -> Calibration:
-    """Return what is expected of any vehicle: an identity, and how far from it.
+    """Return the prior of any vehicle: an identity and its uncertainty.
 
     Parameters
     ----------
     parameters : tuple of Parameter
-        Its moving masses.
+        Moving masses of the vehicle.
     field : float
-        nT, F_0.
+        Reference field F_0, nT.
     order : int
-        Of the polynomials.
+        Highest total degree of the polynomials.
 
     Notes
     -----
@@ -80,7 +80,7 @@ class Fitted(NamedTuple):
     covariance: FloatArray
     """(K + 4, K + 4): Of both."""
     noise: float
-    """nT, 1-sigma of a channel."""
+    """Noise of a channel, nT, 1-sigma."""
 
 
 class Start:
@@ -113,7 +113,7 @@ class Start:
 
     @property
     def fitted(self) -> bool:
-        """Whether they have been: until then the filter is linearised at what is known of the class."""
+        """Return True if a fit was made; before it, the filter is linearised at the prior of the class."""
         return self._next > FIRST
 
     @property
