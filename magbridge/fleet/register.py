@@ -34,8 +34,8 @@ from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.toml import Table, check_entries, convert, load_toml
 
 __all__ = [
-    "Deployment", "Vehicle", "add_logs", "add_vehicle", "current_files", "logs_of", "masses", "read_fleet",
-    "vehicle_named", "vehicles",
+    "Deployment", "Vehicle", "add_logs", "add_vehicle", "current_files", "is_file_name", "logs_of", "masses",
+    "read_fleet", "vehicle_named", "vehicles",
 ]  # fmt: skip
 
 
