@@ -4,7 +4,7 @@
 
     logs --> fitting --> Calibration (model) <--> cal.json (file)
                               |
-                              +--> compilation --> Kernel (kernel, arithmetic)
+                              +--> compilation --> Kernel (kernel)
                                                      |
     raw channels, telemetry --> correct <------------+--> forward <-- true field, telemetry
                                    |                         |

@@ -2,10 +2,6 @@
 
 Notes
 -----
-The regressors of effects are first multiplied by a power of two. One that is large beside the constant 1,
-as a pressure in Pa, would leave too few bits for the constant in the split of :mod:`.kernel`. In the unit
-chosen, a regressor of 1 makes a difference of about 1,000 nT.
-
 The nine coefficients become twelve in body axes: ``A' = R A`` (nine, R the boresight) and T. For the
 covariance V of the corrected vector ``b = A' d, d = H_r - T``, write ``db = dA' d - A' dT``: V is quadratic
 in d, and the table holds the covariance in just the combinations that V needs: 36 for the quadratic part Q,
@@ -19,8 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.arithmetic import COARSE, FINE
-from magbridge.calibration.kernel import COLUMNS, Kernel
+from magbridge.calibration.kernel import TABLE_SUMS, Kernel
 from magbridge.calibration.terms import Exponents
 from magbridge.estimation.residual import PAIRS
 
@@ -29,8 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = ["coefficient_tensor", "compile_kernel"]
 
-ORDINARY = 1024.0
-"""nT, the difference that an effect's regressor of 1 may make at most, in the unit chosen for it."""
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
 """Index of ``A[i, k]`` among the nine coefficients."""
 
@@ -43,23 +36,15 @@ def compile_kernel(calibration: Calibration) -> Kernel:
     W = np.tensordot(calibration.coefficients, P, 1)
     W[0, :3] += 1.0
     first, second, table = _table(P, W, calibration, exponents)
-    units = _units(P[:, len(exponents) :], W[len(exponents) :], calibration)
-    units = np.concatenate([np.ones(len(exponents)), units])
-    table /= (units[first] * units[second])[:, None]
-    size = 2.0 ** np.frexp(np.abs(table).max(axis=0))[1]  # a power of two above each column
-    coarse = ((table / size + COARSE) - COARSE).T * size[:, None]
-    fine = ((table / size - coarse.T / size + FINE) - FINE).T * size[:, None]
     return Kernel(
         centre=tuple(parameter.centre for parameter in calibration.parameters),
         scale=tuple(parameter.scale for parameter in calibration.parameters),
         field=calibration.reference.field,
         parents=tuple((row[_parent(e)[0]], _parent(e)[1]) for e in exponents[1:]),
         weights=W,
-        units=tuple(units.tolist()) if calibration.effects else None,
         first=first,
         second=second,
-        coarse=coarse,
-        fine=fine,
+        table=np.ascontiguousarray(table.T),
     )
 
 
@@ -110,17 +95,6 @@ def _closed(exponents: set[Exponents], calibration: Calibration) -> list[Exponen
     return sorted(closed, key=lambda e: (sum(e), [-power for power in e]))
 
 
-def _units(P: FloatArray, W: FloatArray, calibration: Calibration) -> FloatArray:
-    """Return (r,) powers of two near ``s / ORDINARY``; s is what a regressor of 1 may change, in nT.
-
-    That is the largest over the nine coefficients, each with its uncertainty.
-    """
-    variance = np.einsum("kri,kl,lri->ri", P, calibration.covariance, P)
-    field = np.array([calibration.reference.field] * 6 + [1.0] * 3)
-    s = (np.sqrt(W * W + np.abs(variance)) * field).max(axis=1)
-    return np.ldexp(1.0, np.where(s > 0.0, np.frexp(s / ORDINARY)[1], 0))
-
-
 def _body_axes(calibration: Calibration) -> FloatArray:
     """Return the matrix (9, 12) from A's six entries and T to the nine of ``R A``, row by row, and T."""
     R = np.eye(3) if calibration.boresight is None else calibration.boresight.matrix()
@@ -151,7 +125,7 @@ def _table(
     for i in range(m):
         for j in range(i, m):
             products.setdefault(key(i, j), []).append((i, j))
-    table = np.zeros((len(products), COLUMNS))
+    table = np.zeros((len(products), TABLE_SUMS))
     table[:m, :12] = W @ B
     for q, pairs in enumerate(products.values()):
         S = np.sum([C[i, :, j] + (C[j, :, i] if i != j else 0.0) for i, j in pairs], axis=0)

@@ -1,4 +1,4 @@
-"""Correct raw samples, many at once: the bits of :class:`.corrector.Corrector`, whose arithmetic it is."""
+"""Correct raw samples, many at once, with the functions that :class:`.corrector.Corrector` uses for one."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.calibration.arithmetic import for_arrays
 from magbridge.calibration.corrector import (
     EXTRAPOLATED,
     GAP,
@@ -18,7 +17,7 @@ from magbridge.calibration.corrector import (
     omega,
     ranges,
 )
-from magbridge.calibration.kernel import Kernel
+from magbridge.calibration.kernel import Kernel, apply, prepare
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Series, Step
 from magbridge.errors import CalibrationError
@@ -29,7 +28,6 @@ __all__ = ["CorrectedArrays", "correct", "regressors", "vector_covariance"]
 
 CHUNK = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
-MANY = for_arrays()
 
 
 class CorrectedArrays(NamedTuple):
@@ -48,7 +46,7 @@ class CorrectedArrays(NamedTuple):
 def correct(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> CorrectedArrays:
-    """Correct many samples; bit for bit what :class:`Corrector` gives one by one.
+    """Correct many samples; within 1e-12 of the field what :class:`Corrector` gives one by one.
 
     Parameters
     ----------
@@ -87,7 +85,7 @@ def correct(
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             prepared = _prepare_many(kernel, phi)
             hx, hy, hz = field[part].T
-            out[:, part] = MANY.apply(hx, hy, hz, prepared, turn)
+            out[:, part] = apply(hx, hy, hz, prepared, turn, np.sqrt)
         quality = np.full(n, base_flags(calibration))
         for value, (low, high) in zip(channels.T, ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
@@ -109,7 +107,7 @@ def vector_covariance(
 
     Notes
     -----
-    ``V_ij = Q_ij . (d d^T) + L_ij . d + O_ij`` with ``d = H_r - T`` (:mod:`.arithmetic`).
+    ``V_ij = Q_ij . (d d^T) + L_ij . d + O_ij`` with ``d = H_r - T`` (:mod:`.kernel`).
     """
     kernel, steps, out = calibration.kernel, begun(calibration), np.empty((len(field), 3, 3))
     with np.errstate(all="ignore"):
@@ -144,8 +142,7 @@ def regressors(
 ) -> FloatArray:
     """(m, n) regressors of every sample, from a fresh state, in the effects' array form.
 
-    Arguments as for :func:`correct`, which steps through the effects, since live and replayed samples must
-    have the same bits.
+    Arguments as for :func:`correct`, which steps through the effects as the bridge does.
     """
     kernel, channels = calibration.kernel, channels.reshape(len(field), -1)
     series = Series(time, field, dict(zip(calibration.channels, channels.T, strict=True)), kernel)
@@ -161,8 +158,8 @@ def _prepare_many(kernel: Kernel, phi: FloatArray) -> Any:
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
     if 2 * np.count_nonzero(new) > len(new):
-        return MANY.prepare(list(kernel.sums(phi)))
+        return prepare(list(kernel.sums(phi)))
     phi = phi[:, new]
-    linear, V = MANY.prepare(list(kernel.sums(phi)))
+    linear, V = prepare(list(kernel.sums(phi)))
     back = np.cumsum(new) - 1
     return [row[back] for row in linear], [[row[back] for row in entry] for entry in V]

@@ -3,7 +3,7 @@
 Where a channel of the field or a position is NaN, or so large that the total field exceeds
 :data:`~magbridge.records.BEYOND`, total and vector are NaN and the sigmas infinite. The flag is ``gap`` if
 the field's channels are the reason, else ``stale_telemetry``. The total is never a guess. The equations stand
-in :mod:`.arithmetic`.
+in :mod:`.kernel`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from math import inf, isnan, nan, sqrt
 from typing import Final
 
-from magbridge.calibration.arithmetic import Linear, Numbers, Prepared, apply, largest, linear, prepare
-from magbridge.calibration.kernel import FARTHEST
+from magbridge.calibration.kernel import Linear, Numbers, Prepared, apply, linear, prepare
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
 from magbridge.errors import CalibrationError
@@ -34,7 +33,7 @@ class Corrector:
 
     Notes
     -----
-    While positions and the regressors of effects stay the same, only :func:`.arithmetic.apply` runs anew.
+    While positions and the regressors of effects stay the same, only :func:`.kernel.apply` is computed again.
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -188,11 +187,8 @@ class Corrector:
         return [totals[high] - totals[low] for low, high in self._ends]
 
     def _linear_at(self, positions: tuple[float, ...]) -> Linear:
-        """Return A's six entries and T; NaN if the positions are too far off."""
-        phi = self._kernel.monomials(positions, 1.0)
-        if not largest(phi) < FARTHEST:
-            return nan, nan, nan, nan, nan, nan, nan, nan, nan
-        return linear(phi, self._weights)
+        """Return A's six entries and T."""
+        return linear(self._kernel.monomials(positions, 1.0), self._weights)
 
 
 def _total(field: tuple[float, float, float], there: Linear) -> float:
@@ -207,7 +203,7 @@ def _total(field: tuple[float, float, float], there: Linear) -> float:
 
 
 def omega(calibration: Calibration) -> tuple[float, ...] | None:
-    """Return six entries of the boresight's covariance, as :func:`.arithmetic.apply` takes them."""
+    """Return six entries of the boresight's covariance, as :func:`.kernel.apply` takes them."""
     if calibration.boresight is None:
         return None
     O = calibration.boresight.covariance  # noqa: E741 - Omega, as in the equation

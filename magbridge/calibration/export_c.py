@@ -1,8 +1,8 @@
 """A calibration as C99 for a microcontroller: one header, one source, no allocation, float or double.
 
-The source is the table of :class:`~magbridge.calibration.kernel.Kernel` and the arithmetic of
-:mod:`~magbridge.calibration.arithmetic`, in the same order, with the table's two parts added: in double it
-gives the field to the last bits that the sum's order keeps (1e-8 nT), in float to some 0.02 nT of 50,000.
+The source is the table of :class:`~magbridge.calibration.kernel.Kernel` and the arithmetic of that module,
+in the same order: in double it gives the field to the last bits that the sum's order keeps (1e-8 nT), in
+float to some 0.02 nT of 50,000.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from string import Template
 
 from magbridge.calibration.file import calibration_id
-from magbridge.calibration.kernel import COLUMNS
+from magbridge.calibration.kernel import TABLE_SUMS
 from magbridge.calibration.model import Calibration
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
@@ -87,7 +87,7 @@ void magbridge_correct(const magbridge_real field[3], const magbridge_real *para
     for (i = 0; i < $columns; i++)
         t[i] = (real)0;
     for (j = 0; j < PRODUCTS; j++) {
-        const real psi = phi[pair[j][0]] * phi[pair[j][1]] * unit[j];
+        const real psi = phi[pair[j][0]] * phi[pair[j][1]];
         for (i = 0; i < $columns; i++)
             t[i] += table[j][i] * psi;
     }
@@ -98,7 +98,7 @@ void magbridge_correct(const magbridge_real field[3], const magbridge_real *para
         b[i] = t[3 * i] * d[0] + t[3 * i + 1] * d[1] + t[3 * i + 2] * d[2];
     out->total = ROOT(b[0] * b[0] + b[1] * b[1] + b[2] * b[2]);
 
-    /* V = Q.(d d') + L.d + O for each of its six entries; L and O as in magbridge's arithmetic.prepare */
+    /* V = Q.(d d') + L.d + O for each of its six entries; L and O as in magbridge's kernel.prepare */
     for (i = 0; i < 6; i++)
         e[i] = d[row[i]] * d[column[i]];
     for (k = 0; k < 6; k++) {
@@ -160,9 +160,6 @@ def c_source(calibration: Calibration) -> str:
         names = ", ".join(sorted({type(one).__name__ for one in calibration.effects}))
         raise CalibrationError(f"{names}: effects that follow telemetry in time are not written as C")
     kernel = calibration.kernel
-    units = kernel.units or (1.0,) * len(kernel.weights)
-    products = [(i, j, units[i] * units[j]) for i, j in kernel.pairs]
-    table = (kernel.coarse + kernel.fine).T
     omega = calibration.boresight.covariance if calibration.boresight else ((0.0,) * 3,) * 3
     place = [[0] * 3 for _ in range(3)]
     for k, (i, j) in enumerate(PAIRS):
@@ -173,19 +170,22 @@ def c_source(calibration: Calibration) -> str:
         _reals("scale[]", kernel.scale or (1.0,)),
         _rows("real", "range[][2]", [[_hex(one.low), _hex(one.high)] for one in some] or [["0", "0"]]),
         _rows("int", "parent[][2]", [[str(n) for n in one] for one in kernel.parents] or [["0", "0"]]),
-        _rows("int", "pair[][2]", [[str(i), str(j)] for i, j, _ in products]),
-        _reals("unit[]", [unit for _, _, unit in products]),
+        _rows("int", "pair[][2]", [[str(i), str(j)] for i, j in kernel.pairs]),
         _rows("int", "place[3][3]", [[str(n) for n in one] for one in place]),
         _rows("real", "omega[3][3]", [[_hex(float(n)) for n in one] for one in omega]),
         f"static const int row[6] = {{{', '.join(str(i) for i, _ in PAIRS)}}};",
         f"static const int column[6] = {{{', '.join(str(j) for _, j in PAIRS)}}};",
-        _rows("real", f"table[PRODUCTS][{COLUMNS}]", [[_hex(float(n)) for n in one] for one in table]),
+        _rows(
+            "real",
+            f"table[PRODUCTS][{TABLE_SUMS}]",
+            [[_hex(float(n)) for n in one] for one in kernel.table.T],
+        ),
     ]
     return SOURCE.substitute(
         id=f"{calibration_id(calibration):08x}",
         monomials=len(kernel.parents) + 1,
-        products=len(products),
-        columns=COLUMNS,
+        products=len(kernel.pairs),
+        columns=TABLE_SUMS,
         tables="\n".join(tables),
     )
 

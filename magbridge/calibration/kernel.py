@@ -9,38 +9,44 @@ positions. So both are one sum over products ``psi``::
 
     (theta, covariance of theta) = table psi
 
-A matrix product rounds in an order that depends on its shape and on the machine. So psi and table are
-split into a coarse and a fine part of 21 bits each: products of parts and their sums then fit a
-double *exactly*, in whatever order (Ozaki et al. 2012, Numer. Algorithms 59:95), and one sample live
-gives the same bits as a million in a batch, here and on any other computer. What the split leaves
-out is 2e-13 of the largest: 1e-8 nT.
+With ``A' = R A`` and T at the sample's positions, R the boresight and Omega its covariance, V the covariance
+of the corrected vector::
 
-The table is made by :mod:`.compilation`.
+    d = H_r - T,  b = A' d,  F = |b|,  u = b / F
+    V_ij = Q_ij . (d d^T) + L_ij . d + O_ij         (dA', dT and the sensor's noise carried through)
+    sigma_F^2 = u^T V u,  sigma_i^2 = V_ii + ([b] Omega [b]^T)_ii
+
+:func:`prepare` and :func:`apply` accept floats (one sample, :mod:`.corrector`) and arrays (a log,
+:mod:`.correct`). The two differ only in the order in which the product with the table is summed: by less
+than 1e-12 of the field. The table is made by :mod:`.compilation`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import frexp, ldexp, nan
+from math import nan, sqrt
 from typing import Any
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.arithmetic import BITS, COARSE, FINE, largest, monomials, split
+from magbridge.estimation.residual import PAIRS
 
-__all__ = ["COLUMNS", "FARTHEST", "Kernel"]
+__all__ = ["TABLE_SUMS", "Kernel", "Linear", "Numbers", "Prepared", "apply", "linear", "prepare"]
 
-EXPONENT = 3
-"""psi is kept below 2^3, scaled by a power of two where positions lie far outside the range seen. Then sums
-of up to 256 products of 24 and 21 bits still fit a double's 53 bits."""
-FARTHEST = 2.0**BITS
-"""A regressor this large cannot be used: beside its square the constant 1 is below the split's last bit."""
-
-COLUMNS = 81
+TABLE_SUMS = 81
 """Sums that the table gives: A' and T (12), then the 69 combinations of their covariance."""
+MAX_REGRESSOR = 1e100
+"""Beyond, the product with the table would overflow, and the total field is no number of use."""
+
+Prepared = tuple[list[Any], list[list[Any]]]
+"""What :func:`apply` needs at one set of positions: A' row by row, then T (12 numbers); and for each of V's
+six entries Q (6), L (3) and O (1)."""
+Numbers = tuple[float, float, float, float, float, float, float, float]
+Linear = tuple[float, float, float, float, float, float, float, float, float]
+"""A's entries xx, yy, zz, xy, xz, yz; T's x, y, z."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,61 +63,29 @@ class Kernel:
     weights: FloatArray
     """(m, 9): W, with ``A`` itself (not ``a``) in the first six; the rows of monomials, then those of
     effects."""
-    units: tuple[float, ...] | None
-    """Powers of two that the regressors are multiplied by; None where all are 1."""
     first: IndexArray
     second: IndexArray
-    """`first`, `second`, (q,): Product q is ``phi[first[q]] * phi[second[q]]``, of regressors in their units;
-    the first m products are the regressors themselves."""
-    coarse: FloatArray
-    fine: FloatArray
-    """`coarse`, `fine`, (81, q): The table in two parts."""
+    """`first`, `second`, (q,): Product q is ``phi[first[q]] * phi[second[q]]``; the first m products are the
+    regressors themselves."""
+    table: FloatArray
+    """(81, q): Share of each product in each sum."""
 
     def sums(self, phi: FloatArray) -> FloatArray:
         """Return ``table psi`` (81, n) of many samples' regressors (m, n)."""
-        if self.units is not None:
-            phi = phi * np.array(self.units)[:, None]
-        psi = np.empty((len(self.pairs), phi.shape[1]))
-        for row, (i, j) in zip(psi, self.pairs, strict=True):
-            np.multiply(phi[i], phi[j], out=row)
-        size = max(float(phi.max()), -float(phi.min()))
-        scale = None if size * size < 2.0**EXPONENT else _scales(phi)
-        if scale is not None:
-            psi *= scale
-        coarse = psi + COARSE
-        coarse -= COARSE
-        fine = np.subtract(psi, coarse, out=psi)
-        fine += FINE
-        fine -= FINE
-        found = self.fine @ coarse
-        found += self.coarse @ fine
-        found += self.coarse @ coarse
-        return np.asarray(found if scale is None else found / scale)
+        return np.asarray(self.table @ (phi[self.first] * phi[self.second]))
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
-        """Return the same 81 sums for one sample's regressors, with few numpy calls for speed."""
-        if self.units is not None:
-            phi = [value * unit for value, unit in zip(phi, self.units, strict=True)]
-        size = largest(phi)
-        scale = ldexp(1.0, min(EXPONENT - frexp(size * size)[1], 0)) if size < FARTHEST else nan
-        count = len(self.pairs)
-        parts = np.fromiter(split(phi, self.pairs, scale), float, 2 * count)  # much faster than np.array
-        found = self.crossed.dot(parts)
-        found += self.coarse.dot(parts[count:])
-        if scale != 1.0:
-            found /= scale
-        sums: list[float] = found.tolist()
+        """Return the same 81 sums for one sample's regressors; NaN where a regressor is too large."""
+        if max(phi) > MAX_REGRESSOR or min(phi) < -MAX_REGRESSOR:
+            return [nan] * TABLE_SUMS
+        psi = [phi[i] * phi[j] for i, j in self.pairs]
+        sums: list[float] = self.table.dot(np.fromiter(psi, float, len(psi))).tolist()
         return sums
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:
         """`first` and `second` as pairs of Python integers, by which lists are indexed fastest."""
         return list(zip(self.first.tolist(), self.second.tolist(), strict=True))
-
-    @cached_property
-    def crossed(self) -> FloatArray:
-        """(81, 2 q) `coarse` beside `fine`, to multiply the fine parts of psi and then its coarse parts."""
-        return np.concatenate([self.coarse, self.fine], axis=1)
 
     @property
     def position_weights(self) -> FloatArray:
@@ -124,16 +98,111 @@ class Kernel:
         return np.asarray(self.position_weights * np.array([self.field] * 6 + [1.0] * 3))
 
     def monomials(self, values: Sequence[Any], one: Any) -> list[Any]:
-        """Return the monomials, of floats or of arrays: the same multiplications in the same order."""
-        return monomials(values, self.centre, self.scale, self.parents, one)
+        """Return the monomials of positions (floats or arrays), each as its parent times one position.
+
+        `values` may hold more channels than there are positions: those of effects, which follow, are ignored.
+        `one` is the constant monomial: 1.0 or an array of ones.
+        """
+        # strict=False: the channels of effects are left aside
+        x = [
+            (value - centre) / scale
+            for value, centre, scale in zip(values, self.centre, self.scale, strict=False)
+        ]
+        phi = [one]
+        for parent, k in self.parents:
+            phi.append(phi[parent] * x[k])
+        return phi
 
     def monomials_of(self, positions: FloatArray) -> FloatArray:
         """(m, n) monomials of (n, k) positions."""
         return np.stack(self.monomials(list(positions.T), np.ones(len(positions))))
 
 
-def _scales(phi: FloatArray) -> FloatArray:
-    """Return (n,) powers of two that keep each sample's products small enough; NaN: too far outside."""
-    largest = np.abs(phi).max(axis=0)
-    scales = np.ldexp(1.0, np.minimum(EXPONENT - np.frexp(largest * largest)[1], 0))
-    return np.where(largest < FARTHEST, scales, np.nan)
+def linear(phi: list[float], weights: list[Linear]) -> Linear:
+    """Return A's six entries and T: the sums of regressors times weights, in this order."""
+    xx = yy = zz = xy = xz = yz = tx = ty = tz = 0.0
+    for value, (a, b, c, d, e, f, g, h, i) in zip(phi, weights):  # noqa: B905 - the weights of effects are left aside
+        xx += value * a
+        yy += value * b
+        zz += value * c
+        xy += value * d
+        xz += value * e
+        yz += value * f
+        tx += value * g
+        ty += value * h
+        tz += value * i
+    return xx, yy, zz, xy, xz, yz, tx, ty, tz
+
+
+def prepare(t: list[Any]) -> Prepared:
+    """Turn the table's 81 sums at one set of positions into what :func:`apply` needs there.
+
+    ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``.
+    """
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = t[0:9]
+    G = []
+    for k in range(48, 75, 3):
+        x, y, z = t[k], t[k + 1], t[k + 2]
+        G += [x * xx + y * xy + z * xz, x * yx + y * yy + z * yz, x * zx + y * zy + z * zz]
+    sxx, syy, szz, sxy, sxz, syz = t[75:81]
+    AS = []
+    for k in range(0, 9, 3):
+        x, y, z = t[k], t[k + 1], t[k + 2]
+        AS += [sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z]
+    V = []
+    for e, (i, j) in enumerate(PAIRS):
+        O = t[3 * i] * AS[3 * j] + t[3 * i + 1] * AS[3 * j + 1] + t[3 * i + 2] * AS[3 * j + 2]  # noqa: E741
+        L = [-(G[9 * i + 3 * k + j] + G[9 * j + 3 * k + i]) for k in range(3)]
+        V.append([*t[12 + 6 * e : 18 + 6 * e], *L, O])
+    return t[:12], V
+
+
+def apply(
+    hx: Any,
+    hy: Any,
+    hz: Any,
+    prepared: Prepared,
+    omega: tuple[float, ...] | None,
+    root: Callable[[Any], Any] = sqrt,
+) -> Numbers:
+    """Correct one sample (or arrays of them); return total, its sigma, the vector, and the vector's sigmas.
+
+    Parameters
+    ----------
+    hx, hy, hz : float or (n,) array
+        nT, raw channels of the sensor.
+    prepared : Prepared
+        From :func:`prepare`, for the positions of the samples.
+    omega : tuple of 6 float, optional
+        xx, yy, zz, xy, xz, yz of the boresight's covariance, rad^2; None where there is no boresight.
+    root : callable
+        Square root: of one number, or ``np.sqrt`` where the samples are arrays.
+
+    Notes
+    -----
+    The equations stand at the top of the module.
+    """
+    (xx, xy, xz, yx, yy, yz, zx, zy, zz, tx, ty, tz), V = prepared
+    dx, dy, dz = hx - tx, hy - ty, hz - tz
+    bx = xx * dx + xy * dy + xz * dz
+    by = yx * dx + yy * dy + yz * dz
+    bz = zx * dx + zy * dy + zz * dz
+    F = root(bx * bx + by * by + bz * bz)
+    over = 1.0 / (F + 1e-300)  # a vector of length zero has no direction, but must not raise
+    ux, uy, uz = bx * over, by * over, bz * over
+    exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
+    vxx, vyy, vzz, vxy, vxz, vyz = [
+        q0 * exx + q1 * eyy + q2 * ezz + q3 * exy + q4 * exz + q5 * eyz + l0 * dx + l1 * dy + l2 * dz + o
+        for q0, q1, q2, q3, q4, q5, l0, l1, l2, o in V
+    ]
+    variance = (
+        ux * ux * vxx + uy * uy * vyy + uz * uz * vzz
+        + 2.0 * (ux * uy * vxy + ux * uz * vxz + uy * uz * vyz)
+    )  # fmt: skip
+    if omega is not None:  # its error turns the vector and leaves the length, so sigma_F stays
+        oxx, oyy, ozz, oxy, oxz, oyz = omega
+        vxx = vxx + (bz * bz * oyy + by * by * ozz - 2.0 * by * bz * oyz)
+        vyy = vyy + (bz * bz * oxx + bx * bx * ozz - 2.0 * bx * bz * oxz)
+        vzz = vzz + (by * by * oxx + bx * bx * oyy - 2.0 * bx * by * oxy)
+    # abs: rounding may leave a variance of zero at -1e-12
+    return F, root(abs(variance)), bx, by, bz, root(abs(vxx)), root(abs(vyy)), root(abs(vzz))

@@ -79,7 +79,7 @@ class Floors:
     def __init__(self, kernel: Kernel, positions: np.ndarray) -> None:
         self.kernel = kernel
         self.phi = np.ascontiguousarray(kernel.monomials_of(positions).T)
-        self.table = np.ascontiguousarray((kernel.coarse + kernel.fine).T)
+        self.table = np.ascontiguousarray(kernel.table.T)
 
     def product(self, piece: int) -> None:
         """One product of monomials and table, in pieces of so many samples."""
@@ -87,15 +87,6 @@ class Floors:
         for start in range(0, len(self.phi), piece):
             part = self.phi[start : start + piece]
             (part[:, kernel.first] * part[:, kernel.second]) @ self.table
-
-    def contained(self) -> None:
-        """The products as `correct` has them: three, because coarse and fine parts make them exact."""
-        kernel = self.kernel
-        for start in range(0, len(self.phi), CHUNK):
-            part = self.phi[start : start + CHUNK]
-            psi = (part[:, kernel.first] * part[:, kernel.second]).T
-            for table in (kernel.fine, kernel.coarse, kernel.coarse):
-                table @ psi
 
 
 def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
@@ -117,11 +108,6 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
     return [
         compared("correct, sigmas and all, positions new with every sample", "bare", bare, least=0.5),
         compared("the same, the product in pieces that stay in the cache", "pieces", "as above, in pieces"),
-        compared(
-            "the same, against all three products that it contains",
-            "contained",
-            "coarse and fine parts, in pieces",
-        ),
         Row("correct, positions held", median(found["still"]), "us"),
         Row("one sample live, positions held", median(found["live held"]), "us"),
         Row("one sample live, positions new", median(found["live"]), "us"),
@@ -150,7 +136,6 @@ def _jobs(
     jobs: dict[str, tuple[Callable[[], object], int]] = {
         "bare": (lambda: floors.product(n), n),
         "pieces": (lambda: floors.product(CHUNK), n),
-        "contained": (floors.contained, n),
         "moving": (lambda: correct(calibration, field, moving, when), n),
         "still": (lambda: correct(calibration, field, still, when), n),
         "live": (lambda: live(values), few),
