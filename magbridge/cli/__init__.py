@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _open_streams() -> None:
-    """See to it that what is printed goes somewhere, whatever the locale."""
+    """Open missing output streams, and make every character printable in any locale."""
     # closed by the parent process; opened in this order, each gets its own descriptor
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:

@@ -1,4 +1,4 @@
-"""Attach a bridge: write its configuration, see what speaks where, and what the drivers take."""
+"""Attach a bridge: write its configuration, find devices on serial ports, and list the drivers' options."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def init(
 ) -> None:
     """Write a commented bridge.toml, from five questions or from options.
 
-    On a terminal it asks for what no option says: sensor, port, link, system id, moving masses.
+    On a terminal it asks for each value without an option: sensor, port, link, system id, moving masses.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def ports(
     seconds: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=600))] = 1.5,
     json: Json = False,
 ) -> None:
-    """Listen on serial ports, and show what speaks on each.
+    """Listen on serial ports, and show which device sends on each.
 
     It is a sensor, an autopilot, a GPS, or a line that cannot be parsed, which is then shown. Nothing is
     sent: a sensor that waits for a command stays silent here.

@@ -88,7 +88,7 @@ def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
 def run(*, config: Path, check: bool = False) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
 
-    magbridge init writes a configuration, magbridge ports shows what speaks on which serial port, and
+    magbridge init writes a configuration, magbridge ports shows which device sends on which serial port, and
     magbridge drivers lists the drivers of sensors with their options.
 
     Parameters
@@ -96,7 +96,7 @@ def run(*, config: Path, check: bool = False) -> None:
     config
         The configuration (bridge.toml).
     check
-        Say all that would go wrong, and end; no port is opened.
+        Report everything that would go wrong, and exit; no port is opened.
     """
     if check:
         _check(config)
@@ -118,8 +118,8 @@ def _check(config: Path) -> None:
         complain(one.text)
     fatal = sum(one.fatal for one in found)
     if fatal:
-        raise WrongUse(f"{config}: the bridge would not start: {counted(fatal, 'thing')} to mend")
-    print(f"{config}: the bridge would start" + (", with what is said above" if found else ""))
+        raise WrongUse(f"{config}: the bridge would not start: {counted(fatal, 'problem')} to fix")
+    print(f"{config}: the bridge would start" + (", with the warnings above" if found else ""))
 
 
 @command("replay FILE... [--config bridge.toml] [OPTIONS]")
@@ -192,7 +192,7 @@ def monitor(
     map: Annotated[Path | None, Parameter(name="--map")] = None,  # noqa: A002 - as the other commands name it
     show: bool = False,
 ) -> None:
-    """Serve the ground station's page, which shows live what a bridge measures and announces over MAVLink.
+    """Serve the ground station's page, which shows live the data and messages that a bridge sends by MAVLink.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def monitor(
     baudrate
         Baud rate of a serial link.
     signing_key
-        The file of 32 bytes that the bridge has: what is sent is signed, and what is not is refused.
+        The file of 32 bytes that the bridge has: sent messages are signed, and unsigned ones are rejected.
     map
         An anomaly grid to be shown beneath the track.
     show

@@ -74,14 +74,14 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     output
         The calibration to write (cal.json).
     parameter
-        A column that gives the position of a moving mass, or a current; may be repeated. auto: of the log's
-        currents, throttles, motors and masses those that predict parts left out better, and it is said by how
+        A column that gives the position of a moving mass, or a current; may be repeated. auto: the log's
+        currents, throttles, motors and masses that predict held-out parts better; the command prints by how
         much (method auto).
     order
         Highest total degree of the polynomials in the parameters.
     method
         auto is the one to use: survey where only the main field or a map is known at the log's positions
-        (the rock below is found with the calibration), else the fit to a known field. For comparison:
+        (the crustal field is estimated with the calibration), else the fit to a known field. For comparison:
         nominal (one ellipsoid for all positions), cubic (the paper's), runs (an ellipsoid for each run,
         then polynomials through them: the paper's first stage), horizontal (one ellipsoid, levelled by
         roll and pitch: the alternative that the paper names).
@@ -91,8 +91,8 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     grid
         An anomaly grid to add to the IGRF.
     base
-        A base station's log (total_field, or a vector): by how much the Earth's field varied, to add to the
-        reference. So is that of an observatory (IAGA-2002) among the logs.
+        A base station's log (total_field, or a vector): the Earth's field variation, to add to the reference.
+        A log of an observatory (IAGA-2002) among the logs is added in the same way.
     reference
         mean: use the mean length of the log's own readings as the reference, if neither the log nor --date
         gives the Earth's field. The total field then has the sensor's own scale, which site_bias counts: by
@@ -103,15 +103,15 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
         main-field models do not reach of the crust (error model of the World Magnetic Model 2020). The
         corrected field's sigma counts it, and level_sigma says how much is common to all samples.
     position_sigma
-        1-sigma in m by which dead-reckoned positions slowly drift, where the rock is found with the
-        calibration: the track is bent to where the rock repeats itself; 0: positions are exact.
+        1-sigma in m by which dead-reckoned positions slowly drift, where the crustal field is estimated with
+        the calibration: the track is corrected to where the field repeats itself; 0: positions are exact.
     filter_cutoff
         Cut-off frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
         undone; 0: no filter.
     fleet
-        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from what the
-        vehicle's earlier deployments and its fleet let expect, and it is said what that is worth (method
-        auto). Two runs are then often enough.
+        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from the prediction
+        of the vehicle's earlier deployments and its fleet, and the command prints the gain (method auto). Two
+        runs are then often enough.
     refit
         Which refit it flies with, if its logs are not catalogued; by default a new one.
     plot

@@ -60,7 +60,7 @@ def file_to_write(*suffixes: str) -> Callable[[Any, Any], None]:
         if path.is_dir():
             raise ValueError("It is a folder.")
         if not path.parent.is_dir():
-            raise ValueError(f"There is no folder {path.parent}.")
+            raise ValueError(f"The folder {path.parent} does not exist.")
         if not os.access(path.parent, os.W_OK):
             raise ValueError(f"The folder {path.parent} cannot be written to.")
         if suffixes and path.suffix.lower() not in suffixes:
@@ -141,7 +141,7 @@ class Reading:
 
     @property
     def options(self) -> Options:
-        """The same for :mod:`magbridge.logs`."""
+        """Options of the same meaning for :mod:`magbridge.logs`."""
         boot = None if self.date is None else dt.datetime.combine(self.date, dt.time(), dt.UTC).timestamp()
         return Options(
             self.strict, boot, self.compass, self.sensor_log, self.clock_offset, self.column, self.columns
@@ -149,7 +149,7 @@ class Reading:
 
     @property
     def alone(self) -> Options:
-        """The same for a log that is read alone, without the sensor's own logs."""
+        """Options for a log that is read without the sensor's own logs."""
         return replace(self.options, sensor_log=(), clock_offset_s=0.0)
 
 

@@ -48,7 +48,7 @@ KEPT = (
     *("local_north", "local_east", "dr_latitude", "dr_longitude", "gps_latitude", "gps_longitude"),
     *("truth_latitude", "truth_longitude"),
 )
-"""Columns of a log that stay beside the corrected field, with the calibration's parameters."""
+"""Columns of a log that are copied to the output, with the calibration's parameters."""
 
 
 @command("correct FILE... --calibration cal.json -o FILE [OPTIONS]")
@@ -70,10 +70,11 @@ def correct(
     each and its age; [align] and every max_age are known as they were when the log began, not as they were
     set later. The bridge itself uses every message about a moving mass, and the channels of a sensor that has
     no counts are float32 here (to 0.002 nT of 50,000 nT). Of another log, telemetry counts as new in every
-    row that has it, and rows that have nothing else are not samples: they are left out of the output. For
-    what the bridge would have published bit for bit, put the calibration into a bridge.toml and run:
-    magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from what
-    was published at the time.
+    no counts are float32 here (to 0.002 nT of 50,000 nT). In another log, telemetry counts as new in every
+    row that has it, and rows that have nothing else are not samples: they are left out of the output. To
+    compute the bridge's output bit for bit, put the calibration into a bridge.toml and run:
+    magbridge replay LOG --config bridge.toml --log DIR. The replay also reports that this differs from the
+    output published at the time.
 
     Parameters
     ----------
@@ -82,17 +83,17 @@ def correct(
     calibration
         The calibration (cal.json); with --config by default that of the bridge.
     output
-        The file to write: total field with its sigma, vector, anomaly and quality flags; beside them the
-        log's position, depth, attitude and the calibration's parameters.
+        The file to write: total field with its sigma, vector, anomaly and quality flags; also the log's
+        position, depth, attitude and the calibration's parameters.
     learn
-        Learn the calibration on the way, as a bridge with [learning] does; the log needs positions.
+        Learn the calibration during the run, as a bridge with [learning] does; the log needs positions.
     config
-        With --learn: the bridge.toml whose [learning] and calibration count. It may have no calibration: what
-        is known of the vehicle is then learned from nothing.
+        With --learn: the bridge.toml whose [learning] and calibration count. It may have no calibration:
+        learning then starts without one.
     save
         With --learn: where to write the calibration that was published last.
     plot
-        A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and what is flagged.
+        A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and the flagged samples.
     """
     source = _source(calibration, config, learn=learn)
     logs_to_read(files, output, source)
@@ -104,7 +105,7 @@ def correct(
     for doubt in warnings_of(known, source):
         complain(doubt)
     if save is not None and not learn:
-        raise WrongUse("--save writes what was learned: give --learn, too")
+        raise WrongUse("--save writes the learned calibration: give --learn, too")
     tally = Tally()
     correction: Correction | None = None
     pieces: list[dict[str, Any]] = []
@@ -135,7 +136,7 @@ def correct(
 
 
 def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Path:
-    """Return the file that says what is known of the vehicle."""
+    """Return the file that describes the vehicle: the calibration, or the configuration."""
     if config is not None and not learn:
         raise WrongUse("--config says how to learn: give --learn, too")
     source = calibration or config
@@ -170,7 +171,7 @@ def _known(file: Path | None, config: Path | None) -> tuple[Calibration, Config]
 def _corrected(
     parts: Iterable[xr.Dataset], files: tuple[Path, ...], known: Calibration, file: Path, learn: Config | None
 ) -> Iterator[tuple[xr.Dataset, xr.Dataset, Correction]]:
-    """Yield each piece of a log, what is made of it, and by what; DataError: it has no field."""
+    """Yield each piece of a log, its corrected samples, and the correction; DataError: it has no field."""
     from magbridge.correction import Correction
     from magbridge.rows import correct_rows
 
@@ -201,7 +202,7 @@ def _learner(known: Calibration, log: xr.Dataset, settings: Config) -> Learner:
 
 
 def _notify(correction: Correction) -> None:
-    """Print what was found doubtful, and what learning has changed."""
+    """Print the quality flags and the notifications of learning."""
     for text in correction.notices:
         complain(text)
     correction.notices.clear()
@@ -212,7 +213,7 @@ def _notify(correction: Correction) -> None:
 
 
 def _keep_learned(learner: Learner, known: Calibration, facts: dict[str, Any], file: Path | None) -> str:
-    """Write what was published last, add to the facts to print as JSON, and return them in words."""
+    """Write the last published calibration, add to the facts to print as JSON, and return a summary."""
     from magbridge.calibration.file import calibration_id, save
 
     if file is not None:

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 NOTHING = (-9999.0, -99999.0)
 """Numbers that logs commonly use for "not known", in any unit."""
 ITSELF = (
-    "the calibration was fitted to this log and has absorbed part of its errors, so that what is left of "
-    "them easily gets a wrong name, and nothing is held out; calibrate on separate calibration runs, with "
+    "the calibration was fitted to this log and has absorbed part of its errors, so that the remaining part "
+    "easily gets a wrong name, and nothing is held out; calibrate on separate calibration runs, with "
     "--filter-cutoff if the sensor has an anti-alias filter"
 )
 
@@ -44,11 +44,11 @@ def diagnose(
     reading: Reading = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
-    """Find what the calibration model gets wrong, why, and what extending it gains.
+    """Find the errors of the calibration model and their causes, and measure how much an extension gains.
 
-    Writes report.html, for people: what was found, how sure it is, and whether the extended calibration may
-    fly; findings.json, the same for programs; and calibration.json, the extended calibration, for correct,
-    run and replay.
+    Writes report.html, for people: the causes, how certain they are, and whether the extended calibration may
+    be used; findings.json, the same for programs; and calibration.json, the extended calibration, for
+    correct, run and replay.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def diagnose(
     output
         The folder to write to.
     training_logs
-        A log that the calibration was fitted to, to tell what has appeared since; may be repeated.
+        A log that the calibration was fitted to, to find newer errors; may be repeated.
     grid
         An anomaly grid to add to the IGRF, where a log has no reference_field.
     """
@@ -106,14 +106,14 @@ def diagnose(
 
 
 def summary(facts: dict[str, Any], parts: str) -> str:
-    """Return the findings in lines: the verdict with its RMS, fit for use or not with the doubts, each cause.
+    """Return the findings in lines: the verdict with its RMS, fit for use or why not, each cause.
 
     Parameters
     ----------
     facts : dict
-        What ``findings.json`` holds.
+        Contents of ``findings.json``.
     parts : str
-        What was left out of the fit in turn, to measure the RMS after; empty where nothing was.
+        Parts that were held out in turn to measure the RMS after; empty if none was.
     """
     from magbridge.diagnose.words import number
 
@@ -133,7 +133,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
 
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
-    """Return a line for each cause found, with the alternatives to it, and for what is left unexplained."""
+    """Return a line for each cause found, with the alternatives to it, and for the unexplained residual."""
     from magbridge.diagnose.seen import WHITE
     from magbridge.diagnose.words import number
 
@@ -158,7 +158,7 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
 
 
 def _followed(what: dict[str, Any] | None) -> str:
-    """Return what is seen, apart from what it may be: the series that an effect follows, lag and axis."""
+    """Return the series that an effect follows, with lag and axis, without its interpretation."""
     if not what:
         return ""
     late = f" {what['lag_s']:g} s late" * bool(what["lag_s"])

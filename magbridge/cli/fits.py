@@ -1,4 +1,4 @@
-"""The fit that ``calibrate`` asks for: alone or from a fleet's memory, and what is said of its data."""
+"""The fit of ``calibrate``, with or without a fleet's prior, and the warnings about its data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["drifting", "fitted", "fleet_start", "from_fleet", "naming", "undecla
 
 @contextmanager
 def naming(deployment: xr.Dataset) -> Iterator[None]:
-    """Name the logs in what is wrong with them."""
+    """Name the logs in error messages about them."""
     try:
         yield
     except (CalibrationError, OutOfRange) as error:
@@ -67,7 +67,7 @@ def from_fleet(
 
 
 def fleet_start(fleet: str, member: str, refit: str, files: tuple[Path, ...]) -> Start:
-    """Return what a fleet lets expect of these logs."""
+    """Return a fleet's prior for these logs."""
     from magbridge.fleet.start import start
 
     with waiting("learning"):
@@ -77,12 +77,12 @@ def fleet_start(fleet: str, member: str, refit: str, files: tuple[Path, ...]) ->
 def drifting(position_sigma: float, data: Observations, method: str) -> dict[str, float]:
     """Return the option by which positions drift; WrongUse: the fit has no use for positions."""
     if position_sigma and not (data.lacks_rock and method in ("auto", "survey")):
-        raise WrongUse("--position-sigma: positions matter where the rock is found, by method survey")
+        raise WrongUse("--position-sigma: positions matter only where the field is mapped (method survey)")
     return {"position_sigma": position_sigma} if position_sigma else {}
 
 
 def undeclared_columns(deployment: xr.Dataset, data: Observations, found: Fit) -> list[str]:
-    """Return a line for each column of the log that moves the field and is no parameter."""
+    """Return a line for each column of the log that changes the field and is not a parameter."""
     import numpy as np
 
     from magbridge.calibration.fitting.parameter_choice import undeclared

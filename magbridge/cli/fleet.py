@@ -1,4 +1,4 @@
-"""Many vehicles, many logs: catalogue them, process what is new, show what changed."""
+"""Many vehicles, many logs: catalogue them, process new ones, show changes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def add(
     parameter
         A column that moves one of the vehicle's masses; may be repeated.
     serial
-        The vehicle's serial number: tells two of one name apart.
+        The vehicle's serial number: distinguishes two of one name.
     sensor
         Its sensor: logs of another are refused. Without --parameter, that of this deployment.
     date
@@ -132,10 +132,10 @@ def process(
     scheduler: str = "",
     json: Json = False,
 ) -> None:
-    """Read, check, calibrate and correct what is new; begin again where it was interrupted.
+    """Read, check, calibrate and correct new logs; continue where it was interrupted.
 
     A deployment's logs are calibrated together: against a known field where they have reference_field, else
-    with the rock below (as calibrate does). What is wrong with one log is a line, and the rest goes on.
+    with an estimated crustal field (as calibrate does). An error in one log is printed, and the rest goes on.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def process(
 
 @fleet.command
 def status(*, catalogue: Where = HERE, json: Json = False) -> None:
-    """Say what is catalogued, what is done, and what failed."""
+    """Print the catalogued logs, the finished work, and the failures."""
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.status import status as of
 
@@ -206,7 +206,7 @@ def status(*, catalogue: Where = HERE, json: Json = False) -> None:
 def show(
     vehicle: str = "", /, *, catalogue: Where = HERE, html: Path | None = None, json: Json = False
 ) -> None:
-    """Say how a vehicle's coefficients went from deployment to deployment, and when they changed.
+    """Print how a vehicle's coefficients went from deployment to deployment, and when they changed.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def show(
 def export(
     vehicle: str, /, *, output: Output, refit: str = "", catalogue: Where = HERE, json: Json = False
 ) -> None:
-    """Write what is expected of a vehicle's next deployment as a calibration, before any run is flown.
+    """Write the prediction for a vehicle's next deployment as a calibration, before any run is flown.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def export(
     others = len(learnt.lessons) - count
     print_result(
         {"file": str(output), "vehicle": vehicle, "deployments": count},
-        f"{output}: what {counted(count, 'deployment')} of {vehicle} and {others} of its fleet let expect",
+        f"{output}: as {counted(count, 'deployment')} of {vehicle} and {others} of its fleet predict",
         json,
     )
 

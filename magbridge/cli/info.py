@@ -1,4 +1,4 @@
-"""Say what logs hold, and what could be done with them."""
+"""Describe the contents of logs, and the commands that could use them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIDE = 110
 
 @command("info FILE... [OPTIONS]")
 def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> None:
-    """Say what logs hold: columns, units, rates, gaps, ranges, and what could be done with them.
+    """Describe logs: columns, units, rates, gaps, ranges, and the commands that could use them.
 
     Several logs are described one after the other; a sensor's own log and a vehicle's logs also together.
 

@@ -51,7 +51,7 @@ def navigate(
     """Find the track by matching the corrected field to an anomaly map.
 
     Writes the filtered and the smoothed track with covariance and innovations. Without --map the track is
-    bent to where it meets the field again that it met itself: one smoothed track, and what it was worth.
+    corrected to where it crosses itself in the field: one smoothed track, and how much the field improved it.
 
     With --bound, FILE is a planned track (time, latitude, longitude; its corners suffice), and the result is
     the smallest position error that any filter could reach along it.
@@ -68,9 +68,9 @@ def navigate(
         The calibration (cal.json). A log with total_field, corrected or of a scalar magnetometer, needs none.
         For a plan it gives the sensor noise; without it 1 nT.
     config
-        A bridge.toml whose [navigation.options] say how well start, current and map are known.
+        A bridge.toml whose [navigation.options] give the uncertainty of start, current and map.
     bound
-        Compute what the map is worth along a planned track.
+        Compute the accuracy that the map allows along a planned track.
     sample_interval
         Seconds between samples, for --bound. By default those of FILE where it is a log with a magnetometer,
         else those of the calibration, else 4.

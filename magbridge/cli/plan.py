@@ -28,8 +28,8 @@ def plan(
 ) -> None:
     """Choose the calibration runs to fly next: those that make the mission's worst error smallest.
 
-    With --survey: the patterns of a survey that calibrates itself, without runs and without a map, what each
-    is expected to bring and what it leaves open.
+    With --survey: the patterns of a survey that calibrates itself, without runs and without a map, with the
+    expected accuracy of each.
 
     Parameters
     ----------

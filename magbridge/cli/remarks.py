@@ -76,7 +76,7 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
 def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: Any) -> tuple[str, ...]:
     """Return the parameters of a fit: those that are named, or for ``auto`` the columns that are worth it.
 
-    What each that was tried buys on parts left out is told on stderr. `options` are of
+    The improvement by each column on held-out parts is printed to stderr. `options` are of
     :func:`~magbridge.calibration.fitting.parameter_choice.best_parameters`.
 
     WrongUse: ``auto`` among names.

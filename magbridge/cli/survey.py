@@ -60,21 +60,21 @@ def survey(
 ) -> None:
     """Make an anomaly map, with its sigma, from a survey's own logs: no calibration runs, no map.
 
-    Raw logs are calibrated with the rock below, found from the same data, unless a calibration is given.
-    Lines are levelled, what changes slowly with time is taken out, and the field is gridded.
+    Raw logs are calibrated with an estimate of the crustal field, from the same data, unless a calibration is
+    given. Lines are levelled, slow changes with time are subtracted, and the field is gridded.
 
     With --strict, also exit with 1 when the data do not support the calibration.
 
     Parameters
     ----------
     logs
-        The survey's logs: raw (mag_x mag_y mag_z), or corrected by others (total_field or anomaly, with line
+        The survey's logs: raw (mag_x mag_y mag_z), or corrected elsewhere (total_field or anomaly, with line
         and line_type where there are any), also a plain table without times.
     output
         The map, netCDF (.nc): what navigate --map takes. With --predict: the predictions (.csv).
     parameter
         A column that gives the position of a moving mass, or a current; may be repeated. auto: those of the
-        log that predict parts left out better.
+        log that predict held-out parts better.
     order
         Highest total degree of the polynomials in the parameters.
     calibration
@@ -84,10 +84,10 @@ def survey(
     position_sigma
         As of calibrate: by how many m dead-reckoned positions slowly drift, while the calibration is found.
     base
-        A base station's log (total_field, or a vector): its variation is taken off. So is that of an
-        observatory (IAGA-2002) among the logs.
+        A base station's log (total_field, or a vector): its variation is subtracted. A log of an
+        observatory (IAGA-2002) among the logs is used in the same way.
     spacing
-        m between nodes of the map; by default an eighth of the rock's length.
+        m between nodes of the map; by default an eighth of the crustal field's length.
     altitude
         m above the sea to which the map is continued upward; by default that of the survey.
     predict
@@ -191,7 +191,7 @@ def _calibrated(
     data = observations(together, parameters)
     found = fit(data, order=order, **options)
     if not found.supported and data.lacks_rock and found.calibration.method == "auto":
-        with suppress(CalibrationError):  # a map is wanted, so what is rock must not count as the vehicle's
+        with suppress(CalibrationError):  # a map must not attribute the crustal field to the vehicle
             found = fit(data, "survey", order=order, **options)
     for warning in found.warnings:
         complain(warning)
@@ -205,7 +205,7 @@ def _calibrated(
 
 
 def _predict(done: Result, points: Path, output: Path) -> None:
-    """Write the anomaly at points of one's own."""
+    """Write the anomaly at the user's points."""
     from magbridge.survey.read import read_points
     from magbridge.survey.write import write_points
 

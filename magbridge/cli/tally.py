@@ -1,4 +1,4 @@
-"""What has come of a log that was corrected."""
+"""Statistics of a corrected log."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ __all__ = ["Tally"]
 
 @dataclass
 class Tally:
-    """What has come of a log so far."""
+    """Statistics of a log so far."""
 
     samples: int = 0
     left_out: int = 0
-    """`samples`, `left_out`: Rows corrected, and those that are no samples."""
+    """`samples`, `left_out`: Rows corrected, and rows that are not samples."""
     flagged: int = 0
-    """Samples whose total field is in doubt."""
+    """Samples whose total field is flagged."""
     flags: Counter[str] = field(default_factory=Counter)
     """Name of a flag -> samples that carry it."""
     unearthly: int = 0
@@ -44,7 +44,7 @@ class Tally:
         self.unearthly += int(((total < EARTHS[0]) | (total > EARTHS[1])).sum())
 
     def doubt(self) -> str:
-        """Return why the calibration may be another vehicle's; empty where nothing says so."""
+        """Return why the calibration may be another vehicle's; empty without such an indication."""
         from magbridge.field.reference import EARTHS
 
         if self.unearthly <= self.samples / 2:

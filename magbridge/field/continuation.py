@@ -51,13 +51,14 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     Parameters
     ----------
     grid : AnomalyGrid
-        One of unknown altitude is returned as it is. Holes stay holes.
+        A grid of unknown altitude is returned unchanged. Holes stay holes.
     depth : array_like, (n,)
-        m below the surface, all at which the grid will be used; negative is above. Their mean is the level.
+        All depths at which the grid will be used, m below the surface; negative is above. Their mean is the
+        level of the result.
 
     Notes
     -----
-    The cosine transform mirrors the field at its edges, so that the wrap-around joins equal values. Of the
+    The cosine transform mirrors the field at its edges, so that the wrap-around joins equal values. With the
     error's spectrum E(k), sigma² is the mean of |E|², and length² = 2 sigma² / mean of |k E|².
     """
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
@@ -90,23 +91,23 @@ def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatAr
 
 
 ALIKE = 0.25
-"""Share of the wavelength that is smoothed away, within which what was taken out has one sign."""
+"""Fraction of the smoothed wavelength within which the removed part has one sign."""
 
 
 def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
-    """Return a grid without its short waves; what is taken out counts as its sigma. Holes stay holes.
+    """Return a grid without its short waves; the removed part counts as its sigma. Holes stay holes.
 
     Parameters
     ----------
     grid : AnomalyGrid
-        Of any altitude.
+        Grid of any altitude.
     wavelength : float
-        m, of which half the amplitude stays; of twice that 84 %, of half that 6 %.
+        Wavelength that keeps half its amplitude, m; twice that keeps 84 %, half that 6 %.
 
     Notes
     -----
     The cosine transform's terms are multiplied by ``2^-(k λ / 2π)²``, a Gaussian. The sigma added is the RMS
-    of what was taken out, over the map: around a node it is that of a wave or two, and chance.
+    of the removed part, over the map: around a node it is that of a wave or two, and chance.
     """
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 

@@ -77,7 +77,7 @@ def geographic(
         raise FormatError(
             path,
             "projected coordinates of an unknown projection: reproject the grid to longitude and latitude, "
-            f"or put its projection beside it as {path.stem}.prj",
+            f"or put its projection next to it as {path.stem}.prj",
         )
     own = crs.axis_info[0].unit_conversion_factor if crs.axis_info else 1.0
     scale = METRES.get(axes.unit.lower(), own) / own
@@ -106,7 +106,7 @@ def _are_degrees(path: Path, x: RealArray, y: RealArray, unit: str, crs: Any) ->
 
 
 def _reference_system(path: Path, crs: str | dict[str, Any] | None) -> Any:
-    """Return pyproj's CRS of what the file states, or of the ``.prj`` beside it; None where there is none."""
+    """Return pyproj's CRS of the file's own statement, or of the ``.prj`` next to it; None without either."""
     sidecar = path.with_suffix(".prj")
     if not crs and not sidecar.is_file():
         return None
@@ -157,7 +157,7 @@ def _reprojected(
 
 
 def _sampled(values: RealArray, at: RealArray) -> RealArray:
-    """Return values (ny, nx) at fractional rows and columns (2, m, n): NaN outside and beside a hole."""
+    """Return values (ny, nx) at fractional rows and columns (2, m, n): NaN outside and next to a hole."""
     from scipy.ndimage import map_coordinates  # noqa: PLC0415  the live path runs without scipy
 
     hole = map_coordinates(np.isnan(values).astype(float), at, order=1, mode="constant", cval=1.0)

@@ -15,7 +15,7 @@ __all__ = [
 ]  # fmt: skip
 
 EQUATORIAL_RADIUS = 6_378_137.0
-"""m, of WGS84."""
+"""Equatorial radius of WGS84, m."""
 ECCENTRICITY_SQUARED = 6.694_379_990_14e-3
 """Of WGS84."""
 RADIAN = pi / 180.0

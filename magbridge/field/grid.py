@@ -40,7 +40,7 @@ PARAMETERS = (
     "longitude", "latitude", "anomaly", "sigma", "altitude", "name", "vertical", "sigma_length",
     "typical_error", "level_sigma",
 )  # fmt: skip
-"""Of a grid."""
+"""Names of a grid's variables."""
 
 DOWN, ACROSS = [0, 1, 0, 2, 1, 0], [0, 0, 1, 0, 1, 2]
 """Orders of derivative, north and east, in the order of Local."""
@@ -67,16 +67,16 @@ class AnomalyGrid:
         nT/m, vertical gradient at that altitude, positive if the anomaly grows downward; without it the map
         is the same at every depth.
     sigma_length : float, optional
-        m, within which errors of that sigma are alike; 0: those of any two samples are independent.
+        m, within which errors of that sigma are correlated; 0: those of any two samples are independent.
     typical_error : float, optional
         nT, of an error that lasts from sample to sample; `sigma` is then all of that kind.
     level_sigma : float, optional
-        nT, 1-sigma of what the whole map may be off by; `sigma` is without it.
+        Common error of the whole map, nT, 1-sigma; `sigma` is without it.
 
     Raises
     ------
     FormatError
-        Axes that are not geographic, not even or too short; a field that is no anomaly; nothing but holes.
+        Axes that are not geographic, not even or too short; a field that is not an anomaly; only holes.
     """
 
     def __init__(

@@ -21,7 +21,7 @@ from magbridge.field.grid_netcdf import Parts, netcdf
 __all__ = ["TEXT", "ascii_grid", "folder", "geotiff", "grd", "libraries"]
 
 BAD_GEOSOFT = (ValueError, NotImplementedError, OSError, IndexError, UnboundLocalError, OverflowError)
-"""What harmonica raises on a file that is no such grid, or damaged; beside zlib's error."""
+"""Exceptions that harmonica raises for a file of another format or a damaged one, in addition to zlib's."""
 BAD_TIFF = (OSError, KeyError, AttributeError, TypeError, ValueError)
 """What Pillow, or a tag that is not as it should be, raises."""
 TEXT: Any = {"encoding": "utf-8-sig", "errors": "replace"}
@@ -148,9 +148,9 @@ def ascii_grid(path: Path) -> Parts:
 
 
 def folder(path: Path) -> Parts:
-    """Read MagNav's example: longitudes, latitudes and altitude beside a matrix, each a CSV file.
+    """Read MagNav's example: longitudes, latitudes and altitude next to a matrix, each a CSV file.
 
-    FormatError: one of the files is missing or is no table of numbers.
+    FormatError: one of the files is missing or is not a table of numbers.
     """
     try:
         with warnings.catch_warnings():

@@ -28,7 +28,7 @@ ANOMALY = (
 """What the anomaly is called, the surest first: z may be a height."""
 SIGMA = ("sigma", "error", "uncertainty", "std")
 EASTWARD_NORTHWARD = ("east", (*LONGITUDE, *PROJECTED[0])), ("north", (*LATITUDE, *PROJECTED[1]))
-"""Which way an axis runs, and what it is called."""
+"""Direction of an axis, and its names."""
 
 
 def netcdf(path: Path) -> Parts:
@@ -74,7 +74,7 @@ def netcdf(path: Path) -> Parts:
 
 
 Coordinates = tuple[tuple[str, str], RealArray, RealArray, Axes]
-"""Dimensions north and east, x and y along them, and what is stated of them."""
+"""Dimensions north and east, x and y along them, and the attributes of the axes."""
 
 
 def _along_its_axes(path: Path, grid: Any, data: Any) -> Coordinates:
@@ -107,7 +107,7 @@ def _two_dimensional(path: Path, grid: Any, data: Any) -> Coordinates | None:
     if any(str(grid[d].attrs.get("units", "")).lower() in METRES for d in grid.dims if d in grid.coords):
         return None  # a projection's
     raise FormatError(
-        path, "longitudes and latitudes that are no even grid: regrid it to longitude and latitude"
+        path, "longitudes and latitudes that are not an even grid: regrid it to longitude and latitude"
     )
 
 
@@ -125,7 +125,7 @@ def write(grid: AnomalyGrid, path: str | Path) -> None:
         "sigma": (over, grid.sigma, {"units": "nT", "long_name": "1-sigma of the magnetic anomaly"}),
     }
     if grid.sigma_length:
-        fields["sigma"][2]["length_m"] = grid.sigma_length  # within which its errors are alike
+        fields["sigma"][2]["length_m"] = grid.sigma_length  # correlation length of its errors
     attrs: dict[str, object] = {"Conventions": "CF-1.8", "title": "magnetic anomaly"}
     if isfinite(grid.altitude):
         attrs |= {"altitude": grid.altitude, "altitude_units": "m above the ellipsoid"}

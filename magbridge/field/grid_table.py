@@ -38,7 +38,7 @@ OTHERS = (
     "depth",
     "elev",
 )
-"""Columns that are no anomaly, whatever else there is."""
+"""Columns that are not an anomaly, whatever other columns there are."""
 HEADER = "name the columns in the first row: longitude,latitude,anomaly"
 
 
@@ -82,7 +82,7 @@ def table(path: Path) -> Parts:
 
 
 def _beginning(path: Path) -> tuple[list[str], str | None, int]:
-    """Return the words of the headings, or of the first row; the separator; how many lines are no rows."""
+    """Return the words of the headings or of the first row, the separator, and how many lines to skip."""
     remarks: list[str] = []
     with path.open(**TEXT) as file:
         first = next((line for line in file if not _is_remark(line, remarks)), "")
@@ -99,7 +99,7 @@ def _beginning(path: Path) -> tuple[list[str], str | None, int]:
 
 
 def _is_remark(line: str, remarks: list[str]) -> bool:
-    """Whether a line is no row, nor headings: it is then kept."""
+    """Return True and keep the line if it is neither a row nor headings."""
     found = REMARK.match(line) is not None
     if found:
         remarks.append(line)
@@ -137,7 +137,7 @@ def _column(place: int, word: str) -> Column:
 
 
 def _order(path: Path, rows: RealArray) -> list[int]:
-    """Return where longitude, latitude and anomaly are in columns without names: beyond 90 is no latitude."""
+    """Return the columns of longitude, latitude and anomaly without names: beyond 90 cannot be a latitude."""
     first, second = np.abs(rows[:, :2]).max(axis=0)
     if second > 90.0 >= first:
         return [1, 0, 2]

@@ -25,7 +25,7 @@ from magbridge.field.geodesy import ECCENTRICITY_SQUARED, EQUATORIAL_RADIUS
 __all__ = ["coverage", "igrf", "magnitude", "total_field"]
 
 REFERENCE_RADIUS = 6_371_200.0
-"""m, of the model's sphere."""
+"""Radius of the model's sphere, m."""
 BLOCK = 2048
 """Samples; the working arrays of a block stay in the cache."""
 
@@ -158,7 +158,7 @@ def _legendre(
 ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
     """Yield for n = 1, 2, ... ``P_n0`` and ``dP_n0/dθ`` (k,), ``S_nm`` and ``dP_nm/dθ`` (n, k), m = 1 to n.
 
-    Of the colatitudes' sine and cosine (k,); see the notes of :func:`igrf`.
+    The arguments are the colatitudes' sine and cosine (k,); see the notes of :func:`igrf`.
     """
     p_before, p = np.zeros_like(sin), np.ones_like(sin)  # P_n-1, P_n of order 0
     s_before = s = np.empty((0, sin.size))

@@ -25,7 +25,7 @@ LONG = 20 * 86_400.0
 
 
 REPEAT_US = 1_000_000
-"""µs after which the field at the same place is computed anew."""
+"""Time after which the field at the same place is computed again, µs."""
 
 
 class HeldField:
@@ -37,7 +37,7 @@ class HeldField:
         self._when_us, self._field = 0, np.nan
 
     def at(self, where: tuple[float, float, float], utc_us: int) -> float:
-        """Return the total field in nT; what was computed for this place less than a second ago holds.
+        """Return the total field in nT; a value computed for this place less than a second ago is reused.
 
         Parameters
         ----------

@@ -83,7 +83,7 @@ def prepare(
     result, apart = merge(lifted, spacing)
     if len(grids) > 1:
         nowhere = "no two of them overlap"
-        differ = f"{apart:.1f} nT RMS apart where they overlap" if isfinite(apart) else nowhere
+        differ = f"{apart:.1f} nT RMS difference in their overlap" if isfinite(apart) else nowhere
         steps.append(Step(f"merged, {differ}", result))
     if mask is not None:
         result = _masked(result, np.asarray(mask, float))
@@ -91,7 +91,7 @@ def prepare(
     if smooth:
         before, result = result, smoothed(result, 1000.0 * smooth)
         lost = float(np.sqrt(np.nanmean((before.anomaly - result.anomaly) ** 2)))
-        steps.append(Step(f"smoothed over {smooth:g} km: {lost:.1f} nT RMS taken out, now its sigma", result))
+        steps.append(Step(f"smoothed over {smooth:g} km: {lost:.1f} nT RMS removed, now its sigma", result))
     return result, steps
 
 

@@ -1,7 +1,7 @@
 """Anomaly grids from the formats in which surveys come.
 
 A format is a function from a path to ``(longitude, latitude, anomaly, options of AnomalyGrid)``. The table
-:data:`READERS` chooses it by the file's suffix; the kinds of GRD file, which share one, are told apart by
+:data:`READERS` chooses it by the file's suffix. The formats that share the suffix GRD are distinguished by
 their first bytes.
 """
 
@@ -30,7 +30,7 @@ __all__ = ["READERS", "read_grid", "read_polygon", "without_fill"]
 FILLS = tuple(sign * number for number in (99999.0, 9999.0, 32768.0, 32767.0, 999.0) for sign in (-1.0, 1.0))
 """Numbers that files without NaN write for "not known"."""
 CERTAIN = 9_000.0
-"""nT: a fill value as large as this is no anomaly; -999 may be one."""
+"""Value from which on a constant counts as a fill value, nT; -999 may be an anomaly."""
 TINY = 1.0
 """A map that does not say its unit, with nothing beyond this, is hardly in nT."""
 NANOTESLA = {unit.lower(): factor for unit, factor in NT_PER_UNIT.items()}
@@ -64,19 +64,19 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     Raises
     ------
     FormatError
-        A file that is no such grid, damaged, in a unit that is no magnetic field, or on axes that are neither
-        degrees nor lengths of a known projection.
+        A file of another format, damaged, in a unit that is not one of a magnetic field, or on axes that are
+        neither degrees nor lengths of a known projection.
 
     Notes
     -----
-    What the axes are is decided by their units, names, reference system and range
-    (:mod:`~magbridge.field.coordinates`); a projection that the file does not state may stand beside it in a
-    ``.prj``. A library reads the file in a process of its own (:mod:`magbridge.guard`).
+    The units, names, reference system and range of the axes determine their meaning
+    (:mod:`~magbridge.field.coordinates`). If the file does not state its projection, a ``.prj`` file next to
+    it may. A library reads the file in a process of its own (:mod:`magbridge.guard`).
     """
     path = Path(path)
     if not path.exists():
         raise FormatError(path, "no such file")
-    if not (path.is_file() or path.is_dir()):  # opening a pipe waits for whoever writes to it
+    if not (path.is_file() or path.is_dir()):  # opening a pipe would wait for a writer
         raise FormatError(path, "expected a file, not a pipe or a device")
     reader = folder if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:

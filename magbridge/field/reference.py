@@ -68,7 +68,7 @@ def reference_field(
     -----
     ``H_e = |IGRF(φ, λ, depth, t)| + anomaly(φ, λ, depth) + site bias``: eq. 4, whose anomaly is the map's
     at its own altitude. Depth matters: about 0.02 nT/m in the main field, and far more in the anomalies of
-    shallow rock.
+    shallow crustal sources.
     """
     size = deployment.sizes["time"]
     given = np.array(np.broadcast_to(deployment.get("reference_field", np.nan), size), float)
@@ -144,7 +144,7 @@ def earth_field(
 
 
 def other_units(channels: FloatArray, reference: float) -> str:
-    """Say so when raw channels (n, 3) cannot be nT in a field of `reference`, nT, as gauss or µT; else "".
+    """Return a message if raw channels (n, 3) cannot be nT in a field of `reference`, nT, as gauss; else "".
 
     No iron changes the field tenfold.
     """

@@ -47,12 +47,12 @@ def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> 
 
 
 def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> list[Lesson]:
-    """Return what deployments of vehicles with the masses of one, `like`, have taught.
+    """Return the training records of all deployments of vehicles with the masses of the vehicle `like`.
 
-    The estimates from logs of these SHA-256, `without`, is left out. So is a calibration made
-    elsewhere from logs that were calibrated here, too.
+    Estimates from logs of the SHA-256 in `without` are left out. A calibration made elsewhere from logs that
+    were also calibrated here is left out, too.
 
-    WrongUse: there is no such vehicle.
+    WrongUse: the vehicle does not exist.
     """
     vehicle_named(catalogue, like)
     kinds = {name: _kind(row) for name, row in vehicles(catalogue).items()}

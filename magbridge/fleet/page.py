@@ -111,7 +111,7 @@ def _table(headings: str, rows: Sequence[str]) -> str:
 
 def _overview(histories: Mapping[str, History], links: Mapping[str, str]) -> Iterator[str]:
     yield (
-        "<p>A vehicle's magnetism is compared with what its earlier deployments, and its fleet, let expect. "
+        "<p>A vehicle's magnetism is compared with the prediction from earlier deployments and its fleet. "
         "The broad band is that expectation (2 sigma), the dot what the deployment's own runs made of it, a "
         "dotted line a refit; <span class=changed>red</span> left its band.</p>"
     )

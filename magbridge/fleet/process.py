@@ -94,7 +94,7 @@ def process(catalogue: Catalogue, todo: list[Job], client: Client) -> Iterator[O
             line = f"{job.vehicle['vehicle']} {job.deployment}: its workers were killed (out of memory?)"
             done = Done({}, line)
         except CancelledError as error:
-            raise PortError(address, "the dask scheduler was lost: run again to do what is left") from error
+            raise PortError(address, "the dask scheduler was lost: run again to do the rest") from error
         future.release()
         yield _kept(catalogue, job, done)
         if number % PACE == 0 or number == len(futures):

@@ -156,7 +156,7 @@ def add_logs(
         if last is not None and content == {key: last[key] for key in content}:
             continue
         if last is not None and last["sha256"] != sha:
-            lines.append(f"{log}: has changed since it was catalogued; what it holds now counts")
+            lines.append(f"{log}: has changed since it was catalogued; its present contents count")
         rows.append({**content, "version": 1 if last is None else last["version"] + 1})
     return catalogue.add("files", rows), lines
 

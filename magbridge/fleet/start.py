@@ -84,7 +84,7 @@ def gained(found: Fit, alone: Fit | None, began: Start) -> tuple[dict[str, Any],
     lines = [f"{past}: expect {with_it:.1f} nT of error {otherwise}"]
     if departure > UNLIKE:
         lines.append(
-            f"{began.vehicle} is not as its past lets expect, by {departure:.1f} times: another vehicle, or "
-            "something on it has changed"
+            f"{began.vehicle} differs from its past by {departure:.1f} times the expected: another "
+            "vehicle, or something on it has changed"
         )
     return facts, lines

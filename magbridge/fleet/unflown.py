@@ -30,5 +30,5 @@ def unflown(fleet: Fleet, vehicle: str, refit: str = "") -> Calibration:
     return Calibration(
         known.parameters, (Polynomial(exponents=known.exponents),), np.asarray(known.mean), known.covariance,
         Noise(noise), Reference(known.field), method="fleet", software=f"magbridge {__version__}",
-        warnings=("no run of this deployment: its coefficients are what its fleet lets expect",),
+        warnings=("no run of this deployment: its coefficients are its fleet's prediction",),
     )  # fmt: skip

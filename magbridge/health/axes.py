@@ -63,7 +63,7 @@ class RepetitionCheck:
 
     @property
     def is_repeating(self) -> bool:
-        """Whether the last reading repeats the one before on all axes."""
+        """Return True if the last reading repeats the previous one on all axes."""
         return self._common.run > 0
 
     def is_stuck(self, raw: Vector, white_sigma: float) -> bool:

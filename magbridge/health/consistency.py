@@ -1,4 +1,4 @@
-r"""Check whether the corrected total field depends on what it must not depend on.
+r"""Check whether the corrected total field depends on quantities that do not change the Earth's field.
 
 The Earth's field does not depend on the vehicle's attitude, temperature or mass positions. An error of the
 calibration does. With u the direction of the corrected field in sensor axes, an error changes the total field
@@ -103,7 +103,7 @@ class ConsistencyCheck:
     masses : int
         Number of mass positions that the calibration depends on.
     messages : Messages
-        Receives what is found.
+        Receives the messages.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class ConsistencyCheck:
         self._decide(largest, sigma)
 
     def _learn_roughness(self, squared: float, unit: Any) -> None:
-        """Let the crustal field's curvature follow the innovations where the attitude stays the same."""
+        """Update the crustal field's curvature from the innovations while the attitude stays the same."""
         turned = float(np.abs(unit - self._last_unit).max())
         self._last_unit = unit
         if turned < STRAIGHT and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:

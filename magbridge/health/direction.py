@@ -1,14 +1,14 @@
-"""Whether the corrected vector points where the main field does, given the vehicle's attitude.
+"""Check the direction of the corrected vector against the main field, given the vehicle's attitude.
 
-The total field does not tell a wrong mounting, two axes that are exchanged or one whose sign is wrong. The
-direction does: with the unit vector *d* that is down in body axes, ``sin I = b·d / |b|`` is the field's
-inclination, which needs no heading; and the levelled vector's heading from magnetic north, ``m = atan2(-b·s,
-b·f)``, f and s forward and starboard in the horizontal plane, gives the declination ``D = yaw - m``.
+The total field does not show a wrong mounting, two exchanged axes or one of wrong sign. The direction does:
+with the unit vector *d* that is down in body axes, ``sin I = b·d / |b|`` is the field's inclination, which
+needs no heading; and the levelled vector's heading from magnetic north, ``m = atan2(-b·s, b·f)``, f and s
+forward and starboard in the horizontal plane, gives the declination ``D = yaw - m``.
 
-Roll and pitch come from gravity, and are off by a degree or two: an inclination more than :data:`INCLINED`
-off is flagged. The heading of an autopilot may come from a compass beside the same iron, or be none before a
-flight: if it and the vector differ by more than :data:`TURNED`, one of both is wrong, which is not known from
-aboard. It is reported, and the vector's sigma spans the difference.
+Roll and pitch come from gravity, and have errors of a degree or two: an inclination error above
+:data:`INCLINED` is flagged. The heading of an autopilot may come from a compass near the same iron, or be
+missing before a flight. If it and the vector differ by more than :data:`TURNED`, one of them is wrong, and
+the check cannot decide which. It reports the difference, and the vector's sigma includes it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from magbridge.records import Quality
 __all__ = ["DirectionCheck"]
 
 INCLINED: Final = radians(10.0)
-"""Five sigmas of 2 deg: attitude 1.5, boresight 1, main field 0.2 (Chulliat et al. 2020, table 14), rock."""
+"""Five sigmas of 2 deg: attitude 1.5, boresight 1, main field 0.2 (Chulliat et al. 2020, table 14), crust."""
 TURNED: Final = radians(60.0)
 """Five sigmas of a compass that is off by 12 deg."""
 STEEP: Final = 0.2
@@ -34,22 +34,22 @@ FRESH_US: Final = 5_000_000
 LASTING: Final = 8
 """Looks in a row that differ: what a manoeuvre does to an attitude is over by then."""
 LONG_US: Final = 3_600_000_000
-"""µs for which what was seen is remembered: at some headings a reversed axis looks right."""
+"""Time for which a disagreement is remembered, µs: at some headings a reversed axis looks right."""
 IMPLAUSIBLE: Final = int(Quality.IMPLAUSIBLE)
 
 
 class DirectionCheck:
-    """Judges the vector now and then.
+    """Check the vector at intervals.
 
     Parameters
     ----------
     messages : Messages, optional
-        Takes what is found.
+        Receives the messages.
 
     Attributes
     ----------
     flags : int
-        Of the last sample: :class:`~magbridge.records.Quality` bits.
+        :class:`~magbridge.records.Quality` bits of the last sample.
     """
 
     def __init__(self, messages: Messages | None = None) -> None:
@@ -65,12 +65,12 @@ class DirectionCheck:
         self._until_us = self._tilted_until_us = 0
 
     def attitude(self, time_us: int, roll: float, pitch: float, yaw: float) -> None:
-        """Take the vehicle's attitude, rad, of forward-starboard-down axes, yaw from true north."""
+        """Set the vehicle's attitude, rad, of forward-starboard-down axes, yaw from true north."""
         if isfinite(roll + pitch + yaw):
             self._roll, self._pitch, self._yaw, self._attitude_us = roll, pitch, yaw, time_us
 
     def expect(self, north: float, east: float, down: float) -> None:
-        """Take the main field at the vehicle, any unit; NaN where it is not known."""
+        """Set the main field at the vehicle, any unit; NaN if it is not known."""
         self._inclination = atan2(down, sqrt(north * north + east * east))
         self._declination = atan2(east, north)
 

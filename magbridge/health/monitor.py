@@ -35,7 +35,7 @@ class HealthMonitor:
     noise : Noise
         The calibration's noise model.
     messages : Messages, optional
-        Receives what is found.
+        Receives the messages.
     level : float
         Part of every sample's sigma that is common to all samples, nT.
     masses : int
@@ -65,7 +65,7 @@ class HealthMonitor:
         self._unit: Vector = (0.0, 0.0, 0.0)
 
     def set_position(self, time_us: int, latitude: float, longitude: float) -> None:
-        """Record the vehicle's position, deg; what is noise and what is crust depends on the speed."""
+        """Record the vehicle's position, deg; the speed separates noise from crustal field."""
         if not self._has_position:
             self._has_position = True
             self._trend.set_speed(SUPPOSED_SPEED)

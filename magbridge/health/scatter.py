@@ -5,15 +5,15 @@ From sample to sample it measures white noise. A disturbance of the period P add
 times its amplitude: little at a lag T of a tenth of P, all of it at a third. The crustal field limits T: a
 wave of length L, passed at the speed v, adds :math:`(2 \pi v T / L)^2`, which is 2 % where v T is
 :data:`TRAVEL_M` and L is 500 m. That much is subtracted. (The Allan variance shows in the same way at each
-interval what is noise there: Allan 1966, *Statistics of atomic frequency standards*, Proc. IEEE 54:221.)
+interval the noise there: Allan 1966, *Statistics of atomic frequency standards*, Proc. IEEE 54:221.)
 
 The calibration's noise model (a white fraction w, the rest an AR(1) process of autocorrelation
 :math:`\rho(T)`) has second differences of variance
 
 .. math:: V(T) = \sigma^2 \left( 6 w + (1 - w)(6 - 8 \rho(T) + 2 \rho(2T)) \right)
 
-The largest ratio of what is measured to V(T) is the factor by which the whole noise, its slow part included,
-has grown: sigma grows by that factor.
+The largest ratio of the measured variance to V(T) is the factor by which the whole noise, its slow part
+included, has grown: sigma grows by that factor.
 """
 
 from __future__ import annotations
@@ -103,13 +103,13 @@ class Scatter:
     noise : Noise
         The calibration's noise model.
     messages : Messages
-        Receives what is found.
+        Receives the messages.
 
     Attributes
     ----------
     variance : float
-        Variance of an innovation from one sample to the next, nT²; at least what the calibration's noise
-        gives.
+        Variance of an innovation from one sample to the next, nT²; at least that of the calibration's noise
+        model.
     speed : float
         Speed of the vehicle, m/s; NaN while it is not known.
     """

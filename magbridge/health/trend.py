@@ -93,7 +93,7 @@ class TrendCheck:
     scatter : Scatter
         Noise of the samples.
     messages : Messages
-        Receives what is found.
+        Receives the messages.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class TrendCheck:
 
     @property
     def is_established(self) -> bool:
-        """Whether the rate at which the field changes is known, from the speed or from the samples."""
+        """Return True if the field's rate of change is known, from the speed or from the samples."""
         return self._has_speed or self._accepted >= ESTABLISHED_SAMPLES
 
     @property
@@ -219,7 +219,7 @@ class TrendCheck:
         return self._unrest
 
     def _adapt(self, square: float) -> None:
-        """Let q follow a normalised squared innovation, whose mean is 1 if q is right."""
+        """Adapt q to a normalised squared innovation, whose mean is 1 if q is right."""
         self._log_q = max(self._log_q + ADAPTATION * (square - 1.0), self._min_log_q)
 
     def _begin(self, time_us: int, level: float, sigma: float, noise: float) -> None:

@@ -125,7 +125,7 @@ class Bank:
         self.P = F @ half + Q[:, :, None]
 
     def update(self, block: Block) -> tuple[float, float, float]:
-        """Take in one measurement; return its innovation (nT), its variance and its log-likelihood.
+        """Update with one measurement; return its innovation (nT), its variance and its log-likelihood.
 
         A hypothesis off the map predicts the map's mean, with the map's variance, and is not updated.
         """
@@ -148,7 +148,7 @@ class Bank:
         return self._observe(block.anomaly - anomaly - self.x[4] - errors * self.x[5], gain, s + v, off)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
-        """Take in a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
+        """Update with a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
         for axis, value in enumerate((north, east)):
             gain = self.P[axis]
             self._observe(
@@ -158,7 +158,7 @@ class Bank:
     def _observe(
         self, y: FloatArray, gain: FloatArray, s: FloatArray, off: BoolArray
     ) -> tuple[float, float, float]:
-        """Take in innovations (n,) of variances (n,), with ``P H'`` (6, n); return as :meth:`update`."""
+        """Update with innovations (n,) of variances (n,) and ``P H'`` (6, n); return as :meth:`update`."""
         z2 = y * y / s
         likelihood = -0.5 * (np.minimum(z2, self._gate) + np.log(s) + log(2.0 * pi))
         mean = float(self.w @ y)

@@ -53,16 +53,16 @@ class Collector:
     def add(
         self, time_us: int, where: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
     ) -> Block | None:
-        """Take in a sample; return the block that it fills, or that it lies too far from to belong to.
+        """Add a sample; return the block that it fills, or the one that it is too far away to join.
 
         Parameters
         ----------
         time_us, utc_offset_us : int
-            µs of a clock that is never set, and the offset to UNIX time: the main field has a date.
+            Monotonic time and its offset to UNIX time, µs: the main field depends on the date.
         where : DeadReckoning
-            At the place of the sample.
+            Dead reckoning at the sample's place.
         total_field, sigma : float
-            nT.
+            Total field and its 1-sigma, nT.
         """
         main, slope_north, slope_east = self._main_field.at(
             where.latitude, where.longitude, where.depth, (time_us + utc_offset_us) * 1e-6

@@ -255,7 +255,7 @@ class Estimate:
         against = unmapped - seen.log_likelihood
         if (
             not seen.accepted
-        ):  # the likelihood is limited by the gate: what was rejected never speaks for the map
+        ):  # the likelihood is limited by the gate: a rejected sample never supports the map
             against = max(against, 0.0)
         self._nowhere = max(self._nowhere + against, -log(self.options.doubt))
         if self._nowhere > log(self.options.doubt):
@@ -328,7 +328,7 @@ class Estimate:
 
     @property
     def informed(self) -> bool:
-        """Whether the field has improved the position of dead reckoning alone."""
+        """Return True if the field has improved the position of dead reckoning alone."""
         return widest(self.P) <= UNINFORMED * widest(self.alone)
 
     def _near_fix(self) -> bool:

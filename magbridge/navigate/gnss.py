@@ -71,7 +71,7 @@ OK_STATE, DETECTED_STATE = 1, 3
 
 
 class GnssState(IntEnum):
-    """Whether the positions of the receiver are used; the values are those sent over the link."""
+    """Use of the receiver's positions; the values are those sent over the link."""
 
     NONE = 0
     """No position yet."""

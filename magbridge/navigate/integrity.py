@@ -184,14 +184,14 @@ class IntegrityMonitor:
         )
 
 
-def squared_mahalanobis(apart: FloatArray, P: FloatArray) -> float:
+def squared_mahalanobis(difference: FloatArray, P: FloatArray) -> float:
     """Return the squared Mahalanobis distance of two positions.
 
     Parameters
     ----------
-    apart : (2,) or (6,) array
-        m north and east from one to the other, first.
+    difference : (2,) or (6,) array
+        Difference of the positions; its first two elements are m north and east.
     P : (2, 2) or (6, 6) array
-        m², covariance.
+        Covariance of the difference, m².
     """
-    return float(apart[:2] @ np.linalg.solve(P[:2, :2], apart[:2]))
+    return float(difference[:2] @ np.linalg.solve(P[:2, :2], difference[:2]))

@@ -62,16 +62,16 @@ class Navigator:
     def fix(
         self, time_us: int, latitude: float, longitude: float, sigma: float | None = None
     ) -> Record | None:
-        """Take in a position: the start, or a GPS fix; return the update that it completes.
+        """Update with a position, the start or a GPS fix; return the update that it completes.
 
         Parameters
         ----------
         time_us : int
-            µs of event time.
+            Event time, µs.
         latitude, longitude : float
-            deg.
+            Position, deg.
         sigma : float, optional
-            m, each axis; default ``options.start_sigma``.
+            1-sigma of each axis, m; default ``options.start_sigma``.
         """
         return self._correct(time_us, (latitude, longitude), sigma, None)
 
@@ -138,7 +138,7 @@ class Navigator:
         return record
 
     def telemetry(self, time_us: int, **values: float) -> None:
-        """Take in telemetry for dead reckoning, named as :meth:`DeadReckoning.telemetry` has it."""
+        """Update the dead reckoning with telemetry, named as in :meth:`DeadReckoning.telemetry`."""
         self._reckoning.telemetry(time_us * 1e-6, values)
 
     def new_motion(self, time_us: int) -> None:
@@ -148,13 +148,13 @@ class Navigator:
         self.estimate.other_motion()
 
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
-        """Take in a corrected sample; return the update that it completes, if it does."""
+        """Add a corrected sample; return the update that it completes, or None."""
         if corrected.quality & UNUSABLE:
             return None
         return self.measure(time_us, corrected.total_field, corrected.total_field_sigma)
 
     def measure(self, time_us: int, total_field: float, sigma: float) -> Record | None:
-        """Take in a total field and its 1-sigma, nT; return the update that it completes, if it does.
+        """Add a total field and its 1-sigma, nT; return the update that it completes, or None.
 
         A sample that is NaN, not later than the previous one, or before any position is ignored.
         """

@@ -44,7 +44,7 @@ the number of blocks at most: of more, every second or third is used."""
 FEWEST = 12
 """Blocks."""
 STAGES, PARTICLES = 10, 80
-"""Parts in which the track is taken in, and tracks that are followed."""
+"""Parts in which the track is processed, and number of tracks (particles)."""
 SOON = 0.49
 """Share of the blocks from which on a track can be lost."""
 CONTRADICTED = 1.5
@@ -57,9 +57,10 @@ GAINED = 0.85
 class _Found:
     """The tracks that agree with the field: their errors (k, n, 2), m, and the likeliest kind of field.
 
-    `typical` (q,) is the one of that kind that lies nearest to the mean; `scales` (3,) are the median size,
-    length and noise. Tracks further apart than the field's length agree with it at different repetitions, of
-    which so few particles miss most: then `lost`, and the errors are those of dead reckoning alone.
+    `typical` (q,) is the track of that kind nearest to the mean; `scales` (3,) are the median amplitude,
+    length and noise. Tracks that differ by more than the field's length agree with it at different
+    repetitions, most of which so few particles miss. Then `lost` is set, and the errors are those of dead
+    reckoning alone.
     """
 
     moved: FloatArray
@@ -80,7 +81,7 @@ class _Found:
 
 
 def _lost(field: OwnField, u: FloatArray, count: int | None = None) -> bool:
-    """Return whether tracks u (k, q) lie further apart than the field's length over the first `count` blocks.
+    """Return True if tracks u (k, q) differ by more than the field's length over the first `count` blocks.
 
     Then more blocks do not bring them together: the first half decides.
     """
@@ -194,7 +195,7 @@ def _dataset(
 
 
 def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> Iterator[str]:
-    """Say what the field was worth."""
+    """Yield sentences on how much the field improved the track."""
     sigma = np.sqrt((result["covariance_nn"] + result["covariance_ee"]).to_numpy())
     alone = result["unaided_sigma"].to_numpy()
     size, length, noise = found.scales.tolist()
@@ -220,8 +221,8 @@ def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> 
         )
     if found.lost:
         yield (
-            "tracks further apart than the field's length agree with it alike, and not all are known: this "
-            "is dead reckoning alone"
+            "tracks that differ by more than the field's length agree with it equally well, and not all are "
+            "known: this is dead reckoning alone"
         )
     elif np.median(alone) > length:
         yield (

@@ -62,12 +62,13 @@ class Tracker:
         self._filter.predict()
 
     def update(self, block: Block) -> Innovation:
-        """Take in one measurement of the field.
+        """Update with one measurement of the field.
 
         Notes
         -----
-        ``h = a(p) + ∇F·δ + b + e m`` and ``R = r + map variance``, both with what the map's curvature adds
-        (:func:`~magbridge.field.local.curvature`); e as in :meth:`~magbridge.field.grid.AnomalyGrid.error`.
+        ``h = a(p) + ∇F·δ + b + e m`` and ``R = r + map variance``, both with the contribution of the map's
+        curvature (:func:`~magbridge.field.local.curvature`); e as in
+        :meth:`~magbridge.field.grid.AnomalyGrid.error`.
         """
         north, east = float(self.x[0]), float(self.x[1])
         per_latitude, per_longitude = metres_per_degree(block.latitude)
@@ -87,7 +88,7 @@ class Tracker:
         return innovation._replace(anomaly=local.anomaly)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
-        """Take in a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
+        """Update with a position fix, m from the dead-reckoned position, with its 1-sigma on each axis."""
         for axis, value in enumerate((north, east)):
             row = np.zeros((1, N_STATES))
             row[0, axis] = 1.0

@@ -1,4 +1,4 @@
-"""Crossovers: where a survey meets its own lines again, and how far apart the two readings are there."""
+"""Crossovers: places where a survey crosses its own lines, and the difference of the two readings there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from magbridge.arrays import FloatArray, IndexArray
 __all__ = ["Crossovers", "crossovers"]
 
 SEGMENTS = 60_000
-"""Segments of all lines, at most: a longer track is taken in longer steps."""
+"""Largest number of segments of all lines: a longer track is processed in longer steps."""
 APART = 20
 """Segments of one line between two that can be a crossover."""
 
@@ -66,7 +66,7 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
 
 
 def _near(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return pairs of segments, from `a` (m, 2) along `way` (m, 2), in one cell: those of one line apart."""
+    """Return pairs of segments, from `a` (m, 2) along `way` (m, 2), in a cell, not adjacent on a line."""
     cell = max(float(np.quantile(np.abs(way).max(axis=1, initial=0.0), 0.99)), 1.0) if len(a) else 1.0
     keys: list[IndexArray] = []
     of: list[IndexArray] = []

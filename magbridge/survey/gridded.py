@@ -33,16 +33,16 @@ class Posterior:
     w: FloatArray
     """(nodes,): The field's coefficients."""
     follow: FloatArray
-    """(nodes, r): How they move with 1-sigma of what is uncertain elsewhere: levels, slow changes, the
+    """(nodes, r): Change of the nodes with 1-sigma of each other uncertainty: levels, slow changes, the
     calibration."""
     precision: csr_array
     """(nodes, nodes), in units of the noise's."""
     inverse: InverseBlocks
     """Of it."""
     levels: FloatArray
-    """(n,), nT, what was taken off each sample: its line's level and the slow part, about their mean."""
+    """(n,), nT, subtracted from each sample: its line's level and the slow part, about their mean."""
     mean: float
-    """nT, of the field over the samples: a level, which no survey knows and which is not doubt of the map."""
+    """Mean of the field over the samples, nT: a level, which no survey determines and the sigma excludes."""
 
     def at(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance, (n,) each, of splines B (n, nodes)."""
@@ -61,7 +61,7 @@ class Gridded:
     """A gridded survey: ask it for the field at any place."""
 
     posteriors: tuple[Posterior, ...]
-    """Of the likeliest size and length first, then of others that the data leave open."""
+    """Posterior of the likeliest size and length first, then further ones that the data allow."""
     roughness: Roughness
     """How the field's size varies from place to place."""
     rho: float
@@ -71,11 +71,11 @@ class Gridded:
     mean: float
     """nT, of all samples, and of the map over them."""
     kept: BoolArray
-    """(n,): Which samples are no outliers."""
+    """(n,): True for samples that are not outliers."""
     widths: Hyperparameters
     """As the evidence chose them."""
     kriged: Kriged | None = None
-    """What predicts instead of the nodes where these are coarser than the rock."""
+    """Predictor to use instead of the nodes if these are coarser than the crustal field."""
 
     @property
     def field(self) -> GaussianField:
@@ -94,7 +94,7 @@ class Gridded:
 
     @property
     def levels(self) -> FloatArray:
-        """nT, what was taken off each sample (n,): its line's level and the slow part."""
+        """(n,), nT, subtracted from each sample: its line's level and the slow part."""
         return np.asarray(sum(one.weight * one.levels for one in self.posteriors))
 
     def at(self, place: FloatArray, depth: FloatArray | float | None = None) -> tuple[FloatArray, FloatArray]:
@@ -124,7 +124,7 @@ class Gridded:
         return mean, np.sqrt(variance + ((B @ self.posteriors[0].follow) ** 2).sum(axis=1))
 
     def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
-        """Yield about so many anomalies (n,), nT, at places (n, 2), m, that the data leave open alike."""
+        """Yield about `number` equally probable anomalies (n,), nT, at places (n, 2), m."""
         rng, rough = np.random.default_rng(0), self.roughness.at(place)
         for one in self.posteriors:
             B = one.field.basis(place)

@@ -2,11 +2,11 @@ r"""The map from corrected samples: a Gaussian field in place, with each line's 
 
 .. math:: y_i = f(x_i) + l_{line(i)} + s(t_i) + e_i
 
-f is the field of :mod:`magbridge.estimation.gaussian_field`. Its size, length and smoothness are chosen by
-the evidence, as those of a survey that calibrates itself are; so are the widths of the levels l and of
-the slow changes s.
-Map and sigma are the posterior's mean and standard deviation. What the calibration does not know (its
-`modes`) is not fitted again to the same data: it is carried into the sigma as it stands (a *considered*
+f is the field of :mod:`magbridge.estimation.gaussian_field`. The evidence selects its size, length and
+smoothness, as in a survey that calibrates itself. It also selects the widths of the levels l and of the
+slow changes s.
+Map and sigma are the posterior's mean and standard deviation. The uncertainty of the calibration (its
+`modes`) is not fitted again to the same data: it is added to the sigma unchanged (a *considered*
 uncertainty: Schmidt 1966).
 """
 
@@ -47,7 +47,7 @@ SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """As in a survey that calibrates itself."""
 UNSEEN = 0.25
 """nT of slow changes where the samples show none. On a track that never crosses itself a slow change is as
-likely as rock: with a width of their own they took up to 6 nT of it."""
+likely as a crustal anomaly: with a free width, slow changes absorbed up to 6 nT of it."""
 SEARCHED, SEARCHED_NODES = 4_000, 12_000
 """Samples about the middle with which the field is searched, and nodes at most."""
 WIDE = 5_000.0
@@ -55,7 +55,7 @@ WIDE = 5_000.0
 OUTLIER = 6.0
 """Sigmas beyond which a sample is left out."""
 LARGE, LIKELIER = 100.0, 5.0
-"""Areas of a length's square, and nats, from which on the field's size may vary from place to place."""
+"""Areas of a length's square, and log-likelihood gain, from which on the field's size may vary with place."""
 MOST = 40_000
 """Nodes at most; their variances take 0.5 GB."""
 
@@ -86,7 +86,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         z, _ = _solved(reduced, widths, family)
         w = reduced.field(z)
         e = samples.value - problem.mean - problem.D @ z - problem.rock(choice.field, w)
-        e = e / problem.scale  # where the rock is rough, so is what no node resolves
+        e = e / problem.scale  # unresolved anomalies grow with the roughness of the crustal field
         if turn or not (far := np.abs(e) > OUTLIER * max(robust_scale(e), widths.sigma)).any():
             break
         problem.kept = ~far
@@ -148,7 +148,7 @@ def _groups(samples: Samples) -> tuple[ParameterBlock, ...]:
     levels = np.zeros((len(of), int(of.max()) + 1))
     levels[np.arange(len(of)), of] = 1.0
     groups = [ParameterBlock("levels of lines", levels, np.ones(levels.shape[1]), LEVEL, LEVEL_SPREAD)]
-    if levels.shape[1] == 1:  # rock of its size may be all on one side of zero along one line
+    if levels.shape[1] == 1:  # the crustal field of its size may have one sign along a single line
         groups = [ParameterBlock("level", levels, np.ones(1), max(float(np.ptp(samples.value)), LEVEL))]
     if np.isfinite(samples.time).all():
         waves, shape = slow_functions(samples.time)
@@ -226,5 +226,5 @@ def _considered(
 
 
 def _apart(follow: FloatArray, mean: FloatArray) -> FloatArray:
-    """Take from the uncertain shifts of the field (nodes, r) their mean over the samples: that is level."""
+    """Subtract from the uncertain shifts of the field (nodes, r) their mean over the samples: the level."""
     return np.asarray(follow - (mean @ follow)[None, :] / max(mean.sum(), 1e-9))

@@ -1,14 +1,14 @@
-r"""Kriging from the nearest samples, where an area allows no nodes as fine as its rock.
+r"""Kriging from the nearest samples, for areas where nodes as fine as the crustal field are too many.
 
-Sources that lie anyhow at a depth d have the spectrum :math:`e^{-2 k d}` (Spector & Grant 1970), and so, as
-:math:`\int e^{-k h} J_0(k r)\, k\, dk = h / (r^2 + h^2)^{3/2}`, the covariance
+Sources that are distributed at random at a depth d have the spectrum :math:`e^{-2 k d}` (Spector & Grant
+1970), and so, as :math:`\int e^{-k h} J_0(k r)\, k\, dk = h / (r^2 + h^2)^{3/2}`, the covariance
 
 .. math:: C(r) = s^2 h^3 / (r^2 + h^2)^{3/2}, \quad h = 2 d.
 
-Depth, size s and noise are those with which some samples are likeliest, each given the nearest of those
-before it in a random order (Vecchia 1988). A line that was flown elsewhere than it says reads rock of the
-same kind that no other line meets: its samples have :math:`(1 + g^2) C` in common, g by what the others
-predict.
+The estimate of depth, size s and noise maximises the likelihood of some samples, each given the nearest of
+those that precede it in a random order (Vecchia 1988). A line with wrong positions reads a crustal field of
+the same kind, which no other line crosses: its samples have :math:`(1 + g^2) C` in common, with g from the
+predictions of the other lines.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ AMONG = 400
 CHOOSING = 600
 """Samples that do."""
 STEPS = 50
-"""Of the climb to the likeliest depth, size and noise."""
+"""Steps of the maximisation over depth, size and noise."""
 SHARE, SPREAD = 0.1, np.log(5.0)
 """g as expected, and the 1-sigma of its logarithm."""
 SHARES = np.geomspace(0.02, 5.0, 60)
@@ -73,13 +73,13 @@ class Kriged:
         return out[:, 0], out[:, 1]
 
     def of_a_line(self, place: FloatArray) -> FloatArray:
-        """Return by how many nT (n,), 1-sigma, a line reads what is not the field at places (n, 2), m."""
+        """Return 1-sigma (n,), nT, of a line's own part, which is not the field, at places (n, 2), m."""
         return np.asarray(np.hypot(rms(self.share) * self.size * self.roughness.at(place), self.noise))
 
     def given(self, place: FloatArray, near: IndexArray, line: IndexArray | None = None) -> FloatArray:
         """Return the field and its variance (n, 2) at places (n, 2) given the samples `near` them (n, k).
 
-        About a place its mean is not known but for the spread of all samples. With `line` (n,) it is the
+        The mean about a place is known only to the spread of all samples. With `line` (n,) it is the
         field as that line reads it.
         """
         x, lines, here = self.place[near], self.line[near], self.roughness.at(place)

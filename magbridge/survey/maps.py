@@ -20,7 +20,7 @@ NODES = 250_000
 DRAWN = 100
 """Fields by which the sigma of a continued map is found: to 7 %."""
 KNOWN = 0.95
-"""Of the field's own size: where the sigma is as large, nothing is known, and the map has a hole."""
+"""Fraction of the field's size at which the sigma counts as unknown, and the map has a hole."""
 
 
 def anomaly_map(

@@ -43,7 +43,7 @@ ANOMALY = (
     "magnetic_anomaly",
     "tfa",
 )
-"""Names of the anomaly in tables of others."""
+"""Names of the anomaly in third-party tables."""
 HEIGHT = ("height", "altitude", "height_m", "height_ell_m", "altitude_m", "elevation")
 TABLES = (".csv", ".csv.gz", ".csv.xz", ".csv.bz2")
 MODES, FAINT = 24, 0.05
@@ -130,7 +130,7 @@ def corrected_by_others(ds: xr.Dataset, label: int) -> Samples:
 
 
 def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples:
-    """Correct a log with its calibration; doubtful samples are left out, the calibration's doubt is kept."""
+    """Correct a log with its calibration; flagged samples are left out, the calibration's sigma is kept."""
     ds = at_one_time(ds)
     corrected = correct_rows(Correction(calibration), ds)
     value = np.where(_doubtful(corrected), np.nan, corrected["anomaly"].to_numpy() - _daily(ds))
@@ -144,7 +144,7 @@ def from_vector(ds: xr.Dataset, calibration: Calibration, label: int) -> Samples
     modes = _modes(apart_from_level(calibration), field, read, ds["time"].to_numpy()[known])
     return replace(
         samples,
-        rho=None if calibration.warnings else calibration.noise.autocorrelation,  # rock, taken for noise
+        rho=None if calibration.warnings else calibration.noise.autocorrelation,  # else it is the crust
         modes=modes,
         level_sigma=calibration.reference.level_sigma,
     )
@@ -190,7 +190,7 @@ def _together(rho: Sequence[float | None]) -> float | None:
 
 
 def _doubtful(corrected: xr.Dataset) -> BoolArray:
-    """Return which samples carry a flag that may spoil the field (n,); none where there are no flags."""
+    """Return True for samples with a flag that may affect the field (n,); all False without flags."""
     quality = np.asarray(corrected.get("quality", np.zeros(corrected.sizes["time"])), float)
     return np.asarray(np.nan_to_num(quality).astype(int) & int(~Quality.NO_BORESIGHT), bool)
 

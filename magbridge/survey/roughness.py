@@ -1,8 +1,8 @@
-"""How rough the rock is from place to place, from how the field bends along the lines.
+"""Roughness of the crustal field from place to place, from the field's second differences along the lines.
 
-One size for a whole survey is too small where an intrusion crops out and too large beside it. The field's
-second differences along the lines, smoothed over some of its lengths, say where it is rougher: the field's
-size is made proportional to their root mean square.
+A single amplitude for a whole survey is too small over an intrusion that crops out, and too large elsewhere.
+The field's second differences along the lines, smoothed over some of its lengths, show where it is rougher:
+the field's amplitude is made proportional to their root mean square.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Roughness"]
 LAG, REACH = 0.5, 2.0
 """Lengths between the samples of a second difference, and of the smoothing's sigma."""
 LEAST, LARGEST = 0.2, 6.0
-"""Of a roughness, over the typical one."""
+"""Limits of a roughness, relative to the typical one."""
 CELLS = 400
 """Most cells a side."""
 PRIOR = 0.1
@@ -34,7 +34,7 @@ class Roughness:
     low: FloatArray
     """(2,), m north and east."""
     cell: float
-    """m."""
+    """Side of a cell, m."""
     scale: FloatArray
     """(a, b)."""
 

@@ -103,12 +103,12 @@ def survey(samples: Samples) -> Result:
     after = ties.misties(samples.value - found.levels)
     if not len(before) and samples.line.any():
         warnings.append(
-            "no line crosses another: what is level of a line and what is rock rests on its smoothness"
+            "no line crosses another: only the smoothness of the crustal field separates it from line levels"
         )
     elif not samples.line.any() and not sum(crossed(*courses(samples.place), SHARE * found.field.length)):
         warnings.append(
-            "the track never crosses itself: what changes slowly with time cannot be told from rock, and is "
-            "in the map"
+            "the track never crosses itself: slow changes with time cannot be distinguished from the crustal "
+            "field, and are in the map"
         )
     if found.size > found.sigma:
         warnings += too_rough(samples.place, found.field.length)
@@ -120,8 +120,8 @@ def survey(samples: Samples) -> Result:
 def _gridded(samples: Samples) -> Gridded:
     """Grid samples; where the track jumps, they are as uncertain as their places.
 
-    Where stretches that are out of place cross, they contradict each other: each has a level of its own,
-    and what is left is no change with time.
+    Where stretches that are out of place cross, they contradict each other: each has a level of its own, and
+    the rest is not a change with time.
     """
     at = jumps(samples.place, samples.time)
     at = at[samples.line[at] == samples.line[at + 1]]
@@ -135,10 +135,10 @@ def _gridded(samples: Samples) -> Gridded:
 
 
 def _misplaced(samples: Samples, at: IndexArray, found: Gridded) -> FloatArray:
-    """Return what the samples (n, r), nT, may be off by since the track jumps `at` (m,) ends of lines.
+    """Return the errors (n, r), nT, that jumps of the track `at` (m,) ends of lines may cause in the samples.
 
-    Of the stretches before and after a jump by d one is off by d, nobody knows which: each is by N(0, d²/2).
-    Places and fields are drawn; their mean square is the variance.
+    After a jump by d, either the stretch before or the one after is wrong by d: each has an error of
+    N(0, d²/2). Places and fields are drawn; their mean square is the variance.
     """
     rng, field = np.random.default_rng(0), found.posteriors[0].field
     stretch, steps = samples.line, samples.place[at + 1] - samples.place[at]
@@ -186,7 +186,7 @@ def summary(result: Result) -> str:
     )
     rock = known["rock"]
     return (
-        f"{known['samples']} samples on {counted(known['lines'], 'line')}, {ties}; rock of "
+        f"{known['samples']} samples on {counted(known['lines'], 'line')}, {ties}; crustal field of "
         f"{rock['size_nT']:.0f} nT over {rock['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT"
     )
 

@@ -24,11 +24,11 @@ class Samples:
     value: FloatArray
     """(n,), nT, anomaly."""
     line: IndexArray
-    """(n,): Label of the line, or of the log where there are no lines."""
+    """(n,): Label of the line, or of the log if it is not divided into lines."""
     tie: BoolArray
     """(n,): Whether the line is a tie line."""
     origin: tuple[float, float]
-    """deg, latitude and longitude."""
+    """Latitude and longitude of the origin, deg."""
     weight: FloatArray = field(default_factory=lambda: np.empty(0))
     """(n,): Noise of a sample over the typical one's."""
     rho: float | None = 0.0

@@ -1,4 +1,4 @@
-"""What a survey writes beside its map: GeoTIFF, tracks as GeoJSON and KML, crossovers as CSV."""
+"""Further outputs of a survey: GeoTIFF, tracks as GeoJSON and KML, crossovers as CSV."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from magbridge.survey.samples import Samples
 __all__ = ["write_crossovers", "write_geotiff", "write_points", "write_tracks"]
 
 VERTICES = 5_000
-"""Of a track, at most."""
+"""Largest number of vertices of a track."""
 SCALE, TIE, KEYS, NODATA = 33550, 33922, 34735, 42113
 """TIFF tags: ModelPixelScale, ModelTiepoint, GeoKeyDirectory (GeoTIFF 1.1), and GDAL's NODATA."""
 WGS84 = (1, 1, 0, 3, 1024, 0, 1, 2, 1025, 0, 1, 1, 2048, 0, 1, 4326)

@@ -138,7 +138,7 @@ def test_init_says_what_is_left_to_fill_in(command: Command) -> None:
     output = command("init", "--driver", "digitizer")
     assert "sensor.options.sensitivity: missing key" in output.err
     assert "FILL IN" in Path("bridge.toml").read_text()
-    assert "1 thing to mend" in command("run", "--check", "--config", "bridge.toml", code=2).err
+    assert "1 problem to fix" in command("run", "--check", "--config", "bridge.toml", code=2).err
 
 
 @pytest.mark.parametrize(

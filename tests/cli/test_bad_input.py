@@ -141,7 +141,7 @@ def test_a_position_in_another_unit_is_refused(
         ("map none.nc -o x.foo", 2, "must end in .nc"),
         ("map none.nc -o x.nc --altitude 1e308", 2, "Must be <= 1000000"),
         ("map none.nc -o x.nc --plot x.foo", 2, "must end in .png or .pdf or .svg"),
-        ("convert {d} -o nowhere/x.csv", 2, "There is no folder nowhere"),
+        ("convert {d} -o nowhere/x.csv", 2, "The folder nowhere does not exist"),
         ("convert {d} -o .", 2, "It is a folder"),
         ("simulate demo --trajectory-from {d} b.nc -o x.nc", 2, "b.nc: unexpected argument"),
         ("simulate demo --trajectory-from {d} b c d -o x.nc", 2, "b and 2 more: unexpected"),

@@ -116,7 +116,7 @@ def test_longitudes_and_latitudes_node_by_node(tmp_path: Path, bend: float) -> N
     array = xr.DataArray(MAP, {"lat": (("j", "i"), lat), "lon": (("j", "i"), X)}, ("j", "i"), "anomaly")
     array.to_netcdf(tmp_path / "a.nc")
     if bend:
-        with pytest.raises(FormatError, match="no even grid"):
+        with pytest.raises(FormatError, match="not an even grid"):
             read_grid(tmp_path / "a.nc")
     else:
         np.testing.assert_allclose(read_grid(tmp_path / "a.nc").latitude, LAT)

@@ -126,9 +126,10 @@ def test_it_is_told_how_far_surveys_are_apart() -> None:
         return prepare(surveys)[1][-1].title
 
     a, b, c = (AnomalyGrid(LON, LAT, monopole(60.0) + offset) for offset in (0.0, 3.0, 9.0))
-    assert merged(a, b) == "merged, 3.0 nT RMS apart where they overlap"
+    assert merged(a, b) == "merged, 3.0 nT RMS difference in their overlap"
     assert (
-        merged(a, b, c) == f"merged, {np.sqrt((3**2 + 9**2 + 6**2) / 3):.1f} nT RMS apart where they overlap"
+        merged(a, b, c)
+        == f"merged, {np.sqrt((3**2 + 9**2 + 6**2) / 3):.1f} nT RMS difference in their overlap"
     )
     west, east = (AnomalyGrid(LON[part], LAT, a.anomaly[:, part]) for part in (slice(30), slice(40, None)))
     assert merged(west, east) == "merged, no two of them overlap"

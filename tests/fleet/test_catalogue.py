@@ -122,7 +122,7 @@ def test_a_log_that_changed_is_another_version(empty: Catalogue, tmp_path: Path)
     fly(log, 1, 1)
     count, (output,) = add_logs(empty, "comet", MAY, [log])
     assert count == 1
-    assert output.endswith("log.nc: has changed since it was catalogued; what it holds now counts")
+    assert output.endswith("log.nc: has changed since it was catalogued; its present contents count")
     (now,) = current_files(empty.rows("files"))
     assert now["version"] == 2
     assert jobs(empty)[0].name != first
