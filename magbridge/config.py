@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from math import inf, isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
@@ -17,8 +17,8 @@ from magbridge.errors import ConfigError
 from magbridge.toml import Table, check_entries, convert, load_toml
 
 __all__ = [
-    "Align", "CalibrationFile", "Config", "Learning", "Link", "Log", "Navigation", "NotNegative", "Positive",
-    "Sensor", "Telemetry", "load",
+    "Align", "CalibrationFile", "Config", "HeadingOutput", "Learning", "Link", "Log", "Navigation",
+    "NotNegative", "Positive", "Sensor", "Telemetry", "load",
 ]  # fmt: skip
 
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
@@ -164,6 +164,24 @@ class Navigation(Table, frozen=True):
     """Prior uncertainties and settings of the position filter: :class:`magbridge.navigate.Options`."""
 
 
+class HeadingOutput(Table, frozen=True):
+    """``[heading]``: heading from the corrected field and the autopilot's roll and pitch."""
+
+    send: Literal["odometry", "vision_position_estimate"] | None = None
+    """Message in which the heading goes to the autopilot as a yaw: ``odometry`` or
+    ``vision_position_estimate``; not sent by default."""
+    rate: NotNegative = 10.0
+    """Hz of that message; 0 is with every sample. ArduPilot needs 4 Hz at least, PX4 10 Hz."""
+    tilt_sigma: Positive = 0.3
+    """deg, 1-sigma of the autopilot's roll and pitch."""
+    nmea: Name | None = None
+    """Port for the NMEA 0183 sentences HDG, HDT and PASHR: ``udp:HOST:PORT`` or a serial device."""
+    nmea_baudrate: Baudrate = 4800
+    """bit/s, where `nmea` is a serial device."""
+    nmea_rate: Positive = 1.0
+    """Hz of the sentences."""
+
+
 class Learning(Table, frozen=True):
     """``[learning]``: the calibration's coefficients are learned in flight."""
 
@@ -216,6 +234,7 @@ class Config(Table, frozen=True):
     align: Align = Align()
     publish: dict[str, Rate] = msgspec.field(default_factory=lambda: {"MAG_FIELD": 0.0})
     log: Log | None = None
+    heading: HeadingOutput = HeadingOutput()
     navigation: Navigation | None = None
     learning: Learning | None = None
     path: Path = Path("bridge.toml")

@@ -10,7 +10,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import vector_covariance
-from magbridge.calibration.heading import heading, model_declination_sigma
+from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
 from magbridge.columns import AGE, CHANNELS, COLUMNS, CORRECTED, HEADINGS, require
 from magbridge.correction import Correction
 from magbridge.field.igrf import magnitude
@@ -141,13 +141,8 @@ def _headings(
     time = np.asarray(deployment["time"].to_numpy(), float)
     assert calibration.boresight is not None
     turn = np.array(calibration.boresight.covariance)
-    covariance = vector_covariance(calibration, field, channels, time)
-    # What checks and moving masses add to the published sigmas has no direction of its own.
-    length = np.einsum("ni,ni->n", vector, vector)
-    stated = np.trace(covariance, axis1=1, axis2=2)
-    stated += np.trace(turn) * length - np.einsum("ni,ij,nj->n", vector, turn, vector)
-    more = np.nan_to_num(np.maximum(published - stated, 0.0) / 3.0, posinf=1e12)
-    covariance += more[:, None, None] * np.eye(3)
+    stated = vector_covariance(calibration, field, channels, time)
+    covariance = published_covariance(stated, turn, vector, published)
     declination = np.degrees(np.arctan2(main[:, 1], main[:, 0]))
     uncertain = model_declination_sigma(np.hypot(main[:, 0], main[:, 1]), crustal_sigma)
     found = heading(

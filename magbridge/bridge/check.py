@@ -16,6 +16,7 @@ import msgspec
 from magbridge.bridge.learning import first_calibration, open_learner
 from magbridge.bridge.links import LINKS, open_link
 from magbridge.bridge.needs import unmet
+from magbridge.bridge.nmea import nmea_port
 from magbridge.bridge.serial_port import serial_line
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, load
@@ -112,6 +113,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
     yield from _tried(lambda: open_link(config.link.url, config.link.baudrate, str(path)))
     if config.link.url.partition(":")[0] not in LINKS:
         yield from _device(config, "link.url", config.link.url.removeprefix("serial:"))
+    yield from _tried(lambda: nmea_port(config))
     if config.link.signing_key and (key := config.resolve(config.link.signing_key)).exists():
         yield from _tried(lambda: load_key(key))
     for name, one in config.telemetry.items():
@@ -120,6 +122,9 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
         yield from _tried(partial(check_publish, {name: rate}, path))
     if calibration is not None:
         yield from _parameters(config, calibration)
+        if calibration.boresight is None and (config.heading.send or config.heading.nmea):
+            text = f"{path}: heading: the calibration has no boresight: no heading is sent"
+            yield ConfigFault(fatal=False, text=text)
     if config.navigation is not None:
         yield from _map(config, calibration)
     if (reference := names.get("learning.reference")) is None or config.resolve(reference).exists():

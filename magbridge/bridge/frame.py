@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from math import cos, isnan, nan, sin
+from math import isnan, nan
 
 from magbridge.field.geodesy import separation
+from magbridge.link.attitude import quaternion
 from magbridge.link.fixes import Pose
 from magbridge.mavlink import Message, by_id
 
@@ -80,16 +81,3 @@ class Frame:
         if (message["latitude"], message["longitude"]) != UNSET:
             where = message["latitude"] * 1e-7, message["longitude"] * 1e-7
             self.origin = *where, 1e-3 * message["altitude"]
-
-
-def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return w, x, y, z of the rotation from body to north-east-down by three angles, rad (3-2-1)."""
-    sr, cr = sin(0.5 * roll), cos(0.5 * roll)
-    sp, cp = sin(0.5 * pitch), cos(0.5 * pitch)
-    sy, cy = sin(0.5 * yaw), cos(0.5 * yaw)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )

@@ -8,9 +8,11 @@ from glob import has_magic
 from math import nan
 from typing import TYPE_CHECKING, Final
 
+from magbridge.align import Sample
 from magbridge.bridge import states
 from magbridge.bridge.changes import StateChanges
 from magbridge.bridge.events import Event, Start
+from magbridge.bridge.heading import LiveHeading
 from magbridge.bridge.learning import Learning, open_learner
 from magbridge.bridge.log_header import beginning, declarations
 from magbridge.bridge.needs import check
@@ -21,6 +23,7 @@ from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.config import Align, Config
 from magbridge.correction import Correction
+from magbridge.link.attitude import NO_ATTITUDE, Attitude
 from magbridge.link.authority import Sources
 from magbridge.link.component import Component
 from magbridge.link.message_rates import check_publish
@@ -31,7 +34,7 @@ from magbridge.link.telemetry import TelemetryMap
 from magbridge.link.validity import is_possible
 from magbridge.mavlink import Message, Signing, Spec, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
-from magbridge.records import Channel, Quality, Reading
+from magbridge.records import Channel, Corrected, Quality, Reading
 from magbridge.sensors import open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
 from magbridge.version import __version__
@@ -44,6 +47,8 @@ __all__ = ["Pipeline"]
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
 ATTITUDE: Final = spec("ATTITUDE").id
+HEADING_INPUTS: Final = frozenset((ATTITUDE, spec("HEARTBEAT").id))
+"""Messages from which the heading is computed and sent."""
 LATELY = 64
 """Samples over which the sample rate is computed."""
 DOUBTFUL = int(
@@ -145,6 +150,8 @@ class Pipeline:
         self._raw_rate = self.component.rates["MAG_RAW"]
         self._parts, self._ignored_positions = self._correction.parts, set[int]()
         self._position = Position(self._report_no_anomaly)
+        has_boresight = used is not None and used.boresight is not None
+        self.heading = LiveHeading(config.heading, self.component) if has_boresight else None
         self._samples = self._lost = self._quality = 0
         self._late = False
         self._times: deque[int] = deque(maxlen=LATELY)
@@ -245,11 +252,23 @@ class Pipeline:
         if self.navigation is not None:
             self._parts.call("navigation", None, self.navigation.sample, sample.time_us, corrected)
         publisher = component.publisher
-        publisher.publish(sample, corrected, anomaly)
+        attitude = self._parts.call("heading", NO_ATTITUDE, self._attitude, sample, corrected)
+        publisher.publish(sample, corrected, anomaly, attitude)
+        if self.heading is not None:
+            self.heading.send(attitude, sample.time_us, corrected.quality)
         if self.recorder.active and self._raw_rate.hertz != 0:
             self.recorder.raw(component.codec.now_us, publisher.raw_payload(sample))
         if self.learning is not None:
             self._parts.call("learning", None, self.learning.sample, sample.time_us)
+
+    def _attitude(self, sample: Sample, corrected: Corrected) -> Attitude:
+        """Return the attitude at a sample with the heading that follows from the corrected field."""
+        if self.heading is None:
+            return NO_ATTITUDE
+        time_us, correction = sample.time_us, self._correction
+        main = self._position.direction(time_us, time_us + self.component.codec.utc_offset_us)
+        crustal = correction.aligner.settings.reference_sigma
+        return self.heading.compute(sample, corrected, correction.calibration, main, crustal)
 
     def _receive_link(self, data: bytes, time_us: int) -> None:
         component = self.component
@@ -267,16 +286,22 @@ class Pipeline:
                 continue
             if message.id == Position.MESSAGE:
                 self._locate(message, time_us)
-            elif message.id == ATTITUDE and message.component == self._config.link.autopilot:
+            elif message.id == ATTITUDE and self._is_autopilot(message):
                 self._parts.call("direction check", None, self._turn, message, time_us)
+            if self.heading is not None and message.id in HEADING_INPUTS and self._is_autopilot(message):
+                self.heading.receive(message, time_us)
             if self.navigation is not None:
                 self._parts.call("navigation", None, self.navigation.receive, message, time_us)
         self.recorder.link(time_us, component.received)
         component.received.clear()
 
+    def _is_autopilot(self, message: Message) -> bool:
+        """Return True if the autopilot sent a message."""
+        return message.component == self._config.link.autopilot
+
     def _locate(self, message: Message, time_us: int) -> None:
         """Use the autopilot's position; report that another component sends one, too, and ignore that."""
-        if message.component == self._config.link.autopilot:
+        if self._is_autopilot(message):
             self._parts.call("position", None, self._position.update, message, time_us)
         elif message.component not in self._ignored_positions:
             self._ignored_positions.add(message.component)

@@ -19,6 +19,7 @@ from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.keeper import Keeper
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
+from magbridge.bridge.nmea import NmeaOutput, nmea_port
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.serial_port import serial_line
 from magbridge.config import Config, load
@@ -56,6 +57,7 @@ def run(path: Path) -> None:
     clock = HostClock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
     sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
+    nmea = nmea_port(config)
     own = config.link
     who, signed = (own.system, own.autopilot), own.signing_key is not None
     link = open_link(
@@ -71,6 +73,7 @@ def run(path: Path) -> None:
     keeper.attach(edge)
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
     log = _open_log(config, edge, pipeline)
+    sentences = NmeaOutput(nmea, edge.notify) if nmea is not None else None
     _stop_on_signals(edge)
     # not before a signal would end the bridge in good order: a program that reads the first text may send one
     Thread(
@@ -96,6 +99,8 @@ def run(path: Path) -> None:
                 edge.answer(station, pipeline.interleaved(messages))
         keeper.look(pipeline, time_us)
         watch.look(time_us)
+        if sentences is not None and pipeline.heading is not None:
+            sentences.send(pipeline.heading.nmea, time_us)
         if pipeline.sensor.wrong_device:
             pipeline.sensor.wrong_device = False
             sensor.move_on()
@@ -106,6 +111,8 @@ def run(path: Path) -> None:
         keeper.save(pipeline, last=True)
         files.close()
         edge.close()
+        if sentences is not None:
+            sentences.close()
         if log is not None:
             log.close()
 

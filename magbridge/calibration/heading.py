@@ -31,7 +31,14 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["DEFAULT_TILT_SIGMA_DEG", "Heading", "heading", "level_vector", "model_declination_sigma"]
+__all__ = [
+    "DEFAULT_TILT_SIGMA_DEG",
+    "Heading",
+    "heading",
+    "level_vector",
+    "model_declination_sigma",
+    "published_covariance",
+]
 
 DEFAULT_TILT_SIGMA_DEG = 0.3
 """deg, 1-sigma of roll and of pitch where the log does not state one."""
@@ -144,6 +151,33 @@ def heading(
         sigma = np.minimum(np.where(np.isnan(sigma), np.inf, sigma), UNIFORM_SIGMA_DEG)
     unknown = np.isnan(magnetic)
     return Heading(magnetic, (magnetic + declination) % 360.0, np.where(unknown, np.inf, sigma))
+
+
+def published_covariance(
+    stated: FloatArray, turn: FloatArray, vector: FloatArray, variance: FloatArray
+) -> FloatArray:
+    """Return the covariance of published vectors without the boresight's part, (n, 3, 3) nT^2.
+
+    Checks and moving masses increase the published variances. That increase has no direction, so each
+    axis gets a third of it.
+
+    Parameters
+    ----------
+    stated : (n, 3, 3) array
+        nT^2, by the calibration alone (:func:`.correct.vector_covariance`).
+    turn : (3, 3) array
+        rad^2, covariance of the boresight's rotation vector.
+    vector : (n, 3) array
+        nT, corrected field in body axes.
+    variance : (n,) array
+        nT^2, sum of the three components' published variances.
+    """
+    # trace of the boresight's part: tr(Omega) |b|^2 - b^T Omega b
+    length = np.einsum("ni,ni->n", vector, vector)
+    known = np.trace(stated, axis1=1, axis2=2)
+    known = known + np.trace(turn) * length - np.einsum("ni,ij,nj->n", vector, turn, vector)
+    more = np.nan_to_num(np.maximum(variance - known, 0.0) / 3.0, posinf=1e12)
+    return np.asarray(stated + more[:, None, None] * np.eye(3))
 
 
 def model_declination_sigma(horizontal: FloatArray, crustal_sigma: float = 0.0) -> FloatArray:

@@ -8,6 +8,7 @@ from struct import Struct
 from typing import Final
 
 from magbridge.align import Sample, nearest
+from magbridge.link.attitude import NO_ATTITUDE, Attitude, send_attitude
 from magbridge.link.output import Outbox, Rate
 from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAG_RAW_FLAGS
@@ -32,6 +33,8 @@ COUNTS: Final = int(MAG_RAW_FLAGS.COUNTS)
 SEQUENCE: Final = int(MAG_RAW_FLAGS.SEQUENCE)
 POWER_CYCLE: Final = int(MAG_RAW_FLAGS.POWER_CYCLE)
 NO_COUNTS: Final = (0, 0, 0)
+NO_HEADING: Final = (0.0, 0.0, 0.0)
+"""The extension fields of MAG_FIELD without a heading: zeros at the end are not transmitted."""
 
 
 class Publisher:
@@ -54,10 +57,12 @@ class Publisher:
         self._outbox, self._codec = outbox, outbox.codec
         self.calibration_id, self._start_us = calibration_id, start_us
         self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
-        self.latest: tuple[Sample, Corrected, float] | None = None
+        self.latest: tuple[Sample, Corrected, float, Attitude] | None = None
         self.samples = 0
 
-    def publish(self, sample: Sample, corrected: Corrected, anomaly: float = nan) -> None:
+    def publish(
+        self, sample: Sample, corrected: Corrected, anomaly: float = nan, attitude: Attitude = NO_ATTITUDE
+    ) -> None:
         """Send what is due of a sample; ``outbox.codec.now_us`` is the time of sending.
 
         Parameters
@@ -68,23 +73,25 @@ class Publisher:
             What the calibration made of it.
         anomaly : float
             nT above the main field; NaN where the position is not known.
+        attitude : Attitude
+            With the heading that follows from the corrected field.
         """
-        self.latest = sample, corrected, anomaly
+        self.latest = sample, corrected, anomaly, attitude
         self.samples += 1
         time_us = sample.time_us
         for rate, send in self._messages:
             if rate.hertz == 0.0 or rate.due(time_us):
-                send(sample, corrected, anomaly)
+                send(sample, corrected, anomaly, attitude)
 
     def repeat(self, name: str) -> bool:
         """Send message `name` of the latest sample again; False where there is none yet."""
         if self.latest is None:
             return False
-        send: Callable[[Sample, Corrected, float], None] = getattr(self, PUBLISHED[name])
+        send: Callable[[Sample, Corrected, float, Attitude], None] = getattr(self, PUBLISHED[name])
         send(*self.latest)
         return True
 
-    def _raw(self, sample: Sample, _: Corrected, __: float) -> None:
+    def _raw(self, sample: Sample, *_: object) -> None:
         self._outbox.put(RAW, self.raw_payload(sample))
 
     def raw_payload(self, sample: Sample) -> bytes:
@@ -108,7 +115,7 @@ class Publisher:
             reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, 0, flags,
         )  # fmt: skip
 
-    def _field(self, sample: Sample, corrected: Corrected, anomaly: float) -> None:
+    def _field(self, sample: Sample, corrected: Corrected, anomaly: float, attitude: Attitude) -> None:
         x, y, z = corrected.field
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
         payload = FIELD.struct.pack(
@@ -116,16 +123,17 @@ class Publisher:
             self.samples & MASK, self.calibration_id, corrected.total_field_sigma,
             x, y, z, x_sigma, y_sigma, z_sigma, anomaly, sample.age,
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
+            *(attitude.heading_fields if attitude.is_known else NO_HEADING),
         )  # fmt: skip
         self._outbox.put(FIELD, payload)
 
-    def _imu(self, sample: Sample, corrected: Corrected, _: float) -> None:
+    def _imu(self, sample: Sample, corrected: Corrected, *_: object) -> None:
         x, y, z = corrected.field
         time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
         payload = IMU_FIELD.pack(time_us, x * GAUSS, y * GAUSS, z * GAUSS, MAGNETOMETER, 0)
         self._outbox.put(IMU, payload)
 
-    def _named(self, sample: Sample, corrected: Corrected, anomaly: float) -> None:
+    def _named(self, sample: Sample, corrected: Corrected, anomaly: float, _: Attitude) -> None:
         boot_ms = (sample.time_us - self._start_us) // 1000 & MASK
         values = [(b"mag_total", corrected.total_field), (b"mag_sigma", corrected.total_field_sigma)]
         if isfinite(anomaly):
@@ -133,9 +141,14 @@ class Publisher:
         for name, value in values:
             self._outbox.put(NAMED, NAMED.struct.pack(boot_ms, value, name))
 
-    def _vector(self, sample: Sample, corrected: Corrected, _: float) -> None:
+    def _vector(self, sample: Sample, corrected: Corrected, *_: object) -> None:
         time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
         self._outbox.put(VECTOR, VECTOR.struct.pack(time_us, *corrected.field, b"mag_field"))
+
+    def _quaternion(self, sample: Sample, _: Corrected, __: float, attitude: Attitude) -> None:
+        if isfinite(attitude.heading):
+            time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
+            send_attitude(self._outbox, attitude, time_us)
 
 
 PUBLISHED: dict[str, str] = {
@@ -144,5 +157,6 @@ PUBLISHED: dict[str, str] = {
     "HIGHRES_IMU": "_imu",
     "NAMED_VALUE_FLOAT": "_named",
     "DEBUG_VECT": "_vector",
+    "ATTITUDE_QUATERNION_COV": "_quaternion",
 }
 """The messages that follow the samples, and which method of `Publisher` sends each."""

@@ -13,9 +13,10 @@ from magbridge.link.clock import VehicleClock
 from magbridge.mavlink import Message, Spec, spec
 from magbridge.mavlink.messages import IDS, Field, nearest_name, split_index
 
-__all__ = ["TelemetryMap"]
+__all__ = ["TelemetryMap", "own_time", "sent_us"]
 
 Value = tuple[str, float, int]
+ReadTime = Callable[[bytes], tuple[int, int]]
 YEAR_2001_US = 10**15
 """µs; a 64-bit time beyond it counts from 1970 and not from the boot."""
 
@@ -107,7 +108,7 @@ class TelemetryMap:
         self._autopilot = autopilot
         self.delays_us = {name: round(what.delay * 1e6) for name, what in telemetry.items()}
         self._by_id: dict[int, list[Extractor]] = {}
-        self._times: dict[int, Callable[[bytes], tuple[int, int]] | None] = {}
+        self._times: dict[int, ReadTime | None] = {}
         for name, what in telemetry.items():
             try:
                 layout = spec(what.message)
@@ -140,15 +141,24 @@ class TelemetryMap:
 
     def _time(self, message: Message, t_us: int, clock: VehicleClock) -> int:
         read = self._times[message.id]
-        if read is None or message.component != self._autopilot or not clock.known:
-            return t_us
-        vehicle_us, wrap_us = read(message.payload)
-        if vehicle_us <= 0 or vehicle_us > YEAR_2001_US:  # not filled in, or another clock than TIMESYNC's
-            return t_us
-        return clock.ours(vehicle_us, t_us, wrap_us)
+        return t_us if message.component != self._autopilot else sent_us(read, message.payload, t_us, clock)
 
 
-def own_time(layout: Spec) -> Callable[[bytes], tuple[int, int]] | None:
+def sent_us(read: ReadTime | None, payload: bytes, t_us: int, clock: VehicleClock) -> int:
+    """Return our time (µs) of the values in a payload of the autopilot that was received at `t_us`.
+
+    It is the message's own time, which `read` (of :func:`own_time`) returns, where the autopilot's clock is
+    known; else `t_us`.
+    """
+    if read is None or not clock.known:
+        return t_us
+    vehicle_us, wrap_us = read(payload)
+    if vehicle_us <= 0 or vehicle_us > YEAR_2001_US:  # not filled in, or another clock than TIMESYNC's
+        return t_us
+    return clock.ours(vehicle_us, t_us, wrap_us)
+
+
+def own_time(layout: Spec) -> ReadTime | None:
     """Return a function that reads a message's own time and the µs after which it wraps, or None."""
     for name, unit_us in (("time_boot_ms", 1000), ("time_usec", 1)):
         field = layout.fields.get(name)

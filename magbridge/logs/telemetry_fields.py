@@ -165,7 +165,7 @@ def sample(payload: bytes) -> Columns:
 
 def correction(payload: bytes) -> Columns:
     """Return the time of a ``MAG_FIELD``, and the columns of a corrected sample."""
-    time_us, total, _, _, sigma, x, y, z, _, _, _, anomaly, _, _, flags, _ = CORRECTION.unpack(payload)
+    time_us, total, _, _, sigma, x, y, z, _, _, _, anomaly, _, _, flags, *_ = CORRECTION.unpack(payload)
     return {
         "time": time_us / 1e6,
         **dict(zip(CORRECTED, (total, sigma, x, y, z, anomaly, flags), strict=True)),

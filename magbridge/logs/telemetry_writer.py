@@ -139,7 +139,8 @@ class FileWriter:
         flags = int(Quality.UNCALIBRATED) if isnan(quality) else int(quality)
         self._sequence += 1
         fields = time_us, total, self._sequence, 0, sigma, x, y, z, nan, nan, nan, anomaly, nan, nan, flags, 0
-        self._write_message(time_us, Channel.SENT, self._bridge, FIELD_, *fields)
+        heading = 0.0, 0.0, 0.0  # unknown: these columns have messages of their own
+        self._write_message(time_us, Channel.SENT, self._bridge, FIELD_, *fields, *heading)
 
 
 def short_name(name: str, taken: Collection[str]) -> str:

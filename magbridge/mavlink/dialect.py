@@ -608,22 +608,22 @@ class MAVLink_mag_field_message(MAVLink_message):
 
     id = MAVLINK_MSG_ID_MAG_FIELD
     msgname = "MAG_FIELD"
-    fieldnames = ["time_usec", "total_field", "sequence", "calibration_id", "total_field_sigma", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z", "anomaly", "telemetry_age", "latency", "flags", "sensor_id"]
-    ordered_fieldnames = ["time_usec", "total_field", "sequence", "calibration_id", "total_field_sigma", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z", "anomaly", "telemetry_age", "latency", "flags", "sensor_id"]
-    fieldtypes = ["uint64_t", "double", "uint32_t", "uint32_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint8_t"]
+    fieldnames = ["time_usec", "total_field", "sequence", "calibration_id", "total_field_sigma", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z", "anomaly", "telemetry_age", "latency", "flags", "sensor_id", "magnetic_heading", "heading", "heading_sigma"]
+    ordered_fieldnames = ["time_usec", "total_field", "sequence", "calibration_id", "total_field_sigma", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z", "anomaly", "telemetry_age", "latency", "flags", "sensor_id", "magnetic_heading", "heading", "heading_sigma"]
+    fieldtypes = ["uint64_t", "double", "uint32_t", "uint32_t", "float", "float", "float", "float", "float", "float", "float", "float", "float", "float", "uint16_t", "uint8_t", "float", "float", "float"]
     fielddisplays_by_name: Dict[str, str] = {"flags": "bitmask"}
     fieldenums_by_name: Dict[str, str] = {"flags": "MAG_QUALITY"}
-    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "total_field": "nT", "total_field_sigma": "nT", "x": "nT", "y": "nT", "z": "nT", "sigma_x": "nT", "sigma_y": "nT", "sigma_z": "nT", "anomaly": "nT", "telemetry_age": "s", "latency": "s"}
-    native_format = bytearray(b"<QdIIffffffffffHB")
-    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]
-    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]
-    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "total_field": "nT", "total_field_sigma": "nT", "x": "nT", "y": "nT", "z": "nT", "sigma_x": "nT", "sigma_y": "nT", "sigma_z": "nT", "anomaly": "nT", "telemetry_age": "s", "latency": "s", "magnetic_heading": "deg", "heading": "deg", "heading_sigma": "deg"}
+    native_format = bytearray(b"<QdIIffffffffffHBfff")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]
     crc_extra = 213
-    unpacker = struct.Struct("<QdIIffffffffffHB")
+    unpacker = struct.Struct("<QdIIffffffffffHBfff")
     instance_field = "sensor_id"
     instance_offset = 66
 
-    def __init__(self, time_usec: int, total_field: float, sequence: int, calibration_id: int, total_field_sigma: float, x: float, y: float, z: float, sigma_x: float, sigma_y: float, sigma_z: float, anomaly: float, telemetry_age: float, latency: float, flags: int, sensor_id: int):
+    def __init__(self, time_usec: int, total_field: float, sequence: int, calibration_id: int, total_field_sigma: float, x: float, y: float, z: float, sigma_x: float, sigma_y: float, sigma_z: float, anomaly: float, telemetry_age: float, latency: float, flags: int, sensor_id: int, magnetic_heading: float = 0, heading: float = 0, heading_sigma: float = 0):
         MAVLink_message.__init__(self, MAVLink_mag_field_message.id, MAVLink_mag_field_message.msgname)
         self._fieldnames = MAVLink_mag_field_message.fieldnames
         self._instance_field = MAVLink_mag_field_message.instance_field
@@ -644,9 +644,12 @@ class MAVLink_mag_field_message(MAVLink_message):
         self.latency = latency
         self.flags = flags
         self.sensor_id = sensor_id
+        self.magnetic_heading = magnetic_heading
+        self.heading = heading
+        self.heading_sigma = heading_sigma
 
     def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
-        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.total_field, self.sequence, self.calibration_id, self.total_field_sigma, self.x, self.y, self.z, self.sigma_x, self.sigma_y, self.sigma_z, self.anomaly, self.telemetry_age, self.latency, self.flags, self.sensor_id), force_mavlink1=force_mavlink1)
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.total_field, self.sequence, self.calibration_id, self.total_field_sigma, self.x, self.y, self.z, self.sigma_x, self.sigma_y, self.sigma_z, self.anomaly, self.telemetry_age, self.latency, self.flags, self.sensor_id, self.magnetic_heading, self.heading, self.heading_sigma), force_mavlink1=force_mavlink1)
 
 
 # Define name on the class for backwards compatibility (it is now msgname).
@@ -1803,7 +1806,7 @@ class MAVLink(object):
         """
         self.send(self.mag_raw_encode(time_usec, sequence, x, y, z, count_x, count_y, count_z, delay_x, delay_y, delay_z, temperature, supply, power_cycle, sensor_id, flags), force_mavlink1=force_mavlink1)
 
-    def mag_field_encode(self, time_usec: int, total_field: float, sequence: int, calibration_id: int, total_field_sigma: float, x: float, y: float, z: float, sigma_x: float, sigma_y: float, sigma_z: float, anomaly: float, telemetry_age: float, latency: float, flags: int, sensor_id: int) -> MAVLink_mag_field_message:
+    def mag_field_encode(self, time_usec: int, total_field: float, sequence: int, calibration_id: int, total_field_sigma: float, x: float, y: float, z: float, sigma_x: float, sigma_y: float, sigma_z: float, anomaly: float, telemetry_age: float, latency: float, flags: int, sensor_id: int, magnetic_heading: float = 0, heading: float = 0, heading_sigma: float = 0) -> MAVLink_mag_field_message:
         """
         One corrected sample, all channels at one time, in body axes (sensor
         axes while MAG_QUALITY_NO_BORESIGHT is set).
@@ -1824,11 +1827,14 @@ class MAVLink(object):
         latency                   : From the sample to this message. [s] (type:float)
         flags                     : Why the sample is doubtful. (type:uint16_t, values:MAG_QUALITY)
         sensor_id                 : Which sensor. (type:uint8_t)
+        magnetic_heading          : Heading clockwise from magnetic north, 0 to 360; unknown where heading_sigma is 0. [deg] (type:float)
+        heading                   : Heading clockwise from true north, 0 to 360; NaN where the declination is unknown. [deg] (type:float)
+        heading_sigma             : 1-sigma of the heading; 0: no heading. [deg] (type:float)
 
         """
-        return MAVLink_mag_field_message(time_usec, total_field, sequence, calibration_id, total_field_sigma, x, y, z, sigma_x, sigma_y, sigma_z, anomaly, telemetry_age, latency, flags, sensor_id)
+        return MAVLink_mag_field_message(time_usec, total_field, sequence, calibration_id, total_field_sigma, x, y, z, sigma_x, sigma_y, sigma_z, anomaly, telemetry_age, latency, flags, sensor_id, magnetic_heading, heading, heading_sigma)
 
-    def mag_field_send(self, time_usec: int, total_field: float, sequence: int, calibration_id: int, total_field_sigma: float, x: float, y: float, z: float, sigma_x: float, sigma_y: float, sigma_z: float, anomaly: float, telemetry_age: float, latency: float, flags: int, sensor_id: int, force_mavlink1: bool = False) -> None:
+    def mag_field_send(self, time_usec: int, total_field: float, sequence: int, calibration_id: int, total_field_sigma: float, x: float, y: float, z: float, sigma_x: float, sigma_y: float, sigma_z: float, anomaly: float, telemetry_age: float, latency: float, flags: int, sensor_id: int, magnetic_heading: float = 0, heading: float = 0, heading_sigma: float = 0, force_mavlink1: bool = False) -> None:
         """
         One corrected sample, all channels at one time, in body axes (sensor
         axes while MAG_QUALITY_NO_BORESIGHT is set).
@@ -1849,9 +1855,12 @@ class MAVLink(object):
         latency                   : From the sample to this message. [s] (type:float)
         flags                     : Why the sample is doubtful. (type:uint16_t, values:MAG_QUALITY)
         sensor_id                 : Which sensor. (type:uint8_t)
+        magnetic_heading          : Heading clockwise from magnetic north, 0 to 360; unknown where heading_sigma is 0. [deg] (type:float)
+        heading                   : Heading clockwise from true north, 0 to 360; NaN where the declination is unknown. [deg] (type:float)
+        heading_sigma             : 1-sigma of the heading; 0: no heading. [deg] (type:float)
 
         """
-        self.send(self.mag_field_encode(time_usec, total_field, sequence, calibration_id, total_field_sigma, x, y, z, sigma_x, sigma_y, sigma_z, anomaly, telemetry_age, latency, flags, sensor_id), force_mavlink1=force_mavlink1)
+        self.send(self.mag_field_encode(time_usec, total_field, sequence, calibration_id, total_field_sigma, x, y, z, sigma_x, sigma_y, sigma_z, anomaly, telemetry_age, latency, flags, sensor_id, magnetic_heading, heading, heading_sigma), force_mavlink1=force_mavlink1)
 
     def mag_status_encode(self, time_usec: int, vehicle_clock_offset: int, uptime: int, calibration_id: int, samples: int, samples_lost: int, sensor_bytes_skipped: int, sensor_frames_bad: int, link_frames: int, link_frames_lost: int, link_bytes_skipped: int, link_refused: int, log_records: int, log_lost: int, telemetry_stale: int, sample_rate: float, sensor_clock_drift: float, vehicle_clock_sigma: float, vehicle_clock_drift: float, vehicle_reboots: int, sensor_state: int, autopilot_state: int, log_state: int) -> MAVLink_mag_status_message:
         """

@@ -1,0 +1,160 @@
+"""The heading of the live bridge: the corrected vector, levelled with the autopilot's roll and pitch."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import cos, degrees, hypot, inf, isfinite, radians, sin, tan
+from typing import Final
+
+import numpy as np
+
+from magbridge.align import Sample
+from magbridge.arrays import FloatArray
+from magbridge.calibration.correct import vector_covariance
+from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
+from magbridge.calibration.model import Boresight, Calibration
+from magbridge.config import HeadingOutput
+from magbridge.link.attitude import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
+from magbridge.link.component import Component
+from magbridge.link.output import Rate
+from magbridge.link.telemetry import own_time, sent_us
+from magbridge.mavlink import Message, spec
+from magbridge.mavlink.enums import MAV_AUTOPILOT
+from magbridge.records import Corrected, Quality, Vector
+
+__all__ = ["LiveHeading"]
+
+ATTITUDE, HEARTBEAT = spec("ATTITUDE"), spec("HEARTBEAT").id
+MAX_ATTITUDE_AGE_US: Final = 1_000_000
+"""µs between a sample and the ATTITUDE that levels it; beyond, the heading is unknown."""
+COVARIANCE_INTERVAL_US: Final = 200_000
+"""µs for which the covariance of the vector is used again: it changes with attitude and masses, slowly."""
+MAX_PITCH_RAD: Final = radians(89.0)
+"""rad: beyond, roll and heading cannot be told apart."""
+MAX_SENT_SIGMA_DEG: Final = 30.0
+"""deg: a heading that is known less well is not sent to the autopilot."""
+MAX_WAITING: Final = 8
+"""Sentences that wait at most."""
+UNUSABLE: Final = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.IMPLAUSIBLE | Quality.NO_BORESIGHT)
+"""Flags of samples whose heading is not sent to the autopilot or to NMEA receivers."""
+
+
+class LiveHeading:
+    """Computes the heading of each sample, and sends it to the autopilot and to NMEA receivers.
+
+    Parameters
+    ----------
+    wanted : HeadingOutput
+        ``[heading]`` of the configuration.
+    component : Component
+        The MAVLink side.
+
+    Attributes
+    ----------
+    nmea : deque of bytes
+        Sentences that are due; the bridge takes them out. A replay does not: the oldest are dropped.
+    stack : int
+        MAV_AUTOPILOT of the autopilot; GENERIC before it is known.
+    """
+
+    def __init__(self, wanted: HeadingOutput, component: Component) -> None:
+        self.nmea: deque[bytes] = deque(maxlen=MAX_WAITING)
+        self.stack = int(MAV_AUTOPILOT.GENERIC)
+        self._component = component
+        self._send = HEADING_SENDERS[wanted.send] if wanted.send is not None else None
+        self._rate = Rate(wanted.rate)
+        self._nmea_rate = Rate(wanted.nmea_rate if wanted.nmea is not None else -1.0)
+        self._tilt_sigma = radians(wanted.tilt_sigma)
+        self._read_time = own_time(ATTITUDE)
+        self._attitude_us = -(1 << 62)
+        self._roll = self._pitch = 0.0
+        self._rates = (0.0, 0.0, 0.0)
+        self._covariance: FloatArray | None = None
+        self._covariance_us = 0
+        self._calibration: Calibration | None = None
+
+    def receive(self, message: Message, time_us: int) -> None:
+        """Process an ATTITUDE or HEARTBEAT of the autopilot, received at `time_us`."""
+        if message.id == HEARTBEAT:
+            self.stack = message["autopilot"]
+            return
+        clock = self._component.vehicle.clock
+        self._attitude_us = sent_us(self._read_time, message.payload, time_us, clock)
+        self._roll, self._pitch = message["roll"], message["pitch"]
+        self._rates = message["rollspeed"], message["pitchspeed"], message["yawspeed"]
+
+    def compute(
+        self, sample: Sample, corrected: Corrected, calibration: Calibration, main: Vector, crustal: float
+    ) -> Attitude:
+        """Return the attitude at a sample, with its heading; unknown without a recent ATTITUDE.
+
+        Parameters
+        ----------
+        sample, corrected
+            As aligned, and as corrected.
+        calibration : Calibration
+            With which it was corrected.
+        main : tuple of 3 float
+            nT, main field, north-east-down; NaN where unknown.
+        crustal : float
+            nT, 1-sigma of the crustal field that the main-field model lacks.
+        """
+        boresight = calibration.boresight
+        since_us = sample.time_us - self._attitude_us
+        if boresight is None or abs(since_us) > MAX_ATTITUDE_AGE_US or not isfinite(corrected.total_field):
+            return NO_ATTITUDE
+        roll, pitch, tilt_sigma = self._tilt(since_us * 1e-6)
+        if not abs(pitch) < MAX_PITCH_RAD:
+            return NO_ATTITUDE
+        north, east, _ = main
+        declination = degrees(np.arctan2(east, north))
+        uncertain = model_declination_sigma(np.array([hypot(north, east)]), crustal)
+        covariance, turn = self._vector_covariance(sample, corrected, calibration, boresight)
+        found = heading(
+            np.array([corrected.field]), roll, pitch, declination, covariance=covariance,
+            boresight_covariance=turn, tilt_sigma_deg=degrees(tilt_sigma), declination_sigma_deg=uncertain,
+        )  # fmt: skip
+        magnetic, true, sigma = (one.item() for one in (found.magnetic, found.true, found.sigma))
+        return Attitude(magnetic, true, sigma, declination, roll, pitch, self._rates, tilt_sigma)
+
+    def _tilt(self, elapsed: float) -> tuple[float, float, float]:
+        """Return roll, pitch and their standard deviation (rad), `elapsed` s after the last ATTITUDE.
+
+        The body rates p, q, r give ``droll/dt = p + tan(pitch) (q sin(roll) + r cos(roll))`` and
+        ``dpitch/dt = q cos(roll) - r sin(roll)``.
+        """
+        roll, pitch, (p, q, r) = self._roll, self._pitch, self._rates
+        if not (isfinite(p + q + r) and abs(pitch) < MAX_PITCH_RAD):
+            return roll, pitch, self._tilt_sigma
+        roll_change = elapsed * (p + tan(pitch) * (q * sin(roll) + r * cos(roll)))
+        pitch_change = elapsed * (q * cos(roll) - r * sin(roll))
+        # half of the extrapolated change counts as its standard deviation
+        sigma = hypot(self._tilt_sigma, 0.5 * max(abs(roll_change), abs(pitch_change)))
+        return roll + roll_change, pitch + pitch_change, sigma
+
+    def _vector_covariance(
+        self, sample: Sample, corrected: Corrected, calibration: Calibration, boresight: Boresight
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the covariances of the vector, (1, 3, 3) nT^2, and of the boresight, (3, 3) rad^2."""
+        is_old = abs(sample.time_us - self._covariance_us) >= COVARIANCE_INTERVAL_US
+        if self._covariance is None or is_old or calibration is not self._calibration:
+            channels = np.array([sample.values[: len(calibration.channels)]], float).reshape(1, -1)
+            times = np.array([sample.time_us * 1e-6])
+            # effects begin in a fresh state here: their part of the covariance is that of the steady state
+            self._covariance = vector_covariance(calibration, np.array([sample.field]), channels, times)
+            self._covariance_us, self._calibration = sample.time_us, calibration
+        turn = np.array(boresight.covariance)
+        variance = sum(one * one for one in corrected.field_sigma)
+        published = np.array([variance if variance < inf else inf])
+        return published_covariance(self._covariance, turn, np.array([corrected.field]), published), turn
+
+    def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
+        """Send the heading of a sample where it is due and good enough; `time_us` is the sample's time."""
+        if not attitude.is_known or quality & UNUSABLE or attitude.sigma > MAX_SENT_SIGMA_DEG:
+            return
+        utc_us = time_us + self._component.codec.utc_offset_us
+        is_true = isfinite(attitude.heading)
+        if self._send is not None and is_true and self._rate.due(time_us):
+            self._send(self._component.outbox, attitude, max(utc_us, 0), self.stack)
+        if self._nmea_rate.due(time_us):
+            self.nmea.append(nmea_sentences(attitude, max(utc_us, 0)))
