@@ -23,19 +23,19 @@ from magbridge.diagnose.unexplained.varying import varying
 __all__ = ["accept", "odds_over_random_walk", "settle"]
 
 AGAINST = 2.0
-"""Log odds by which dives left out must speak against names. They say it with noise: of 14 right names of S/N
-8 one was behind by 1.9, of ten wrong ones of foreign effects four by more."""
+"""Log odds of the held-out dives against the names from which on names are rejected. These odds are noisy: of
+14 right names of S/N 8 one had 1.9, of ten wrong ones of unlisted effects four had more."""
 
 
 def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
-    """Say whether the names are asserted, and describe what is left beside them, or else the whole signal.
+    """Decide whether the names are asserted, and describe the remaining signal, or else the whole signal.
 
     Names and free descriptions both pay for the number of alternatives they were chosen from. The evidence of
-    a description of what the names leave is added to theirs; unless it is a remnant of one of the named
-    causes, they pay for it as for a further cause. A cause that the table lacks competes like any other:
-    names are asserted if they are likelier than every description of the whole signal, and foretell every
-    eighth dive as well. They remain possible unless one beats them 20:1, allowing for the error of their
-    regressors.
+    a description of the remaining signal is added to the names' evidence; unless it is a remnant of one of
+    the named causes, the names pay for it as for a further cause. A cause that the table lacks competes like
+    any other: names are asserted if they are likelier than every description of the whole signal, and predict
+    every eighth dive as well. They remain possible unless one beats them 20:1, allowing for the error of
+    their regressors.
     """
     model = [h.candidate for h in outcome.chosen]
     uneven = [
@@ -53,7 +53,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
         names += rest.among
         if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
             rest = None
-    # a description that contains the names' own regressors, with nothing else beside them, is no alternative
+    # a description that contains the names' own regressors and nothing else is not an alternative
     alone = rest is None or _same(outcome.chosen, rest)
     but = model if alone else ()
     free = leftover(problem, [], outcome.null, tone, but=but, also=uneven)
@@ -71,10 +71,10 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
 def settle(
     problem: Problem, candidates: Sequence[Candidate], causes: int, tone: Candidate | None
 ) -> tuple[Outcome, bool, Leftover | None]:
-    """Search, and return the outcome that counts, and what :func:`accept` says of it.
+    """Search, and return the selected outcome with the result of :func:`accept`.
 
-    Slow noise takes part of what descriptions stand for, too, and so makes names look better beside them. So
-    where the names found without it are not asserted, or something switches, none are searched for beside it.
+    Slow noise absorbs part of the signal that descriptions represent, and so makes names look better. So if
+    the names found without slow noise are not asserted, or something switches, no search with it is made.
     """
     plain = search(problem, candidates, causes)
     asserted, rest = accept(problem, plain, tone)
@@ -85,7 +85,7 @@ def settle(
 
 
 def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, best: Leftover | None) -> float:
-    """Return how well every eighth dive is foretold by a model with the best description beside it, if any.
+    """Return the log odds by which a model with the best description, if any, predicts every eighth dive.
 
     Descriptions that were picked from many places or periods pay for that, as in the fit.
     """
@@ -97,7 +97,7 @@ def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, best: Left
 
 
 def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
-    """Say whether the rest is what the idealised regressor of a stronger named cause has left."""
+    """Return True if the rest is a remnant of the idealised regressor of a stronger named cause."""
     description = rest.description
     if description is None or description.wider:
         return False
@@ -108,7 +108,7 @@ def _within(outcome: Outcome, behind: float) -> tuple[CompetingHypothesis, ...]:
     """Return the names, and their competing hypotheses, the likeliest first.
 
     A description beats the names by `behind`; those that it does not beat by their threshold stay. Its
-    shape follows the data, whereas a regressor is idealised, a named cause's as well as the others'.
+    shape follows the data, whereas the regressors of all causes are idealised.
     """
     found: dict[Group, CompetingHypothesis] = {}
     for hypothesis, competing in zip(outcome.chosen, outcome.competing, strict=True):
@@ -127,8 +127,8 @@ def odds_over_random_walk(outcome: Outcome, own: Hypothesis) -> float:
     -----
     A random walk has a power of 1/f^2: half waves of variance ``g / k^2`` in place of the ``g / k`` of
     :mod:`~magbridge.diagnose.compare.slow_noise`. Most of that is of the lowest frequencies, of which a step
-    or a drift of a low signal-to-noise is, too, so a log may not tell them apart. Both are weighed by their
-    evidence, each autoregression at Akaike's price: beside a walk it is shorter.
+    or a drift of a low signal-to-noise is, too, so a log may not distinguish them. Both are compared by their
+    evidence, each autoregression at Akaike's price: with a walk it is shorter.
     """
     slots, noise = outcome.problem.survey.slots, outcome.null.noise
     others = [one.candidate for one in outcome.chosen if one is not own]
@@ -138,7 +138,7 @@ def odds_over_random_walk(outcome: Outcome, own: Hypothesis) -> float:
     order = autoregressive_order(rough.residual, slots)
     walk = fit_joint(walking, columns, order, spectra=spectra, blocks=noise.uneven)
     without = fit_joint(outcome.problem, columns, noise.past.order, spectra=spectra, blocks=noise.uneven)
-    # coefficients that what is left no longer needs have each gained half a nat by chance
+    # coefficients that the remainder does not need have each gained half a log-likelihood unit by chance
     price = 0.5 * (noise.past.order + autoregressive_order(outcome.fit.residual, slots))
     price += float(np.log(outcome.look_elsewhere[own.candidate.cause]))
     return own.evidence - price + without.log_likelihood - (walk.log_likelihood - order)

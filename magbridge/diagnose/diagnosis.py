@@ -30,7 +30,7 @@ from magbridge.estimation.residual import rms
 __all__ = ["WORTH", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
 
 WORTH = 0.01
-"""Share that what was found must take off the RMS which the calibration's own numbers fitted anew leave."""
+"""Least fraction of the refitted calibration's RMS that the findings have to remove."""
 
 
 def counted(problem: Problem, wrong: Outliers | None) -> BoolArray:
@@ -50,7 +50,7 @@ class Finding:
     competing: tuple[CompetingHypothesis, ...]
     """The causes that could take its place, the likeliest first."""
     improvement: Improvement
-    """What this cause gains beside the others."""
+    """Improvement by this cause in addition to the others."""
     coefficients: FloatArray
     """(k,) in units of their prior width."""
     covariance: FloatArray
@@ -78,16 +78,16 @@ class Finding:
 
     @property
     def may_be_noise(self) -> bool:
-        """Whether offsets that wander would do nearly as well."""
+        """Return True if a random walk of the offsets explains the signal nearly as well."""
         return self.over_random_walk < ODDS
 
     def field(self, problem: Problem) -> FloatArray:
-        """(n,) nT, what it adds to the total field; its columns are in the sensor's nanotesla."""
+        """Return the effect on the total field (n,), nT; its columns are in the sensor's nanotesla."""
         columns = self.candidate.columns(slice(0, len(problem)))
         return np.asarray(columns @ self.coefficients / problem.reference_jacobian)
 
     def follows(self, problem: Problem, fit: Joint) -> Seen:
-        """Say what is seen of it in what all other causes leave: nothing where noise hides it."""
+        """Return the series that it follows in the residual of all other causes: none if noise hides it."""
         field = self.field(problem)
         found = seen(problem, field + fit.residual / problem.reference_jacobian, field)
         return found._replace(size=rms(field))
@@ -111,9 +111,9 @@ class Diagnosis:
     before: FloatArray
     after: FloatArray
     """`before`, `after` (n,): corrected field less reference, nT, with the calibration as given, and held out
-    with the extended one, the named errors of the reference taken out."""
+    with the extended one, the named errors of the reference subtracted."""
     total: Improvement
-    """Improvement by all findings together, with the named errors of the reference taken out."""
+    """Improvement by all findings together, with the named errors of the reference subtracted."""
     improvement: Improvement
     """Improvement of the corrected field over the calibration as given, against the reference as given."""
     over_refit: Improvement
@@ -126,17 +126,17 @@ class Diagnosis:
     """Allowed and found value behind a refusal, nT."""
     isolability: Isolability
     beyond: Improvement
-    """Of all findings together, over the calibration's own numbers fitted anew, held out."""
+    """Held-out improvement by all findings together over a refit of the calibration's own coefficients."""
     verdict: str
-    """As in ``findings.json``: ``explained`` only where what was left out of the fit shows a gain."""
+    """Verdict of ``findings.json``: ``explained`` only if held-out parts show a gain."""
     negligible: bool
-    """What was found makes next to no difference beside the calibration's own numbers fitted anew."""
+    """True if the findings hardly improve on a refit of the calibration's own coefficients."""
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
     """The table of causes that were asked about."""
 
     @cached_property
     def assessment(self) -> Assessment:
-        """Every number and verdict that a reader gets beside the findings."""
+        """Assessment: numbers and verdicts that the report shows in addition to the findings."""
         return assess(self, self.causes)
 
     @property
@@ -161,7 +161,7 @@ class Diagnosis:
 
 
 def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool:
-    """Say whether what is left without a name is negligible, too, and the residual (n,), nT, noise."""
+    """Return True if the unnamed remainder is negligible, too, and the residual (n,), nT, is noise."""
     if rest is not None and (rest.size is None or rest.size**2 > 2.0 * WORTH * rms(residual) ** 2):
         return False
     return not far_from_white(problem, memory(problem, residual / problem.reference_jacobian))
@@ -170,7 +170,7 @@ def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool
 def verdict_of(
     named: Sequence[Hypothesis], wrong: Outliers | None, rest: Leftover | None, total: Improvement
 ) -> str:
-    """Say which verdict of ``findings.json`` it is; names that gain nothing held out explain only in part."""
+    """Return the verdict of ``findings.json``; names without a held-out gain explain only in part."""
     if named or wrong:
         return "partly_explained" if rest or (named and not total.shown) else "explained"
     return "unexplained" if rest else "nothing_found"

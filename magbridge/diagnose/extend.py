@@ -1,4 +1,4 @@
-"""From a finding to a calibration: found effects become terms, and its own numbers are fitted anew."""
+"""From findings to a calibration: effects become terms, and the calibration's coefficients are refitted."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ MODES = 64
 def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibration:
     """Return the calibration with the effects of `model` added, at the values of `fit`.
 
-    An error of the reference is no property of the vehicle: of such causes only a constant bias is kept, as
-    the reference's. Of a filter's attenuation nothing is kept; the other coefficients are free of it. All
+    An error of the reference is not a property of the vehicle: only a constant bias is kept, as the
+    reference's. A filter's attenuation is not kept; the other coefficients are free of it. All
     covariances are those of the joint posterior.
     """
     calibration, q = problem.calibration, len(problem.centre)

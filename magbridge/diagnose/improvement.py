@@ -300,7 +300,7 @@ def check_written(
     -------
     tuple of 2 float or None
         RMS error with the calibration as given and with the written one, nT, if the latter is larger by more
-        than the noise; None where the file holds what was promised.
+        than the noise; None if the file performs as computed.
     """
     written = decode_calibration(content, "calibration.json")
     errors: dict[bool, list[FloatArray]] = {False: [], True: []}

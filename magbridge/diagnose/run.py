@@ -143,7 +143,7 @@ def _examine(
         extension = extension_of(problem, model, fit, counts, candidates)
         extension.problem.let_go()
         if extension.score < refit.score - ODDS:
-            # The dives left out speak 20:1 against these names
+            # The held-out dives contradict these names 20:1
             named, competing, model, extension = (), (), [], refit
             rest = leftover(problem, [], outcome.null, tone)
     progress("measuring the improvement")
@@ -198,7 +198,7 @@ def _posed(survey: Survey, calibration: Calibration) -> Problem:
 
 
 def _put_forward(problem: Problem, causes: Mapping[str, Cause]) -> tuple[list[Candidate], dict[str, str]]:
-    """Return all candidates, and what it would take to test the causes that have none."""
+    """Return all candidates, and the requirements of causes that have none."""
     candidates = {name: cause.candidates(problem) for name, cause in causes.items()}
     untestable = {name: causes[name].needs for name, made in candidates.items() if not made}
     if len(untestable) == len(causes):
@@ -221,7 +221,7 @@ def _whenever(candidates: Sequence[Candidate], learned: BoolArray) -> list[Candi
 
 
 def _strongest_tone(problem: Problem, candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the strongest tone, to describe what is left, where tones are not among the candidates."""
+    """Return the strongest tone, to describe the remainder, if tones are not among the candidates."""
     known = any(isinstance(e, TimeEffect) and e.shape == "tone" for c in candidates for e in c.effects)
     return None if known else next(iter(interference_tone(problem)), None)
 
@@ -273,6 +273,6 @@ def _families(named: Sequence[Hypothesis]) -> list[list[int]]:
 
 
 def _is_slow(problem: Problem, one: Hypothesis) -> bool:
-    """Say whether a cause is slow: most of its power is left in means over many samples."""
+    """Return True for a slow cause: most of its power is left in means over many samples."""
     added = one.candidate.columns(slice(0, len(problem))) @ one.fit.coefficients[-one.candidate.size :]
     return memory(problem, added).slow >= SLOW

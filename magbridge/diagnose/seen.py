@@ -1,4 +1,4 @@
-r"""What is seen in a signal, apart from what it may be: which series it follows, how late, along which axis.
+r"""Observed properties of a signal: the series it follows, the lag, and the axis.
 
 Notes
 -----
@@ -29,15 +29,15 @@ from magbridge.estimation.residual import rms
 __all__ = ["WHITE", "Memory", "Seen", "memory", "seen"]
 
 LAGS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 700.0, 1700.0, 4000.0, 10000.0)
-"""s, lags that are tried."""
+"""Lags that are tried, s."""
 LEAST = 0.1
-"""Share of a signal's power that a series must explain to be said to be followed."""
+"""Least fraction of a signal's power that a series must explain to be reported."""
 MOSTLY = 0.8
-"""Share of what all axes together explain that one must explain alone, to be said to be the one."""
+"""Least fraction, of the part that all axes explain, that one axis must explain alone to be reported."""
 WORTH = 0.02
 """Share of the signal's power that a lag must add over none."""
 CLEARLY = 0.1
-"""Share of what is left unexplained by which an axis must beat the next, to be said to be the one."""
+"""Least fraction of the unexplained part by which an axis must beat the next to be reported."""
 WAVES, SLOW = 48, 0.5
 """Half waves per log by which the axis of a slow signal that follows no series is found, and the share of its
 power, constants aside, that they must explain."""
@@ -53,10 +53,10 @@ class Seen(NamedTuple):
     """What a signal follows."""
 
     channel: str | None
-    """The series that explains most of it: telemetry, ``time``, ``roll``, ``pitch`` or ``heading``; None if
-    none explains a tenth, or as much as that may be chance: what is slow goes with anything slow."""
+    """Series that explains most of it: telemetry, ``time``, ``roll``, ``pitch`` or ``heading``. None if no
+    series explains a tenth, or a slow signal might be correlated by chance."""
     lag: float
-    """s, by which it follows."""
+    """Lag of the signal behind the series, s."""
     axis: str | None
     """``x y z`` of the body, ``field`` along the field; None where several take part, or the signal neither
     follows a series nor is slow."""
@@ -82,14 +82,14 @@ class Memory(NamedTuple):
 
     @property
     def lasts(self) -> bool:
-        """Whether it is more than what changes from one sample to the next."""
+        """Return True if the residual is more than changes from one sample to the next."""
         return self.white < WHITE * self.rms
 
 
 def seen(problem: Problem, signal: FloatArray, of: FloatArray | None = None) -> Seen:
-    """Say which series a signal (n,), nT of the total field, follows.
+    """Return the series that a signal (n,), nT of the total field, follows.
 
-    Where it is only `of` (n,) it that matters, beside something else, that must follow the series, too.
+    If only its part `of` (n,) is of interest, this part must follow the series, too.
     """
     part = slice(None, None, -(-len(signal) // ROWS))
     u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
@@ -178,7 +178,7 @@ def _scaled(*values: FloatArray) -> FloatArray:
 
 
 def memory(problem: Problem, residual: FloatArray) -> Memory:
-    """Say how far from white a residual (n,), nT, is."""
+    """Return how far from white a residual (n,), nT, is."""
     survey = problem.survey
     e = residual - residual.mean()
     size = max(rms(e), 1e-300)

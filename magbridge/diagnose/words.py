@@ -57,7 +57,7 @@ def measured(value: float, sigma: float | None) -> str:
     if not sigma or not isfinite(sigma):
         return f"{float(f'{value:.4g}'):g}"
     places = 1 - floor(log10(sigma))
-    # an added 0 turns what was rounded to -0 into 0
+    # an added 0 turns a value that was rounded to -0 into 0
     return f"{round(value, places) + 0.0:.{max(places, 0)}f}".replace("-", "\N{MINUS SIGN}")
 
 
@@ -103,7 +103,7 @@ def row(name: str, value: float, sigma: float | None, unit: str) -> str:
 
 
 def table(heads: Sequence[str], rows: Iterable[str]) -> str:
-    """Return a table of rows under their heads; nothing where there are no rows."""
+    """Return a table of rows under their heads; empty without rows."""
     header, body = "".join(f"<th>{one}</th>" for one in heads), "".join(rows)
     return f'<div class="wide" tabindex="0"><table><tr>{header}</tr>{body}</table></div>' * bool(body)
 

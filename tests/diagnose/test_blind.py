@@ -191,7 +191,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     assert page.count("data:image/png;base64,") >= 5
     assert page.index("<b>current field</b>") < page.index("<h2")
     assert "<h3><b>current field</b>" in page
-    assert "The extended calibration, calibration.json beside this page," in page
+    assert "The extended calibration, calibration.json next to this page," in page
     assert "http" not in page.replace("http-equiv", "")
 
 

@@ -86,7 +86,7 @@ def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
     """It says how much is left, how long that remembers unless it is white, and what a refit would do."""
     page, last = report_html(clear, CAUSES), clear.assessment.residual
     assert "Nothing else" not in page
-    assert re.search(r"What is left, [\d.]+\xa0nT RMS, looks like noise", page)
+    assert re.search(r"The remaining [\d.]+\xa0nT RMS look like noise", page)
     assert ("remembers" in page) == last.lasts
     assert clear.improvement.after < clear.over_refit.before <= 1.01 * clear.improvement.before
     assert f"A refit of the calibration alone leaves {number(clear.over_refit.before)}\xa0nT" in page

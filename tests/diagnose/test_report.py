@@ -297,7 +297,7 @@ def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     assert "water would do nearly as well" in channels
     for output in (alone, channels):
         assert "none comes within odds of 20:1" in output
-    assert "cannot tell it from temperature offset (water) or offset drift (" in causes
+    assert "cannot distinguish it from temperature offset (water) or offset drift (" in causes
     assert cause.disambiguation in causes
 
 

@@ -67,7 +67,7 @@ def test_what_makes_no_difference_needs_no_extension(clear: Diagnosis) -> None:
     """And a calibration whose own data do not support it sets the condition."""
     small = replace(clear, negligible=True)
     assert answer(small).reason == "not_needed"
-    assert "Nothing needs explaining: what was found makes" in report_html(small, CAUSES).partition("<h2")[0]
+    assert "Nothing needs explaining: the causes found make" in report_html(small, CAUSES).partition("<h2")[0]
     given = replace(clear.problem.calibration, warnings=("all headings lie within 20 degrees",))
     found = answer(replace(clear, problem=replace(clear.problem, calibration=given)))
     assert found.fit_for_use == "conditional"
@@ -100,7 +100,7 @@ def test_each_other_objection_is_reported(clear: Diagnosis) -> None:
     own = replace(clear.problem, survey=replace(survey, fitted=np.ones(len(survey), bool)))
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, None)
     doubtful = {
-        "shows no improvement on what was left out": with_(clear, improvement=IDLE),
+        "shows no improvement on held-out parts": with_(clear, improvement=IDLE),
         "10 times the usual size": with_(clear, coefficients=large),
         OWN: replace(clear, problem=own),
         "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),
@@ -137,9 +137,9 @@ def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
 def test_predicted_and_remaining_residual_stand_beside_each_other(clear: Diagnosis) -> None:
     output = "".join(remaining(clear, CAUSES))
     assert output.count("<tr><td>") == 5
-    assert "times worse than what was fitted" not in output
+    assert "times worse than fitted ones" not in output
     worse = replace(clear, total=clear.total.__class__(5.0, 3.0, 0.6, (0.5, 0.7)))
-    assert "times worse than what was fitted" in "".join(remaining(worse, CAUSES))
+    assert "times worse than fitted ones" in "".join(remaining(worse, CAUSES))
 
 
 def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> None:

@@ -207,7 +207,7 @@ def test_the_whole_preparation_and_its_pictures(tmp_path: Path) -> None:
         "continued +30 m: low.grd",
         "merged",
         "masked",
-        "smoothed over 1 km: 1.5 nT RMS taken out",
+        "smoothed over 1 km: 1.5 nT RMS removed",
     ]
     assert np.isnan(grid.look_up(-58.09, 49.5).anomaly)
     inside = grid.look_up(-58.02, 49.51).anomaly

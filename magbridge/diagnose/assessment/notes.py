@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 __all__ = ["DOUBTS", "IMPLAUSIBLE", "Note", "contested", "not_separated", "notes"]
 
 IMPLAUSIBLE = 5.0
-"""Multiple of its plausible size above which a cause is doubted."""
+"""Multiple of its plausible size above which a cause is implausible."""
 DOUBTS = ("contested", "random_walk", "implausible_amplitude", "no_improvement")
-"""Codes of notes that speak against the use of an extended calibration."""
+"""Codes of notes that are reasons against the use of an extended calibration."""
 
 
 class Note(NamedTuple):
@@ -42,7 +42,7 @@ def notes(diagnosis: Diagnosis, finding: Finding, cause: Cause) -> list[Note]:
 
 
 def _of_numbers(finding: Finding) -> Iterator[Note]:
-    """Say what its numbers mean, whether they are implausibly large, and whether it may be noise."""
+    """Yield notes on its numbers, on an implausible amplitude, and on whether it may be noise."""
     candidate = finding.candidate
     if any(name.endswith(")") for name in candidate.names):
         yield Note(
@@ -78,7 +78,7 @@ def _of_numbers(finding: Finding) -> Iterator[Note]:
 
 
 def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
-    """Say when and where it acts, whether it is corrected, and what that improves."""
+    """Yield notes on when and where it acts, whether it is corrected, and how much that improves."""
     candidate, rest = finding.candidate, diagnosis.unexplained
     found = motion(diagnosis.problem, finding)
     if found is not None:
@@ -114,7 +114,7 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
     if not finding.improvement.shown:
         yield Note(
             "no_improvement",
-            "It shows no improvement on what was left out of the fit: it may be a remnant of another effect.",
+            "It shows no improvement on held-out parts: it may be a remnant of another effect.",
         )
     if rest is not None and rest.signal_to_noise >= finding.signal_to_noise:
         yield Note(
@@ -124,14 +124,14 @@ def _of_use(diagnosis: Diagnosis, finding: Finding) -> Iterator[Note]:
 
 
 def contested(finding: Finding) -> bool:
-    """Say whether another cause, not only another series, remains possible."""
+    """Return True if another cause, not only another series, remains possible."""
     return any(hypothesis.candidate.cause != finding.candidate.cause for hypothesis in finding.competing)
 
 
 def not_separated(
     candidate: Candidate, cause: Cause, competing: Sequence[CompetingHypothesis]
 ) -> Iterator[Note]:
-    """Say which causes could take its place, and what would tell them apart."""
+    """Yield notes on the causes that could take its place, and on how to distinguish them."""
     alone = "No other known cause explains the data nearly as well (none comes within odds of 20:1)."
     if not competing:
         yield Note("alone", alone)
@@ -145,7 +145,7 @@ def not_separated(
     else:
         yield Note(
             "contested",
-            f"The data cannot tell it from {names_of(competing, ' or ')} (odds below 20:1), and a correction "
-            "under a wrong name may fit this log and fail on the next. To tell them apart: "
+            f"The data cannot distinguish it from {names_of(competing, ' or ')} (odds below 20:1). A "
+            "correction under a wrong name may fit this log and fail on the next. To distinguish them: "
             f"{cause.disambiguation}.",
         )

@@ -1,4 +1,4 @@
-"""What is measured of a diagnosis beside its findings: shifts, shares, delays, and the budget of its RMS."""
+"""Quantities of a diagnosis in addition to its findings: shifts, fractions, delays, budget of its RMS."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Delays(NamedTuple):
 
 
 class TelemetryDelay(NamedTuple):
-    """Delay of the telemetry behind the sensor, and what it corrects by itself."""
+    """Delay of the telemetry behind the sensor, and the delays that the model corrects itself."""
 
     delay_s: float
     """Time by which the telemetry is late, s."""
@@ -60,7 +60,7 @@ class TelemetryDelay(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Share of a cause's power beside moving masses, the share of such samples, and the interval, s."""
+    """Fraction of a cause's power next to moving masses, fraction of such samples, and the interval, s."""
 
     share: float
     usual: float

@@ -38,18 +38,18 @@ Reason = Literal[
 ]  # fmt: skip
 """Code of the reason for the answer."""
 OWN = (
-    "The calibration was fitted to this very log and has absorbed part of what is wrong: the improvement is "
-    "no test."
+    "The calibration was fitted to this very log and has absorbed part of its errors: the improvement is "
+    "not a test."
 )
 REPEATS = "All parts left out of the fit belong to this log: a log of another day may differ."
 SLOWLY = 0.9
-"""Share of its power that a trend and a bend over the log explain, of what is called slow."""
+"""Fraction of its power that a trend and a curvature over the log explain, for a cause to be called slow."""
 SUMMARIES: dict[Reason, str] = {
     "held_out_and_other_day": "The corrected field improves on parts and on days left out of the fit.",
     "not_needed": "There is no need for it: the calibration's own coefficients, refitted, do as well.",
-    "reference_only": "It has no new term: what was found belongs to the reference, not to the vehicle. Its "
-    "coefficients are refitted with that taken out.",
-    "no_improvement": "The corrected field does not improve on what was left out of the fit.",
+    "reference_only": "It has no new term: the error found belongs to the reference, not to the vehicle. Its "
+    "coefficients are refitted without that error.",
+    "no_improvement": "The corrected field does not improve on held-out parts.",
     "refit_as_good": "A refit of the calibration alone corrects as well: calibrate again instead.",
 }
 REFUSALS = {
@@ -72,7 +72,7 @@ CONDITIONS = {
     "implausibly large.",
     "reference_shift": "compare the corrected field with another reference, because all of it is shifted.",
     "cancelling": "compare the corrected field with another reference, because two causes largely cancel.",
-    "unexplained": "find the cause of what is left without a name.",
+    "unexplained": "find the cause of the unexplained residual.",
     "spatial_temporal": "cross the track again at another time, to distinguish a map's error from a change "
     "with time.",
     "no_improvement": "compare another log, because one of the causes shows no improvement of its own.",
@@ -83,34 +83,34 @@ CONDITIONS = {
 
 @dataclass(frozen=True)
 class Assessment:
-    """All that a reader gets beside the findings themselves."""
+    """Verdict, reasons and quantities that the report shows in addition to the findings."""
 
     fit_for_use: Fitness
-    """Whether the written calibration may be used in place of the one as given."""
+    """Usability of the written calibration in place of the given one."""
     reason: Reason
     """Code of the reason for that."""
     condition: str
-    """The one condition of a conditional answer; empty otherwise."""
+    """Condition of a conditional verdict; empty otherwise."""
     summary: str
     """The answer as a sentence."""
     reasons_for: tuple[Note, ...]
     reasons_against: tuple[Note, ...]
     manoeuvres: tuple[str, ...]
-    """What to fly to settle the doubts."""
+    """Manoeuvres that would resolve the open questions."""
     notes: tuple[tuple[Note, ...], ...]
     """What to know before believing each finding."""
     reference_shift: Level | None
     """Shift of the whole corrected field that may be the reference's."""
     delays: Delays | None
-    """Of the sensor's axes, where they look interpolated."""
+    """Delays of the sensor's axes, if they look interpolated."""
     budget: Budget
     """RMS predicted, before, after, fitted."""
     residual: Memory
-    """How far from white it is, of what is left."""
+    """Autocorrelation of the residual: how far from white it is."""
     follows: Seen
-    """What it follows."""
+    """Series that the residual follows."""
     returns: Returns | None
-    """Whether the track tells place from time; None without positions."""
+    """How well the track separates place from time; None without positions."""
 
 
 def assess(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> Assessment:
@@ -214,7 +214,7 @@ def _extremes(values: FloatArray) -> tuple[float, float]:
 
 
 def _as_given(diagnosis: Diagnosis) -> str:
-    """Say what to think of the calibration where nothing is added to it."""
+    """Return the verdict on the given calibration if nothing is added to it."""
     given = "calibration.json is the calibration as it was given."
     if diagnosis.unexplained is None:
         return f"{given} As far as this log can show (last section), it holds."
@@ -225,7 +225,7 @@ def _as_given(diagnosis: Diagnosis) -> str:
 
 
 def useful(diagnosis: Diagnosis) -> str:
-    """Say what the extended calibration corrects for and what not; nothing where nothing was added to it."""
+    """Return what the extended calibration corrects for and what not; empty if nothing was added to it."""
     added = diagnosis.calibration.effects
     if diagnosis.refused:
         return ""
@@ -236,15 +236,15 @@ def useful(diagnosis: Diagnosis) -> str:
     verdict = (
         "corrects for what belongs to the vehicle and its sensor"
         if diagnosis.improvement.shown
-        else "shows no improvement on what it was not fitted to: do not use it before another log does"
+        else "shows no improvement on data that it was not fitted to: do not use it before another log does"
     )
-    return f"The extended calibration, calibration.json beside this page, {verdict}.{but}"
+    return f"The extended calibration, calibration.json next to this page, {verdict}.{but}"
 
 
 def _against(
     diagnosis: Diagnosis, noted: Sequence[Sequence[Note]], shift: Level | None, track: Returns | None
 ) -> list[Note]:
-    """List what a reviewer must see settled; `noted` is what to know of each finding."""
+    """List the reasons against use, which a reviewer must resolve; `noted` has the notes of each finding."""
     survey, rest = diagnosis.problem.survey, diagnosis.unexplained
     found = [Note("own_log", OWN)] if (survey.fitted & ~survey.learned).any() else []
     if warnings := "; ".join(diagnosis.problem.calibration.warnings):
@@ -267,7 +267,7 @@ def _against(
     for one, other, a, b, both in cancelling(diagnosis):
         text = (
             f"{_name(one)} and {_name(other)} largely cancel each other ({number(a)} and {number(b)} nT RMS, "
-            f"together {number(both)}): outside of what was flown, their sum may be far off."
+            f"together {number(both)}): outside of the range of this log, their sum may be far off."
         )
         found.append(Note("cancelling", text, {"one_nT": a, "other_nT": b, "together_nT": both}))
     if rest:
@@ -277,17 +277,17 @@ def _against(
 
 
 def _spatial_temporal(diagnosis: Diagnosis, track: Returns | None) -> list[Note]:
-    """Say so where an error of the reference is slow, and the track does not tell place from time."""
+    """Return a note if an error of the reference is slow and the track does not separate place from time."""
     if track is None or track.distinguishable:
         return []
     about = [one for one in diagnosis.findings if one.candidate.about in ("place", "time")]
     slow = [_name(one) for one in about if slow_share(diagnosis.problem, one) >= SLOWLY]
-    text = f"{track.text} Only their usual shapes speak for: {', '.join(slow)}."
+    text = f"{track.text} Only their usual shapes support: {', '.join(slow)}."
     return [Note("spatial_temporal", text, track._asdict())] if slow else []
 
 
 def _manoeuvres(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
-    """List what would tell the possible causes apart."""
+    """List the manoeuvres that would distinguish the possible causes."""
     found = [causes[one.candidate.cause].disambiguation for one in diagnosis.findings if contested(one)]
     rest = diagnosis.unexplained
     if rest is not None and rest.within:

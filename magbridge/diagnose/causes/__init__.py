@@ -39,9 +39,9 @@ class Cause(NamedTuple):
     needs: str
     """What a log must contain for it to be tested."""
     disambiguation: str
-    """The manoeuvre that tells it from its competing hypotheses."""
+    """Manoeuvre that distinguishes the cause from its competing hypotheses."""
     meaning: str = ""
-    """What it means, as a clause."""
+    """Meaning of the cause, as a clause."""
 
 
 CAUSES: dict[str, Cause] = {
@@ -59,7 +59,7 @@ CAUSES: dict[str, Cause] = {
     "clock_offset": Cause(clock_offset, "a calibration with parameters that move while sampled", "move an actuator at constant attitude", "the clocks of sensor and telemetry differ"),
     "nonlinearity": Cause(nonlinearity, "attitudes that take an axis of the sensor through its range", "turn every axis of the sensor through the whole field", "the sensor's response bends"),
     "saturation": Cause(saturation, "an axis of the sensor near its end", "turn that axis away from the field: saturation occurs only near full scale", "an axis of the sensor clips near the end of its range"),
-    "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: the temperature settles, the pressure effect stays", "the sensor's zero shifts with depth or pressure"),
+    "pressure_offset": Cause(pressure_offset, "depth or pressure that varies", "hold one depth for an hour: the temperature becomes constant, the pressure effect stays", "the sensor's zero shifts with depth or pressure"),
     "diurnal_variation": Cause(diurnal_variation, "at least two hours", "a base station ashore", "the Earth's field itself changed during the day"),
     "map_error": Cause(map_error, "positions over some hundred metres", "cross the track again, at another depth too: an error of the map is the same on every pass at one depth", "the map or field model that served as the truth is wrong from place to place"),
     "reference_bias": Cause(reference_bias, "a reference", "calibrate and survey at one place, next to a proton magnetometer", "the map or field model that served as the truth is wrong by a constant"),
@@ -68,9 +68,9 @@ CAUSES: dict[str, Cause] = {
 
 
 def known() -> dict[str, Cause]:
-    """Return the table with what other packages add to it.
+    """Return the table of causes, with those that other packages add.
 
-    PluginError: one cannot be imported, is no cause, or has the name of one that is there.
+    PluginError: one cannot be imported, is not a cause, or has the name of an existing one.
     """
     added = {}
     for name, point in plugins(GROUP).items():

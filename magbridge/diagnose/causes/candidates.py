@@ -42,7 +42,7 @@ class GridPoint:
     narrow: float = 0.0
     """Log of how much narrower than their grid's cells the parameters are by the data."""
     cells: tuple[float, ...] = ()
-    """How far apart the grid's points are, in each parameter."""
+    """Spacing of the grid's points, in each parameter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class Candidate:
     units: tuple[str, ...]
     """`names`, `units`: of the coefficients."""
     effects: tuple[Effect, ...] = ()
-    """What it adds to the calibration; none where the reference is wrong, or what it was fitted to."""
+    """Effects to add to the calibration; empty if the reference is wrong, or the data of the fit."""
     point: GridPoint = GridPoint()
     """Its nonlinear parameters."""
     look_elsewhere: float = 1.0
@@ -103,7 +103,7 @@ class Candidate:
 
     @property
     def nonparametric(self) -> bool:
-        """Whether it is a Gaussian process: it takes any shape, and leaves no remnant of an idealised one."""
+        """Return True for a Gaussian process: it has a flexible shape, and leaves no idealised remnant."""
         return self.spectra is not None and not self.effects
 
     @property

@@ -19,12 +19,12 @@ __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 CELLS = 300
 """Most cells at which a map's error is described."""
 FINEST = 125.0
-"""m, the smallest cell."""
+"""Side of the smallest cell, m."""
 SCALES = np.array([1.0, 2.0, 4.0, 8.0, 32.0])
-"""Depths of the rock below the deepest place of the track, and half the correlation lengths of what is the
-same at every depth, in cells."""
+"""Depths of the crustal sources below the deepest place of the track, and half the correlation lengths of the
+part that is the same at every depth, in cells."""
 ALTITUDE = 100.0
-"""m above the sea at which a map holds: aircraft survey at 60 to 150 m. Of a map from 300 m a third of the
+"""m above the sea at which a map holds: aircraft survey at 60 to 150 m. For a map from 300 m a third of the
 mean error is still found."""
 FAINT = 1e-6
 """Share of a map's mean square error below which one of the functions that describe it is left out."""
@@ -41,12 +41,12 @@ def map_error(problem: Problem) -> list[Candidate]:
     .. math:: e(x, z) = T(x, z) - T(x, -a)
 
     The error is the same on every pass at one depth, and changes with depth as Laplace's equation demands. So
-    dives tell it from an offset: even its mean is known. Rock at a depth d gives T the covariance (Moritz
-    1980, the reciprocal distance)
+    dives distinguish it from an offset: even its mean is known. Sources at a depth d give T the covariance
+    (Moritz 1980, the reciprocal distance)
 
     .. math:: C(z, z') = (s^2 + r^2)^{-1/2}, \quad s = 2 d - z - z'
 
-    between places r apart, and e the covariance ``C(z, z') - C(z, -a) - C(-a, z') + C(-a, -a)``.
+    between places at a distance r, and e the covariance ``C(z, z') - C(z, -a) - C(-a, z') + C(-a, -a)``.
 
     *Drawn wrong*: a smooth function of the position that is the same at every depth (Matern 3/2). A constant
     is another cause.
@@ -124,7 +124,7 @@ def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
 
 
 def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
-    """(n, m) covariance between places (n, 3) and (m, 3) of what a map lacks of rock at a depth d."""
+    """Return the covariance (n, m), at places (n, 3), (m, 3), of a map's missing field of depth d."""
     r2 = cdist(a[:, :2], b[:, :2], "sqeuclidean")
 
     def between(above: FloatArray | float, below: FloatArray | float) -> FloatArray:
@@ -160,7 +160,7 @@ def diurnal_variation(problem: Problem) -> list[Candidate]:
 
 
 def reference_bias(problem: Problem) -> list[Candidate]:
-    """The reference is off by a constant, as a main-field model is by the rock that it lacks.
+    """Return candidates for a constant error of the reference: a main-field model lacks the crustal field.
 
     At 68 % of sites each component is within 73 to 114 nT (Beggan 2022, Earth Planets Space 74:17).
     """

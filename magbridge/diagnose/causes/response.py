@@ -26,7 +26,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     The leak is that of an even harmonic. A feedback of finite gain leaves the core the field that its output
     takes, and that is the inverse of its magnetisation curve: steeper the farther out, but not flat at zero
     either. So a core that shows through also changes the sensitivity, and p = 1 belongs to the bend. All nine
-    coefficients have one common size, because the three axes are built alike, up to :data:`BENT`: nine
+    coefficients have one common size, because the three axes have the same design, up to :data:`BENT`: nine
     free numbers could otherwise take a wrong reference and a mass' error for one bend.
     """
     # a common size is at most ten widths (:data:`~magbridge.diagnose.inference.statistic.SIZES`)

@@ -1,4 +1,4 @@
-"""What follows a telemetry channel: temperatures, currents, pressures."""
+"""Causes that follow a telemetry channel: temperatures, currents, pressures."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperatur
 LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, spaced so closely that any lag between two of them is matched to within a fifth (RMS)."""
 STAGES = 2
-"""Equal lags in series, because conducted heat passes the hull before it reaches the core. Of the
-temperature in the centre of a slab one lag misses 10 to 30 %, two in series miss 4 to 9 %."""
+"""Equal lags in series, because conducted heat passes the hull before it reaches the core. One lag misses 10
+to 30 % of the temperature in the centre of a slab, two in series miss 4 to 9 %."""
 
 TOGETHER = 12
 """Most currents that are also tried together."""

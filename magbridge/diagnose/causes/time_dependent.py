@@ -1,4 +1,4 @@
-"""What follows time alone: steps, drifts, tones."""
+"""Causes that follow time alone: steps, drifts, tones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from magbridge.diagnose.compare.problem import Problem
 __all__ = ["interference_tone", "offset_drift", "offset_step"]
 
 ONSETS = 40
-"""Moments tried for a step, evenly over the samples. Four times as many gain 0.6 nats: each costs a trial."""
+"""Moments tried for a step, evenly over the samples. Four times as many gain only 0.6 in log odds."""
 
 
 def offset_step(problem: Problem) -> list[Candidate]:

@@ -102,7 +102,7 @@ def _shortened(problem: Problem) -> Candidate:
 
 
 def clock_offset(problem: Problem) -> list[Candidate]:
-    """Telemetry stamped by another clock: ``T += tau dT/dp dp/dt``, and A alike."""
+    """Telemetry stamped by another clock: ``T += tau dT/dp dp/dt``, and the same for A."""
     return _delay(problem, ClockEffect(cause="clock_offset"), 5.0)
 
 

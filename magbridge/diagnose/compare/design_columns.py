@@ -25,7 +25,7 @@ lacks it, adds to the residual. Best stored column by column."""
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    r"""Columns that are linear combinations of others: :math:`\sum_i X_i M_i`.
+    r"""Columns that are linear combinations of further columns: :math:`\sum_i X_i M_i`.
 
     Many hypotheses share few parts: one lagged temperature serves all the origins that it is tried with.
     Sums over a log are therefore taken once for each different ``X_i``.

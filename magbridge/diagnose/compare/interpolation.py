@@ -11,8 +11,8 @@ from magbridge.diagnose.compare.survey import Survey
 __all__ = ["LOST", "interpolation_error", "rates"]
 
 LOST = 3
-"""Most samples missing in a row within a leg: the rate beside such a gap still has 98 % of the true
-one's power."""
+"""Largest number of samples missing in a row within a leg: the rate next to such a gap still has 98 % of the
+true one's power."""
 
 
 def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
@@ -28,7 +28,7 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
 
     The rates ``D e`` of noise e, of covariance Sigma, correlate with the noise:
     :math:`E[(D e)^T \Sigma^{-1} e] = \mathrm{tr} D`, whatever Sigma is. A one-sided difference has a trace,
-    which would pass for an effect; the spline treats both directions of time alike and has none.
+    which would pass for an effect; the spline treats both directions of time equally and has none.
     """
     t, out = survey.time, np.zeros_like(H)
     starts = np.flatnonzero(~survey.follows(LOST))

@@ -1,7 +1,7 @@
-"""What kind of quantity a telemetry series is, by its unit and its name, and so what it may be the cause of.
+"""The kind of quantity of a telemetry series, by its unit and its name, and the causes it may belong to.
 
-A name that the kind contradicts is never put forward: a throttle that the field follows is no temperature.
-Only a series of which neither unit nor name say anything may be of every kind.
+A cause that contradicts the kind is never proposed: a throttle that the field follows is not a temperature.
+Only a series without a meaningful unit or name may be of every kind.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ __all__ = ["ANY", "kinds_of"]
 
 ANY = ("temperature", "current", "pressure", "position")
 DRIVE = ("current", "position")
-"""What drives something: its current flows when it turns, and what it turns may carry iron."""
+"""Quantities of a drive: its current flows when it turns, and the part that it turns may carry iron."""
 UNITS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("degC", "K", "degF"), ("temperature",)),
     **dict.fromkeys(("A", "mA", "uA", "W", "mW"), ("current",)),

@@ -27,7 +27,7 @@ class Past:
     ----------
     order : int
     whole : (n,) bool array
-        There is no gap: the p samples before have the lags 1 to p.
+        True if no gap precedes: the p previous samples have the lags 1 to p.
     rows : (m,) int array
         Samples where there is one.
     lags : (l, p) int array

@@ -1,7 +1,7 @@
 """The prior of a calibration's coefficients in a deployment.
 
-It is the calibration's posterior without what it learned from samples that are compared here again, and with
-a drift between days that no instrument is free of.
+It is the calibration's posterior without the information of samples that are compared here again, and with a
+drift between days, which every instrument has.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ def prior(
 def _without_repeats(
     survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return L and m of the posterior without what it learned from samples that are compared here again.
+    """Return L and m of the posterior without the information of samples that are compared here again.
 
-    The information of the calibration's samples that are in the survey again (`survey.fitted`) is taken out
-    of its posterior: it would count twice. In the posterior's own units the precision left is
+    The information of the calibration's samples that are in the survey again (`survey.fitted`) is subtracted
+    from its posterior: it would count twice. In the posterior's own units the precision left is
     ``P_0 = 1 - H`` with H the information of those samples, and since the gradient of the whole fit vanished
     at c_0, ``P_0 m = L^T J^T W e``, the sum over those samples.
     """

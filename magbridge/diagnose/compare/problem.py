@@ -14,11 +14,11 @@ these data can determine.
 
 Three delays are free, too: the sensor's axes may have been sampled late, and then interpolated to their rows
 (:mod:`.interpolation`). That is a fault of the log, not of the vehicle, so the delays change no coefficient;
-were they left out, a pair of large causes that cancel each other could mimic them. They have one common size
-(:mod:`~magbridge.diagnose.inference.statistic`), because many logs have no such delays, and three numbers
-that are each free take up to a tenth of a skew's power.
+without them, a pair of large causes that cancel each other could mimic them. They have one common size
+(:mod:`~magbridge.diagnose.inference.statistic`), because many logs have no such delays, and three independent
+numbers absorb up to a tenth of a skew's power.
 
-Where the data want it (:func:`with_slow_noise`), so is the slow part of the noise (:mod:`.slow_noise`).
+The slow part of the noise (:mod:`.slow_noise`) is free if the data need it (:func:`with_slow_noise`).
 
 Derivatives are taken at ``H_r - e w / |w|^2``, the reading moved until its residual vanishes: at the reading
 itself they would correlate with its noise, and scales could grow against offsets until they fit the noise
@@ -90,13 +90,13 @@ class Problem:
         return len(self.residual)
 
     def channels_of(self, kind: str) -> list[str]:
-        """Name the channels that may be of this kind, but for the calibration's own parameters."""
+        """Name the channels that may be of this kind, except the calibration's own parameters."""
         own = {parameter.name for parameter in self.calibration.parameters}
         return [name for name, c in self.survey.channels.items() if kind in c.kinds and name not in own]
 
     @property
     def known(self) -> slice:
-        """Places in z of what moves the calibration's own coefficients."""
+        """Places in z of the calibration's own coefficients."""
         return slice(len(self.centre) - len(self.waves) - 3)
 
     @property

@@ -22,18 +22,18 @@ from magbridge.diagnose.compare.survey import Survey
 __all__ = ["Returns", "returns"]
 
 CELL = 250.0
-"""m, side of the cells: rock is seldom nearer, and a map's own grid seldom finer."""
+"""Side of the cells, m: crustal sources are seldom nearer, and a map's own grid is seldom finer."""
 AWAY = 900.0
 """s after which passing a place again is a return."""
 SEPARABLE = 0.1
-"""Least share from which place and time are distinguished: at S/N 10 that is worth 5 nats, odds of 150:1."""
+"""Least fraction from which on place and time are distinguished: at S/N 10 it gives log odds of 5 (150:1)."""
 
 
 class Returns(NamedTuple):
     """The returns of a track."""
 
     share: float
-    """Of the samples, that lie where the track passes again."""
+    """Fraction of the samples that lie where the track passes again."""
     longest: float
     """s, the longest time between two passes of one place."""
     separable: float
@@ -46,7 +46,7 @@ class Returns(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The same in words."""
+        """Description of the track as a sentence."""
         both = "an error of the map and a slow change with time (a daily variation)"
         if not self.share:
             return f"The track never returns to a place: {both} cannot be distinguished."

@@ -84,7 +84,7 @@ class Survey:
 
     @property
     def interval(self) -> float:
-        """s, the sampling interval."""
+        """Sampling interval, s."""
         known = self.steps[1:] < FAR
         return float(np.median(np.diff(self.time)[known] / self.steps[1:][known])) if known.any() else 1.0
 

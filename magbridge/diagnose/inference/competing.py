@@ -119,7 +119,7 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
 
 
 def _separate(new: list[Candidate], pieces: list[Candidate], at: list[int]) -> bool:
-    """Say whether each candidate of one common size would be the only one of its cause."""
+    """Return True if each candidate of one common size would be the only one of its cause."""
     changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in at)]
     causes = [candidate.cause for candidate in changed]
     return all(candidate.spectra is None or causes.count(candidate.cause) == 1 for candidate in changed)

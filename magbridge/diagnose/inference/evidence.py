@@ -52,14 +52,14 @@ IDEAL = 0.2
 """Error of an idealised regressor, as a share of its norm: a cause that explains less by no more than that
 competes with it."""
 REMNANT = 0.3
-"""Share of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor,
+"""Fraction of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor,
 not another cause.
 
-The price: a second cause that weak is not named beside it.
+The price: a second cause of so low a signal-to-noise is not named.
 """
 SMOOTH, MOST_REMAINING = 0.1, 8.0
-"""The same of a Gaussian process, and the most that it leaves: it takes any shape, but not any equally, and
-what a map's error leaves of itself is slow in time, too."""
+"""Fraction (as REMNANT) for a Gaussian process, and the largest signal-to-noise of its remnant: a process has
+a flexible shape, but not any shape equally, and the remnant of a map's error is slow in time, too."""
 SIMULATIONS = 400
 PIECE, PIECES = 600, 64
 """Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
@@ -171,8 +171,8 @@ def log_odds(
 ) -> float:
     """Log posterior odds of a whole model of this likelihood ratio against no effect.
 
-    `shaped` is the part of it that is left beside causes that take any shape (:func:`~.state.shaped_ratio`).
-    The others' size is judged by that part, as beside the calibration.
+    `shaped` is the part of it that causes of flexible shape do not explain (:func:`~.state.shaped_ratio`).
+    The size of the remaining causes is judged by that part.
 
     Every regressor pays for the number of hypotheses of its cause. Each after the first also pays for the
     prior odds of a further fault in one log, and for its choice among the causes. How narrowly the data

@@ -65,7 +65,7 @@ def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
 
 
 def _product(r: FloatArray, slots: IntArray, lag: int) -> float:
-    """Mean product of samples that are so many intervals apart."""
+    """Return the mean product of samples at a distance of `lag` intervals."""
     before = np.searchsorted(slots, slots - lag)
     pair = slots[before] == slots - lag
     return float(np.mean(r[pair] * r[before[pair]])) if pair.any() else 0.0
@@ -151,7 +151,7 @@ def _stable(ar: FloatArray, n: int) -> FloatArray:
 
 
 def _uneven(v: FloatArray, count: IntArray) -> bool:
-    """Tell whether the blocks' mean absolute values differ by more than chance."""
+    """Return True if the blocks' mean absolute values differ significantly."""
     if count.size < 4:
         return False
     size = np.abs(v)

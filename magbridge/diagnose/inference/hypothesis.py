@@ -1,4 +1,4 @@
-"""A cause beside the others of a model: what is found, and what it is worth."""
+"""A cause together with the others of a model: its fit and its evidence."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Best", "Hypothesis", "shaped_ratio", "wald_ratio"]
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """One cause beside the others of a model."""
+    """One cause, fitted together with the others of a model."""
 
     candidate: Candidate
     ratio: float
@@ -28,7 +28,7 @@ class Hypothesis:
     p_value: float
     """With the price of the hypotheses behind the cause (look-elsewhere) and of the number of causes."""
     fit: Joint
-    """Of the whole model; this cause's coefficients are the last."""
+    """Fit of the whole model; this cause's coefficients are the last."""
 
     @property
     def signal_to_noise(self) -> float:
@@ -53,9 +53,9 @@ class Best(NamedTuple):
 
 
 def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: bool = False) -> float:
-    """Likelihood ratio of the causes of a model that have a shape, beside those that take any.
+    """Likelihood ratio of a model's causes of fixed shape, given its causes of flexible shape.
 
-    `ratio` is that of the whole model, and of `slow` noise beside it.
+    `ratio` is the likelihood ratio of the whole model, with `slow` noise if there is any.
     """
     free = np.repeat([one.nonparametric for one in model], [one.size for one in model])
     return min(ratio, fit.wald(np.flatnonzero(~free))) if slow or free.any() else ratio

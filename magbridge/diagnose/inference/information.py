@@ -62,7 +62,7 @@ class Information:
         )
 
     def instead(self, base: Joint, *places: slice) -> Information:
-        """Take the coefficients at these places out of the model of `base`, and project out its others.
+        """Remove the coefficients at these places from the model of `base`, and project out its others.
 
         The model's columns are the last. The scores are those of what `base` leaves and of what the
         coefficients at these places explain in it.

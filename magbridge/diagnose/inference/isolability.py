@@ -1,4 +1,4 @@
-r"""What a log with this calibration can show, and which causes it cannot tell apart, whatever it measured.
+r"""The causes that a log with this calibration can show, and those that it cannot distinguish.
 
 Notes
 -----
@@ -27,7 +27,7 @@ __all__ = [
 ]  # fmt: skip
 
 CONFOUNDED = 0.85
-"""Correlation beyond which two causes are listed as a pair: at this one they are told apart in 95 of 100
+"""Correlation beyond which two causes are listed as a pair: at this one they are distinguished in 95 of 100
 cases at signal-to-noise 6."""
 
 LARGEST = 50.0
@@ -53,7 +53,7 @@ class Isolability:
 
     visible: tuple[Visible, ...]
     pairs: tuple[tuple[Visible, Visible, float], ...]
-    """Causes that look alike, with their correlation."""
+    """Causes with correlated effects, and their correlation."""
     untestable: dict[str, str]
     """Cause that this log cannot test -> what a log would need for it."""
 

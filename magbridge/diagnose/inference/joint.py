@@ -1,4 +1,4 @@
-r"""The joint likelihood: calibration free, effects free, the noise fitted anew under each hypothesis.
+r"""The joint likelihood: calibration and effects free, the noise refitted under each hypothesis.
 
 Notes
 -----
@@ -37,8 +37,8 @@ class Joint:
     """A hypothesis at its maximum."""
 
     log_likelihood: float
-    """Of the noise model, with the prior of the calibration and of the effects; coefficients of one common
-    size, as the axes' delays and slow noise are, are integrated out (Laplace's approximation)."""
+    """Log-likelihood of the noise model, with the prior of the calibration and the effects; coefficients of
+    one common size, as the axes' delays and slow noise are, are integrated out (Laplace's approximation)."""
     z: FloatArray
     """(q,)."""
     coefficients: FloatArray
@@ -47,7 +47,7 @@ class Joint:
     """(q + k, q + k)."""
     noise: Noise
     residual: FloatArray
-    """(n,) nT, what is left of the residual."""
+    """(n,) nT, residual of the fit."""
     prior: FloatArray
     """(q + k,) prior precision of every coefficient, effects in units of their widths."""
 

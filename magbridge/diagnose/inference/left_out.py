@@ -1,4 +1,4 @@
-r"""Dives that a fit has not seen: what it leaves of them, and how well it foretells them.
+r"""Held-out dives: the residual of a fit without them, and how well it predicts them.
 
 Notes
 -----
@@ -11,8 +11,8 @@ Woodbury's identity) is
               + \log\det P - \log\det (P - A_f^T A_f) \right]
 
 the log likelihood less the price of predicting each fold with coefficients learned from the others. The logs
-that the calibration was fitted to have their say by ``|z|``, in sigmas, by which it has moved from what they
-gave: without that, a constant that the calibration absorbs is foretold by every other dive. The
+that the calibration was fitted to enter by ``|z|``, the distance in sigma between the coefficients and their
+prior: without that, every other dive would predict a constant that the calibration absorbs. The
 difference of two models' scores is the log of the odds that the left-out dives give one against the other:
 the pseudo-Bayes factor (Geisser & Eddy 1979, JASA 74:153).
 """
@@ -38,9 +38,9 @@ FOLDS = 8
 DRAWS = 2000
 """Bootstrap samples: an end of the interval then scatters by 1.5 % of its width."""
 QUANTILES = (0.025, 0.975)
-"""Of the bootstrap samples: the ends of the interval."""
+"""Quantiles of the bootstrap samples: the ends of the interval."""
 LEVEL = QUANTILES[1] - QUANTILES[0]
-"""Of the interval."""
+"""Confidence level of the interval."""
 
 
 class HeldOut(NamedTuple):
@@ -66,9 +66,9 @@ def held_out(
 ) -> HeldOut:
     """Leave out dives, fold by fold.
 
-    Nonlinear parameters and noise are those of the fit to all dives; every coefficient is fitted anew without
-    the fold. Folds are stretches of dives, so that a slow change must be foretold; or, `interleaved`, every
-    eighth dive, so that it need only be filled in. `groups` (n,) takes the place of the dives' numbers.
+    Nonlinear parameters and noise are those of the fit to all dives; every coefficient is refitted without
+    the fold. Folds are stretches of dives, so that a slow change is extrapolated; or, `interleaved`, every
+    eighth dive, so that it is only interpolated. `groups` (n,) takes the place of the dives' numbers.
     """
     X, noise, prior = Design(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
@@ -89,7 +89,7 @@ def held_out(
     others = whole_P - P
     without = np.linalg.solve(others, (whole_b - b)[:, :, None])[:, :, 0]
     corrected, residual = without.copy(), np.empty(len(problem))
-    corrected[:, problem.slow] = 0.0  # noise is left in what is corrected
+    corrected[:, problem.slow] = 0.0  # the corrected field keeps its slow noise
     for rows in X.pieces:
         residual[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), corrected[of[rows]])
     away = c - without
@@ -110,7 +110,7 @@ class Improvement:
 
     @property
     def shown(self) -> bool:
-        """Whether the held-out dives show a gain: the interval lies below 1."""
+        """Return True if the held-out dives show a gain: the interval lies below 1."""
         return self.interval[1] < 1.0
 
 

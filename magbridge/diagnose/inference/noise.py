@@ -65,7 +65,7 @@ class Noise:
 
     @property
     def uneven(self) -> bool:
-        """Whether its level changes: likelihoods are comparable only under one kind of noise."""
+        """Return True if its level changes: likelihoods are comparable only under one kind of noise."""
         return bool(np.ptp(self.scale))
 
     @property

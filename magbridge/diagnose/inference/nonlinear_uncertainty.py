@@ -1,4 +1,4 @@
-r"""The uncertainty of nonlinear parameters, and what it adds to the covariance of all coefficients.
+r"""The uncertainty of nonlinear parameters, and its contribution to the covariance of all coefficients.
 
 Notes
 -----
@@ -9,7 +9,7 @@ cell, the covariance of the other coefficients is
 
 .. math:: C + K (M + 1)^{-1} K^T
 
-*Beyond that cell* there may be other peaks: those of an onset may lie hours apart, each with a size of its
+*Beyond that cell* there may be other peaks: those of an onset may differ by hours, each with a size of its
 own. With d_k the difference of all coefficients at another point of the grid, C_k their covariance there, and
 w_k that point's posterior weight, the mixture of all points has the covariance
 
@@ -138,7 +138,7 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
     alone = info.instead(fit, own)
 
     def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
-        """Return evidence, all coefficients and their covariance, each up to what is common to all points."""
+        """Return evidence, all coefficients and their covariance, each up to a part common to all points."""
         s = score(alone, place, candidate)
         # the other causes change with this one, and the calibration with all of them
         way = np.zeros((len(fit.covariance), candidate.size))

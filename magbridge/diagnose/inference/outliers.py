@@ -21,7 +21,7 @@ from magbridge.estimation.residual import robust_scale
 __all__ = ["LOST", "Outliers", "outliers", "switches"]
 
 LOST, PLACES = 2, 6
-"""Regressors beside which a level that shifts at more than so many places is no cause of the list."""
+"""Regressors of a model, and shifts of the level from which on the table has no cause for the signal."""
 AFTERWARDS = 16
 """Samples beyond the noise's order in which a shift of the level is looked for."""
 
@@ -35,20 +35,20 @@ class Outliers(NamedTuple):
     """Twice the gain in log likelihood."""
     p_value: float
     neighbours: float
-    """Chance that good samples beside them would be off as far as theirs are."""
+    """Probability of errors as large as the neighbours' in good samples."""
     lasting: bool
     """From them on the level stays shifted: something switched."""
 
     @property
     def isolated(self) -> bool:
-        """Whether the samples beside them are good: beside what passes, rings, or switches, they are not."""
+        """Return True if the neighbouring samples are good, which excludes transients and ringing."""
         return self.neighbours >= LEVEL and not self.lasting
 
 
 def outliers(fit: Joint, causes: int) -> Outliers | None:
     """Test for wrong samples: a few innovations from a wide distribution of their own.
 
-    Heavy tails alone are no outliers: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the
+    Heavy tails alone are not outliers: the mixture ``(1 - eps) t_nu + eps N(0, S^2)`` must beat the
     best ``t_nu``.
     """
     v = fit.noise.innovations
@@ -68,7 +68,7 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
 
 
 def switches(fit: Joint, model: Sequence[Candidate], causes: int) -> bool:
-    """Say whether the level shifts at many places beside a model's first few regressors."""
+    """Return True if the level shifts at many places that a model's first few regressors do not explain."""
     if sum(len(candidate.pieces) for candidate in model) < LOST:
         return False
     off = outliers(fit, causes)
@@ -76,11 +76,11 @@ def switches(fit: Joint, model: Sequence[Candidate], causes: int) -> bool:
 
 
 def _lasting(fit: Joint, rows: IndexArray) -> bool:
-    r"""Say whether shifts of the level at `rows` (k,) are likelier than impulses there.
+    r"""Return True if shifts of the level at `rows` (k,) are likelier than impulses there.
 
     Notes
     -----
-    Noise of a long memory absorbs what switches but for the switching itself. Whitened by the filter
+    Noise of a long memory absorbs switching signals, except for the switching itself. Whitened by the filter
     ``h = (1, -a)`` an impulse is h and a shift its running sum s; of either, x, with the innovations v from
     the row on (Chen & Liu 1993, J. Am. Stat. Assoc. 88:284),
 
@@ -104,9 +104,9 @@ def _neighbours(fit: Joint, rows: IndexArray) -> float:
 
     .. math:: G c = b, \qquad G_{jk} = \sum_l h_l h_{l+|j-k|}, \qquad b_j = \sum_l h_l v_{j+l}
 
-    Then the outer c are noise if the neighbours are good; in the second case the innovations beside i are. Of
-    either kind each neighbour has as its p-value its rank among those of all samples, whatever the noise's
-    tails; Fisher's method combines them, each sample being of the kind that is kinder to its neighbours.
+    Then the outer c are noise if the neighbours are good; in the second case the innovations next to i are.
+    In both cases each neighbour has as its p-value its rank among those of all samples, whatever the noise's
+    tails; Fisher's method combines them, and each sample counts as the kind that has the better neighbours.
     """
     noise, p = fit.noise, len(fit.noise.ar)
     h = np.concatenate([[1.0], -noise.ar, np.zeros(2)])

@@ -2,8 +2,8 @@ r"""Two causes at once: every pair of candidates in place of two regressors of a
 
 Notes
 -----
-A wrong cause may persist only because another is wrong, too: replacing either alone is no improvement. So
-replacements are weighed in pairs, with the rest of the model projected out (:mod:`.information`):
+A wrong cause may persist only because another is wrong, too: replacing either alone is not an improvement. So
+replacements are compared in pairs, with the rest of the model projected out (:mod:`.information`):
 
 .. math:: E_{ab} = E_a + E_{b \mid a}, \qquad
           E_{AB} = \ln \frac{1}{|A| |B|} \sum_{a \in A, b \in B} e^{E_{ab}}
@@ -68,7 +68,7 @@ class _Stack:
     def conditional_on(
         self, rows: FloatArray, K: FloatArray, taken: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(n, m) log evidences, likelihood ratios and freedoms (:func:`~.evidence.score`) beside n others.
+        """Log evidences, likelihood ratios, freedoms (n, m) (:func:`~.evidence.score`) given n others.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class _Table:
         self.paid = float(np.sum(np.log([candidate.look_elsewhere for candidate in self.standing])))
 
     def _fill(self) -> None:
-        """Score every candidate alone, and beside each other one."""
+        """Score every candidate alone, and together with each other one."""
         m, info = len(self.candidates), self.info
         free = [n for n, candidate in enumerate(self.candidates) if candidate.spectra is None]
         stacks = [_Stack(places, self.at, self.candidates, info) for places in self._by_size(free)]
@@ -208,9 +208,9 @@ class _Table:
         return Pair(two, one, behind) if self._swapped(a, b) else Pair(one, two, behind)
 
     def _significant(self, a: int, b: int) -> bool:
-        """Say whether each passes its test beside the other.
+        """Return True if each passes its test in the presence of the other.
 
-        Where one cause stood, neither may be what the other leaves.
+        Where one cause stood, neither may be a remnant of the other.
         """
         ratios = []
         for n, other in ((a, b), (b, a)):
@@ -225,7 +225,7 @@ class _Table:
         return not same or min(ratios) >= REMNANT**2 * max(ratios)
 
     def _swapped(self, a: int, b: int) -> bool:
-        """Say whether a rather replaces the second one, judged by cause, else by the signal it explains."""
+        """Return True if a rather replaces the second, judged by cause, else by the signal it explains."""
         if len(self.standing) == 1:
             return False
         names = [candidate.cause for candidate in self.standing]

@@ -1,4 +1,4 @@
-"""Profile nonlinear parameters between the points of their grid, beside the other causes of a model."""
+"""Profile nonlinear parameters between the points of their grid, with the other causes of a model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ stages: after each the bracket is narrowed to the neighbours of the best value."
 
 
 def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
-    """Profile the nonlinear parameters of a cause beside `model`, whose fit is `base`, one after the other.
+    """Profile the nonlinear parameters of a cause given `model`, whose fit is `base`, one after the other.
 
     Many values are scored at once under the present noise, because the likelihood of an onset has several
     peaks. The evidence pays for the choice: the average over the bracket counts, not the peak.
@@ -94,7 +94,7 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
 def refined(
     state: State, model: list[Candidate], base: Joint, members: int | None = None
 ) -> tuple[list[Candidate], Joint]:
-    """Profile the nonlinear parameters of the first `members`, each beside the others; they end up last."""
+    """Profile the nonlinear parameters of the first `members`, each given the others; they end up last."""
     for _ in range(len(model) if members is None else members):
         own, others = model[0], model[1:]
         c = np.append(base.coefficients[own.size :], base.coefficients[: own.size])

@@ -9,13 +9,13 @@ on while one does. A cause that is found again needs more than one regressor: th
 causes are exchanged for competing hypotheses (:mod:`.competing`). Last, causes that later findings have made
 needless are dropped.
 
-Noise that ends up slow may have absorbed what several causes do together: then none alone stands out from it.
-So a second start finds causes beside noise of a short correlation, and weighs them beside noise of any. What
-switches unseen takes regressor after regressor, and none describes it: where the level still shifts at many
-places beside the first few (:func:`~.outliers.switches`), nothing more is searched for.
+Slow noise may have absorbed the joint effect of several causes: then none is significant on its own.
+So a second start finds causes under noise of a short correlation, and compares them under noise of any. A
+switching signal uses regressor after regressor, and none describes it: if the level still shifts at many
+places that the first few do not explain (:func:`~.outliers.switches`), the search ends.
 
-What is found, and asserted, is then searched for beside noise that grows towards low frequencies, where that
-gains anything (:mod:`~.compare.slow_noise`), and the likelier is kept: a cause that only stands for such
+Asserted causes are then searched for again under noise that grows towards low frequencies, if that gains
+anything (:mod:`~.compare.slow_noise`), and the likelier result is kept: a cause that only represents such
 noise is not found. The competing hypotheses are read off one matrix at the end: the information of all
 candidates under the noise that is left, the other causes projected out.
 """
@@ -75,9 +75,9 @@ class Outcome:
     look_elsewhere: dict[str, float]
     """Cause -> number of independent hypotheses behind it."""
     evidence: float
-    """Log evidence of what was found and of its noise, against the null without slow noise."""
+    """Log evidence of the causes found and of their noise, against the null without slow noise."""
     switches: bool
-    """Whether the search ended because something switches that no cause describes."""
+    """True if the search ended because of a switching signal that no cause describes."""
 
 
 def search(
@@ -98,8 +98,8 @@ def search(
     model = [h.candidate for h in chosen]
     info = state.conditional_on(model, base)
     competing = sets_of(state, info, model, base) if model else ()
-    # Akaike's price of the autoregression, which slow noise makes shorter. Of the coefficients that what is
-    # left no longer needs, as beside a step, only the half nat counts that each has gained by chance
+    # Akaike's price of the autoregression, which slow noise makes shorter. Coefficients that the residual
+    # no longer needs, for example after a step, have each gained only half a unit of log-likelihood by chance
     needed = autoregressive_order(base.residual, problem.survey.slots)
     evidence = state.value(model, base, plain) - 0.5 * (order + needed)
     return Outcome(
@@ -109,7 +109,7 @@ def search(
 
 
 def beside_slow_noise(found: Outcome, candidates: Sequence[Candidate], causes: int) -> Outcome:
-    """Search again beside slow noise what was found without it; return the likelier."""
+    """Repeat the search of the causes found, with slow noise; return the likelier outcome."""
     noisy, null = with_slow_noise(found.problem), found.null
     slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
     if slow.log_likelihood <= null.log_likelihood:
@@ -118,7 +118,7 @@ def beside_slow_noise(found: Outcome, candidates: Sequence[Candidate], causes: i
 
 
 def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
-    """Return the likelier of the models found beside any noise, and beside a short-lived one if need be."""
+    """Return the likeliest of the models found with any noise, and with a short-lived one if need be."""
     model, base = _forward_selection(state, first)
     if switches(base, model, state.causes):
         return model, base
@@ -195,9 +195,9 @@ def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list
 def _backward_elimination(
     state: State, model: list[Candidate], base: Joint
 ) -> tuple[list[Hypothesis], Joint]:
-    """Drop causes without which the model is likelier, or which fail their test beside the others.
+    """Drop causes without which the model is likelier, or which fail their test given the others.
 
-    Of what then stays, drop what a Gaussian process may have left of itself, or dives left out speak against.
+    Then drop the remnants of a Gaussian process, and causes that the held-out dives contradict.
     """
     chosen: list[Hypothesis] = []
     k = 0
@@ -221,10 +221,10 @@ def _backward_elimination(
 
 
 def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | None:
-    """Return the place of the weakest cause if it need not be there, beside a Gaussian process or its like.
+    """Return the place of the weakest cause if it is redundant given a Gaussian process or a similar cause.
 
-    A process takes part in every slow shape, and what it leaves of a map's error passes for a second one. Two
-    that look alike share what neither is; where that gains nothing on new dives left out, one is too many.
+    A process represents part of every slow shape, and its remnant of a map's error passes for a second one.
+    Two correlated causes share a signal; if the second gains nothing on held-out dives, it is redundant.
     """
     smooth = max((_remnant(h) for h in chosen if h.candidate.nonparametric), default=0.0)
     k = min(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
@@ -243,7 +243,7 @@ def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | N
 
 
 def _like_another(state: State, model: Sequence[Candidate], base: Joint, k: int) -> bool:
-    """Say whether the log shows the k-th cause much as another of the model."""
+    """Return True if in this log the k-th cause is strongly correlated with another of the model."""
     info = state.conditional_on(model, base)
     every = {state.candidates[n].group: n for n in most_visible(state.candidates, info, state.at)}
     own, *others = (every[candidate.group] for candidate in (model[k], *model[:k], *model[k + 1 :]))

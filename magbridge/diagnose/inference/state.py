@@ -1,7 +1,7 @@
-"""What a search knows of a log, and a round of it: score every cause beside a model, fit the likeliest.
+"""State of a search in a log, and one round of it: score every cause given a model, fit the likeliest.
 
-The model is no part of it: every step of a search takes one and returns another. What a round adds belongs
-to the log and not to the model, and is the same whenever it is computed: the look-elsewhere factors and the
+The model is not part of the state: every step of a search takes one and returns another. A round adds data of
+the log, not of the model, which are the same whenever they are computed: the look-elsewhere factors and the
 certainty of the noise's level, in the first; and the last information, which several steps ask for.
 """
 
@@ -39,7 +39,7 @@ SHORT_LIST = 9
 
 
 class State:
-    """The problem of one search, its candidates, and what is known of the log.
+    """The problem of one search, its candidates, and quantities of the log.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class State:
         return found
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
-        """Fit the best causes beside `model`, each on its own, and list them, the likeliest first."""
+        """Fit the best causes given `model`, each on its own, and list them, the likeliest first."""
         as_fitted = self.conditional_on(model, base).fitted(base)
         if not self.look_elsewhere:
             self.look_elsewhere = look_elsewhere_factors(as_fitted, self.candidates, self.at)

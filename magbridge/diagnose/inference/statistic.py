@@ -62,7 +62,7 @@ class Statistic:
         self.spectra = spectra
         if spectra is None:
             values, self.vectors = np.linalg.eigh(S)
-            self.values = np.where(values > VISIBLE, values, np.inf)  # what is hardly seen says nothing
+            self.values = np.where(values > VISIBLE, values, np.inf)  # ignore directions without a signal
             self.freedom = np.asarray(np.isfinite(self.values).sum(axis=-1))
             return
         root = np.sqrt(spectra)

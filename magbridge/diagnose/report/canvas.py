@@ -20,13 +20,13 @@ __all__ = [
 ]  # fmt: skip
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
-"""Vermilion and blue, which any eye tells apart; in grey print the second is darker."""
+"""Vermilion and blue, which any eye distinguishes; in grey print the second is darker."""
 SMALL = 9.0
 """pt, the smallest letters."""
 POINTS = 4000
 """Points drawn per curve; more only make the page heavy."""
 COLOURS = 256
-"""Colours of a picture: as many as fit a byte for each pixel, with which it takes two fifths of the room."""
+"""Colours of a plot: as many as fit a byte for each pixel, which needs two fifths of the memory."""
 DOTS: dict[str, Any] = {
     "marker": "s",
     "markersize": 1.6,
@@ -95,7 +95,7 @@ def rolling(diagnosis: Diagnosis, values: FloatArray) -> tuple[FloatArray, Float
 
 
 def ends(*values: FloatArray, low: float, high: float) -> tuple[float, float]:
-    """Return an axis' limits for `values` (n,), few wild ones left aside; `low`, `high`: shares of room."""
+    """Return an axis' limits for `values` (n,) without extremes; `low`, `high`: margins, as fractions."""
     first, last = np.nanquantile(np.concatenate(values), [0.002, 0.998])
     span = max(float(last - first), 1e-9)
     return float(first) - low * span, float(last) + high * span

@@ -1,4 +1,4 @@
-"""The page's folded parts: each cause, what is left, and what such a log can show at all."""
+"""The page's folded parts: each cause, the unexplained part, and the causes that such a log can show."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ KINDS = {
     "transient": "A transient",
     "broadband": "Something broadband",
 }
-"""What is left, as the subject of a sentence."""
+"""Descriptions of the unexplained part, as the subject of a sentence."""
 WORSE = 1.3
 """Multiple of the fitted residual from which the one held out is remarked on."""
 ALIKE = 4
@@ -52,7 +52,7 @@ ALIKE = 4
 
 
 def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
-    """Return what is known of each cause, and of isolated wrong samples."""
+    """Return the details of each cause, and of isolated outliers."""
     if not diagnosis.findings and diagnosis.wrong is None:
         return [f"<p>None of {len(causes)} causes is named.</p>"]
     parts = [figure(figures.terms(diagnosis), "What each cause adds, through what all others leave.")]
@@ -88,7 +88,7 @@ def _when(time: FloatArray) -> str:
 
 
 def _outliers(time: FloatArray) -> str:
-    """Say how many samples are wrong, and when: `time` (k,) in s since 1970."""
+    """Return how many samples are outliers, and when: `time` (k,) in s since 1970."""
     wrong = "1 isolated sample is wrong" if time.size == 1 else f"{time.size} isolated samples are wrong"
     return f"<h3><b>outliers</b></h3><p>{wrong}, {_when(time)}. No RMS before or after counts them.</p>"
 
@@ -104,7 +104,7 @@ def _folded(terms: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
-    """Return what is left: how large, how slow, what it goes with, and beside what was predicted."""
+    """Return the unexplained part: amplitude, time scale, the series that it follows, and its prediction."""
     rest, residual = diagnosis.unexplained, diagnosis.assessment.residual
     shifts = diagnosis.problem.survey.time[list(rest.shifts if rest else ())]
     budget, parts = diagnosis.assessment.budget, diagnosis.problem.survey.parts
@@ -121,8 +121,8 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         if size is not None
     )
     worse = (
-        f"<p>What was left out is predicted {number((budget.after or 0.0) / budget.fitted, 2)} times worse "
-        "than what was fitted: this log determines some of the new terms badly, or they act differently from "
+        f"<p>Held-out parts are predicted {number((budget.after or 0.0) / budget.fitted, 2)} times worse "
+        "than fitted ones: this log determines some of the new terms badly, or they act differently from "
         "part to part.</p>"
     )
     how = (
@@ -141,7 +141,7 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
 
 
 def _goes(what: Seen) -> str:
-    """Say what the rest goes with, and along which axis it lies."""
+    """Return the series that the rest follows, and the axis along which it lies."""
     reported = goes_with(what, share=True)
     if what.channel:
         return f"and follows {reported}"
@@ -150,7 +150,7 @@ def _goes(what: Seen) -> str:
 
 
 def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
-    """Say why the rest has no name, and what would tell the possible causes apart."""
+    """Return why the rest has no name, and how to distinguish the possible causes."""
     if not rest.within:
         return "It fits no known cause, so it has no name."
     return (
@@ -160,7 +160,7 @@ def nameless(rest: Leftover, causes: Mapping[str, Cause]) -> str:
 
 
 def described(rest: Leftover, residual: Memory) -> str:
-    """Return what is left, its size and how long it lasts, as a sentence without its full stop, as HTML."""
+    """Return the unexplained part, its size and duration, as a sentence without its full stop, as HTML."""
     goes = f"; best described by <code>{escape(rest.best_channel)}</code>" if rest.best_channel else ""
     period = f" of period {rest.period_s:.4g} s" if rest.period_s else ""
     size = f"signal-to-noise ratio {rest.signal_to_noise:.1f}"
@@ -183,13 +183,13 @@ def _noise(diagnosis: Diagnosis) -> str:
     )
     return (
         f"The noise model: {number(float(np.median(noise.scale)))} nT per sample, {tails}; {correlation}"
-        f"{f'; beside it {number(slow)} nT RMS of slow noise, of power 1/f or so' if slow else ''}. "
+        f"{f'; also {number(slow)} nT RMS of slow noise, of power 1/f or so' if slow else ''}. "
         f"The calibration states {number(diagnosis.problem.calibration.noise.sensor)} nT."
     )
 
 
 def visible(diagnosis: Diagnosis) -> list[str]:
-    """Say how large each cause must be to be found in such a log, and which look like it."""
+    """Return how large each cause must be to be found in such a log, and which ones are similar to it."""
     report = diagnosis.isolability
     hidden = [one for one in report.visible if not any(isfinite(size) for size, _ in one.sizes.values())]
     rows = (
@@ -212,7 +212,7 @@ def visible(diagnosis: Diagnosis) -> list[str]:
         f"<p>{track.text}</p>" if track else "",
         table(heads, rows),
         f"<p>Not to be found at any plausible size: {unseen}.</p>" if unseen else "",
-        f"<p>Not testable here, with what it would take: {missing}.</p>" if missing else "",
+        f"<p>Not testable here, with the requirements: {missing}.</p>" if missing else "",
     ]
 
 

@@ -102,7 +102,7 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
     """Value, sigma and unit of every coefficient, and of the nonlinear parameters.
 
     Where one channel acts with several lags, or an offset jumps more than once, the sum is given and its
-    parts beside it. Coefficients with one common size are summed up as the RMS of their effect over the
+    parts next to it. Coefficients with one common size are summed up as the RMS of their effect over the
     log's `samples`.
     """
     candidate = finding.candidate
@@ -144,13 +144,13 @@ def _rms(finding: Finding, samples: int) -> dict[str, Any]:
 
 
 def _adds_up(candidate: Candidate) -> bool:
-    """Tell whether coefficients of one name add up: those of one channel at several lags or onsets."""
+    """Return True if coefficients of one name add up: those of one channel at several lags or onsets."""
     channels = {getattr(effect, "channel", None) for effect in candidate.effects}
     return len(channels) == 1 and not candidate.point.shape.keys().isdisjoint(("lag", "onset"))
 
 
 def assessment(found: Assessment) -> dict[str, Any]:
-    """Return all that the report shows beside the findings, rounded."""
+    """Return the parts of the report in addition to the findings, rounded."""
     delays, budget, residual, track = found.delays, found.budget, found.residual, found.returns
     return {
         "fit_for_use": found.fit_for_use,
@@ -191,7 +191,7 @@ def _notes(some: Sequence[Note]) -> list[dict[str, Any]]:
 
 
 def follows(what: Seen) -> dict[str, Any]:
-    """Return what is seen, apart from what it may be."""
+    """Return the observed correlate, without its interpretation."""
     return {
         "channel": what.channel,
         "lag_s": what.lag,
@@ -232,7 +232,7 @@ def _improvement(improvement: Improvement, diagnosis: Diagnosis) -> dict[str, An
 
 
 def _corrected(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the improvement of the corrected field, beside a refit of the calibration alone."""
+    """Return the improvement of the corrected field, compared with a refit of the calibration alone."""
     found, over = diagnosis.improvement, diagnosis.over_refit
     day = diagnosis.other_day
     return _improvement(found, diagnosis) | {

@@ -1,4 +1,4 @@
-"""``report.html``: the answer on the first screen, below it, folded, what it rests on. The files."""
+"""``report.html``: the verdict on the first screen, the details folded below it. Also writes the files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
     Parameters
     ----------
     diagnosis : Diagnosis
-        What is shown.
+        Diagnosis to show.
     causes : mapping
         The table of causes that were asked about.
     remarks : sequence of str
@@ -84,7 +84,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
 
 
 def _log(diagnosis: Diagnosis) -> str:
-    """Say in a line what was compared."""
+    """Return the compared data as one line."""
     survey, calibration = diagnosis.problem.survey, diagnosis.problem.calibration
     new = survey.time[~survey.learned]
     first, last = (datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in new[[0, -1]])
@@ -100,7 +100,7 @@ def _log(diagnosis: Diagnosis) -> str:
 
 
 def _sentence(diagnosis: Diagnosis) -> str:
-    """Return the verdict: what was found, what it improves, and what is left."""
+    """Return the verdict: the causes, the improvement, and the unexplained part."""
     total, rest, residual = diagnosis.total, diagnosis.unexplained, diagnosis.assessment.residual
     before, stated = number(total.before), diagnosis.assessment.budget.predicted
     allowed = f" {before} nT are within the {number(stated)} nT that the calibration states for itself."
@@ -121,7 +121,7 @@ def _sentence(diagnosis: Diagnosis) -> str:
     worth = f"Without them, {before} nT RMS; nothing is added to the calibration."
     if diagnosis.findings:
         survey, refitted = diagnosis.problem.survey, number(diagnosis.over_refit.before)
-        own = (survey.fitted & ~survey.learned).any()  # the calibration was fitted to what is diagnosed
+        own = (survey.fitted & ~survey.learned).any()  # the calibration was fitted to the diagnosed log
         worth = (
             f"{improved(diagnosis.improvement, '' if own else survey.parts)} A refit of the calibration "
             f"alone leaves {refitted} nT.{_reference_part(diagnosis)}{allowed}"
@@ -130,19 +130,19 @@ def _sentence(diagnosis: Diagnosis) -> str:
     other = f"Something {'stronger' if louder else 'else'} is left that no known cause explains."
     if not rest:
         remembers = f" that remembers {number(residual.correlation_time, 2)} s" * residual.lasts
-        other = f"What is left, {number(residual.rms)} nT RMS, looks like noise{remembers}."
-    start = "Nothing needs explaining: what was found makes next to no difference. "
+        other = f"The remaining {number(residual.rms)} nT RMS look like noise{remembers}."
+    start = "Nothing needs explaining: the causes found make next to no difference. "
     if rest and diagnosis.negligible:
         other = "What else is left has no name, and is as small."
     return f"{start * diagnosis.negligible}Found: {'; '.join(names)}. {worth} {other}"
 
 
 def _reference_part(diagnosis: Diagnosis) -> str:
-    """Return what is left with the named errors of the reference taken out; empty where none is named."""
+    """Return the RMS without the named errors of the reference; empty if none is named."""
     if all(candidate.about == "vehicle" for candidate in diagnosis.named):
         return ""
     left = number(diagnosis.total.after)
-    return f" With the named errors of the reference taken out of the comparison, {left} nT are left."
+    return f" Without the named errors of the reference, {left} nT are left."
 
 
 def _or(competing: Sequence[CompetingHypothesis]) -> str:
@@ -150,9 +150,9 @@ def _or(competing: Sequence[CompetingHypothesis]) -> str:
 
 
 def improved(improvement: Improvement, parts: str) -> str:
-    """Return by how much the corrected field improves on what was left out, or that it does not.
+    """Return by how much the corrected field improves on held-out parts, or that it does not.
 
-    `parts` is what was left out in turn; empty where the calibration was fitted to the log itself.
+    `parts` names the held-out parts; it is empty if the calibration was fitted to the log itself.
     """
     low, high = improvement.interval
     where = f"On {parts} left out of the fit" if parts else "On the log that the calibration was fitted to"
@@ -199,7 +199,7 @@ def _overview(diagnosis: Diagnosis) -> str:
 
 
 def late(found: Delays | None) -> str:
-    """Say so when the axes look interpolated, which adds a noise that no calibration can undo."""
+    """Return a warning if the axes look interpolated, a noise that no calibration can undo; else ''."""
     if found is None:
         return ""
     y, z = (f"{measured(x, s)} ± {measured(s, s)} s" for x, s in zip(found.later, found.sigma, strict=True))
@@ -234,7 +234,7 @@ def write(
 ) -> None:
     """Write ``findings.json``, ``calibration.json`` and ``report.html``: all three, or none.
 
-    WriteError: one of them cannot be written; what was there before is as it was.
+    WriteError: one of them cannot be written; the previous files are unchanged.
     """
     contents = {
         "calibration.json": encode_calibration(diagnosis.calibration),

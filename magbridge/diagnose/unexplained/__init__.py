@@ -1,5 +1,5 @@
-"""What is left beside the named causes, described without a name.
+"""The part of a signal that the named causes do not explain, described without a name.
 
 :mod:`.leftover` weighs the descriptions that :mod:`.descriptions` lists. They are made of :mod:`.shapes`, of
-what lasts for a while (:mod:`.packets`), and of named causes that do not keep their size (:mod:`.varying`).
+transient signals (:mod:`.packets`), and of named causes that change their size (:mod:`.varying`).
 """

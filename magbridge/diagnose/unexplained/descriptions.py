@@ -45,22 +45,22 @@ class Description(NamedTuple):
     look_elsewhere: float = 1.0
     """Number of independent descriptions that it was chosen from."""
     period: float | None = None
-    """s, of a tone."""
+    """Period of a tone, s."""
     holds: Callable[[Candidate], bool] = _is()
-    """Whether a candidate's own regressors are among the columns, beside those of the same channel."""
+    """Return True if the columns include a candidate's own regressors, not only those of the same channel."""
     turned: bool = False
     """The columns are the same functions along each of the body's axes."""
     remembers: bool = False
     """It follows the channel's past (from which side it came), not its value."""
     scales: bool = False
-    """The effect is in proportion to each reading: a change of sensitivity, not of offset. Only of heat is
-    that told apart: of other channels either description says what a cause does with more numbers."""
+    """The effect is in proportion to each reading: a change of sensitivity, not of offset. Only for heat are
+    these distinguished: for other channels both describe the effect of a cause with more numbers."""
     wider: bool = False
-    """It is much more general than a cause that it holds: what it finds beside that is no remnant, and it is
-    an alternative to that cause together with another."""
+    """It is much more general than a cause that it holds: a signal found in addition is not a remnant, and it
+    is an alternative to that cause together with another."""
 
     def covers(self, model: Sequence[Candidate]) -> bool:
-        """Say whether it contains a cause of `model`, with more coefficients; a wider one, whether all."""
+        """Return True if it contains a cause of `model`, with more coefficients; a wider one, all causes."""
         heat = "scale" if self.scales else "offset"
         same = [
             self.holds(candidate)
@@ -160,7 +160,7 @@ def _of_reading(problem: Problem) -> list[Description]:
 
 
 def _of_channels(problem: Problem) -> list[Description]:
-    """For each telemetry channel, a curve of its value, functions of its past, and what follows it late.
+    """Return for each channel a curve of its value, functions of its past, and functions that follow it late.
 
     Late, as heat soaks into a hull: an offset, or a sensitivity.
     """

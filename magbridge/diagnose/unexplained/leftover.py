@@ -1,11 +1,11 @@
-"""What is left: structure of any kind that no cause of the table accounts for, described but not named.
+"""The unexplained part: structure of any kind that no cause of the table accounts for, without a name.
 
 Notes
 -----
 A free description has more coefficients than the data can determine, so they have one common free size
 (:mod:`~.inference.statistic`). Noise that was fitted without an effect may have absorbed it. So descriptions
 are scored under the noise of the fit and under that which is left when slow curves are fitted as well; the
-best are then weighed by the whole likelihood, with the noise fitted anew.
+best are then compared by the whole likelihood, with the noise refitted.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Leftover(NamedTuple):
     evidence: float
     """Log Bayes factor of the description against the model."""
     period_s: float | None
-    """Of a tone."""
+    """Period of a tone, s."""
     best_channel: str | None
     """The telemetry that its description is a function of."""
     description: Description | None = None
@@ -126,7 +126,7 @@ def leftover(
     but: Sequence[Candidate] = (),
     also: Sequence[Description] = (),
 ) -> Leftover | None:
-    """Test whether anything is left beside `model`; the description with the best evidence, or None.
+    """Test whether `model` leaves anything unexplained; return the best description by evidence, or None.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _calm(problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence
 
 
 def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Scored) -> Fitted:
-    """Fit a description beside the model, its noise anew; its log evidence by Laplace's approximation."""
+    """Fit a description with the model and the noise; its log evidence by Laplace's approximation."""
     one, best, q = scored.description, scored.best, len(fit.z)
     c, columns = best.estimate, one.columns
     moved = -scored.shift @ c

@@ -7,7 +7,7 @@ J. IEE 93:429):
 
 .. math:: e^{-(t - t_0)^2 / 2 L^2} \left(a \cos 2 \pi f (t - t_0) + b \sin 2 \pi f (t - t_0)\right)
 
-Its moment t_0 is as likely as any other, and so are the logarithm of its length L and its cycles f L. With
+Its moment t_0 is uniformly distributed, as are the logarithm of its length L and its cycles f L. With
 g the score of each single sample and h its information at that frequency, the likelihood ratio of a and b is
 ``R = |B|^2 / S``,
 

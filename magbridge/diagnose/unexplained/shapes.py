@@ -1,6 +1,6 @@
 """The functions of which descriptions without a name are made, and their prior widths.
 
-Arguments are histories of the log's n samples, (n,) or (n, 3); what is returned is a block of columns,
+Arguments are histories of the log's n samples, (n,) or (n, 3); the result is a block of columns,
 (m, k) of m rows: :mod:`magbridge.diagnose.compare.design_columns`. Whole histories of a long log fill the
 memory: what can be computed row by row is not kept.
 """
@@ -131,7 +131,7 @@ def delayed(time: FloatArray, values: FloatArray) -> Columns:
 
 def swings(time: FloatArray, rate: FloatArray) -> Columns:
     """Return functions of a turn's rate (n,), with lags: the rate; its square, the same to either side."""
-    low, high = np.quantile(rate, (0.001, 0.999))  # telemetry that jumps is no turn
+    low, high = np.quantile(rate, (0.001, 0.999))  # a jump of the telemetry is not a turn
     y = np.clip(rate, low, high) / max(high, -low, 1e-12)
     swung = _followed(time, y[None], SWAYS)
     return _centred(lambda rows: np.reshape(powers(swung(rows).T, 2), (2 * len(SWAYS), -1)).T, len(rate))

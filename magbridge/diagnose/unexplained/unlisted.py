@@ -1,4 +1,4 @@
-"""What is left though no description of the list stands out of it: wrong samples, slow noise, mere size."""
+"""The unexplained part without a description: outliers, slow noise, mere size."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def unlisted(
     after: FloatArray,
     counts: BoolArray,
 ) -> Leftover | None:
-    """Return what is left beside the causes that are `named`, or None.
+    """Return the part that the `named` causes leave unexplained, or None.
 
     `off` are wrong samples, `after` (n,) is the residual on parts left out, nT, of which `counts` (n,) count.
     """
@@ -46,10 +46,10 @@ def unlisted(
 def switching(
     problem: Problem, fit: Joint, named: Sequence[Hypothesis], off: Outliers | None, *, ended: bool
 ) -> Leftover | None:
-    """Describe what switches, if that is stronger than all causes that are `named`, or has ended the search.
+    """Describe a switching signal if it is stronger than all `named` causes, or has ended the search.
 
-    Else None. The noise's memory has absorbed it but for its level shifts, and the names are of what that
-    leaves; of a search that ended they were exchanged for no others.
+    Else return None. The noise's memory has absorbed the signal except for its level shifts, and the names
+    describe that rest; after a search that ended, competing names were not tried.
     """
     if off is None or not off.lasting:
         return None
@@ -80,7 +80,7 @@ def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | 
 
 
 def far_from_white(problem: Problem, found: Memory) -> bool:
-    """Say whether a residual of this memory is more than noise of the sensor."""
+    """Return True if a residual of this memory is more than noise of the sensor."""
     lasts = found.slow >= SLOW or found.rms >= SMOOTH * found.white
     return lasts and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference))
 
@@ -88,8 +88,8 @@ def far_from_white(problem: Problem, found: Memory) -> bool:
 def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
     """Describe a residual that is far from white, though no description of the list stands out of it.
 
-    Noise of a long memory can describe anything slow: what it describes is still no noise of the sensor. So
-    can noise that grows towards low frequencies, unless it may be a remnant of the strongest cause.
+    Noise of a long memory can describe any slow signal, but such a signal is not noise of the sensor. Noise
+    that grows towards low frequencies can, too, unless it may be a remnant of the strongest cause.
     """
     slow = problem.slow_noise(fit.z)
     residual = (fit.residual + slow) / problem.reference_jacobian

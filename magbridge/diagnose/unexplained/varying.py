@@ -59,7 +59,7 @@ def varying(
 
 
 def _followed(problem: Problem, own: str | None) -> list[FloatArray]:
-    """List what a size might follow, (n,) each: time, telemetry but for the cause's `own`, attitude."""
+    """List what a size might follow, (n,) each: time, telemetry except the cause's `own`, attitude."""
     survey = problem.survey
     channels = [c.values for name, c in survey.channels.items() if name not in (own, *survey.still)]
     if survey.attitude is None:
