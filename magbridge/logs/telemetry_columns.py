@@ -20,7 +20,7 @@ from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import IMUS, TELEMETRY
 from magbridge.logs.telemetry_survey import LogContents
 from magbridge.mavlink import spec
-from magbridge.mavlink.blocks import Block, blocks
+from magbridge.mavlink.tlog import Block, blocks
 
 __all__ = ["read_at_once"]
 

@@ -19,7 +19,7 @@ from magbridge.logs.compasses import LogCompass
 from magbridge.logs.deployment import CHANGES
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, DeclaredField, Value, correction, sample
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.blocks import Block, blocks
+from magbridge.mavlink.tlog import Block, blocks
 from magbridge.records import Channel
 
 __all__ = ["AUTOPILOT", "LogContents", "survey"]

@@ -1,4 +1,4 @@
-"""Find frames in bytes of a link or of a log; pymavlink computes their checksums and decodes them.
+"""Find frames in bytes of a link; pymavlink computes their checksums and decodes them.
 
 This replaces pymavlink's ``parse_char``. After a wrong checksum, that method skips as many bytes as the
 header claimed, so that garbage that looks like a header swallows valid frames (ArduPilot/pymavlink#387).
@@ -55,11 +55,11 @@ def find_magic(data: bytes, start: int, stop: int) -> int:
     return v1 if v1 >= 0 else end
 
 
-def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = False) -> int:
+def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
     """Return where the frame ends that begins at ``data[start]``.
 
     The checksum of a message outside the dialect cannot be checked; it is believed when its header is
-    plausible and another frame begins `gap` bytes after its end, or when it ends with the data. A random
+    plausible and another frame begins at its end, or when it ends with the data. A random
     header hardly ever is plausible, so that garbage does not hold up what follows it.
 
     Parameters
@@ -68,8 +68,6 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
         Bytes received; ``data[start]`` is a magic byte.
     start, stop : int
         Look at no more than ``data[start:stop]``.
-    gap : int
-        bytes between frames: 0 on a link, 8 in a log.
     last : bool
         Nothing comes after `stop`.
 
@@ -95,9 +93,9 @@ def frame_end(data: bytes, start: int, stop: int, gap: int = 0, *, last: bool = 
     if extra is not None:
         right = checksum(data[start + 1 : body_end], extra)
         return end if right == data[body_end] | data[body_end + 1] << 8 else NOT_A_FRAME
-    if end + gap >= stop:
+    if end >= stop:
         return end if last else MORE
-    return end if data[end + gap] in (V1, V2) else NOT_A_FRAME
+    return end if data[end] in (V1, V2) else NOT_A_FRAME
 
 
 def message(frame: bytes) -> Message:

@@ -26,7 +26,7 @@ def is_own_log(path: Path) -> bool:
     if path.suffix.lower() != ".tlog":
         return False
     with path.open("rb") as file:
-        first = next(iter(LogReader(file)), None)
+        first = next(iter(LogReader(file, block_bytes=4096)), None)
     return first is not None and first.channel == Channel.STATE and first.message.id == BEGIN
 
 

@@ -6,12 +6,14 @@ import io
 import random
 from pathlib import Path
 
+import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink import mavutil
 
 from magbridge.mavlink import Codec, LogReader, pack_record
+from magbridge.mavlink.tlog import BLOCK_BYTES, blocks
 
 START = 1_700_000_000_000_000
 
@@ -24,8 +26,18 @@ def records(count: int) -> list[bytes]:
     ]
 
 
-def read(data: bytes) -> tuple[list[bytes], LogReader]:
-    reader = LogReader(io.BytesIO(data))
+def several_messages() -> bytes:
+    """Return 60 records of several messages, whose payloads are cut to different lengths."""
+    codec = Codec(1, 1)
+    names = ("RAW_IMU", "ATTITUDE", "NAMED_VALUE_FLOAT", "HEARTBEAT")
+    fields = ({"xmag": 5}, {"yaw": 1.5}, {"name": "battpos", "value": 2.0}, {"type": 12})
+    return b"".join(
+        pack_record(START + 4 * k, k % 4, codec.pack(names[k % 4], **fields[k % 4])) for k in range(60)
+    )
+
+
+def read(data: bytes, block_bytes: int = BLOCK_BYTES) -> tuple[list[bytes], LogReader]:
+    reader = LogReader(io.BytesIO(data), block_bytes)
     return [pack_record(one.time_us, one.channel, one.frame) for one in reader], reader
 
 
@@ -37,13 +49,36 @@ def test_round_trip() -> None:
     assert (one.time_us, one.channel, one.message["time_boot_ms"]) == (START + 8, 2, 2)
 
 
-def test_chunks_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_do_not_matter() -> None:
     data = b"".join(records(200))
     damaged = data[:3000] + data[3010:5000] + b"\xfd\x00" * 30 + data[5000:-7]
     whole = read(damaged)[0]
     for size in (1, 7, 64, 1000):
-        monkeypatch.setattr("magbridge.mavlink.tlog.CHUNK", size)
-        assert read(damaged)[0] == whole
+        assert read(damaged, size)[0] == whole
+
+
+@given(
+    at=st.integers(0, 3000),
+    junk=st.binary(max_size=80),
+    cut=st.integers(0, 80),
+    size=st.sampled_from([330, 999]),
+)
+@settings(max_examples=100, deadline=None)
+def test_damage_across_the_blocks_that_are_read(at: int, junk: bytes, cut: int, size: int) -> None:
+    data = several_messages()
+    at %= len(data)
+    damaged = data[:at] + junk + data[at + cut :]
+    (found, reader), (whole, all_at_once) = read(damaged, size), read(damaged)
+    assert found == whole
+    assert (reader.bytes_skipped, reader.damages) == (all_at_once.bytes_skipped, all_at_once.damages)
+
+
+def test_payloads_have_the_zeros_that_were_cut() -> None:
+    (block, *_) = [one for one in blocks(io.BytesIO(several_messages())) if len(one.number)]
+    which = np.flatnonzero(block.number == 27)  # RAW_IMU
+    assert (np.diff(block.end[which] - block.payload[which]) == 0).all()
+    for row, k in zip(block.payloads(which), which, strict=True):
+        assert bytes(row) == block.message(int(k)).payload
 
 
 @given(st.binary(max_size=300))
