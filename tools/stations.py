@@ -22,7 +22,6 @@ PYTHON = (
     "pymavlink==2.4.50",
     "pyserial==3.5",
     "lxml==6.1.3",
-    "fastcrc==0.5.0",
 )
 NODE = ("node-mavlink@2.3.0",)
 
