@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from magbridge.calibration.fitting.fit import Fit
+    from magbridge.calibration.fitting.observations import Observations
 
 ALL = "all"
 """``--compass all``: a calibration for each compass."""
@@ -180,10 +181,10 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     if refused:
         raise DataError(f"{output}: not written, because {found.warnings[0]}; --force writes it all the same")
     save(found.calibration, output)
-    left_out = deployment.sizes["time"] - len(data)
+    left_out, facts = deployment.sizes["time"] - len(data), _facts(found, data)
     print_result(
-        {"file": str(output), "method": method, **_facts(found, len(data)), "left_out": left_out, **worth},
-        f"{output}: {method}, {_summary(found, len(data))}"
+        {"file": str(output), "method": method, **facts, "left_out": left_out, **worth},
+        f"{output}: {method}, {_summary(facts)}"
         + (f"; {counted(left_out, 'row')} without every value left out" if left_out else ""),
         json,
     )
@@ -247,11 +248,14 @@ def _each_compass(
         raise DataError(f"{files[0]}: not one of its compasses could be calibrated")
 
 
-def _facts(found: Fit, samples: int) -> dict[str, Any]:
+def _facts(found: Fit, data: Observations) -> dict[str, Any]:
+    from magbridge.calibration.fitting.validate import expected_heading_sigma
     from magbridge.calibration.paper import facts
 
+    sigma = expected_heading_sigma(found.calibration, data)
     return {
-        "samples": samples,
+        "samples": len(data),
+        "heading_sigma_deg": sigma if isfinite(sigma) else None,
         "rms_nT": found.rms,
         "supported": found.supported,
         "scales": found.scales,
@@ -261,12 +265,18 @@ def _facts(found: Fit, samples: int) -> dict[str, Any]:
     }
 
 
-def _summary(found: Fit, samples: int) -> str:
-    low, high = found.scales
-    return (
-        f"{samples} samples, {found.rms:.2f} nT RMS in the sensor's own units, "
+def _summary(facts: dict[str, Any]) -> str:
+    from magbridge.calibration.heading import DEFAULT_TILT_SIGMA_DEG
+
+    low, high = facts["scales"]
+    text = (
+        f"{facts['samples']} samples, {facts['rms_nT']:.2f} nT RMS in the sensor's own units, "
         f"with scales of {low:.3f} to {high:.3f}"
     )
+    if (sigma := facts["heading_sigma_deg"]) is None:
+        return f"{text}; no heading, which needs roll and pitch in the log at several pitch angles"
+    tilt = f"with roll and pitch good to {DEFAULT_TILT_SIGMA_DEG:g} deg"
+    return f"{text}; magnetic heading {sigma:.2f} deg (1-sigma, {tilt})"
 
 
 def _digests(files: tuple[Path, ...]) -> dict[str, str]:

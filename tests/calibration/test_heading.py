@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import magbridge as mb
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.tilt_boresight import TiltBoresight, boresight_from_tilt
+from magbridge.calibration.fitting.validate import expected_heading_sigma
 from magbridge.calibration.heading import heading, level_vector, model_declination_sigma
 from magbridge.errors import CalibrationError
 from sitl import load, simulate
@@ -149,6 +150,8 @@ def test_correct_writes_the_heading_of_a_log_and_states_its_error() -> None:
     sigma = corrected["heading_sigma"].to_numpy()[good]
     assert np.sqrt(np.mean(error**2)) < 2.0
     assert 0.3 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.6
+    expected = expected_heading_sigma(found.calibration, runs)  # without the declination's part
+    assert 0.5 * np.median(sigma) < expected < 1.5 * np.median(sigma)
     shift = difference_deg(corrected["heading"].to_numpy(), corrected["magnetic_heading"].to_numpy())
     np.testing.assert_allclose(shift[good], corrected["declination"].to_numpy()[good], atol=1e-9)
 

@@ -84,7 +84,8 @@ def test_what_headings_are_counted_from_may_be_told(deployment: Path, command: C
     boresights = []
     for reference in ("true", "magnetic"):
         options = "--method", "nominal", "--heading-reference", reference
-        command("calibrate", deployment, *options, "-o", "cal.json")
+        text = command("calibrate", deployment, *options, "-o", "cal.json").out
+        assert re.search(r"; magnetic heading \d+\.\d\d deg \(1-sigma, with roll and pitch good", text)
         boresights.append(load_calibration("cal.json").boresight)
     assert boresights[0] is not None
     assert boresights[0] == boresights[1]  # roll and pitch determine it, not the headings
@@ -94,7 +95,7 @@ def test_a_fit_can_be_looked_at(deployment: Path, command: Command) -> None:
     """Also where the log tells of no attitude, and a parameter has no part in the fit."""
     write(read(deployment).drop_vars(["roll", "pitch", "heading"]), "bare.csv")
     fitted = "calibrate", "bare.csv", "--method", "nominal", "--parameter", "battpos"
-    command(*fitted, "-o", "cal.json", "--plot", "fit.png")
+    assert "no heading, which needs roll" in command(*fitted, "-o", "cal.json", "--plot", "fit.png").out
     assert Path("fit.png").stat().st_size > 40_000
 
 
