@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
-from magbridge.bridge.address import parse
 from magbridge.bridge.peers import Peers
 from magbridge.bridge.port import Port
 from magbridge.bridge.serial_port import may_be_device, serial_line
-from magbridge.bridge.tcp import TcpClient, TcpServer
-from magbridge.bridge.udp import UdpPort
+from magbridge.bridge.sockets import TcpClient, TcpServer, UdpPort, parse_address
 from magbridge.errors import ConfigError
 
 __all__ = ["LINKS", "open_link"]
@@ -65,9 +63,9 @@ def open_link(
             raise ConfigError(source, key, f"expected {known} or a serial device, got {url!r}")
         return serial_line(url.removeprefix("serial:"), baudrate, source, key)
     try:
-        host, port = parse(address)
+        host, port = parse_address(address)
         if not port and kind in ("udpout", "tcp"):  # of one's own, 0 is any that is free
-            raise ValueError(url)  # noqa: TRY301 - as `parse` does
+            raise ValueError(url)  # noqa: TRY301 - as `parse_address` does
     except ValueError as error:
         raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error
     if kind in OWN:

@@ -17,8 +17,7 @@ from urllib.parse import urlsplit
 
 import serial
 
-from magbridge.bridge.port import CHUNK
-from magbridge.bridge.stream import PacedPort
+from magbridge.bridge.port import CHUNK, PacedPort
 from magbridge.errors import ConfigError, PortError
 
 __all__ = ["SerialPort", "may_be_device", "serial_line"]
@@ -38,18 +37,12 @@ class SerialPort(PacedPort):
     """A serial line by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
 
     def __init__(self, name: str, baudrate: int) -> None:
-        super().__init__(name, round(baudrate / 10 * LEAD))
+        super().__init__(name, round(baudrate / 10 * LEAD), CHUNK, "hung up")
         self.baudrate = baudrate
         self._last = self._passed = ""
         self._idle_at = -inf
         self._serial: Any = None
-        self._fd = -1
         self._pump: _Pump | None = None
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the device is open."""
-        return self._serial is not None
 
     def open(self) -> None:
         """Open the first device that the name or pattern finds; raises :class:`PortError`."""
@@ -66,11 +59,11 @@ class SerialPort(PacedPort):
                 reason = _reason(error)
                 continue
             try:
-                self._fd = opened.fileno()
+                descriptor = opened.fileno()
             except (AttributeError, OSError):  # loop:// and rfc2217:// have no descriptor
                 self._pump = _Pump(opened)
-                self._fd = self._pump.fd
-            self._serial, self._last = opened, name
+                descriptor = self._pump.fd
+            self._serial, self._last, self._fd = opened, name, descriptor
             return
         raise PortError(self.name, str(reason))
 
@@ -87,24 +80,13 @@ class SerialPort(PacedPort):
         found = glob.glob(self.name)  # noqa: PTH207 - it may be absolute, which pathlib does not glob
         return sorted(found, key=lambda name: (name <= self._passed, name))
 
-    def fds(self) -> list[int]:
-        """Return the one descriptor, if open."""
-        return [self._fd] if self._serial is not None else []
-
     def read(self) -> bytes:
         """Return what has come; an end of file or an error on the line is a lost port.
 
         A backlog is returned as a whole: of an instrument without a clock, only the last reading's time of
         arrival says when it was sent.
         """
-        try:
-            data = os.read(self._fd, CHUNK)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise self.lost(error.strerror) from error
-        if not data:
-            raise self.lost("hung up")
+        data = super().read()
         return data if len(data) < PIECE else data + self._backlog()
 
     def _backlog(self) -> bytes:
@@ -140,15 +122,13 @@ class SerialPort(PacedPort):
         return room
 
     def _put(self, data: bytes | bytearray) -> int:
-        try:
-            if self._pump is not None:
+        if self._pump is not None:
+            try:
                 self._serial.write(data)
-                return len(data)
-            sent = os.write(self._fd, data)
-        except BlockingIOError:
-            return 0
-        except (serial.SerialException, OSError) as error:
-            raise self.lost(_reason(error)) from error
+            except (serial.SerialException, OSError) as error:
+                raise self.lost(_reason(error)) from error
+            return len(data)
+        sent = super()._put(data)
         if self._idle_at > -inf:
             self._idle_at = max(self._idle_at, time.monotonic()) + sent * 10 / self.baudrate
         return sent

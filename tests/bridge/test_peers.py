@@ -16,7 +16,7 @@ import pytest
 from magbridge.bridge.links import open_link
 from magbridge.bridge.peers import ANSWERED, KNOWN, SHARE, Peers
 from magbridge.bridge.port import Port
-from magbridge.bridge.tcp import CONNECTIONS
+from magbridge.bridge.sockets import CONNECTIONS
 from magbridge.mavlink import Codec
 
 PILOT = (1, 1)
@@ -213,7 +213,7 @@ def test_connections_never_turn_the_autopilot_out() -> None:
 
 
 def test_a_client_that_only_listens_has_to_go_for_one_that_speaks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("magbridge.bridge.tcp.GREETING", 0.0)
+    monkeypatch.setattr("magbridge.bridge.sockets.GREETING", 0.0)
     with opened("tcpin") as (port, place), ExitStack() as stack:
         mute = [stack.enter_context(socket.create_connection(place)) for _ in range(CONNECTIONS)]
         for _ in mute:

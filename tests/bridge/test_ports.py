@@ -23,9 +23,9 @@ from magbridge.bridge.events import HostClock
 from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.peers import Peers
+from magbridge.bridge.port import MAX_WAIT_S, MAX_WAITING_MESSAGES
 from magbridge.bridge.serial_port import SerialPort
-from magbridge.bridge.stream import MAX_WAIT_S, MAX_WAITING_MESSAGES
-from magbridge.bridge.tcp import TcpServer
+from magbridge.bridge.sockets import TcpServer
 from magbridge.errors import ConfigError, PortError
 from magbridge.mavlink import Codec, Message, Signing
 from magbridge.records import Channel

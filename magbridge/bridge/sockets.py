@@ -1,60 +1,72 @@
-"""A link by TCP, as client or server."""
+"""Links by TCP (client and server) and by UDP, and their addresses: HOST:PORT or [IPV6]:PORT."""
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import select
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterator
 from contextlib import suppress
-from typing import cast
+from ipaddress import IPv6Address
+from operator import itemgetter
+from typing import Any, cast
 
-from magbridge.bridge.address import resolve
-from magbridge.bridge.peers import Peer, Peers
-from magbridge.bridge.port import Port
-from magbridge.bridge.stream import PacedPort
+from magbridge.bridge.peers import SHARE, Peer, Peers
+from magbridge.bridge.port import CHUNK, PacedPort, Port, cut
 from magbridge.errors import PortError
 
-__all__ = ["TcpClient", "TcpServer"]
+__all__ = ["TcpClient", "TcpServer", "UdpPort", "parse_address"]
 
+ADDRESS = re.compile(r"(?://)?(?:\[(?P<ipv6>.+)\]|(?P<host>[^:]*)):(?P<port>[0-9]{1,5})")
 UNSENT = 4096
 """Bytes that may wait in the system for a slow connection; the rest waits here, where it can be dropped."""
-SHARE = 8192
-"""Bytes of a connection that are read before the sensor's turn: a flood of them is parsed in some 10 ms."""
 CONNECTIONS = 16
 """Most clients of a server; for another one, one that has said nothing valid has to go."""
 GREETING = 0.2
 """s that a client has to say something valid before it has to go for another."""
 ACCEPTED = 4
 """Most clients that are accepted before the sensor's turn."""
+PEER_TIMEOUT = 30.0
+"""s without a packet after which the peer of ``udpout`` is connected again."""
+DATAGRAM = 1400
+"""Bytes that a packet carries on any usual network: more is split on the way, and 64 kB are refused."""
+DATAGRAMS = 512
+"""Most that are read before the sensor's turn: empty ones could keep it waiting for ever."""
+AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
+"""What a UDP socket reports when no program listens (yet): not a fault of the port."""
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """Return host and port; raises ValueError."""
+    match = ADDRESS.fullmatch(text)
+    if match is None or int(match["port"]) > 65535:
+        raise ValueError(text)
+    if match["ipv6"]:
+        return str(IPv6Address(match["ipv6"])), int(match["port"])
+    match["host"].encode("idna")  # raises UnicodeError, as looking it up would
+    return match["host"], int(match["port"])
+
+
+def resolve(address: tuple[str, int], kind: int, *, listen: bool) -> tuple[int, Any]:
+    """Return the family and the socket address of a host; of a name that has both, IPv4's. Raises OSError."""
+    host, port = address
+    found = socket.getaddrinfo(host or None, port, type=kind, flags=socket.AI_PASSIVE if listen else 0)
+    family, *_, resolved = min(found, key=itemgetter(0))
+    return family, resolved
 
 
 class _Connection(PacedPort):
     """One TCP connection."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, UNSENT)
+        super().__init__(name, UNSENT, SHARE, "closed by the other end")
         self._connection: socket.socket | None = None
 
-    def fds(self) -> list[int]:
-        """Return the connection's descriptor, if there is one."""
-        return [self._connection.fileno()] if self._connection is not None else []
-
-    def read(self) -> bytes:
-        """Return what has come."""
-        assert self._connection is not None
-        try:
-            data = self._connection.recv(SHARE)
-        except BlockingIOError:
-            return b""
-        except OSError as error:
-            raise self.lost(error.strerror) from error
-        if not data:
-            raise self.lost("closed by the other end")
-        return data
-
     def write(self, data: bytes) -> None:
-        """Send as :meth:`Stream.write` does; without a connection, `data` are dropped."""
+        """Send as :meth:`PacedPort.write` does; without a connection, `data` are dropped."""
         if self._connection is None:
             self.dropped += len(data)
         else:
@@ -62,15 +74,6 @@ class _Connection(PacedPort):
 
     def _room(self) -> bool:
         return self._connection is not None and bool(select.select([], [self._connection], [], 0)[1])
-
-    def _put(self, data: bytes | bytearray) -> int:
-        assert self._connection is not None
-        try:
-            return self._connection.send(data)
-        except BlockingIOError:
-            return 0
-        except OSError as error:
-            raise self.lost(error.strerror) from error
 
     def write_all(self, data: bytes) -> None:
         """Send `data` whole, waiting for a slow reader."""
@@ -85,18 +88,13 @@ class _Connection(PacedPort):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
         self.close()
-        self._connection = connection
-
-    @property
-    def is_open(self) -> bool:
-        """Whether there is a connection."""
-        return self._connection is not None
+        self._connection, self._fd = connection, connection.fileno()
 
     def close(self) -> None:
         """Close the connection and forget what was to be sent on it."""
         if self._connection is not None:
             self._connection.close()
-        self._connection = None
+        self._connection, self._fd = None, -1
         self._forget()
 
 
@@ -136,8 +134,9 @@ class TcpServer(Port):
     """
 
     def __init__(self, name: str, address: tuple[str, int], peers: Peers, *, signed: bool = False) -> None:
-        super().__init__(name)
-        self._address, self._peers, self._signed = address, peers, signed
+        super().__init__(name, peers)
+        self._peers: Peers
+        self._address, self._signed = address, signed
         self._listener: socket.socket | None = None
         self._clients: dict[int, _Client] = {}
 
@@ -225,14 +224,6 @@ class TcpServer(Port):
         """Return the descriptors of clients that take more once they are writable."""
         return [fd for fd, client in self._clients.items() if client.waiting]
 
-    def credit(self, frames: Iterable[bytes]) -> None:
-        """Answer, from now on, who sent these frames."""
-        self._peers.credit(frames)
-
-    def notice(self) -> str:
-        """Return something to tell about the clients, once."""
-        return self._peers.notices.popleft() if self._peers.notices else ""
-
     def write_all(self, data: bytes) -> None:
         """Send `data` whole to every client, waiting for a slow reader."""
         for client in self._clients.values():
@@ -261,3 +252,142 @@ class TcpServer(Port):
     def _dismiss(self, fd: int) -> None:
         self._clients.pop(fd).close()
         self._peers.forget(fd)
+
+
+class UdpPort(Port):
+    """``udpout`` sends to one address; ``udpin``, given its `peers`, answers those of them that are valid."""
+
+    def __init__(self, name: str, address: tuple[str, int], peers: Peers | None = None) -> None:
+        super().__init__(name, peers)
+        self._address = address
+        self._socket: socket.socket | None = None
+        self._received = 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the socket is open."""
+        return self._socket is not None
+
+    def open(self) -> None:
+        """Bind or connect; raises :class:`PortError`."""
+        try:
+            opened = self._new()
+        except OSError as error:
+            raise PortError(self.name, error.strerror or str(error)) from error
+        self._socket, self._received = opened, time.monotonic()
+
+    def tend(self) -> None:
+        """Connect again if nothing has come for long, and the host, or we, have another address by now."""
+        opened, now = self._socket, time.monotonic()
+        if opened is None or self._peers is not None or now - self._received < PEER_TIMEOUT:
+            return
+        self._received = now
+        with suppress(OSError), self._new() as new:  # not known at present, or closed meanwhile
+            if _ends(new) != _ends(opened):
+                # the same descriptor, because the bridge may be waiting for it
+                os.dup2(new.fileno(), opened.fileno(), inheritable=False)
+
+    def _new(self) -> socket.socket:
+        """Return a socket that is bound or connected; raises OSError."""
+        listen = self._peers is not None
+        family, address = resolve(self._address, socket.SOCK_DGRAM, listen=listen)
+        opened = socket.socket(family, socket.SOCK_DGRAM)
+        opened.setblocking(False)
+        opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        try:
+            (opened.bind if listen else opened.connect)(address)
+        except OSError:
+            opened.close()
+            raise
+        return opened
+
+    def fds(self) -> list[int]:
+        """Return the one descriptor, if open."""
+        return [self._socket.fileno()] if self._socket is not None else []
+
+    def read(self) -> bytes:
+        """Return the datagrams that have come; an unreachable peer is nothing, not an error.
+
+        All that are waiting are returned at once, as from a stream, so that samples that queued up while the
+        bridge stood still meet the telemetry that queued up with them.
+        """
+        assert self._socket is not None
+        datagrams: list[bytes] = []
+        size = 0
+        while size < CHUNK and len(datagrams) < DATAGRAMS:
+            try:
+                datagram, peer = self._socket.recvfrom(CHUNK)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                if datagrams or error.errno in AWAY:
+                    break  # first return what has come
+                raise self.lost(error.strerror) from error
+            size += len(datagram)
+            datagrams.append(datagram)
+            if self._peers is not None:
+                self._peers.receive(peer, datagram)
+        if datagrams:
+            self._received = time.monotonic()
+        return b"".join(datagrams) if self._peers is None else self._peers.drain()
+
+    def write(self, data: bytes) -> None:
+        """Send to each peer, mostly one datagram; what cannot be sent is dropped and counted."""
+        if self._peers is None:
+            self._send(data, None)
+            return
+        for peer in self._peers.answered():
+            if self._peers.affords(peer, len(data)):
+                self._send(data, peer.address)
+
+    def write_to(self, sender: tuple[int, int], data: bytes) -> None:
+        """Send only to the peer from which a system and component was last heard."""
+        if self._peers is None:
+            self._send(data, None)
+        elif (peer := self._peers.route(sender)) is not None and self._peers.affords(peer, len(data)):
+            self._send(data, peer.address)
+
+    def _send(self, data: bytes, peer: Any) -> None:
+        for datagram in _datagrams(data):
+            self._send_one(datagram, peer)
+
+    def _send_one(self, data: bytes, peer: Any) -> None:
+        assert self._socket is not None
+        try:
+            if peer is None:
+                self._socket.send(data)
+            else:
+                self._socket.sendto(data, peer)
+        except BlockingIOError:
+            self.overran(data)
+        except OSError as error:
+            self.dropped += len(data)
+            if self._peers is not None:  # an address that cannot be sent to, as one with port 0, is no fault
+                self._peers.forget(peer)
+            elif error.errno not in AWAY:
+                raise self.lost(error.strerror) from error
+
+    def close(self) -> None:
+        """Close the socket."""
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+
+
+def _datagrams(data: bytes) -> Iterator[bytes]:
+    """Yield `data` in datagrams of whole messages: after a standstill, thousands are sent at once."""
+    if len(data) <= DATAGRAM:
+        yield data
+        return
+    begun = b""
+    for frame in cut(data):
+        if len(begun) + len(frame) > DATAGRAM:
+            yield begun
+            begun = b""
+        begun += frame
+    yield begun
+
+
+def _ends(connected: socket.socket) -> tuple[Any, Any]:
+    """Return our own address, without its port, and the peer's."""
+    return connected.getsockname()[0], connected.getpeername()
