@@ -15,6 +15,7 @@ from magbridge.monitor.history import TIERS
 from magbridge.monitor.learning_panel import LearningPanel
 from magbridge.monitor.link import StationLink, now
 from magbridge.monitor.panels import Figures, Flags, Health, Navigation, Parameters, Texts
+from magbridge.monitor.rose import CompassRose
 from magbridge.monitor.state import State
 from magbridge.monitor.track import Background
 from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, RED, STYLE, Changes, slanted
@@ -71,7 +72,9 @@ class Page:
         self._body.clear()
         with self._body:
             with ui.element().classes(f"{GRID} md:grid-cols-[18rem_minmax(0,1fr)]"):
-                self._figures = Figures(state)
+                with ui.column().classes("w-full gap-4"):
+                    self._figures = Figures(state)
+                    self._rose = CompassRose()
                 self._total = TotalField(self._tier, self._set_tier)
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
                 with ui.column().classes("w-full gap-4"):
@@ -103,7 +106,7 @@ class Page:
         self._offer(list(states))
         state, moment = self._state, now()
         self._show_stream(state, moment)
-        panels = self._figures, self._flags, self._health, self._navigation, self._learning
+        panels = self._figures, self._rose, self._flags, self._health, self._navigation, self._learning
         for panel in (*panels, self._texts, self._parameters):
             panel.show(state, moment)
         self._sound = self._alarms.sound

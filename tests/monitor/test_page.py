@@ -30,6 +30,7 @@ def test_page(page: Station) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.settimeout(10)
         field = {"total_field": 52_134.268, "total_field_sigma": 0.6, "time_usec": 10**15, "flags": 4}
+        field |= {"magnetic_heading": 20.0, "heading": 3.25, "heading_sigma": 0.75}
         sender.sendto(bridge.pack("MAG_FIELD", **field), link)
         received_at = Codec(1, 191).parse(sender.recv(4096))
         assert received_at[0].name in {"HEARTBEAT", "PARAM_REQUEST_LIST"}
@@ -46,6 +47,7 @@ def test_page(page: Station) -> None:
         shown = (
             "52\u202f134.27",
             "± 1.20",
+            "003.2\N{DEGREE SIGN} true ± 1.5\N{DEGREE SIGN}",
             "live, flagged",
             "A mass is moving",
             "49.50000, -57.90000",

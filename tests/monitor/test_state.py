@@ -18,6 +18,7 @@ from magbridge.monitor.bundle import bundle
 from magbridge.monitor.chart import drawn
 from magbridge.monitor.fleet import MOST, Fleet
 from magbridge.monitor.history import TIERS
+from magbridge.monitor.rose import heading_text, rose_picture
 from magbridge.monitor.state import TEMPERATURE, State
 from magbridge.monitor.track import series as track_series
 from magbridge.monitor.words import ago, health, learnt, measured, silence, whereabouts
@@ -55,6 +56,20 @@ class Air:
 @pytest.fixture
 def air() -> Air:
     return Air()
+
+
+def test_the_rose_shows_the_heading_with_its_band(air: Air) -> None:
+    assert heading_text(air.state.field).startswith("No heading")
+    assert "<path" not in rose_picture(air.state.field)
+    air.field(NOW, magnetic_heading=100.0, heading=90.0, heading_sigma=15.0)
+    # 30 deg either side of east: from (80 sin 60, -80 cos 60) to (80 sin 120, -80 cos 120)
+    assert 'd="M 0 0 L 69.28 -40.0 A 80.0 80.0 0 0 1 69.28 40.0 Z"' in rose_picture(air.state.field)
+    assert heading_text(air.state.field) == "090.0\N{DEGREE SIGN} true ± 30.0\N{DEGREE SIGN}"
+    air.field(NOW, magnetic_heading=100.0, heading=nan, heading_sigma=120.0)
+    assert "100.0\N{DEGREE SIGN} magnetic" in heading_text(air.state.field)
+    assert '<circle r="80.0" fill="#3b82f6"' in rose_picture(air.state.field)
+    air.field(NOW, magnetic_heading=0.0, heading=0.0, heading_sigma=0.0)
+    assert heading_text(air.state.field).startswith("No heading")
 
 
 def test_silence_is_told(air: Air) -> None:
