@@ -4,9 +4,10 @@ A multiplexed converter samples one channel after the other: all are brought to 
 (:mod:`magbridge.one_time`). The anti-alias filter delays the field by ``filter_delay``; the sample's time is
 corrected for that, and the telemetry is looked up at the corrected time.
 
-While the process was held up, readings and telemetry waited. What has a time of its own (the instrument's
-clock, the autopilot's by TIMESYNC) keeps it; what has none was taken at some time of the standstill. A sample
-for which either is guessed is flagged ``late_join``, its parameters anywhere between their values meanwhile.
+While the process was held up, readings and telemetry waited. Inputs with a time of their own (the
+instrument's clock, the autopilot's by TIMESYNC) keep it; inputs without one may be of any time of the stall.
+A sample for which either is guessed is flagged ``late_join``, its parameters anywhere between their values
+meanwhile.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class Aligner:
         Of the inputs, and of what else is watched.
     channels : OneTime
     late_since_us : int
-        µs, not 0 while what comes may have waited, at most since then.
+        Start of the stall, µs, or 0: inputs may have waited at most since then.
     motion_since_us : int
         Time of the last report before the motion of the last sample, µs.
     """
@@ -124,7 +125,7 @@ class Aligner:
             self.by_name[name] = Track(Input(name, nan, nan, max_age))
 
     def follow(self, names: tuple[str, ...]) -> None:
-        """Let the inputs be `names`, in the order of another calibration; each is an input or watched."""
+        """Set the inputs to `names`, in the order of another calibration; each is an input or watched."""
         self.tracks = tuple([self.by_name[name] for name in names])
 
     def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
@@ -239,7 +240,7 @@ class Aligner:
         return tuple(values), tuple(spans), oldest, quality, variance
 
     def _is_gap(self, time_us: int) -> bool:
-        """Say whether samples are missing before `time_us`.
+        """Return True if samples are missing before `time_us`.
 
         The time since the last reading is a gap when it exceeds ``gap_factor`` times both the mean period and
         the interval before it: an instrument that is set to sample less often is flagged once, not for ever.

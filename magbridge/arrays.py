@@ -1,4 +1,4 @@
-"""The arrays that docstrings speak of; shapes and units are said there."""
+"""Array types, for annotations; docstrings give the shapes and units."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ IntArray = NDArray[np.int64]
 
 
 def plain(value: object) -> object:
-    """Return a numpy number as Python's, for msgspec, which encodes no other.
+    """Return a numpy number as Python's, for msgspec, which encodes only those.
 
-    NotImplementedError: it is no number of numpy's.
+    NotImplementedError: it is not a numpy number.
     """
     if isinstance(value, np.generic):
         return value.item()

@@ -153,9 +153,9 @@ YEAR_1980 = 315_532_800.0
 
 
 def counts_from_boot(deployment: xr.Dataset) -> bool:
-    """Say whether a deployment's times count from a boot, on an unknown day.
+    """Return True if a deployment's times count from a boot, on an unknown day.
 
-    So its log says (``time_reference = boot``), or they are before 1980.
+    The log states it (``time_reference = boot``), or the times are before 1980.
     """
     time = deployment["time"].values
     reference = deployment.attrs.get("time_reference")
@@ -216,7 +216,7 @@ def factor(unit: str, column: str) -> float | None:
     """Return the factor from `unit` to the unit of `column`; None without a conversion.
 
     A column that is not in :data:`COLUMNS` keeps the unit it declares: its factor is 1. The factor of an
-    undeclared unit is 1, too (empty, or the 1 that is then written).
+    undeclared unit is 1, too (empty, or then written as 1).
     """
     if unit in ("", "1"):
         return 1.0
@@ -236,7 +236,7 @@ def usual(unit: str) -> str:
 
 
 def may_be(unit: str, other: str) -> bool:
-    """Whether two units can be the same; either may be undeclared (empty, or the 1 that is then written)."""
+    """Return True if two units can be equal; either may be undeclared (empty, or then written as 1)."""
     return {unit, other} & {"", "1"} != set() or usual(unit) == usual(other)
 
 

@@ -69,7 +69,7 @@ class Link(Table, frozen=True):
     request_streams: bool = True
     """Request from the autopilot the messages that the bridge needs, if they arrive too rarely."""
     parameters: Name | None = None
-    """File that keeps parameters changed over the link; by default ``bridge.parameters.json`` beside a
+    """File that keeps parameters changed over the link; by default ``bridge.parameters.json`` next to a
     configuration called ``bridge.toml``."""
 
     def __post_init__(self) -> None:
@@ -78,7 +78,7 @@ class Link(Table, frozen=True):
 
     @property
     def shared(self) -> bool:
-        """Whether anyone can come to the link: what is read of it are then whole frames of each peer."""
+        """Return True if the link has many possible peers: it then reads whole frames of each."""
         return self.url.startswith(("udpin:", "tcpin:"))
 
 
@@ -102,7 +102,7 @@ class Telemetry(Table, frozen=True):
     offset: float = 0.0
     """`scale`, `offset`: As above."""
     unit: str = ""
-    """Of the parameter, as in the calibration."""
+    """Unit of the parameter, as in the calibration."""
     max_age: Positive = 30.0
     """s; an older value is stale."""
     delay: float = 0.0
@@ -186,7 +186,7 @@ class Learning(Table, frozen=True):
     """``[learning]``: the calibration's coefficients are learned in flight."""
 
     enabled: bool = False
-    """Whether it learns from the start; ``MB_LEARN`` changes that over the link."""
+    """True to learn from the start; ``MB_LEARN`` changes that over the link."""
     reference: Name = "igrf"
     """What the corrected field is compared with: ``igrf``, or an anomaly grid's file, above the IGRF."""
     map_sigma: NotNegative = 20.0
@@ -194,10 +194,10 @@ class Learning(Table, frozen=True):
     """`map_sigma`, `position_sigma`: nT and m: how well that grid is known, and the vehicle's position on it.
     """
     prior: Name | None = None
-    """Without ``[calibration]``: a calibration file that says what is expected of a vehicle of this class."""
+    """Without ``[calibration]``: a calibration file with the prior of a vehicle of this class."""
     ranges: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
-    """Without both: the parameters of moving masses, each with the least and the greatest value. What is
-    expected is then what any vehicle can have."""
+    """Without both: the parameters of moving masses, each with the least and the greatest value. The prior is
+    then that of any vehicle."""
     max_rate: Annotated[float, Meta(gt=0, le=20)] = 1.0
     """Hz: samples that are learned from, at most."""
     directory: Name | None = None

@@ -44,12 +44,12 @@ class Correction:
     settings : Align, optional
         If not given, and :func:`~magbridge.rows.correct_rows` corrects a bridge's own log: that bridge's.
     learner : Learner, optional
-        Learns from the samples; what it publishes is used from the next sample on.
+        Learns from the samples; its published calibration is used from the next sample on.
 
     Attributes
     ----------
     notices : list of str
-        What was found doubtful since the caller has last emptied it, each once.
+        Messages about flagged samples since the caller last emptied the list, each once.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Correction:
         main_field: float = nan,
         where: tuple[float, float] | None = None,
     ) -> tuple[Sample, Corrected]:
-        """Align and correct one reading, and judge what comes out.
+        """Align and correct one reading, and check the result.
 
         Parameters
         ----------

@@ -53,7 +53,7 @@ class WrongUse(MagbridgeError):
 
 
 class ConfigError(WrongUse, ValueError):
-    """A key of a configuration or scenario file: ``file: key: what was expected``."""
+    """A key of a configuration or scenario file: ``file: key: expected ...``."""
 
     def __init__(self, file: str | Path, key: str, expected: str) -> None:
         self.file, self.key, self.expected = Path(file), key, expected
@@ -61,11 +61,11 @@ class ConfigError(WrongUse, ValueError):
 
 
 class DataError(MagbridgeError):
-    """The data do not allow what was asked."""
+    """The data do not allow the operation."""
 
 
 class FormatError(DataError, ValueError):
-    """A file whose content is wrong: ``file: row 3, column 'mag_x': what was expected``."""
+    """A file whose content is wrong: ``file: row 3, column 'mag_x': expected ...``."""
 
     def __init__(
         self, file: str | Path, expected: str, *, row: int | None = None, column: str | None = None
@@ -84,7 +84,7 @@ class NoSolutionError(CalibrationError):
 
 
 class OutOfRange(DataError, ValueError):
-    """A date, position or grid cell outside the data: ``what = value: what is covered``."""
+    """A date, position or grid cell outside the data: ``quantity = value: expected range``."""
 
     def __init__(self, what: str, value: object, covered: str) -> None:
         self.what, self.value, self.covered = what, value, covered

@@ -20,10 +20,10 @@ ROOM = 1 << 20
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a path beside `path` to write to; rename it onto `path` when the block succeeds.
+    """Yield a path next to `path` to write to; rename it onto `path` when the block succeeds.
 
-    The file is synced to the disk before it is renamed. When the block raises, what was written is removed
-    and `path` is as it was. The partial file of a process that was killed is removed at the next write. The
+    The file is synced to the disk before it is renamed. When the block raises, the partial file is removed
+    and `path` is unchanged. The partial file of a process that was killed is removed at the next write. The
     suffix is kept, because some writers choose the format by it.
 
     WriteError: the operating system does not let the file be written: no folder, no permission, a full disk.
@@ -70,7 +70,7 @@ def existing(path: Path) -> Path:
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file or folder; a calibration keeps those of what it was fitted to."""
+    """Return the SHA-256 of a file or folder; a calibration stores those of its inputs."""
     if path.is_dir():  # a bag: one log in several files
         parts = [digest(file) for file in sorted(path.iterdir()) if file.is_file()]
         return sha256("".join(parts).encode()).hexdigest()
@@ -114,7 +114,7 @@ def systems_reason(path: Path) -> Iterator[None]:
 
 
 def _clear(target: Path) -> None:
-    """Remove partial files beside `target` whose processes no longer run."""
+    """Remove partial files next to `target` whose processes no longer run."""
     partial = re.compile(rf"\.{re.escape(target.stem)}\.(\d+)\.partial{re.escape(target.suffix)}")
     for path in target.parent.iterdir():
         found = partial.fullmatch(path.name)
@@ -123,7 +123,7 @@ def _clear(target: Path) -> None:
 
 
 def _runs(process: int) -> bool:
-    """Say whether a process runs; True where that cannot be found out."""
+    """Return True if a process runs, or if that cannot be found out."""
     if os.name != "posix":  # elsewhere, os.kill(process, 0) may end the process
         return True
     try:

@@ -1,7 +1,7 @@
 """A damaged file read where it can be ended: in a child process with limits on time and memory.
 
 A library that was written for whole files may never end on a damaged one, ask for all memory or crash, and
-take the process with it. In a child, each of these is an error that names the file. What was read comes back
+take the process with it. In a child, each of these is an error that names the file. The result comes back
 through a pipe, piece by piece; for a whole file that costs the fork and one copy.
 """
 
@@ -93,8 +93,8 @@ def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
 
     Notes
     -----
-    Where there is no fork (Windows), or a process may have no children (a worker of a pool), it is read
-    here: then a crash ends the process, and nothing limits the time.
+    Without fork (Windows), or where a process may not have children (a worker of a pool), this process reads
+    the file: then a crash ends the process, and nothing limits the time.
     """
     one = Guarded([Job(path, read)])
     try:
@@ -116,7 +116,7 @@ class Guarded:
         self._child: _Child | None = None
 
     def pieces(self, k: int) -> Iterator[Any]:
-        """Yield what is read of a file, once; of files before it, what was read is kept."""
+        """Yield the pieces of a file, once; the pieces of files before it are kept."""
         import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
 
         if sys.platform == "win32" or multiprocessing.current_process().daemon:
@@ -167,7 +167,7 @@ class _Child:
         with warnings.catch_warnings():
             warnings.simplefilter(
                 "ignore", DeprecationWarning
-            )  # of a fork beside threads: the child uses none
+            )  # of a fork with other threads: the child uses none
             self._process.start()
         end.close()
         self.end = weakref.finalize(self, _end, self._process, self._pieces)
@@ -240,7 +240,7 @@ def _send(end: Connection, jobs: Sequence[Job]) -> None:
 
 
 def _limit(seconds: int, memory: int) -> None:
-    """Limit this process to `seconds` of processor time and `memory` bytes beyond what it has taken."""
+    """Limit this process to `seconds` of processor time and `memory` bytes beyond its present use."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _set(resource.RLIMIT_CPU, round(used.ru_utime + used.ru_stime) + seconds)
@@ -263,7 +263,7 @@ def _set(kind: int, limit: int) -> None:
 
 
 def _ended_by(code: int, seconds: int) -> str:
-    """Return what was wrong with a file whose child ended with this exit code."""
+    """Return the fault of a file whose child ended with this exit code."""
     if code == -signal.SIGXCPU:
         return f"takes longer than {seconds} s of processor time to read: damaged"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"

@@ -8,9 +8,9 @@ it was, by the parabola through that one and the next, h' later (in Newton's for
 Ashore, the reading before the last is known as well, and :func:`interpolate_to_rows` adds the cubic term.
 
 Live, the next reading is not known. The last term, by which the slope lags behind a vehicle that turns ever
-faster or slower, is left out then; what it was with the slope before counts in the sigma, and the next
-reading settles it. That matters: the lag goes with the attitude, so to what is learned from it, it is no
-noise but a bias.
+faster or slower, is left out then; its value for the previous slope counts in the sigma, and the next
+reading corrects it. That matters: the lag depends on the attitude, so for learning it is not a noise but a
+bias.
 """
 
 from __future__ import annotations
@@ -98,9 +98,9 @@ class OneTime:
     Attributes
     ----------
     variance : float
-        nT², of the last reading's total field: the lag of its slopes.
+        Variance of the last reading's total field from the lag of its slopes, nT².
     settled : tuple of 3 float or None
-        nT, the reading before the last without that lag; None where it is as it was.
+        The last but one reading without that lag, nT; None if it is unchanged.
     """
 
     def __init__(self) -> None:
@@ -169,7 +169,7 @@ class OneTime:
 
 
 def _slope(change: float, step: float, before: float) -> float:
-    """Return a slope, nT/s: of a channel that was not read anew that of `before`, or 0 where it had none."""
+    """Return a slope, nT/s: for a channel that was not read again that of `before`, or 0 if it had none."""
     if step > 0.0:
         return change / step
     return 0.0 if isnan(before) else before

@@ -34,7 +34,7 @@ __all__ = ["corrected", "grid", "residuals"]
 
 
 def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = None) -> Axes:
-    """Draw a corrected log against time: the value with its 2-sigma band, flagged samples apart.
+    """Draw a corrected log against time: the value with its 2-sigma band, flagged samples separately.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def corrected(log: xr.Dataset, column: str = "total_field", ax: Axes | None = No
 def residuals(
     calibration: Calibration, data: Observations, against: str = "time", ax: Axes | None = None
 ) -> Axes:
-    """Draw what a calibration leaves of the total field: a trend is what it does not describe.
+    """Draw the residual of the total field after calibration: a trend is an effect that the model lacks.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""What other packages add, by entry points: drivers, formats, terms, emulated instruments.
+"""Plug-ins of other packages, by entry points: drivers, formats, terms, emulated instruments.
 
-Such code is not ours: whatever it raises ends in one line that names the plug-in, its package and the line of
-code, so that whoever installed it knows whom to tell.
+Every exception of such code ends in one line that names the plug-in, its package and the line of code, so
+that the user knows where to report it.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def load(point: EntryPoint) -> Any:
 
 @contextmanager
 def blamed(point: EntryPoint) -> Iterator[None]:
-    """Turn whatever a plug-in raises, but for errors of ours and of files, into a :class:`PluginError`."""
+    """Turn every exception of a plug-in, except ours and those of files, into a :class:`PluginError`."""
     try:
         yield
     except (MagbridgeError, OSError):
         raise
-    except Exception as error:  # code of others may raise anything
+    except Exception as error:  # a plug-in may raise anything
         called = extract_tb(error.__traceback__)[-1]
         place = f"{Path(called.filename).name}, line {called.lineno}"
         raise PluginError(_name(point), f"{type(error).__name__}: {error} ({place})") from error

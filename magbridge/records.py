@@ -77,7 +77,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     """One measurement of the three channels, as the instrument sent it."""
 
     field: Vector
-    """nT, sensor axes, uncorrected."""
+    """Field, nT, sensor axes, uncorrected."""
     counts: tuple[int, int, int] | None = None
     """The converter's own numbers, where the instrument sends counts."""
     sequence: int | None = None
@@ -104,6 +104,6 @@ class Corrected(msgspec.Struct, frozen=True, gc=False):
     field: Vector
     """nT, body axes (sensor axes while ``no_boresight`` is set)."""
     field_sigma: Vector
-    """nT, 1-sigma of each component."""
+    """1-sigma of each component, nT."""
     quality: int
     """:class:`Quality` bits."""

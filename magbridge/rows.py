@@ -39,15 +39,15 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     correction : Correction
         Keeps its state from one piece to the next.
     deployment : Dataset (time)
-        With ``mag_x mag_y mag_z`` (nT, sensor axes), and the parameters that the calibration needs; what is
-        missing is not known, and the samples are flagged, as live.
+        With ``mag_x mag_y mag_z`` (nT, sensor axes), and the parameters that the calibration needs. Missing
+        values are unknown, and the samples are flagged, as live.
 
     Returns
     -------
     Dataset (time)
         ``total_field total_field_sigma field_x field_y field_z anomaly quality``; ``time`` as in the input.
-        The field is in body axes. The anomaly is the total field minus the IGRF, NaN where there is no
-        position or no date. With roll and pitch, and a boresight in the calibration, the columns of
+        The field is in body axes. The anomaly is the total field minus the IGRF, NaN without a position or a
+        date. With roll and pitch, and a boresight in the calibration, the columns of
         :data:`~magbridge.columns.HEADINGS` (deg) are added. ``level_sigma`` is there where the calibration
         states one. All other columns are in nT, except
         ``quality``, the bits of :class:`~magbridge.records.Quality`. A row without any channel is not a

@@ -82,7 +82,7 @@ class Track:
             self.anchor = time_us, value
 
     def stale(self, time_us: int) -> bool:
-        """Say whether the value is unknown, or older than ``max_age``, at `time_us`."""
+        """Return True if the value is unknown, or older than ``max_age``, at `time_us`."""
         return self.lacking or time_us - self.last_us > self.max_age * 1e6
 
     @property
@@ -91,7 +91,7 @@ class Track:
         return self.history[-2][0] if len(self.history) > 1 else self.last_us
 
     def between(self, begin_us: int) -> tuple[float, float]:
-        """Return the least and the greatest value since `begin_us`, what was held then included."""
+        """Return the least and the greatest value since `begin_us`, including the value held then."""
         low = high = self.last
         for then_us, value in reversed(self.history):
             low, high = min(low, value), max(high, value)

@@ -36,7 +36,7 @@ class StateChanges:
     log_lost : int
         Records that the log has lost.
     since_us, until_us : int
-        µs: what comes up to `until_us` may have waited since `since_us`.
+        µs: inputs up to `until_us` may have waited since `since_us`.
     """
 
     def __init__(self, codec: Codec, announcer: Announcer, sensor: SensorLine) -> None:
@@ -51,7 +51,7 @@ class StateChanges:
         return sum(one["duration"] for one in Codec(0, 0).parse(data) if one.id == STANDSTILL)
 
     def receive(self, data: bytes, time_us: int) -> None:
-        """Take frames that came at `time_us`."""
+        """Process frames received at `time_us`."""
         for message in Codec(0, 0).parse(data):
             if message.id == CLOCK_STEP:
                 self._codec.utc_offset_us += message["step"]

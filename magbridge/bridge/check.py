@@ -40,7 +40,7 @@ class ConfigFault(NamedTuple):
     fatal: bool
     """The bridge would not start; otherwise it would start and wait, or run worse."""
     text: str
-    """One line with the file, the key, and what was expected."""
+    """One line with the file, the key, and the expected value."""
 
 
 def findings(path: Path) -> list[ConfigFault]:
@@ -62,7 +62,7 @@ def findings(path: Path) -> list[ConfigFault]:
     ]
     try:
         config = msgspec.structs.replace(convert(left, Config, path), path=path)
-    except ConfigError:  # without sensor or link nothing more can be said
+    except ConfigError:  # without sensor or link nothing more can be checked
         pass
     else:
         found += dict.fromkeys(_contents(config))
@@ -75,7 +75,7 @@ def findings(path: Path) -> list[ConfigFault]:
 
 
 def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[ConfigError]:
-    """Yield what is wrong with a table: each key is taken out, so that the next is found, too."""
+    """Yield the faults of a table: each faulty key is removed, so that the next is found, too."""
     while True:
         try:
             attempt()
@@ -95,7 +95,7 @@ def _without(table: dict[str, Any], key: str) -> bool:
 
 
 def _contents(config: Config) -> Iterator[ConfigFault]:
-    """Yield what is wrong with what the keys say, each looked at on its own."""
+    """Yield the faults of the values, each checked on its own."""
     path = config.path
     yield from _files(config)
     calibration = None
@@ -140,7 +140,7 @@ def _files(config: Config) -> Iterator[ConfigFault]:
 
 
 def _driver(config: Config) -> Iterator[ConfigFault]:
-    """Yield what is wrong with the driver and its options."""
+    """Yield the faults of the driver and its options."""
     options, sensor = deepcopy(config.sensor.options), config.sensor.driver
     left = {"sensor": {"options": options}}
     for error in _errors(left, lambda: open_driver(sensor, options, config.path)):
@@ -174,7 +174,7 @@ def access(device: str) -> str:
         return ""
     group = _group(device)
     hint = (
-        f": it belongs to the group {group}: sudo usermod -aG {group} $USER, then log in anew"
+        f": it belongs to the group {group}: sudo usermod -aG {group} $USER, then log in again"
         if group
         else ""
     )

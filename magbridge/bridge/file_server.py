@@ -1,8 +1,8 @@
 """Files for stations, read by a thread of its own and sent between the bridge's measurements.
 
 The live thread hands on requests and takes replies, a few messages at a time; it never waits for the disk.
-Replies are not in the log, which would grow by what is read of it: it gets their number, so that a replay
-counts on as the bridge did.
+Replies are not in the log, which would grow by everything that is read of it. The log has their number, so
+that a replay counts on as the bridge did.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class FileServer:
             self._asked.put(request)
 
     def drain(self) -> tuple[Sender, list[Reply]]:
-        """Return what is to be sent now, and to whom; returns at once."""
+        """Return the replies to send now, and their receiver; returns at once."""
         sender, replies = (0, 0), list[Reply]()
         while self._ready and len(replies) < BATCH and (not replies or self._ready[0][0] == sender):
             sender, reply = self._ready.popleft()

@@ -43,7 +43,7 @@ HINTS = {
 
 
 class Gps:
-    """Whether the autopilot's GPS has a position."""
+    """Follow whether the autopilot's GPS has a position."""
 
     def __init__(self) -> None:
         self._last_us = self._since_us = -LONGEST_US

@@ -39,7 +39,7 @@ class Frame:
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Take in a message of the autopilot."""
+        """Process a message of the autopilot."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 

@@ -30,7 +30,7 @@ MAX_ATTITUDE_AGE_US: Final = 1_000_000
 COVARIANCE_INTERVAL_US: Final = 200_000
 """µs for which the covariance of the vector is used again: it changes with attitude and masses, slowly."""
 MAX_PITCH_RAD: Final = radians(89.0)
-"""rad: beyond, roll and heading cannot be told apart."""
+"""Largest pitch at which roll and heading are distinguished, rad."""
 MAX_SENT_SIGMA_DEG: Final = 30.0
 """deg: a heading that is known less well is not sent to the autopilot."""
 MAX_WAITING: Final = 8

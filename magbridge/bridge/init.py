@@ -32,7 +32,7 @@ class Answers:
     parameters: tuple[str, ...] = ()
     """``name`` or ``name [unit]`` of each moving mass."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Of the driver."""
+    """Options of the driver."""
     calibration: str | None = None
     """Its file."""
 

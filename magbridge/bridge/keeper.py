@@ -1,4 +1,4 @@
-"""What must outlive a bridge's process: parameters set over the link, time stamps, what was learned."""
+"""State that outlives a bridge's process: parameters set over the link, time stamps, learned calibrations."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Keeper:
         self._learned = kept_path(config)
 
     def attach(self, edge: LiveEdge) -> None:
-        """Tell `edge` when something cannot be kept, or could not be read; then the file is set aside."""
+        """Attach `edge`, to notify it when the state cannot be stored or read; then the file is set aside."""
         self._notify = edge.notify
         if self._spoilt:
             name = self._path.name
@@ -61,7 +61,7 @@ class Keeper:
         return Start(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
-        """Save what was learned, changed parameters within `SAVE_US`, and time stamps every `KEEP_US`."""
+        """Save the learned calibration, changed parameters within `SAVE_US`, time stamps every `KEEP_US`."""
         learning, path = pipeline.learning, self._learned
         if learning is not None and path is not None and (why := keep(learning, path)):
             self._notify(states.notice(why))
@@ -76,7 +76,7 @@ class Keeper:
     def save(self, pipeline: Pipeline, *, last: bool = False) -> bool:
         """Write the file if its content has changed; return False, the old file kept, where that fails.
 
-        At the `last` saving of a run, no stamp need be reserved for what it will yet send.
+        At the `last` saving of a run, no stamp is reserved for frames still to be sent.
         """
         kept = store.StoredState(pipeline.component.parameters.changed())
         if signing := pipeline.signing:

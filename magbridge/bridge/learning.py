@@ -93,7 +93,7 @@ def open_learner(
 
 
 def kept_path(config: Config) -> Path | None:
-    """Return where the learned calibration is kept: beside the first, or in ``learning.directory``."""
+    """Return the file of the learned calibration: next to the first, or in ``learning.directory``."""
     if config.learning is None:
         return None
     first = config.resolve(config.calibration.file if config.calibration else "cal.json")
@@ -107,7 +107,7 @@ class Learning:
     Attributes
     ----------
     to_keep : deque of Calibration
-        What was published since the caller last emptied it: to be written to a file.
+        Calibrations published since the caller last emptied it, to be written to a file.
     """
 
     def __init__(self, learner: Learner, component: Component) -> None:
@@ -133,7 +133,7 @@ class Learning:
             parameters.set(name, 0.0)
 
     def sample(self, time_us: int) -> None:
-        """Say what a sample has changed, and what is due."""
+        """Publish the changes by a sample, and the messages that are due."""
         learner, component = self.learner, self._component
         for notice in learner.notices:
             severity = MAV_SEVERITY.WARNING if notice.grave else MAV_SEVERITY.NOTICE

@@ -64,7 +64,7 @@ def open_link(
         return serial_line(url.removeprefix("serial:"), baudrate, source, key)
     try:
         host, port = parse_address(address)
-        if not port and kind in ("udpout", "tcp"):  # of one's own, 0 is any that is free
+        if not port and kind in ("udpout", "tcp"):  # as a local port, 0 is any that is free
             raise ValueError(url)  # noqa: TRY301 - as `parse_address` does
     except ValueError as error:
         raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error

@@ -125,7 +125,7 @@ class LiveEdge:
             self._lost(Channel.LINK, error)
 
     def credit(self, frames: list[bytes]) -> None:
-        """Tell the link which frames that it read last are signed by someone who has the key."""
+        """Report to the link which frames that it read last are signed with the key."""
         self._ports[Channel.LINK].credit(frames)
 
     def _flush(self, channel: Channel) -> None:
@@ -179,7 +179,7 @@ class LiveEdge:
         return data
 
     def _too_slow(self, now_us: int) -> bool:
-        """Say whether to report now that the link has dropped data because its buffer was full."""
+        """Return True if it is due to report that the link has dropped data because its buffer was full."""
         overrun = self._ports[Channel.LINK].overrun
         if overrun == self._overrun or now_us < self._slow_us:
             return False

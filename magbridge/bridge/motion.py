@@ -98,7 +98,7 @@ class Motion:
         )  # fmt: skip
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Take in a message of the vehicle."""
+        """Process a message of the vehicle."""
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 
@@ -175,7 +175,7 @@ class Motion:
         velocity: tuple[float, float],
         resets: int = 0,
     ) -> None:
-        """Take in an estimate of position (m, north and east) and velocity (m/s)."""
+        """Process an estimate of position (m, north and east) and velocity (m/s)."""
         stream, own = (message.component, message.id), message.component == self._component.peer[1]
         if own and (not self.gps_trusted or time_us - self._unvouched_us < FRESH_US):
             return

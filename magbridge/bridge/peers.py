@@ -33,7 +33,7 @@ LOOK = 1.0
 
 
 class Peer:
-    """One of them.
+    """A network peer of a port.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Peers:
         self.notices: deque[str] = deque(maxlen=8)
 
     def receive(self, address: Hashable, data: bytes) -> None:
-        """Take the bytes that came from one of them."""
+        """Process the bytes that a peer sent."""
         peer, now = self._peers.get(address), time.monotonic()
         if peer is None:
             peer = self._meet(address)
@@ -112,7 +112,7 @@ class Peers:
                 self._prove(peer, message.frame, now)
 
     def drain(self) -> bytes:
-        """Return what has come since the last time: first the frames, then what belongs to none."""
+        """Return the bytes received since the last call: first the frames, then bytes outside of frames."""
         data = b"".join(self._frames + self._stray)
         self._frames, self._stray, self._strangers = [], [], 0
         for peer in self._peers.values():
@@ -133,7 +133,7 @@ class Peers:
         self._look = 0.0
 
     def is_known(self, address: Hashable) -> bool:
-        """Say whether a peer has lately sent something valid."""
+        """Return True if a peer has lately sent something valid."""
         peer = self._peers.get(address)
         return peer is not None and time.monotonic() - peer.genuine < TIMEOUT
 
@@ -148,11 +148,11 @@ class Peers:
         self._answered = valid[:ANSWERED]
         pilots = sum(now - peer.pilot < TIMEOUT for peer in valid)
         self._notify(f"more than {ANSWERED} peers: the others are not answered", len(valid) > ANSWERED)
-        self._notify("the autopilot speaks from several addresses", pilots > 1)
+        self._notify("the autopilot sends from several addresses", pilots > 1)
         return self._answered
 
     def affords(self, peer: Peer | None, size: int) -> bool:
-        """Say whether `size` bytes may go to a peer (None: one that has said nothing), and count them."""
+        """Return True if `size` bytes may go to a peer (None: one that has sent nothing), and count them."""
         now = time.monotonic()
         if self._budget == inf or (peer is not None and now - peer.pilot < TIMEOUT):
             return True

@@ -1,4 +1,4 @@
-"""The bridge without its ports: events in, frames out. The same events always give the same bytes."""
+"""The bridge without its ports: events in, frames out. Equal events always give equal bytes."""
 
 from __future__ import annotations
 
@@ -310,7 +310,7 @@ class Pipeline:
             )
 
     def _turn(self, message: Message, time_us: int) -> None:
-        """Take the vehicle's attitude, with which the vector's direction is compared."""
+        """Set the vehicle's attitude, with which the vector's direction is compared."""
         if self._direction is not None:
             utc_us = time_us + self.component.codec.utc_offset_us
             self._direction.expect(*self._position.direction(time_us, utc_us))

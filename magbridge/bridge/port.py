@@ -30,7 +30,7 @@ MAX_WAITING_MESSAGES = 512
 RENEWED = {spec(name).id for name in LIMITS}
 """Messages that are sent again and again: a newer one makes an older one worthless."""
 NAMED, NAME = spec("NAMED_VALUE_FLOAT").id, 8
-"""The one of them of which each name is a kind of its own, and where in its payload the name begins."""
+"""Message in which each name is a kind of its own, and the offset of the name in its payload."""
 HEADER, CHECKSUM = 10, 2
 """Bytes of a frame before its payload, and after it."""
 
@@ -44,12 +44,12 @@ class Port(ABC):
         self.dropped = 0
         """Bytes that could not be written."""
         self.overrun = 0
-        """Those of the `dropped` bytes for which an open port had no room, because it is too slow."""
+        """Number of the `dropped` bytes that an open port could not buffer, because it is too slow."""
 
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether bytes can come and go."""
+        """Return True if bytes can be read and written."""
 
     @abstractmethod
     def open(self) -> None:
@@ -64,7 +64,7 @@ class Port(ABC):
 
     @abstractmethod
     def read(self) -> bytes:
-        """Return what has come, when a descriptor is ready; raises :class:`PortError` when the port is gone.
+        """Return the received bytes, when a descriptor is ready; raises :class:`PortError` for a lost port.
 
         A serial line that is ready and yet has nothing is one that hung up, so do not ask when none is ready.
         """
@@ -79,14 +79,14 @@ class Port(ABC):
 
     @property
     def waiting(self) -> bool:
-        """Whether something waits that a slow line had no room for."""
+        """Return True if bytes wait that a slow line could not buffer."""
         return False
 
     def flush(self) -> None:  # noqa: B027 - most ports keep nothing
-        """Go on sending what is waiting; raises :class:`PortError` when the port is gone."""
+        """Continue to send the waiting bytes; raises :class:`PortError` when the port is gone."""
 
     def blocked(self) -> list[int]:
-        """Return the file descriptors that take more of what is waiting once they are writable."""
+        """Return the file descriptors that accept more of the waiting bytes once they are writable."""
         return []
 
     def credit(self, frames: Iterable[bytes]) -> None:
@@ -143,7 +143,7 @@ class PacedPort(Port):
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a descriptor."""
+        """Return True if there is a descriptor."""
         return self._fd >= 0
 
     def fds(self) -> list[int]:
@@ -151,7 +151,7 @@ class PacedPort(Port):
         return [self._fd] if self._fd >= 0 else []
 
     def read(self) -> bytes:
-        """Return what has come; an end of file or an error is a lost port."""
+        """Return the received bytes; an end of file or an error is a lost port."""
         try:
             data = os.read(self._fd, self._share)
         except BlockingIOError:
@@ -178,7 +178,7 @@ class PacedPort(Port):
 
     @property
     def waiting(self) -> bool:
-        """Whether a message, or the rest of one, waits for room."""
+        """Return True if a message, or the rest of one, waits."""
         return bool(self._begun or self._waiting)
 
     def flush(self) -> None:
@@ -194,7 +194,7 @@ class PacedPort(Port):
 
     @abstractmethod
     def _room(self) -> bool:
-        """Say whether what is handed to the system now leaves soon."""
+        """Return True if bytes handed to the system now leave soon."""
 
     def _put(self, data: bytes | bytearray) -> int:
         """Hand `data` to the system; return how many bytes it took. Raises :class:`PortError`."""
@@ -211,7 +211,7 @@ class PacedPort(Port):
         self._begun.clear()
 
     def _begin(self) -> None:
-        """Take the next piece of what waits."""
+        """Start to send the next piece of the waiting bytes."""
         late = time.monotonic() - MAX_WAIT_S
         if self._waiting[0].since < late:
             self._thin(late)

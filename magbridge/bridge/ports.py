@@ -58,7 +58,7 @@ def _described(one: Any) -> str:
 def listen(
     device: str, baudrates: Sequence[int] = BAUDRATES, seconds: float = 1.5
 ) -> tuple[Recognised, int | None, bytes]:
-    """Recognise the sender on a device, at which baud rate, and what came; nothing is sent.
+    """Recognise the sender on a device, its baud rate, and the bytes received; nothing is sent.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def listen(
 def _read(device: str, baudrate: int, seconds: float) -> bytes:
     line = serial.serial_for_url(device, baudrate, timeout=0.1, do_not_open=True)
     line.exclusive = None if "://" in device else True
-    # opening must not reset what is at the other end, as it does an Arduino
+    # opening must not reset the device at the other end, as it does an Arduino
     line.dtr = line.rts = False
     data, end = b"", time.monotonic() + seconds
     with line:

@@ -40,7 +40,7 @@ LOG_LOOK_US = 1_000_000
 def run(path: Path) -> None:
     """Attach to the sensor and the link that a ``bridge.toml`` names, until stopped by a signal.
 
-    What is announced over the link is printed on stderr, too.
+    Announcements over the link are printed on stderr, too.
 
     Parameters
     ----------

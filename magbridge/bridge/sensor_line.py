@@ -57,7 +57,7 @@ class SensorLine:
         Commands that are due; the caller of the pipeline sends them and empties the list.
     wrong_device : bool
         No reading has come since the line was opened, but a timeout or NMEA 0183 has: it may be another
-        instrument's. Whoever opened the line tries another one, if there is one, and sets this back.
+        instrument's. The owner of the line tries another one, if there is one, and resets this.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class SensorLine:
         self.to_send: list[bytes] = []
         self.wrong_device = self._known = False
         self._received_us = start_us
-        # no longer than until the line is taken for silent, so that what is said of it does not depend on it
+        # no longer than until the line counts as silent, so that the message does not depend on it
         self._listen_us = min(LISTEN_US, timeout_us // 2) if searching else 0
         self._commands: tuple[bytes, ...] = ()
         self._tail = b""
@@ -88,14 +88,14 @@ class SensorLine:
         timers.every("sensor", LOOK_US, self._look, start_us + LOOK_US)
 
     def on_reading(self, time_us: int) -> None:
-        """Take note of a reading."""
+        """Record a reading."""
         self._received_us, self._known = time_us, True
         if self.state != OK:
             self.state = OK
             self._announcer.state("sensor", f"{self._name} speaks")
 
     def read(self, field: Vector, time_us: int) -> None:
-        """Take note of what a reading holds (nT); one that stays the same for long is announced."""
+        """Check the values of a reading (nT); one that stays the same for long is announced."""
         if field != self._field:
             self._field, self._repeats, self._since_us = field, 0, time_us
             if self._hangs:
@@ -109,7 +109,7 @@ class SensorLine:
             self._announcer.state("reading", text, MAV_SEVERITY.WARNING)
 
     def on_unparsed(self, data: bytes, time_us: int) -> None:
-        """Take note of bytes that complete no reading."""
+        """Record bytes that complete no reading."""
         self._unparsed_us = time_us
         received = self._tail + data
         self._tail = received[-SENTENCE:]
@@ -123,7 +123,7 @@ class SensorLine:
         self._wake(time_us, self._listen_us)
 
     def lost(self, reason: str) -> None:
-        """Take note that the port is gone."""
+        """Record that the port is gone."""
         self.state = MAG_PORT_STATE.LOST
         self._timers.cancel("command")
         self._announcer.state("sensor", f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)
@@ -138,7 +138,7 @@ class SensorLine:
         self._wake(time_us)
 
     def _unparsed(self) -> str:
-        """Say what comes instead of readings: at a wrong baud rate, bytes that are not text."""
+        """Return a description of the bytes without readings: at a wrong baud rate, they are not text."""
         if not TEXT.fullmatch(self._tail):
             return "sends, but no readings: baud rate?"
         if NOT_A_NUMBER.search(self._tail):

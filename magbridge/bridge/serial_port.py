@@ -81,16 +81,16 @@ class SerialPort(PacedPort):
         return sorted(found, key=lambda name: (name <= self._passed, name))
 
     def read(self) -> bytes:
-        """Return what has come; an end of file or an error on the line is a lost port.
+        """Return the received bytes; an end of file or an error on the line is a lost port.
 
-        A backlog is returned as a whole: of an instrument without a clock, only the last reading's time of
+        A backlog is returned as a whole: for an instrument without a clock, only the last reading's time of
         arrival says when it was sent.
         """
         data = super().read()
         return data if len(data) < PIECE else data + self._backlog()
 
     def _backlog(self) -> bytes:
-        """Return what is waiting after a first piece; the next :meth:`read` finds an end of file or error."""
+        """Return the bytes after a first piece; the next :meth:`read` finds an end of file or error."""
         data = b""
         with suppress(OSError):
             while len(data) < CHUNK and select.select([self._fd], [], [], SOON)[0]:
@@ -105,7 +105,7 @@ class SerialPort(PacedPort):
         return super().blocked() if self._idle_at == -inf else []
 
     def _room(self) -> bool:
-        """Say whether less than 256 bytes wait in the system, for only then is a line writable.
+        """Return True if less than 256 bytes wait in the system, for only then is a line writable.
 
         A pseudo-terminal does not say what waits in it and is writable until it is full. Once it was, it gets
         no more than its baud rate carries.
@@ -176,7 +176,7 @@ def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
 
 
 def may_be_device(name: str) -> bool:
-    """Say whether a device has this name, or may get it later: a word, a file or a folder never does."""
+    """Return True if a device has this name, or may get it later: a word, a file or a folder never does."""
     path = Path(name)
     if path.exists():
         return not (path.is_file() or path.is_dir())

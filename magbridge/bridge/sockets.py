@@ -91,7 +91,7 @@ class _Connection(PacedPort):
         self._connection, self._fd = connection, connection.fileno()
 
     def close(self) -> None:
-        """Close the connection and forget what was to be sent on it."""
+        """Close the connection and discard the bytes still to be sent on it."""
         if self._connection is not None:
             self._connection.close()
         self._connection, self._fd = None, -1
@@ -130,7 +130,7 @@ class TcpServer(Port):
     """``tcpin``: waits for clients, and answers those that :class:`Peers` lets it answer.
 
     On a link without signatures a client is answered at once, because it may only want to listen, and its
-    address is no forgery. But who has said something valid is never turned out for another.
+    address cannot be forged. A client that has sent something valid is never disconnected for another.
     """
 
     def __init__(self, name: str, address: tuple[str, int], peers: Peers, *, signed: bool = False) -> None:
@@ -142,7 +142,7 @@ class TcpServer(Port):
 
     @property
     def is_open(self) -> bool:
-        """Whether it listens."""
+        """Return True if it listens."""
         return self._listener is not None
 
     def open(self) -> None:
@@ -161,9 +161,9 @@ class TcpServer(Port):
         return ([self._listener.fileno()] if self._listener is not None else []) + list(self._clients)
 
     def read(self) -> bytes:
-        """Accept clients that wait, then return what all have sent; a client that leaves is no error."""
+        """Accept clients that wait, then return the bytes of all; a client that leaves is not an error."""
         assert self._listener is not None
-        with suppress(OSError):  # nobody waits, or who did has gone, or there are too many open files
+        with suppress(OSError):  # no client waits, or it has gone, or there are too many open files
             for _ in range(ACCEPTED):
                 self._accept(self._listener.accept()[0])
         for fd, client in list(self._clients.items()):
@@ -182,7 +182,7 @@ class TcpServer(Port):
             self._write_one(fd, data)
         if not chosen:
             self.dropped += len(data)
-        elif (first := self._clients.get(chosen[0])) is not None:  # of the others nobody wants to know
+        elif (first := self._clients.get(chosen[0])) is not None:  # the others have no use for it
             self.dropped, self.overrun = self.dropped + first.dropped, self.overrun + first.overrun
             first.dropped = first.overrun = 0
 
@@ -193,7 +193,7 @@ class TcpServer(Port):
             self._write_one(peer.address, data)
 
     def _write_one(self, fd: int, data: bytes) -> None:
-        """Send to one client; one that leaves is no error."""
+        """Send to one client; one that leaves is not an error."""
         try:
             self._clients[fd].write(data)
         except PortError:
@@ -209,11 +209,11 @@ class TcpServer(Port):
 
     @property
     def waiting(self) -> bool:
-        """Whether something waits that a slow client had no room for."""
+        """Return True if bytes wait that a slow client could not buffer."""
         return any(client.waiting for client in self._clients.values())
 
     def flush(self) -> None:
-        """Send to the clients; one that leaves is no error."""
+        """Send to the clients; one that leaves is not an error."""
         for fd, client in list(self._clients.items()):
             try:
                 client.flush()
@@ -265,7 +265,7 @@ class UdpPort(Port):
 
     @property
     def is_open(self) -> bool:
-        """Whether the socket is open."""
+        """Return True if the socket is open."""
         return self._socket is not None
 
     def open(self) -> None:
@@ -321,7 +321,7 @@ class UdpPort(Port):
                 break
             except OSError as error:
                 if datagrams or error.errno in AWAY:
-                    break  # first return what has come
+                    break  # first return the received bytes
                 raise self.lost(error.strerror) from error
             size += len(datagram)
             datagrams.append(datagram)
@@ -362,7 +362,7 @@ class UdpPort(Port):
             self.overran(data)
         except OSError as error:
             self.dropped += len(data)
-            if self._peers is not None:  # an address that cannot be sent to, as one with port 0, is no fault
+            if self._peers is not None:  # an impossible address, as one with port 0, is not a fault
                 self._peers.forget(peer)
             elif error.errno not in AWAY:
                 raise self.lost(error.strerror) from error

@@ -166,7 +166,7 @@ class Corrector:
         values : tuple of float
             ``calibration.channels``, in that order.
         spans : sequence of (int, float, float)
-            Index of a channel, and the two values between which it lies. Spans of channels that are no
+            Index of a channel, and the two values between which it lies. Spans of channels that are not
             positions are left out of the result.
         """
         positions = values[: self._positions]

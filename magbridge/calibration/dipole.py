@@ -9,7 +9,7 @@ mu_0/4pi)::
     G(r) = (3 r-hat r-hat^T - I) / |r|^3,   T += G(r) m,   H -> (I + G(r) chi) H
 
 so that to first order ``A -= G(r) chi``, symmetric part. The second order, ``(G chi)^2``, depends on p
-alone and is left to the polynomial term beside. Moments are kept as the field they make at the sensor, in
+alone and is left to the polynomial term. Moments are stored as the field they make at the sensor, in
 nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
 
 Along a line that is short against the distance, G is a rapidly converging power series in p. So the term is
@@ -127,7 +127,7 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
     moment: Vector = (0.0, 0.0, 0.0)
     """nT at the sensor: where the displacement's columns were linearised."""
     induced: Vector = (0.0, 0.0, 0.0)
-    """nT, likewise."""
+    """Induced moment as a field at the sensor, nT."""
 
     @property
     def size(self) -> int:

@@ -6,8 +6,8 @@ Both correct by a symmetric matrix and an offset, and by a vector times the batt
     PX4        b = M (h + COMP I - OFF)                     G, G/kA
 
 Ours is ``b = R A(x) (h - T(x))``. So ``M = A``, ``OFS = -T``; a parameter in ampere whose field is linear
-gives ``MOT = -A dT/dI``. Masses that move, effects, and the boresight R cannot be held; what that costs is
-told.
+gives ``MOT = -A dT/dI``. The autopilot cannot represent moving masses, effects, and the boresight R; the
+export reports the resulting error.
 
 References
 ----------
@@ -46,7 +46,7 @@ class Compass:
     current: FloatArray | None
     """(3,), nT/A, dT/dI."""
     lost: tuple[str, ...]
-    """What it cannot hold, and what that costs."""
+    """Parts of the calibration that the format cannot represent, with the resulting error."""
 
 
 def compass_of(calibration: Calibration) -> Compass:
@@ -71,7 +71,7 @@ def compass_of(calibration: Calibration) -> Compass:
         worst = max(worst, float(np.linalg.norm(shift - held) + np.linalg.norm((there - matrix) @ field, 2)))
     if worst > 1.0:
         names = ", ".join(one.name for k, one in enumerate(calibration.parameters) if k not in currents)
-        what = f"what moves with {names or 'the current beyond its first order'}"
+        what = f"the field of {names or 'the current beyond its first order'}"
         lost.append(f"{what}: up to {worst:.0f} nT at the ends of its range")
     lost += [f"an effect: {type(one).__name__}" for one in calibration.effects]
     if calibration.boresight is not None:

@@ -1,7 +1,7 @@
 """``cal.json``: a calibration on disk, checked when it is read.
 
-Every fault is one line that names the file and what was expected: a file that was cut short, comes
-from a newer magbridge, or was edited by hand and no longer holds together.
+Every fault is one line that names the file and the expected content: a file that was cut short, comes
+from a newer magbridge, or was edited by hand and is inconsistent.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def load(path: str | Path) -> Calibration:
 def save(calibration: Calibration, path: str | Path) -> None:
     """Write ``cal.json``: whole, or not at all.
 
-    WriteError: the file cannot be written; what was there before is as it was.
+    WriteError: the file cannot be written; the previous file is unchanged.
     """
     with atomic_path(path) as temporary:
         temporary.write_bytes(encode_calibration(calibration))
@@ -213,7 +213,7 @@ def _check_covariance(covariance: FloatArray, whose: str = "") -> None:
     if np.abs(covariance).max(initial=0.0) > MAX_SIGMA**2:
         raise CalibrationError(f"{whose}covariance: expected standard deviations up to {MAX_SIGMA:g}")
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    with np.errstate(over="ignore"):  # a covariance beside a variance of zero: refused below
+    with np.errstate(over="ignore"):  # a covariance with a variance of zero: rejected below
         correlation = covariance / scale / scale[:, None]
     if (np.diag(covariance) < 0.0).any() or np.abs(correlation).max(initial=0.0) > 1.0 + 1e-6:
         raise CalibrationError(f"{whose}covariance: a variance is negative or a correlation above 1")

@@ -29,7 +29,7 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
     start: Annotated[float, Meta(ge=-1e12, le=1e12)]
     """t_0, s since 1970 UTC."""
     period: Width = 86_400.0
-    """s."""
+    """Period of the slowest term, s."""
     order: Power = 1
     """Highest power of a drift."""
 
@@ -145,14 +145,14 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
     kind: ClassVar[str] = "response"
     remembers: ClassVar[bool] = False
     unit: Annotated[float, Meta(ge=1.0, le=1e9)]
-    """nT."""
+    """Unit of the coefficients, nT."""
     power: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
     """``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead."""
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
     """Index of the channel that has the knee."""
     knee: float = 0.0
-    """nT, either sign s. Where ``s H > s knee``, ``T -= s c_1 + c_2 (H - knee) / unit``: two coefficients,
-    nT."""
+    """Knee of the curve, nT, for either sign s. Where ``s H > s knee``, ``T -= s c_1 + c_2 (H - knee) /
+    unit``: two coefficients, nT."""
 
     @property
     def size(self) -> int:

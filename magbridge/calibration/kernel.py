@@ -39,7 +39,7 @@ __all__ = ["TABLE_SUMS", "Kernel", "Linear", "Numbers", "Prepared", "apply", "li
 TABLE_SUMS = 81
 """Sums that the table gives: A' and T (12), then the 69 combinations of their covariance."""
 MAX_REGRESSOR = 1e100
-"""Beyond, the product with the table would overflow, and the total field is no number of use."""
+"""Beyond, the product with the table would overflow, and the total field is useless."""
 
 Prepared = tuple[list[Any], list[list[Any]]]
 """What :func:`apply` needs at one set of positions: A' row by row, then T (12 numbers); and for each of V's
@@ -57,7 +57,7 @@ class Kernel:
     scale: tuple[float, ...]
     """`centre`, `scale`: Of each parameter."""
     field: float
-    """nT, F_0."""
+    """Reference field F_0, nT."""
     parents: tuple[tuple[int, int], ...]
     """Monomial ``i + 1`` is monomial ``parents[i][0]`` times position ``parents[i][1]``."""
     weights: FloatArray
@@ -174,7 +174,7 @@ def apply(
     prepared : Prepared
         From :func:`prepare`, for the positions of the samples.
     omega : tuple of 6 float, optional
-        xx, yy, zz, xy, xz, yz of the boresight's covariance, rad^2; None where there is no boresight.
+        xx, yy, zz, xy, xz, yz of the boresight's covariance, rad^2; None without a boresight.
     root : callable
         Square root: of one number, or ``np.sqrt`` where the samples are arrays.
 

@@ -85,7 +85,7 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
 
     Here ``x_k = (p - centre) / scale - k apart``. Iron that the mass magnetises, or that magnetises the
     mass, makes a field that falls with the cube of their distance. Its place is unknown, but a row of
-    sources beside the path can make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
+    sources near the path can make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
 
     Attributes
     ----------

@@ -23,7 +23,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
     """Backlash or remanence: ``T += c (S(y) - S(p)) / width``, y the play operator of the channel p.
 
     ``y = min(max(y, p - width / 2), p + width / 2)``: y lags behind p by up to half the width, on the side
-    from which the mass came. A drive's backlash makes a loop of constant width (S linear). Steel beside the
+    from which the mass came. A drive's backlash makes a loop of constant width (S linear). Steel near the
     path is remagnetised only while the mass is near (Preisach relays of one width about one place), so its
     loop closes farther away: ``S(v) = scale tanh((v - centre) / scale)``, a generalised play (Brokate &
     Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).

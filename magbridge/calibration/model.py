@@ -46,7 +46,7 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     power_cycle: int | None = None
 
     def may_be(self, name: str) -> bool:
-        """Whether this is the sensor of that name; either may be unknown (empty)."""
+        """Return True if this may be the sensor of that name; either may be unknown (empty)."""
         return "" in (self.name, name) or self.name == name
 
 
@@ -129,7 +129,7 @@ class Calibration:
     method: str = ""
     """Which fit made it; ``"none"`` marks every sample as uncalibrated."""
     inputs: dict[str, str] = field(default_factory=dict)
-    """File -> SHA-256 of what it was made from."""
+    """File -> SHA-256 of the inputs."""
     software: str = ""
     """Version that made it."""
     warnings: tuple[str, ...] = ()

@@ -165,9 +165,9 @@ class Effect(Term, frozen=True, kw_only=True):
     """A term that depends on something other than the positions: a temperature, a current, time.
 
     It turns every sample into a few *regressors* (in a unit of its own); `columns` says what each
-    coefficient does with them. Their physics has two forms side by side: :meth:`begin` computes them sample
-    by sample, and whatever is corrected passes through it, so live and from a log it has the same bits;
-    :meth:`batch` computes those of a whole log at once, for what is simulated, compared or fitted. A NaN in
+    coefficient does with them. Their physics has two forms: :meth:`begin` computes them sample
+    by sample, and every correction uses it, so live and from a log it has the same bits;
+    :meth:`batch` computes those of a whole log at once, for simulation, comparison or fit. A NaN in
     its channel must not spoil its state: hold the last value.
 
     Attributes
@@ -177,7 +177,7 @@ class Effect(Term, frozen=True, kw_only=True):
     """
 
     remembers: ClassVar[bool] = True
-    """Whether regressors depend on earlier samples, too: then those of some rows take the whole log."""
+    """True if regressors depend on earlier samples, too: then those of some rows need the whole log."""
     cause: str = ""
 
     def channels(self) -> tuple[str, ...]:

@@ -1,9 +1,9 @@
-"""What a joint fit finds beside the coefficients: level, slow changes with time, offsets, a bent track.
+"""Unknowns of a joint fit in addition to the coefficients: level, slow changes, offsets, position drift.
 
 Each is a few functions of time with a Gaussian prior whose width the evidence chooses, and enters the fit as
-further unknowns behind the coefficients' own. Of those that are offered only such stay that make the log
-likelier: on a track that never crosses itself what changes slowly with time is as likely as rock, and its
-width may be any.
+further unknowns behind the coefficients' own. Optional terms stay only if they make the log likelier: on a
+track that never crosses itself a slow change with time is as likely as a crustal anomaly, and its width may
+be any.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = [
 ]  # fmt: skip
 
 APART = 3.0 * 3600.0
-"""s without a sample, after which what changes slowly starts anew."""
+"""Time without a sample after which slow changes restart, s."""
 FASTEST = 1.5 * 3600.0
 """s, half the period of the fastest slow change."""
 MOST = 60
@@ -49,7 +49,7 @@ class ParameterBlock:
     """`width`, `spread`: The group's width, in the unknowns' unit, and the 1-sigma of its logarithm; 0: it is
     given."""
     offered: bool = False
-    """Whether it stays only where the log needs it."""
+    """True for an optional term, which stays only if the log needs it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class SlowFunctions:
         self.span = np.maximum(time[first + size - 1] - self.start, 1e-9)
         self.count = np.minimum(self.span / fastest, MOST).astype(int)
         self.levels = len(first) > 1
-        """Whether each has a level against the others, too."""
+        """True if each has a level against the others, too."""
         self.edges = np.cumsum([0, *(self.count + self.levels)])
 
     @property
@@ -125,14 +125,14 @@ def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[SlowFunc
     Notes
     -----
     A random walk over a time T is the sum of ``sqrt(2) cos(pi k t/T)`` with independent weights that fall
-    as 1/k (Karhunen-Loeve), beside where it starts. After a gap of :data:`APART` it starts anew.
+    as 1/k (Karhunen-Loeve), and of its start. After a gap of :data:`APART` it restarts.
     """
     waves = SlowFunctions(time, fastest)
     return waves, waves.shape
 
 
 def in_chunks(n: int, made: Callable[[slice], FloatArray]) -> FloatArray:
-    """Return what is `made` of n rows, (n, ...), some at a time: bounded memory."""
+    """Return the result (n, ...) of `made` for n rows, computed in chunks of bounded memory."""
     return np.concatenate(
         [made(slice(start, start + BLOCK_ROWS)) for start in range(0, max(n, 1), BLOCK_ROWS)]
     )

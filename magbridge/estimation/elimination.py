@@ -28,8 +28,8 @@ from magbridge.estimation.sparse import SparseFactor
 __all__ = ["ColumnProducts", "FieldEliminated", "LinearisedRows", "SampleSums", "eliminate_field", "sum_rows"]
 
 WORST = 1e16
-"""Condition of a prior's precision at most: beyond it rounding moves the evidence by 3 to 10 nats, and such
-steps were climbed to fields of ten times the length."""
+"""Largest condition of a prior's precision: beyond it rounding changes the log evidence by 3 to 10, and the
+maximisation followed such steps to fields of ten times the length."""
 
 
 class LinearisedRows(NamedTuple):

@@ -1,6 +1,6 @@
 r"""A Gaussian random field in place with a sparse precision, and how a crustal field falls off upwards.
 
-Of coefficients w on nodes h apart, with the nodes' Laplacian L,
+With coefficients w on nodes of spacing h and the nodes' Laplacian L,
 
 .. math:: Q = v\, K^\alpha, \quad K = \kappa^2 h^2 I + L, \quad \kappa = \sqrt{2 \nu} / \ell
 
@@ -66,9 +66,9 @@ class GaussianField:
     alpha: int
     """One of :data:`SMOOTHNESS_POWERS`."""
     harmonic: bool = False
-    """Whether it falls off upwards as Laplace's equation demands; else it is the same at every depth."""
+    """True if it falls off upwards by Laplace's equation; else it is the same at every depth."""
     buried: bool = False
-    """Whether its spectrum is that of sources at a depth, of alpha factors; else Matern's."""
+    """True if its spectrum is that of sources at a depth, of alpha factors; else Matern's."""
 
     @property
     def _kappa2(self) -> FloatArray:
@@ -144,7 +144,7 @@ class GaussianField:
 
     @cached_property
     def log_determinant(self) -> float:
-        """Of the precision."""
+        """Log-determinant of the precision."""
         n, variance = self.nodes.size, float(self._spectrum[1].mean())
         lifted = 2.0 * SparseFactor(self._lift).log_determinant if self.harmonic else 0.0
         roots = sum(times * SparseFactor(root).log_determinant for root, times in self._roots)

@@ -25,13 +25,13 @@ class Nodes:
     """Nodes of a square grid, where there are any; numbered strip by strip along the longer side."""
 
     spacing: float
-    """m."""
+    """Spacing of the nodes, m."""
     low: FloatArray
     """(2,), m, north and east, of the box's first node."""
     number: IndexArray
     """(a, b): The number of each of the box's nodes, -1 where there is none."""
     turned: bool
-    """Whether strips run north (the box is longer to the east)."""
+    """True if strips run north (the box is longer to the east)."""
 
     @property
     def size(self) -> int:

@@ -1,4 +1,4 @@
-r"""What physics expects of the coefficients before any data: Gaussians whose widths are themselves learnt.
+r"""Physical priors of the coefficients: Gaussians whose widths are themselves learned.
 
 Notes
 -----
@@ -77,7 +77,7 @@ class PriorFamily:
     names: tuple[str, ...]
     """What ``exp(eta)`` is the width of, number by number."""
     renew: Callable[[FloatArray], PriorFamily] | None = None
-    """``z -> PriorFamily``: the family linearised anew at z."""
+    """``z -> PriorFamily``: the family linearised at another z."""
 
     def widths(self, eta: FloatArray) -> FloatArray:
         """(q,) prior 1-sigma of z at `eta` (h,)."""

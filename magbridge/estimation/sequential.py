@@ -39,8 +39,8 @@ from magbridge.estimation.kalman import KalmanFilter
 __all__ = ["ALARM_LOG_RATIO", "RESTART_PERIODS", "SequentialTest"]
 
 ALARM_LOG_RATIO: Final = 18.0
-"""h, threshold of L. Eight kinds of change have 2.7 onsets a measurement: by chance an alarm in ``e^18 /
-2.7`` measurements at most, 3 years at 0.25 Hz, while the noise is as stated."""
+"""Threshold h of L. Eight kinds of change have 2.7 onsets a measurement, so false alarms come at most once in
+``e^18 / 2.7`` measurements, 3 years at 0.25 Hz, if the noise is as stated."""
 RESTART_PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
 """Measurements after which an onset is replaced by a new one."""
 PROMISING_LOG_RATIO: Final = 6.0

@@ -111,7 +111,7 @@ class InverseBlocks:
 
 
 def inverse_blocks(matrix: csr_array, edges: IndexArray) -> InverseBlocks:
-    """Return the inverse's blocks on and beside the diagonal, of a block-tridiagonal matrix (n, n).
+    """Return the inverse's blocks on and next to the diagonal, of a block-tridiagonal matrix (n, n).
 
     LinAlgError: it is not positive definite.
     """

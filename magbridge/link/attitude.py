@@ -44,7 +44,7 @@ class Attitude(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a magnetic heading."""
+        """Return True if there is a magnetic heading."""
         return isfinite(self.magnetic) and isfinite(self.sigma)
 
     @property

@@ -18,7 +18,7 @@ REMEMBERED = 64
 class Authority:
     """Lets the autopilot and ground stations change parameters and rates, and no other component.
 
-    A station is whoever says so in its heartbeat. A sender of another system that has sent no heartbeat is
+    A station is a sender with a heartbeat of that type. A sender of another system without a heartbeat is
     taken for one, because small programs send none; another component of our own vehicle is not.
 
     Parameters
@@ -41,7 +41,7 @@ class Authority:
         return kind == MAV_TYPE.GCS
 
     def may_change(self, message: Message) -> bool:
-        """Say whether its sender may change what the bridge does."""
+        """Return True if its sender may change the bridge's settings."""
         who = message.system, message.component
         ours = message.system == self._system
         kind = self._kinds.get(who, None if ours else MAV_TYPE.GCS)
@@ -70,7 +70,7 @@ class Sources:
         }
 
     def admit(self, name: str, component: int, time_us: int) -> bool:
-        """Say whether a value of the parameter `name` counts that came from `component`."""
+        """Return True if a value of the parameter `name` from `component` counts."""
         source = self._of[name]
         before = source.component
         if not source.admit(component, time_us):

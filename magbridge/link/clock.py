@@ -44,7 +44,7 @@ class VehicleClock:
 
     @property
     def known(self) -> bool:
-        """Whether there is an estimate."""
+        """Return True if there is an estimate."""
         return bool(self._exchanges)
 
     @property
@@ -58,7 +58,7 @@ class VehicleClock:
         return now_us * 1000
 
     def answer(self, tc1: int, ts1: int, now_us: int) -> None:
-        """Take an answer (ns) received at `now_us`; one to a request that is not ours is ignored."""
+        """Process an answer (ns) received at `now_us`; one to a request that is not ours is ignored."""
         if ts1 not in self._asked:
             return
         self._asked.remove(ts1)

@@ -1,4 +1,4 @@
-"""Commands to the bridge: which message, how often, and what it can do."""
+"""Commands to the bridge: messages to send, their rates, and its capabilities."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Commands:
     A command to component 0 is for any component that can execute it. The bridge then executes only what
     concerns messages of its own dialect and never refuses, because a ground station would take the refusal
     for the autopilot's. Calibration of the autopilot's own compass (DO_START_MAG_CAL and the like) is the
-    autopilot's business; who asks the bridge itself for one is told how ours is calibrated.
+    autopilot's business; a request to the bridge itself gets a STATUSTEXT on how ours is calibrated.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The bridge as a MAVLink component: what it answers, and what it sends unasked."""
+"""The bridge as a MAVLink component: its answers, and the messages that it sends unasked."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Component:
     Attributes
     ----------
     outbox : Outbox
-        What is to be sent.
+        Messages to send.
     received : list of bytes
         Everything that came, as frames for the log; the bridge empties it.
     genuine : list of bytes
@@ -168,7 +168,7 @@ class Component:
         self.codec.now_us = t_us
 
     def receive(self, data: bytes, t_us: int) -> list[Message]:
-        """Take bytes from the link; return the messages that are telemetry of our vehicle.
+        """Process bytes from the link; return the messages that are telemetry of our vehicle.
 
         Requests are answered into the outbox. :meth:`advance` has been called for `t_us` before.
         """
@@ -194,7 +194,7 @@ class Component:
         return ours
 
     def _report_refusals(self, message: Message) -> None:
-        """Say once for each reason why frames are refused: else their sender would only seem to be away."""
+        """Announce once for each reason why frames are rejected: else their sender would only seem absent."""
         if message.frame[7:10] == SETUP_SIGNING:
             text = f"key from {message.system}:{message.component} not taken: keys come from a file"
             self.announcer.state("key", text, MAV_SEVERITY.WARNING)

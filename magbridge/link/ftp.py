@@ -34,7 +34,7 @@ Sender = tuple[int, int]
 
 
 class Opcode(IntEnum):
-    """What is asked for, or that it was granted or not."""
+    """Operation of a request, or the result in a reply."""
 
     NONE = 0
     TERMINATE = 1
@@ -194,7 +194,7 @@ class FtpServer:
         return request.reply(Opcode.ACK)
 
     def _reset(self, sender: Sender, request: Request) -> bytes:
-        """Close all that this station has open: what others have is not its business."""
+        """Close all files that this station has open, but not those of other stations."""
         for key in [key for key in self._sessions if key[0] == sender]:
             self._close(key)
         return request.reply(Opcode.ACK)

@@ -67,7 +67,7 @@ class Losses:
         self._before: dict[int, tuple[int, int]] = {}
 
     def count(self, component: int, number: int, t_us: int) -> None:
-        """Take note of a frame's number."""
+        """Record a frame's number."""
         numbers = self._numbers.get(component)
         if numbers is None:
             if len(self._numbers) >= WATCHED:
@@ -88,7 +88,7 @@ class Losses:
             self._before[component] = numbers.received, numbers.lost
             received, lost = numbers.received - received, numbers.lost - lost
             if lost >= LEAST and lost > MANY * (received + lost):
-                # a router keeps back what is for others alone
+                # a router keeps back frames for other receivers
                 who = f"{self._system}:{component}"
                 text = f"{who}: over {MANY:.0%} of its frames missing, or for others"
                 self._announcer.state(f"losses {component}", text, MAV_SEVERITY.WARNING)

@@ -145,7 +145,7 @@ class Rate:
     def due(self, t_us: int) -> bool:
         """Return whether the sample at `t_us` is sent.
 
-        Slots are one period apart, and a sample may be early by a quarter of a period, so that a stream with
+        Slots differ by one period, and a sample may be early by a quarter of a period, so that a stream with
         jitter at exactly this rate passes completely. After a pause, or a step far back in time, the slots
         start again at the sample.
         """

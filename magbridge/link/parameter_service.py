@@ -58,8 +58,8 @@ class ParameterService:
     def greet(self, station: tuple[int, int]) -> None:
         """Send all parameters to a station that is new, and once more `REPEAT_US` later.
 
-        QGroundControl with an autopilot never asks another component for its parameters, and what it is sent
-        before it has those of the autopilot it forgets.
+        QGroundControl with an autopilot never asks another component for its parameters, and it forgets those
+        that it receives before it has the autopilot's.
         """
         now_us = self._outbox.codec.now_us
         before_us = self._stations.pop(station, None)

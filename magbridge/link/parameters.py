@@ -59,8 +59,8 @@ def learning(enabled: bool) -> list[Tunable]:
     """Return the tunables of ``[learning]``."""
     rows = (
         ("MB_LEARN", "enabled", float(enabled), 1, "whether the calibration is learned in flight"),
-        ("MB_LEARN_FREEZE", "freeze", 0.0, 1, "1: judge and doubt, but learn nothing"),
-        ("MB_LEARN_CMD", "cmd", 0.0, 2, "1 accepts what was learned, 2 forgets it; goes back to 0"),
+        ("MB_LEARN_FREEZE", "freeze", 0.0, 1, "1: compare and raise alarms, but learn nothing"),
+        ("MB_LEARN_CMD", "cmd", 0.0, 2, "1 accepts the learned calibration, 2 forgets it; goes back to 0"),
     )
     return [
         Tunable(name, f"learning.{key}", default, 0, high, "", doc) for name, key, default, high, doc in rows
@@ -102,8 +102,8 @@ def real32(value: float) -> float:
 class Parameters:
     """The values of a table of tunables.
 
-    A value that was never set is exactly the default, not rounded to float32, so that a bridge that nobody
-    tunes computes with the configuration's own numbers.
+    A value that was never set is exactly the default, not rounded to float32, so that an untuned bridge
+    computes with the configuration's own numbers.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Parameters:
         return self._values[self._names_of[key]]
 
     def changed(self) -> dict[str, float]:
-        """Return the values that are no longer the defaults, by name: what has to be kept."""
+        """Return the values that are no longer the defaults, by name: those to store."""
         return {name: value for name, value in self._values.items() if value != self.table[name].default}
 
     def watch(self, watcher: Callable[[str], None]) -> None:

@@ -63,7 +63,7 @@ class Publisher:
     def publish(
         self, sample: Sample, corrected: Corrected, anomaly: float = nan, attitude: Attitude = NO_ATTITUDE
     ) -> None:
-        """Send what is due of a sample; ``outbox.codec.now_us`` is the time of sending.
+        """Send the messages that are due for a sample; ``outbox.codec.now_us`` is the time of sending.
 
         Parameters
         ----------

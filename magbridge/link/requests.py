@@ -99,7 +99,7 @@ class StreamRequests:
             self._received[message.id] += 1
 
     def rebooted(self) -> None:
-        """Begin again: the autopilot has forgotten what was requested."""
+        """Restart: the autopilot has forgotten the requests."""
         self._attempts.clear()
         self._received.clear()
 

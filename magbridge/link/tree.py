@@ -42,7 +42,7 @@ class Tree:
         self._logs = logs
 
     def entries(self, path: str) -> list[Entry]:
-        """Return what is in a folder, in order; raises OSError where there is none."""
+        """Return the entries of a folder, in order; raises OSError if it does not exist."""
         match parts(path):
             case []:
                 texts = [Entry(name, len(text)) for name, text in self._texts.items()]

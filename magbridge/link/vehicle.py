@@ -67,13 +67,13 @@ class VehicleState:
         return self._losses.of(self.autopilot)
 
     def receive(self, message: Message, t_us: int) -> bool:
-        """Take note of a message; return whether it is telemetry of our vehicle."""
+        """Record a message; return True if it is telemetry of our vehicle."""
         if message.system != self.system:
             self._other_sender(message)
             return False
         if message.component == self.component:
             self._announcer.state(
-                "twin", f"another program speaks as {self.system}:{self.component}", MAV_SEVERITY.WARNING
+                "twin", f"another program sends as {self.system}:{self.component}", MAV_SEVERITY.WARNING
             )
             return False
         self._losses.count(message.component, message.sequence, t_us)
@@ -142,7 +142,7 @@ class VehicleState:
         self._changes = [*(when for when in self._changes if t_us - when < CHANGES_US), t_us][-TWICE:]
         if len(self._changes) == TWICE:
             self._announcer.state(
-                "autopilots", f"two autopilots speak as {self.system}:{self.autopilot}", MAV_SEVERITY.WARNING
+                "autopilots", f"two autopilots send as {self.system}:{self.autopilot}", MAV_SEVERITY.WARNING
             )
 
 

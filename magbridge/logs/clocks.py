@@ -77,7 +77,7 @@ class TimeFormat(NamedTuple):
 
     @property
     def is_text(self) -> bool:
-        """Whether the cells are texts."""
+        """Return True if the cells are texts."""
         return self.kind not in EPOCHS
 
     @property
@@ -159,7 +159,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
 
 
 def _on_a_clock(heading: str, texts: Sequence[str]) -> bool:
-    """Say whether six digits are hours, minutes and seconds, as 120059 before 120100, and no count."""
+    """Return True if six digits are hours, minutes and seconds, as 120059 before 120100, and not a count."""
     if not texts or not all(re.fullmatch(r"[0-2]\d[0-5]\d[0-5]\d(\.\d+)?", text) for text in texts):
         return False
     named = re.search("utc|gmt|hhmmss|of.?day|zeit", heading.lower())

@@ -45,7 +45,7 @@ class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
     id: str = ""
     """The device's id or topic; the option takes it, too. Empty where the log does not say."""
     enabled: bool | None = None
-    """Whether the vehicle's settings allow its use; None where the log does not say."""
+    """True if the vehicle's settings allow its use; None if the log does not say."""
     healthy: float | None = None
     """Share of its samples that the vehicle found healthy."""
     priority: int | None = None
@@ -57,7 +57,7 @@ class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def fit(self) -> bool:
-        """Whether the log has no reason against its use."""
+        """Return True if the log has no reason against its use."""
         return self.enabled is not False and (self.healthy is None or self.healthy >= HEALTHY)
 
     @property

@@ -1,4 +1,4 @@
-"""How a text file is laid out: what its first lines say, and what has to be guessed from them.
+"""The layout of a text file: from its first lines, or guessed from them.
 
 Comments (``#``, ``%``, ``//``) and lines of a preamble come first, then the headings, perhaps a row of units,
 then the rows. A heading may itself be a comment. A file without headings is read where its columns are

@@ -120,7 +120,7 @@ def _scalar(file: Any, name: str, kind: Any, value: object, **attributes: object
 
 
 def _deployed(file: Any, known: dict[str, Any]) -> None:
-    """Say when and where the mission began: at the first row whose place is known."""
+    """Set when and where the mission began: at the first row whose place is known."""
     placed = np.isfinite(known["LATITUDE"]) & np.isfinite(known["LONGITUDE"])
     first = int(np.argmax(placed))
     when = {"standard_name": "time", "calendar": "gregorian", "units": EPOCH}

@@ -174,7 +174,7 @@ def _paths(paths: Paths, options: Options) -> list[Path]:
 
 
 def _with_another(path: Path, given: Collection[Path]) -> bool:
-    """Tell whether the file is given that this one is read with, as a flight file with its science file."""
+    """Return True if the companion file is given, too, as a flight file with its science file."""
     leads = LEADS.get(path.suffix.lower())
     return leads is not None and any(path.with_suffix(name) in given for name in (leads, leads.upper()))
 

@@ -49,14 +49,14 @@ class Format(NamedTuple):
     """Regular expression that the first bytes of a file match; None: by its suffix only."""
     writes: bool = False
     guarded: bool = False
-    """Whether another library reads it, which damage may hang or crash: it is read in a child process."""
+    """True if another library reads it, which damage may hang or crash: it is read in a child process."""
     compasses: bool = False
-    """Whether it handles itself which compass the options ask for; else its columns are looked through."""
+    """True if it handles itself which compass the options ask for; else its columns are looked through."""
     maps_columns: bool = False
-    """Whether it handles itself the columns that the options declare of columns; else they are renamed when
+    """True if it handles itself the columns that the options declare of columns; else they are renamed when
     it is read."""
     packed: bool = False
-    """Whether it may be compressed as a whole."""
+    """True if it may be compressed as a whole."""
     plugin: EntryPoint | None = None
     """Where another package brings it."""
 
@@ -142,7 +142,7 @@ def _plugins() -> dict[str, Format]:
 
 
 def _writes(point: EntryPoint) -> bool:
-    """Tell whether a package's format can be written; a faulty one is reported when it is read."""
+    """Return True if a package's format can be written; a faulty one is reported when it is read."""
     try:
         return hasattr(load(point), "FileWriter")
     except PluginError:
@@ -180,7 +180,7 @@ def format_of(path: Path, *, write: bool = False) -> Format:
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a folder is a bag of ROS 2, which is read as one file."""
+    """Return True if a folder is a bag of ROS 2, which is read as one file."""
     return (path / "metadata.yaml").is_file()
 
 

@@ -6,8 +6,9 @@ ballast: moving masses, as ``battpos``, ``battery_roll`` and ``ballast``. A payl
 in small letters, except the CTD's and a vector magnetometer's. Its rows get attitude and masses from the
 navigation file of the same dive, where that is in the same folder.
 
-Whether ``Heading`` is true or magnetic the file does not say. It is taken as true, and said; against the
-compass of an acoustic profiler on SEA063 it was 14 deg off (quartiles 12 and 16) where the declination was 6.
+The file does not say whether ``Heading`` is true or magnetic. The reader uses it as true and adds a note. On
+SEA063 it differed by 14 deg (quartiles 12 and 16) from the compass of an acoustic profiler, at a declination
+of 6 deg.
 
 References
 ----------

@@ -84,7 +84,7 @@ class Dive:
     """(m,) each: ``st_secs`` and ``end_secs``, s since 1970, and the values logged of each, as ``pitch_ctl``.
     """
     elsewhere: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    """(k,) each: Times, s, and values of what has its own times: positions, CTD_COLUMNS."""
+    """(k,) each: Times, s, and values of variables with their own times: positions, CTD_COLUMNS."""
     max_gap: float = MAX_CTD_GAP_S
     """s between two of those times across which nothing is interpolated."""
 

@@ -133,7 +133,7 @@ class TelemetryRows:
         self._skipped = self._damages = 0
 
     def put(self, record: Record) -> None:
-        """Take the next record of the log."""
+        """Process the next record of the log."""
         message = record.message
         number = message.id
         if number == STEP:

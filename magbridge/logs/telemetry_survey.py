@@ -115,7 +115,7 @@ class LogContents:
 
     @property
     def plain(self) -> bool:
-        """Whether no bridge wrote the log: one clock, and nothing declared."""
+        """Return True if no bridge wrote the log: one clock, and nothing declared."""
         return self.source not in ("MAG_RAW", "MAG_FIELD") and not (
             self.ours or self.declared or self.stepped_us
         )

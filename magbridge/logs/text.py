@@ -75,7 +75,7 @@ def chunks(path: Path, rows: int, options: Options = DEFAULTS) -> Iterator[tuple
 
 
 def _encoding(path: Path) -> tuple[str, list[str]]:
-    """Return the encoding of a text file, and what had to be guessed."""
+    """Return the encoding of a text file, and the guesses made."""
     with opened(path) as file:
         start = file.read(LOOKED_AT)
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):

@@ -120,7 +120,7 @@ class TlogWriter:
         self._thread.join(timeout)
 
     def _run(self) -> None:
-        """Write what has come, until an event without records ends it."""
+        """Write the received records, until an event without records ends it."""
         events: list[Sequence[Record]] = []
         while not events or events[-1]:
             events = [self._queue.get()]

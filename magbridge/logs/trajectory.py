@@ -171,7 +171,7 @@ def _columns(path: Path, file: Any, dimension: str | None, clock: Any) -> tuple[
 
 
 def _is_ours(variable: Any) -> bool:
-    """Tell whether a variable has the name of one of our columns, which its standard name does not change."""
+    """Return True if a variable has the name of one of our columns, whatever its standard name."""
     return hasattr(variable, "column") or variable.name.lower() in COLUMNS
 
 
@@ -189,7 +189,7 @@ def _meaning(variable: Any, called: str) -> tuple[str, float]:
 
 
 def _is_magnetic(column: _Column) -> bool:
-    """Tell whether a heading says that it is measured from magnetic north."""
+    """Return True if a heading is stated to be measured from magnetic north."""
     text = " ".join(str(column.variable.getncattr(name)) for name in column.variable.ncattrs())
     return column.name == "heading" and "magnetic" in text.lower()
 

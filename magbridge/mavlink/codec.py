@@ -30,8 +30,8 @@ class Codec:
     Attributes
     ----------
     now_us, utc_offset_us : int
-        Event time, which the caller sets before it parses or sends, and what is to be added to it for UNIX
-        time: what the host's clock was set by since the start.
+        Event time, which the caller sets before it parses or sends, and its offset to UNIX time: the change
+        of the host's clock since the start.
     frames, bytes_skipped : int
         Messages accepted, bytes that belonged to no frame.
     """
@@ -68,7 +68,7 @@ class Codec:
         return self._rest
 
     def parse(self, data: bytes, *, whole: bool = False) -> list[Message]:
-        """Take bytes as they come; return the messages that are complete with them.
+        """Process bytes as they come; return the messages that are complete with them.
 
         Any bytes, however cut, give the same messages. Bytes that belong to no frame come back as a
         message of id `BAD_DATA` just before the message that ended them (or every `WINDOW` bytes), so
@@ -80,7 +80,7 @@ class Codec:
         data : bytes
             As they came.
         whole : bool
-            No frame goes on in what comes next: what is left over belongs to none.
+            No frame continues in the next bytes: remaining bytes belong to none.
         """
         data = self._rest + data
         found: list[Message] = []

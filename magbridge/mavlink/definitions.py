@@ -27,7 +27,7 @@ BOTH = """<?xml version="1.0"?>
 
 
 def write_definitions(folder: Path) -> list[Path]:
-    """Write the XML of the dialect and of what it includes, and a module for pymavlink of each dialect.
+    """Write the XML of the dialect and of its includes, and a module for pymavlink of each dialect.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ def write_definitions(folder: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The dialects' XML and modules, without what is included.
+        The dialects' XML and modules, without the included ones.
 
     Raises
     ------

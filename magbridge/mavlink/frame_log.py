@@ -28,7 +28,7 @@ class FrameLogWriter:
         self._codec = Codec(system, component)
 
     def frames(self, messages: Iterable[Message], pending: bytes) -> list[bytes]:
-        """Return the frames to log for one call of :meth:`Codec.parse`, and what was pending after it."""
+        """Return the frames to log for one call of :meth:`Codec.parse`, and the bytes pending after it."""
         frames: list[bytes] = []
         in_doubt = False
         for one in messages:

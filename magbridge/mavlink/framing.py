@@ -60,7 +60,7 @@ def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
 
     The checksum of a message outside the dialect cannot be checked; it is believed when its header is
     plausible and another frame begins at its end, or when it ends with the data. A random
-    header hardly ever is plausible, so that garbage does not hold up what follows it.
+    header hardly ever is plausible, so that garbage does not delay the frames behind it.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
     Returns
     -------
     int
-        The end, or `NOT_A_FRAME`, or `MORE` where it cannot be told without the bytes from `stop` on.
+        The end, or `NOT_A_FRAME`, or `MORE` if the bytes from `stop` on are needed to decide.
     """
     available = stop - start
     header = 10 if data[start] == V2 else 6

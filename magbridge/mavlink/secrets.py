@@ -1,6 +1,6 @@
-"""Messages that carry a secret: what is kept of them, in a log or in memory, is that they came.
+"""Messages that carry a secret: a log or the memory keeps only the fact that they came.
 
-The bridge takes no key or password over the link, so nobody needs what is in these messages.
+The bridge accepts no key or password over the link, so their content is not needed.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def load_key(path: str | Path) -> bytes:
 
 
 def readable_by_all(path: str | Path) -> bool:
-    """Say whether every user of this computer may read the key; raises OSError where the file is missing."""
+    """Return True if every user of this computer may read the key; raises OSError if the file is missing."""
     return bool(Path(path).stat().st_mode & 0o004)
 
 
@@ -140,7 +140,7 @@ class Signing(MAVLinkSigning):
         return min(max(self.last + SECOND, timestamp(t_us) + ahead), LIMIT)
 
     def accept(self, frame: bytes, stream: tuple[int, int], number: int, t_us: int) -> bool:
-        """Say whether a frame of the `stream` (system, component) is genuine and new."""
+        """Return True if a frame of the `stream` (system, component) is genuine and new."""
         why = "" if number in NEED_NO_SIGNATURE else NOT_SIGNED
         if is_signed(frame):
             why = self._doubt(frame, stream, t_us)

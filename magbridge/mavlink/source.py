@@ -34,7 +34,7 @@ class Source:
         self._received_us = 0
 
     def admit(self, component: int, time_us: int) -> bool:
-        """Say whether a value counts that came from `component` at `time_us` (µs)."""
+        """Return True if a value from `component` at `time_us` (µs) counts."""
         if component != self.component:
             if self.wanted is not None:
                 if component != self.wanted:

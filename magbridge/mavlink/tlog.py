@@ -44,7 +44,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     time_us: int
     """µs of UNIX time; a multiple of 4."""
     channel: int
-    """The stamp's low two bits: :class:`magbridge.records.Channel` in our logs, a link number in others'."""
+    """The stamp's low two bits: :class:`magbridge.records.Channel` in our logs, a link number elsewhere."""
     frame: bytes
     """The MAVLink frame."""
 
@@ -152,7 +152,7 @@ class LogReader:
 
 
 def _block(data: bytes, broken: bool, *, last: bool) -> tuple[Block, int, bool]:
-    """Return the records in `data`, where those that cannot be told yet begin, and whether that is damage."""
+    """Return the records in `data`, where the undecided ones begin, and whether that is damage."""
     stop = len(data) if last else max(len(data) - LONGEST, 0)
     start, found = _candidates(data, stop)
     ends = found.pop("stop")

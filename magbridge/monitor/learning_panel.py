@@ -16,8 +16,8 @@ __all__ = ["LearningPanel"]
 TITLE = "Learning in flight"
 DO = "MB_LEARN_CMD"
 ORDERS = {
-    "Accept": (1.0, "What was learned is the calibration from now on, and the doubt is acknowledged"),
-    "Forget": (2.0, "Go back to the first calibration, and learn anew"),
+    "Accept": (1.0, "Use the learned calibration from now on, and acknowledge the alarm"),
+    "Forget": (2.0, "Return to the first calibration, and restart learning"),
 }
 
 

@@ -68,7 +68,7 @@ def serve(
     address = f"http://{place}" + (f"/?token={token}" if token else "")
     print(f"listening on {link}; the page is {address}", file=sys.stderr)
     if token:
-        warning = "the page is open to the network, unencrypted: whoever reads its address can set parameters"
+        warning = "the page is open to the network, unencrypted: everyone with its address can set parameters"
         print(f"warning: {warning}", file=sys.stderr)
     app.add_middleware(Guard, host=host, port=port, token=token)
     options: dict[str, Any] = {"title": "magbridge", "favicon": "🧲", "show_welcome_message": False}

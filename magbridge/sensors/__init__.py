@@ -74,12 +74,12 @@ class Driver(Protocol):
     def start(self) -> tuple[bytes, ...]:
         """Begin a line that has just been opened, perhaps in the middle of a frame.
 
-        Return the commands to send to the instrument, at least 0.1 s apart; maybe none.
+        Return the commands to send to the instrument, at intervals of at least 0.1 s; maybe none.
         """
         return ()
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Take bytes as they came; return the readings that they complete."""
+        """Process received bytes; return the readings that they complete."""
         ...
 
 

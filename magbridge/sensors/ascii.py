@@ -170,7 +170,7 @@ class Ascii:
         return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
-        """Forget half a line, and skip the next one where nothing would tell it from a whole one.
+        """Discard half a line, and skip the next one if it might be incomplete.
 
         Return the configured commands.
         """

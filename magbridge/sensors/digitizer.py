@@ -95,7 +95,7 @@ class Digitizer:
         return ()
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Take bytes as they came; return the readings that they complete."""
+        """Process received bytes; return the readings that they complete."""
         readings = []
         for frame in self._framer.split(data):
             message = cobs_decode(frame)
@@ -132,5 +132,5 @@ def _count(low: int, high: int) -> int:
 
 
 def _after(time: int, start: int) -> float:
-    """Return `time` - `start` in s, both in µs on the wrapping clock, less than half a turn apart."""
+    """Return `time` - `start` in s, both in µs on the wrapping clock, with a difference below half a turn."""
     return ((time - start + WRAP_US // 2) % WRAP_US - WRAP_US // 2) * 1e-6

@@ -23,7 +23,7 @@ class DigitizerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     reference_voltage: Positive = 2.5
     """V at which the converter is at full scale."""
     gain: Positive = 1.0
-    """Of the amplifier between fluxgate and converter; below 1 for a divider."""
+    """Gain of the amplifier between fluxgate and converter; below 1 for a divider."""
     full_scale: Positive | None = None
     """nT at which the fluxgate itself saturates, where that is before the converter."""
 

@@ -45,7 +45,7 @@ class Framer:
         self._rest, self._overlong = b"", inside
 
     def split(self, data: bytes) -> list[bytes]:
-        """Take bytes; return the frames that they complete, empty ones left out."""
+        """Process bytes; return the frames that they complete, empty ones left out."""
         pieces = (self._rest + data).split(self._delimiter)
         rest = pieces.pop()
         if pieces and self._overlong:
@@ -97,7 +97,7 @@ def cobs_decode(frame: bytes) -> bytes:
 
 
 def saturated(x: float, y: float, z: float, limit: float) -> bool:
-    """Say whether a channel stands at the end of its range, or beyond: ``|channel| >= limit``, in one unit.
+    """Return True if a channel is at the end of its range, or beyond: ``|channel| >= limit``, in one unit.
 
     The channels are numbers: a driver has counted a reading with a NaN as bad before it asks.
     """

@@ -94,7 +94,7 @@ class Hmr2300:
         return tuple(line.encode() for line in lines)
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Take bytes as they came; return the readings that they complete."""
+        """Process received bytes; return the readings that they complete."""
         return self._feed_ascii(data) if self._options.output == "ascii" else self._feed_binary(data)
 
     def _feed_binary(self, data: bytes) -> list[Reading]:

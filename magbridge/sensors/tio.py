@@ -1,4 +1,4 @@
-"""Twinleaf I/O (TIO): packets, and the descriptors that say what is in them.
+"""Twinleaf I/O (TIO): packets, and the descriptors of their content.
 
 As the public drivers read them: ``libtio`` (protocol overview), ``tio-python`` (devices before 2025) and
 ``twinleaf-rust`` (since). On a serial line a packet and its CRC-32 stand between SLIP delimiters (RFC 1055)::

@@ -35,7 +35,7 @@ class TwinleafOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     temperature: str = ""
     """The column with the temperature in degC, if there is one."""
     unit: str | None = None
-    """Of the channels, instead of the one that the device states."""
+    """Unit of the channels, instead of the one that the device states."""
     route: Annotated[str, Meta(pattern=r"^/?(\d+(/\d+)*/?)?$")] = "/"
     """Which device of a tree, as in ``/0/2``."""
     range: Annotated[float, Meta(gt=0)] = 100_000.0
@@ -109,7 +109,7 @@ class Twinleaf:
         return (tio.END + b"".join(map(tio.slip, packets)),)
 
     def feed(self, data: bytes) -> list[Reading]:
-        """Take bytes as they came; return the readings that they complete."""
+        """Process received bytes; return the readings that they complete."""
         readings: list[Reading] = []
         for frame in self._framer.split(data):
             try:

@@ -165,7 +165,7 @@ def test_two_autopilots_answer(rig: Rig, table: Row) -> None:
         return [frame, other.pack("SYS_STATUS"), other.pack("ATTITUDE", time_boot_ms=86_400_000 + 50 * count)]
 
     with rig.autopilot.retelling(both):
-        delay = rig.until_reported("two autopilots speak as 1:1", mark)
+        delay = rig.until_reported("two autopilots send as 1:1", mark)
     back = rig.until_well()
     assert rig.undue_flags(mark) == ""
     assert np.ptp([message["total_field"] for message in rig.of("MAG_FIELD", mark)]) < 1.0
@@ -183,7 +183,7 @@ def test_another_bridge_answers(rig: Rig, table: Row) -> None:
     rig.until_well()
     mark = rig.mark
     rig.autopilot.send(Codec(1, 191).pack("HEARTBEAT", type=18, autopilot=8))
-    delay = rig.until_reported("another program speaks as 1:191", mark)
+    delay = rig.until_reported("another program sends as 1:191", mark)
     back = rig.until_well()
     assert rig.undue_flags(mark) == ""
     table(

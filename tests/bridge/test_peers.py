@@ -136,7 +136,7 @@ def test_two_who_speak_as_the_autopilot_are_told() -> None:
     for who in "ab":
         both.receive(who, beat())
     assert [one.address for one in both.answered()] == ["a", "b"]
-    assert list(both.notices) == ["the autopilot speaks from several addresses"]
+    assert list(both.notices) == ["the autopilot sends from several addresses"]
 
 
 def test_a_peer_that_falls_silent_is_no_longer_answered(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,7 +51,7 @@ def test_each_compass_gets_a_calibration_of_its_own(flight: Path, here: Path, co
 def test_every_option_holds_for_each_compass(flight: Path, command: Command) -> None:
     for which in ("1", "all"):
         asked = "calibrate", flight, "--compass", which, "--position-sigma", "10", "-o", "cal.json"
-        assert "position_sigma: the log does not show the rock" in command(*asked, code=1).err
+        assert "position_sigma: the log does not show the crustal field" in command(*asked, code=1).err
 
 
 def test_one_compass_is_one_calibration(flight: Path, here: Path, command: Command) -> None:

@@ -72,7 +72,7 @@ def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link: Lin
 def test_two_autopilots_with_one_address(link: Line) -> None:
     times = [boot for i in range(20) for boot in (500_000 + 200 * i, 3_000 + 200 * i)]
     texts = boots(link, link.autopilot, times)
-    assert texts[0] == "two autopilots speak as 1:1"
+    assert texts[0] == "two autopilots send as 1:1"
     assert link.component.vehicle.reboots == 0
 
 
@@ -82,7 +82,7 @@ def test_two_autopilots_in_bursts(link: Line) -> None:
         for i in range(12)
         for boot in (500_000, 500_010, 500_020, 500_030, 3_000, 3_010, 3_020, 3_030)
     ]
-    assert "two autopilots speak as 1:1" in boots(link, link.autopilot, times)
+    assert "two autopilots send as 1:1" in boots(link, link.autopilot, times)
 
 
 def test_a_second_vehicle_is_told_once_and_ignored(link: Line) -> None:
@@ -105,7 +105,7 @@ def test_another_program_with_our_address(link: Line) -> None:
     texts = [
         text for _ in range(5) for text in link.texts(link.give(twin.pack("HEARTBEAT", type=18, autopilot=8)))
     ]
-    assert texts == ["another program speaks as 1:191"]
+    assert texts == ["another program sends as 1:191"]
 
 
 def test_lost_frames_are_counted(link: Line) -> None:

@@ -4,11 +4,11 @@ Notes
 -----
 Each start is first brought near the answer, with a noise as large as its residuals. Then three steps
 alternate: coefficients by Gauss-Newton at fixed prior widths; widths and noise by the evidence of the
-quadratic found there; outliers and, once the model has settled, the noise's autocorrelation from the
+quadratic found there; outliers and, once the model has converged, the noise's autocorrelation from the
 residuals. The start with the largest evidence wins. It must be a maximum of the evidence, and its scales
 must not have collapsed.
 
-Choosing the widths by leaving out one run at a time is no better (survey error 1.045 times the noise floor,
+Choosing the widths by leaving out one run at a time is not better (survey error 1.045 times the noise floor,
 against 1.036; median of 8 gliders) and takes hundreds of fits where the evidence needs a few. Leaving out is
 used to check: sigmas grow to what the parts left out show (:mod:`.left_out`), and where one ellipsoid
 predicts those better, it is taken.

@@ -67,13 +67,13 @@ def _wahba(v: FloatArray, b: FloatArray) -> tuple[Rotation, float]:
 
 
 def magnetic_headings(calibration: Calibration, data: Observations) -> str:
-    """Say so where the field points as if headings were measured from magnetic north; else return "".
+    """Return a warning if headings seem to be measured from magnetic north; else "".
 
     Notes
     -----
-    Headings short of the declination D turn every vector by D about the vertical. Of a vehicle that stays
-    level that is a boresight of D, and the mounting looks turned. Of one that dives and climbs at a pitch p
-    it is no rotation of the sensor: the best one is ``D cos p cos^2 I / (cos^2 p cos^2 I + sin^2 p (1 +
+    Headings short of the declination D turn every vector by D about the vertical. For a vehicle that stays
+    level that is a boresight of D, and the mounting looks turned. For one that dives and climbs at a pitch p
+    it is not a rotation of the sensor: the best one is ``D cos p cos^2 I / (cos^2 p cos^2 I + sin^2 p (1 +
     sin^2 I) / 2)`` about z, I the inclination (7.4 deg of 17.6 at p = 24 and I = 70 deg), and leaves angles
     that a correct heading does not.
     """

@@ -36,7 +36,7 @@ samples that a position must have to count."""
 SWEPT = 0.3
 """Share of the half range that one position spans where its mass moved all along."""
 TOGETHER = 0.9
-"""Correlation of two positions above which their effects cannot be told apart."""
+"""Correlation of two positions above which their effects cannot be distinguished."""
 BANKED = 10.0
 """deg, range of roll that shows the vertical offset."""
 STEEP = 5.0
@@ -125,7 +125,7 @@ def _together(calibration: Calibration, data: Observations) -> Iterator[str]:
             if abs(together[i, j]) > TOGETHER:
                 yield (
                     f"{other} and {one} always moved together (correlation {together[i, j]:.2f}): their "
-                    "effects cannot be told apart; fly a run that moves only one of them"
+                    "effects cannot be distinguished; fly a run that moves only one of them"
                 )
 
 
@@ -203,10 +203,10 @@ noise is more than a tenth of the variance there: a fit takes noise for attitude
 second order), and 6,000 samples of 1,500 nT noise gave an ideal compass an offset of 13,900 nT at nine
 sigmas."""
 GAIN = 0.08
-"""Departure of the middle scale from 1 that few sensors have, four sigmas of the prior: a wrong reference
-shrinks all scales, and a real flight was off by as much that had met rock (0.88 to 0.94)."""
+"""Departure of the middle scale from 1 that few sensors have, four sigmas of the prior. A wrong reference
+shrinks all scales: in a real flight over an unmapped crustal anomaly to 0.88 to 0.94."""
 LASTING = 0.98
-"""Autocorrelation of neighbours that no sensor's noise has beside a field in place."""
+"""Autocorrelation of neighbours above which a residual is not sensor noise, if a crustal field is fitted."""
 UNSEEN = 270.0
 """deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
@@ -215,7 +215,7 @@ def judged(found: Fit, data: Observations) -> Fit:
     """Return the fit with its boresight, and with warnings of what the data could not determine."""
     whole, mismatch = found.calibration, []
     calibration = whole.without_effects()
-    if whole.effects or found.creep:  # they have been taken off
+    if whole.effects or found.creep:  # they have been subtracted
         data = replace(data, field=found.samples.field)
     if calibration.boresight is None:
         try:
@@ -257,14 +257,14 @@ def judged(found: Fit, data: Observations) -> Fit:
 
 
 def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterator[str]:
-    """Say why data do not support a fit: error over `noise` (nT), widest gap of the headings (deg), memory.
+    """Yield reasons not to support a fit: error over `noise` (nT), widest gap of headings (deg), correlation.
 
-    `lasting` is the residual's autocorrelation where rock has been taken out of it.
+    `lasting` is the residual's autocorrelation after the crustal field has been subtracted.
     """
     if lasting > LASTING:
         yield (
-            f"residuals of {noise:.0f} nT last for many samples (autocorrelation {lasting:.3f}) though the "
-            "rock is taken out: two vehicles in one log, an offset that jumped, or wrong positions"
+            f"residuals of {noise:.0f} nT last for many samples (autocorrelation {lasting:.3f}) without the "
+            "crustal field: two vehicles in one log, an offset that jumped, or wrong positions"
         )
     if ratio > UNSUPPORTED:
         yield (
@@ -274,7 +274,7 @@ def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterato
     if gap > UNSEEN:
         yield (
             f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
-            "cannot be told from the Earth's"
+            "cannot be distinguished from the Earth's"
         )
 
 
@@ -289,7 +289,7 @@ def _noise_for_attitudes(field: FloatArray, noise: float) -> Iterator[str]:
 
 
 def _suspicions(found: Fit) -> Iterator[str]:
-    """Say what the fit itself shows to be wrong with the samples or with their reference."""
+    """Yield warnings that the fit itself gives about the samples or their reference."""
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield f"{outliers} of {samples} samples are outliers and were left out of the fit"
@@ -298,13 +298,13 @@ def _suspicions(found: Fit) -> Iterator[str]:
         yield (f"{counted(ends, 'sample')} at the ends of the log left out: unlike the others (a crash?)")
     if (ratio := found.details.get("left_out_ratio", 1.0)) > WORSE:
         yield (
-            f"parts left out of the fit are off by {ratio:.1f} times what it claimed, so its sigmas were "
-            "raised by that: the model lacks something (magbridge diagnose), or the reference does"
+            f"held-out parts have errors of {ratio:.1f} times the fit's sigma, so its sigmas were raised by "
+            "that: an effect is missing in the model (magbridge diagnose), or in the reference"
         )
     if (gained := found.details.get("next_order", 0.0)) > LIKELIER:
         yield (
-            f"--order is too low: one more is likelier by {gained:.0f} nats, and the sigmas do not know what "
-            "is missing"
+            f"--order is too low: one more raises the log-likelihood by {gained:.0f}, and the sigmas do not "
+            "include the missing terms"
         )
     smallest, largest = found.scales
     if abs(0.5 * (smallest + largest) - 1.0) > GAIN:

@@ -1,4 +1,4 @@
-"""The default fit from one start: coefficients, widths and noise in turn, until the evidence settles."""
+"""The default fit from one start: coefficients, widths and noise in turn, until the evidence converges."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def climb(
     *,
     shaped: bool = False,
 ) -> Climbed:
-    """Alternate coefficients, widths and noise until the evidence settles; give `noise` if z is near that.
+    """Alternate coefficients, widths and noise until the evidence converges; give `noise` if z is near that.
 
     `z` (q,) and `eta` (h,) are where it begins. `shaped`: the memory of `noise` is kept.
     """
@@ -83,9 +83,9 @@ def climb(
         still = step > 0 and abs(score - last) < 1e-2 and solution.steps <= 1
         if still and not white:
             break
-        # residuals of a wrong model look correlated for long, so the autocorrelation waits until it settles
+        # residuals of a wrong model look correlated for long, so the autocorrelation waits for convergence
         white = white and not still and step < ROUNDS // 2
-        # at last the noise's autocorrelation and outliers are kept, so that the rest settles
+        # at last the noise's autocorrelation and outliers are kept, so that the rest converges
         if step < ROUNDS - 4:
             prior = family.at(eta)
             e = residuals_of(samples, prior.coefficients(z))

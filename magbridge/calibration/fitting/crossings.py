@@ -1,4 +1,4 @@
-"""Whether a track can tell rock from heading: where it came back to a place on another course."""
+"""Test whether a track separates crustal field and heading: it returns to places on other courses."""
 
 from __future__ import annotations
 
@@ -25,30 +25,31 @@ BACK = 150.0
 FEW = 3
 """Crossed places below which a survey says nothing about itself."""
 SHARE = 0.25
-"""Of the rock's length: places as near as that are one."""
+"""Distance within which places count as one, as a fraction of the crustal field's length."""
 FARTHEST, NEAR = 5.0, 1000.0
-"""Of the distance from the middle within which 99 % of the samples stay, and the least such distance, m."""
+"""Multiple of the distance from the middle within which 99 % of the samples stay, and its least value, m."""
 PLACES = (125.0, 250.0, 500.0)
-"""m: places as near as that are one, before the rock's length is known (:data:`SHARE` of 500 m to 2 km)."""
+"""Distance within which places count as one before the length is known, m (:data:`SHARE` of 0.5 to 2 km)."""
 OFTEN, TWICE = 0.08, 2
-"""Share of the places, and how many at least, that a survey meets again on another course if it tells its own
-rock: six hours of a glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
+"""Least fraction and number of the places that a survey has to meet again on another course: six hours of a
+glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
 AHEAD, LEGS = 0.8, 6
-"""Mean resultant length of the courses (Mardia & Jupp 2000, eq. 2.3.3) below which legs lead different ways,
-and places of the widest kind to which they must: rock that is smooth beside a leg is then no heading's. A
-zigzag of 3 h that crosses nothing has 0 to 0.6, dives along one line 0.93; runs stay at one place."""
+"""Mean resultant length of the courses (Mardia & Jupp 2000, eq. 2.3.3) below which legs have different
+courses, and number of the widest places to which they must lead: a crustal field that is smooth near a leg is
+then not correlated with heading. A zigzag of 3 h without crossings has 0 to 0.6, dives along one line 0.93;
+runs stay at one place."""
 AREA = 120.0
-"""m across, below which rock is much the same everywhere: its level, and for the rest the vehicle's."""
+"""Extent, m, below which the crustal field is nearly constant: its level, and the rest is the vehicle's."""
 LEAP = 100.0
 """m beyond what the vehicle can have moved: a jump in position."""
 BETWEEN = 0.5
-"""Of the distance between tracks: rock that changes over less is not the same on any two of them."""
+"""Fraction of the distance between tracks: a crustal field of shorter length differs from track to track."""
 STILL = 5.0
 """m between samples, below which a course is not one."""
 
 
 def tells_rock(data: Observations) -> bool:
-    """Return whether the track can tell what is rock.
+    """Return True if the track separates the crustal field from the vehicle's.
 
     It does where it came back to places on other courses, or where legs on other courses follow each other.
     """
@@ -68,40 +69,41 @@ def tells_rock(data: Observations) -> bool:
 
 
 def left_open(data: Observations, length: float) -> Iterator[str]:
-    """Say, in a pilot's words, what keeps rock of a `length`, m, from being told from the vehicle's field."""
+    """Yield advice, in a pilot's terms, to separate a crustal field of a `length`, m, from the vehicle's."""
     if data.place is None or data.unmapped is None or not data.unmapped.all():
         return
     yield from left_open_by(data.place[:, :2], length)
 
 
 def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
-    """Say what a track (n, 2), m, leaves open over rock of a `length`, m, that nobody has mapped."""
+    """Yield what a track (n, 2), m, cannot separate over an unmapped crustal field of a `length`, m."""
     place, course = courses(track)
     if not len(place) or np.ptp(place, axis=0).max() < SHARE * length:
-        return  # all at one place: the rock is a constant
+        return  # all at one place: the crustal field is a constant
     cells, reversed_cells = crossed(place, course, SHARE * length)
     if cells + reversed_cells == 0:
         yield (
-            "you never crossed your own track: rock and heading cannot be told apart, but for how smooth the "
-            "rock is; fly legs that cross earlier ones at other headings"
+            "you never crossed your own track: only its smoothness separates the crustal field from heading; "
+            "fly legs that cross earlier ones at other headings"
         )
     elif cells < FEW and reversed_cells < FEW:
         yield (
-            f"you crossed your own track at {counted(cells + reversed_cells, 'place')} only: rock and "
-            "heading are told apart by how smooth the rock is; fly more legs that cross earlier ones"
+            f"you crossed your own track at {counted(cells + reversed_cells, 'place')} only: little "
+            "separates the crustal field from heading; fly more legs that cross earlier ones"
         )
 
 
 def rough_rock(data: Observations, rock: Mapping[str, Any] | None, noise: float) -> Iterator[str]:
-    """Say whether a fit's `rock`, where it is larger than the `noise`, nT, is too rough for the track."""
+    """Yield a warning if a fit's crustal field exceeds the `noise`, nT, and is too rough for the track."""
     if rock and data.place is not None and rock["size_nT"] > noise:
         yield from too_rough(data.place[:, :2], rock["length_m"], rock["shortest_m"])
 
 
 def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterator[str]:
-    """Say whether rock of a `length`, m, changes faster than a track (n, 2), m, can follow.
+    """Yield a warning if a crustal field of a `length`, m, changes too fast for a track (n, 2), m.
 
-    `shortest` is the least length, m, that was tried: a fit that ends there has found a limit, not the rock.
+    `shortest` is the least length, m, that was tried: a fit that ends there has found the limit, not the
+    length of the field.
     """
     place = courses(track)[0]
     if len(place) < FEW:
@@ -115,8 +117,8 @@ def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterat
     else:
         return
     yield (
-        f"the rock changes over {length:.0f} m, {than}: rock, vehicle and noise are hardly told apart, nor "
-        "does the map know what lies between; fly tracks closer together"
+        f"the crustal field changes over {length:.0f} m, {than}: it is hardly separated from vehicle and "
+        "noise, and the map is uncertain between tracks; fly tracks closer together"
     )
 
 
@@ -128,7 +130,7 @@ def far_off(place: FloatArray) -> BoolArray:
 
 
 def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
-    """Say what was left out of places (n, 2), m, at times (n,), s, and whether the track jumps."""
+    """Yield which places (n, 2), m, at times (n,), s, were left out, and whether the track jumps."""
     without = ~np.isfinite(place).all(axis=1)
     far = far_off(place) & ~without
     for left_out, why in ((without, "without a position"), (far, "far from all others (a jump in position)")):

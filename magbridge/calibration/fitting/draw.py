@@ -1,4 +1,4 @@
-"""A picture of a fit: the error of the total field, raw and corrected, against what it may depend on."""
+"""Plot of a fit: the error of the total field, raw and corrected, against its possible correlates."""
 
 from __future__ import annotations
 

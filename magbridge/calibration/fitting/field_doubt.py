@@ -1,7 +1,7 @@
-r"""What the data leave open of a field's size and length.
+r"""Posterior uncertainty of a field's amplitude and length.
 
-Of a few patches of rock nobody can tell its size and length well: an answer at the likeliest ones alone would
-be too sure where the track does not go. The evidence is summed over points about its maximum,
+A few anomalies hardly determine the crustal field's amplitude and length: a solution at the likeliest values
+alone would be overconfident away from the track. The evidence is summed over points about its maximum,
 
 .. math:: p(f) \approx \sum_k w_k\, p(f \mid \theta_k), \quad \theta_k = \hat\theta + V S g_k,
 
@@ -25,9 +25,9 @@ __all__ = ["MANY", "plausible"]
 MANY = 2_500
 """Nodes from which on size and length are known well enough."""
 STEP = 0.3
-"""Of the logarithms of size and length, over which the evidence's curvature is taken."""
+"""Step in the logarithms of amplitude and length with which the evidence's curvature is computed."""
 WIDEST = 0.7
-"""Spread of these logarithms at most: beyond, the evidence is no parabola."""
+"""Largest spread of these logarithms: beyond, the evidence is not a parabola."""
 RULE = ((0.0, 2.0 / 3.0), (3.0**0.5, 1.0 / 6.0), (-(3.0**0.5), 1.0 / 6.0))
 """Nodes and weights for a standard normal distribution."""
 LEAST = 0.01

@@ -22,7 +22,7 @@ NODES = 4_000
 SIDE = 1_500
 """Nodes along a side of the area's box at most, where it is a square."""
 SHORTEST = 60.0
-"""m, least length."""
+"""Shortest correlation length, m."""
 
 
 def fine_enough(nodes: Nodes, length: float, alpha: int) -> bool:

@@ -27,13 +27,13 @@ FEWER = 1_500
 CLEAR = 30.0
 """Nats by which one kind of field is likelier than the other at any smoothness, or an offer needed."""
 BENDS = 0.25
-"""Fields look alike where the length times this power of alpha - 1 is the same."""
+"""Fields are similar if the length times this power of alpha - 1 is equal."""
 SMALL = 0.03
 """Autocorrelation below which noise counts as white."""
 HIGHEST = 0.995
 """Largest autocorrelation of a sample with the next one."""
 SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
-"""nT of rock, and the 1-sigma of its logarithm: sea floor and land as airborne surveys meet them."""
+"""Crustal field, nT, and the 1-sigma of its logarithm: sea floor and land, as airborne surveys find them."""
 LENGTH_SPREAD = np.log(6.0)
 """1-sigma of the logarithm of the length, about the middle of those that are tried."""
 
@@ -128,7 +128,7 @@ def choose(
         return best, worse > 0
 
     best, enclosed = down(SMOOTH)
-    if not enclosed:  # rock is rougher than any of these
+    if not enclosed:  # the crustal field is rougher than every candidate
         rough, _ = down(SMOOTHNESS_POWERS[0])
         best = rough if rough.score > best.score else best
 
@@ -152,7 +152,7 @@ def choose(
 
 
 def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> Choice:
-    """Climb from a choice through the powers alpha, upwards, and if that is no better downwards."""
+    """Increase the power alpha from that of `best`, or decrease it if that is not better; return the best."""
     at = SMOOTHNESS_POWERS.index(best.field.alpha)
     for others in (SMOOTHNESS_POWERS[at + 1 :], SMOOTHNESS_POWERS[:at][::-1]):
         before = best
@@ -183,9 +183,9 @@ def climb(
     steps: int = 40,
     near: float = 0.1,
 ) -> Choice:
-    """Climb the evidence from a choice, its nodes kept, to so many nats from where it is largest, or about.
+    """Maximise the evidence from a choice, its nodes kept, to within so much log evidence of the maximum.
 
-    Its length or its noise's memory move, too, if need be.
+    Its length or its noise's memory change, too, if need be.
     """
     share = np.clip(max(start.rho, 0.01) / HIGHEST, 1e-6, 1.0 - 1e-6)
     moves = [0] + [1] * move_rho + [2] * move_length
@@ -221,7 +221,7 @@ def climb(
 def refined(
     sums_of: Callable[[GaussianField], SampleSums], place: FloatArray, choice: Choice, weighed: Weighed
 ) -> Choice:
-    """Climb from a choice; nodes at places (n, 2), m, are made anew where they no longer suit the length."""
+    """Maximise from a choice; nodes at places (n, 2), m, are rebuilt when they no longer suit the length."""
     field = choice.field
     if not fine_enough(field.nodes, field.length, field.alpha):
         nodes = nodes_for(place, field.length, field.alpha)

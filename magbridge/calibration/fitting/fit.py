@@ -40,12 +40,12 @@ ONE_ELLIPSOID = (
 )
 WITHOUT_PARAMETERS = "method nominal has no solution: used was method auto, without parameters"
 UNKNOWN_LENGTH = 500.0
-"""m, taken for the rock's where no field in place was fitted."""
+"""Length assumed for the crustal field without a field in place, m."""
 LEVEL = 145.0
 """nT, 1-sigma by which the total field at a site differs from a main-field model's: what its degrees do not
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
 ROCK, JUDGED = 3.0 * LEVEL, 3000
-"""nT, more than which no rock leaves over a whole track; and samples that are enough to see that."""
+"""RMS that an unmapped crustal field never exceeds over a whole track, nT; samples that suffice to see it."""
 
 
 def fit(
@@ -61,15 +61,15 @@ def fit(
     Parameters
     ----------
     data : Observations
-        The calibration runs; :func:`~.observe.observations` takes them from a deployment.
+        The calibration runs; :func:`~.observe.observations` reads them from a deployment.
     method : str
-        One of :data:`METHODS`. Where the reference lacks the rock and the track crosses itself or turns, so
-        that it tells rock from heading, ``auto`` is ``survey``. (The last of five dives of a Seaglider along
-        one line, left out: 88 nT without a field in place, 94 with it.)
+        One of :data:`METHODS`. If the reference lacks the crustal field and the track crosses itself or
+        turns, which separates it from heading, ``auto`` is ``survey``. (The last of five dives of a Seaglider
+        along one line, left out: 88 nT without a field in place, 94 with it.)
     order : int
         Highest total degree of the polynomials.
     site_bias : float
-        nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site can tell
+        nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site separates
         it from the gain, so it goes into the covariance. By default none of a true field, of a map that of
         the map, and of a main-field model alone :data:`LEVEL`.
     **options
@@ -94,11 +94,11 @@ def fit(
         method = "survey"
     if method != "survey" and options.get("position_sigma"):
         raise CalibrationError(
-            "position_sigma: the log does not show the rock, so its positions do not matter"
+            "position_sigma: the log does not show the crustal field, so its positions do not matter"
         )
     # one thread: for matrices this small threads cost more than they gain, and the order of sums is fixed
     with threadpool_limits(1, "blas"):
-        if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would settle
+        if wrong := other_units(data.field, float(np.median(data.reference))):  # no fit would converge
             raise CalibrationError(wrong)
         _refuse_one_attitude(data)
         away: tuple[str, ...] = ()
@@ -119,7 +119,7 @@ def fit(
 def _first_solution(
     data: Observations, method: str, order: int, bias: float, in_place: bool, options: dict[str, Any]
 ) -> tuple[Fit, str, tuple[str, ...]]:
-    """Return the fit of the first method that has a solution, that method, and what it lacks.
+    """Return the fit of the first method that has a solution, that method, and the reasons of the others.
 
     CalibrationError: no method has one; the message is that of the first.
     """
@@ -154,7 +154,7 @@ def _function(method: str) -> Callable[..., Fit]:
 
 
 def _rock_may_show(data: Observations, order: int) -> bool:
-    """Tell whether a fit without rock leaves no more than rock can be: among a drone's motors it does."""
+    """Return True if a fit without the crustal field leaves a residual that this field can explain."""
     few = data.part(np.arange(len(data)) % max(len(data) // JUDGED, 1) == 0)
     for method in ("nominal", "auto"):
         try:
@@ -167,7 +167,7 @@ def _rock_may_show(data: Observations, order: int) -> bool:
 
 
 def _default_bias(data: Observations) -> float:
-    """Return how well the reference's level is known, nT, as far as nobody says so."""
+    """Return the default uncertainty of the reference's level, nT."""
     if not data.lacks_rock:
         return 0.0
     return LEVEL if data.map_sigma is None else data.map_sigma

@@ -1,6 +1,6 @@
-r"""The fit to a survey: coefficients and the rock below the track, jointly.
+r"""The fit to a survey: coefficients and the crustal field below the track, jointly.
 
-If no true field is known, the reference is the main field, and what it lacks at a place,
+If no true field is known, the reference is the main field, and the missing part at a place,
 
 .. math:: H_e(x, t) = |\mathrm{IGRF}| + b + f(x) + s(t),
 
@@ -77,12 +77,12 @@ def fit_in_place(
     vehicle, known : optional
         As for :func:`~.auto.fit_auto`.
     position_sigma : float
-        m, by which dead-reckoned positions slowly drift; the track is then bent to where the rock repeats.
+        m, by which dead-reckoned positions slowly drift; the fit then corrects the track to the field.
 
     Raises
     ------
     CalibrationError
-        There are no positions.
+        The data have no positions.
     NoSolutionError
         The fit collapsed or did not converge.
     """
@@ -97,7 +97,7 @@ def fit_in_place(
     try:
         found, survey = _settled(survey, posed.family)
     except np.linalg.LinAlgError as problem:
-        raise NoSolutionError("the fit to the survey has no answer: rock cannot be told apart") from problem
+        raise NoSolutionError("the fit to the survey has no solution: the crustal field is free") from problem
     prior, z = found.family.at(found.widths.eta), found.z
     coefficients = prior.coefficients(z)
     check_scales(samples, coefficients)
@@ -127,7 +127,7 @@ def fit_in_place(
 
 
 def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
-    """Return the unknowns beside coefficients and field: the level, its slope, what changes with time."""
+    """Return the unknowns other than coefficients and field: the level, its slope, changes with time."""
     assert data.place is not None
     away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REACH
     level = max(level, 1e-3)
@@ -140,16 +140,16 @@ def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
 
 
 def _settled(survey: SurveySamples, own: PriorFamily) -> tuple[Answer, SurveySamples]:
-    """Return where the rounds come to rest, and the samples with the offers that the log needs.
+    """Return the converged fit, and the samples with the optional terms that the log needs.
 
-    Those of a long log come to rest with every second or tenth sample, and go on with all from there. What is
-    kept of the offers has shaped the field that was searched with it: where it gains little, another search
-    without may do better.
+    A long log converges with every second or tenth sample first, and then with all. Optional terms that are
+    kept have changed the field that was searched with them: if they gain little, another search without them
+    may be better.
 
     Raises
     ------
     CalibrationError
-        They do not come to rest.
+        The fit does not converge.
     """
     step = max(len(survey.kept) // SETTLED, 1)
     best = Rounds(survey.thinned(step), own)

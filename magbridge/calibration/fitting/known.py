@@ -1,4 +1,4 @@
-r"""What is known of a vehicle's coefficients before its runs are flown, and what the runs alone add to that.
+r"""Prior of a vehicle's coefficients before its runs, and the information that the runs alone add to it.
 
 Notes
 -----
@@ -30,7 +30,7 @@ from magbridge.estimation.priors import PriorFamily
 
 __all__ = ["DEPARTURE", "Known", "rescaling"]
 
-DEPARTURE = "departure from what was known"
+DEPARTURE = "departure from the prior"
 """Name of the width of z among ``widths_nT``: 1 where a deployment is as it was expected."""
 SPREAD = np.log(1.5)
 """1-sigma of the logarithm of that width."""

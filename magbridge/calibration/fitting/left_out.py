@@ -13,8 +13,8 @@ like attitude, which tell how far the fit can be carried to attitudes that it ha
 square is Birge's ratio R (Birge 1932, Phys. Rev. 40:207): where it is larger than chance allows, the model
 lacks something of that size, and all sigmas are too small by R.
 
-That takes the normal equations only. To first order two fits can look alike that are not, so where one is to
-be preferred to another each is fitted again without the part (:func:`refitted`).
+This check needs the normal equations only. To first order two different fits can agree, so to prefer one to
+another each is fitted again without the part (:func:`refitted`).
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def leave_out(
     runs : (n,) array
         A label for each sample: whole runs are left out, or blocks of neighbours where there are few runs.
     attitudes : bool
-        Leave out groups of like attitude, too. (Not where noise is remembered for longer than an attitude
-        lasts, as on an aircraft: neighbours that stay then tell what was left out.)
+        Leave out groups of like attitude, too. (Not where noise is correlated for longer than an attitude
+        lasts, as on an aircraft: neighbours that stay would then predict the group.)
     """
     found = _left_out(samples, prior, z, noise, _parts(runs))
     if attitudes and noise.autocorrelation < LASTING:
@@ -147,9 +147,9 @@ def carried_forward(samples: Samples, prior: Prior, z: FloatArray, noise: NoiseM
     """Return the RMS error, nT, of parts of a log that a fit to the earlier parts alone is carried to.
 
     Forward chaining (Hyndman & Athanasopoulos 2021, Forecasting, section 5.10): the first k of
-    :data:`FORWARD_PARTS` parts predict the next one. What a log cannot determine at its beginning, and what
-    has changed since, counts here, but not where parts between others are held out. Arguments as for
-    :func:`refitted`.
+    :data:`FORWARD_PARTS` parts predict the next one. Coefficients that the beginning of a log does not
+    determine count here, and so do later changes; neither counts where parts between others are held out.
+    Arguments as for :func:`refitted`.
     """
     rows = thinned_rows(len(samples.field))
     weight = np.ones(len(samples.field)) if noise.weight is None else noise.weight
@@ -182,8 +182,8 @@ def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
 def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
     """Return the places of each part: runs, several in one where there are many; else blocks.
 
-    The rest of a log says little of a run that is most of it: what is judged then is how far each fit can
-    be carried beyond its samples, and the wider prior loses.
+    The rest of a log says little about a run that is most of it: the comparison is then of extrapolations
+    beyond the samples of each fit, and the wider prior loses.
     """
     _, first, label, count = np.unique(runs, return_index=True, return_inverse=True, return_counts=True)
     if len(first) < 3 or count.max() > len(runs) / 2:

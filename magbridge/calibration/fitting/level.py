@@ -1,7 +1,7 @@
-"""The level of the corrected field: what an unknown constant of the reference leaves uncertain everywhere.
+"""The level of the corrected field: the uncertainty from an unknown constant of the reference.
 
-Of a corrected sample's variance a part is common to all: nobody knows the mean of the field at a site better
-than its reference does. A survey is flown for the rest. With j the mean slope of the corrected field by the
+A part of a corrected sample's variance is common to all samples: the mean of the field at a site is only as
+certain as its reference. A survey determines the rest. With j the mean slope of the corrected field by the
 coefficients and P their covariance, the level's sigma is ``sqrt(j^T P j)``, and the coefficients move with it
 by ``P j / sqrt(j^T P j)``.
 """
@@ -20,16 +20,16 @@ from magbridge.estimation.residual import Samples, jacobian, residuals, symmetri
 __all__ = ["apart_from_level", "level_of", "sizes", "with_level"]
 
 CONTRADICTS = 2.0
-"""1-sigma of the reference's level, beyond which one that was found is not believed."""
+"""Largest departure of an estimated level from the reference's, in its 1-sigma, that is accepted."""
 ROWS = 5_000
 """Samples that the mean is taken over, at most."""
 
 
 def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sigma: float) -> Calibration:
-    """State how much of a calibration's covariance is level.
+    """Compute how much of a calibration's covariance is level.
 
-    A level that was found beyond :data:`CONTRADICTS` sigmas of what was expected is in doubt as a whole: who
-    says that he knows it took something else for it, as the rock that a long log's nodes leave out.
+    A level beyond :data:`CONTRADICTS` sigmas of its prior is uncertain as a whole: a fit that claims to
+    determine it has absorbed another effect, such as crustal anomalies that a long log's nodes leave out.
 
     Parameters
     ----------

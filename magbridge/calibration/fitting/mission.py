@@ -34,9 +34,9 @@ class Mission:
 
     @classmethod
     def of(cls, data: Observations) -> Mission:
-        """Take the attitudes and positions of a deployment.
+        """Return the mission with the attitudes and positions of a deployment.
 
-        CalibrationError: attitude or place is lacking.
+        CalibrationError: attitude or place is missing.
         """
         known, attitude, reference_ned = data.directed()
         if not known.any():

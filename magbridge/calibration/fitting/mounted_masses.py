@@ -5,7 +5,7 @@ Notes
 Latent numbers of each mass: permanent moment (3), induced moment (3), error of its measured place (3) and
 of its measured travel (3). The free polynomials of :mod:`magbridge.estimation.priors` remain, with far
 smaller widths, for what dipoles do not describe (extended masses, a sensor a degree out of alignment). The
-coefficients are linear in the moments. In the errors of place and travel they are linearised, anew in each
+coefficients are linear in the moments. In the errors of place and travel they are linearised again in each
 round of the fit, so that no place is held more certain than `at_sigma`.
 """
 
@@ -53,7 +53,7 @@ class Mounting(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     travel: Vector
     """m per unit of the parameter."""
     at_sigma: Annotated[float, Meta(gt=0)] = 0.05
-    """m, 1-sigma of `at`."""
+    """1-sigma of `at`, m."""
 
 
 class _VehicleFile(msgspec.Struct, forbid_unknown_fields=True):

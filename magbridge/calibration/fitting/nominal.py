@@ -81,7 +81,7 @@ def nominal(
     Raises
     ------
     NoSolutionError
-        The fit collapsed or did not settle.
+        The fit collapsed or did not converge.
     """
     samples = nominal_samples(data)
     E = np.eye(9)
@@ -104,8 +104,8 @@ def nominal(
         if found.settled and (best is None or value < 0.999 * best[0]):
             best = (value, found, noise, rho)
     if best is None:
-        check_scales(samples, E @ z)  # a fit on its way to collapse never settles: that is the better message
-        raise NoSolutionError("nominal: no start settled; are the samples those of one sensor?")
+        check_scales(samples, E @ z)  # a collapsing fit never converges, so report the collapse first
+        raise NoSolutionError("nominal: no start converged; are the samples those of one sensor?")
     _, found, noise, rho = best
     noise = fit_slow_and_white(
         residuals_of(samples, E @ found.z), samples.steps, replace(noise, autocorrelation=rho)
@@ -144,7 +144,7 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
     """Refuse a collapsed fit; `coefficients` are (9 m,), nT.
 
     NoSolutionError: where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field,
-    where the attitudes do not tell it from a scale. All around, any T is known as well as the noise allows.
+    where the attitudes do not separate it from a scale. With all attitudes, the noise alone limits T.
     """
     seen = samples.part(slice(None, None, max(len(samples.phi) // 1000, 1)))
     scales, T = scales_and_offsets(seen, coefficients)
@@ -158,5 +158,5 @@ def check_scales(samples: Samples, coefficients: FloatArray) -> None:
         counts = f"a reading counts {scales[worst].mean():.3g} nT, or " if alike else ""
         raise NoSolutionError(
             f"the fit collapsed: scales {listed} (expected near 1), offset {T[worst]:.0f} nT in a field of "
-            f"{samples.F_0:.0f} nT; {counts}there are too few attitudes to tell scale from offset"
+            f"{samples.F_0:.0f} nT; {counts}there are too few attitudes to separate scale and offset"
         )

@@ -47,7 +47,7 @@ class Observations:
     """(n, k): Actuator positions; k may be 0."""
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    """`names`, `units`: Of the parameters."""
+    """`names`, `units`: Names and units of the parameters."""
     runs: NDArray[np.generic] = attribute(default_factory=_nothing)
     """(n,): A label for each sample: dive, spiral, file. Validation leaves out whole runs. If not given, one
     run."""
@@ -60,8 +60,8 @@ class Observations:
     place: FloatArray | None = None
     """(n, 3), m north, east, down of `origin`."""
     unmapped: FloatArray | None = None
-    """(n,): 1 where the reference lacks the rock below or what a map lacks of it, 0 where it is the true
-    field."""
+    """(n,): 1 where the reference lacks the crustal field, or a map's missing part of it; 0 where it is the
+    true field."""
     temperature: FloatArray | None = None
     """(n,), degC, of the fluxgate; NaN where it is not known."""
     map_sigma: float | None = None
@@ -138,7 +138,7 @@ class Observations:
 
     @property
     def lacks_rock(self) -> bool:
-        """Whether the reference is, anywhere, less than the true field."""
+        """Return True if the reference is, anywhere, less than the true field."""
         return self.unmapped is not None and bool(self.unmapped.any())
 
     @property
@@ -207,7 +207,7 @@ def _plausible(names: Sequence[str], positions: FloatArray) -> None:
         if high > low and far.any():
             raise CalibrationError(
                 f"parameter {name!r} is {column[far][0]:g} in {int(far.sum())} of {len(column)} samples, and "
-                f"{low:g} to {high:g} in the others: leave empty what is not known"
+                f"{low:g} to {high:g} in the others: leave unknown values empty"
             )
 
 

@@ -28,7 +28,7 @@ __all__ = ["at_one_time", "observations"]
 MAP_ERROR = 20.0
 """nT, 1-sigma of a map that does not state its own."""
 GAP = 10.0
-"""Intervals without a sample, after which what comes has nothing to do with what was."""
+"""Intervals without a sample, after which a sample is independent of the previous one."""
 FOLLOWED = (TEMPERATURE, "depth")
 """Columns that move no mass but may be fitted as if they did."""
 
@@ -114,7 +114,7 @@ def _at_rows(ds: xr.Dataset, axis: str) -> FloatArray:
 def _places(ds: xr.Dataset) -> tuple[FloatArray | None, FloatArray | None, tuple[float, float]]:
     """Return m north, east and down of an origin (n, 3), where the true field is not known (n,), the origin.
 
-    The first two are None where there are no positions, or the true field is known all along.
+    The first two are None without positions, or if the true field is known all along.
     """
     known = ds["reference_field"].notnull().to_numpy() if "reference_field" in ds else np.array(False)
     if not {"latitude", "longitude"} <= set(ds.variables) or known.all():

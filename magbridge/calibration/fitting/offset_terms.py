@@ -3,8 +3,8 @@ r"""What a sensor's offset follows during a survey: its temperature, at once or 
 .. math:: T(t) = T + c\,(\Theta_\tau(t) - \bar\Theta) + \sum_k d_k \cos(\pi k t / t_s)
 
 c along each axis, nT/degC, with the temperature through a lag tau; the rest a random walk along each axis. An
-offset of the body is another field on each heading: without these terms it would go into the rock. All are in
-the fit while the rock is searched; then those stay that make the log likelier.
+offset of the body is another field on each heading: without these terms the crustal field would absorb it.
+All terms are in the fit during the field search; then those stay that make the log likelier.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Creep:
     offset: FloatArray
     """(n, 3), nT, sensor axes, about the mean."""
     calibration: Calibration
-    """What holds once that is taken off the readings; beyond the survey the offset may be any of these."""
+    """Calibration without the walk; beyond the survey the offset may have any value of it."""
 
     def at(self, time: FloatArray) -> FloatArray:
         """Return the offset (m, 3), nT, at times (m,), s since 1970 UTC."""
@@ -118,7 +118,7 @@ def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
 
 
 def in_words(calibration: Calibration, creep: Creep | None) -> Iterator[str]:
-    """Say what the offset was found to follow."""
+    """Yield the quantities that the offset follows."""
     for effect in calibration.effects:
         if isinstance(effect, ChannelEffect):
             slope = float(np.linalg.norm(calibration.coefficients[-effect.size :]))

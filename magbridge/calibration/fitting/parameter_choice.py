@@ -37,15 +37,15 @@ that nearly always moves with a declared one is known only by a few: no part may
 BETTER = 0.8
 """Share of the residual that must be left on the parts left out, for a column to be named."""
 LEAST = 2.0
-"""nT, below which nothing is said."""
+"""Least improvement that is reported, nT."""
 NAMED = 3
-"""Columns that are named at most, each beside those before it: what only resembles a mass is not a second."""
+"""Largest number of reported columns, each given the previous ones: a correlate of a mass is not a second."""
 WORTHY = 0.5
 """Share of the first one's worth that another must have: a mass's higher powers leave what anything fits."""
 
 
 def undeclared(calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray]) -> list[str]:
-    """Return a line for each column that explains the residual of a fit although it is no parameter of it.
+    """Return a line for each column that explains the residual of a fit but is not a parameter of it.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ def undeclared(calibration: Calibration, data: Observations, columns: Mapping[st
     Notes
     -----
     A mass at c adds a field ``d(c)`` to the vector, and ``d(c) . u`` to the total field, u its direction: the
-    residual is regressed on ``u, c u, c^2 u`` beside the same of each declared parameter, which without c
-    may have taken some of its part; what c adds is measured on parts left out.
+    residual is regressed on ``u, c u, c^2 u`` and the same functions of each declared parameter, which may
+    have absorbed part of it without c; the improvement by c is measured on held-out parts.
     """
     lines: list[str] = []
     conditional_on: tuple[str, ...] = ()
@@ -87,10 +87,10 @@ def worths(
     better: float = BETTER,
     conditional_on: tuple[str, ...] = (),
 ) -> dict[str, float]:
-    """Return what each column (n,) explains of a residual on parts left out, nT; see :func:`undeclared`.
+    """Return by how many nT each column (n,) reduces a residual on held-out parts; see :func:`undeclared`.
 
-    `columns` are (n,), at the n samples. Those that leave more than the share `better` of it are left out,
-    and so are those that the others are `conditional_on`.
+    `columns` are (n,), at the n samples. Columns that leave more than the fraction `better` of it are left
+    out, as are those that the others are `conditional_on`.
     """
     if set(calibration.channels) != set(data.names) or len(data) < 10 * PARTS:
         return {}
@@ -207,7 +207,7 @@ def best_parameters(
 
 
 def lines(offers: Sequence[Offer]) -> list[str]:
-    """Return a line for each column that was tried: what it buys on parts left out."""
+    """Return a line for each column that was tried, with its improvement on held-out parts."""
     return [
         f"--parameter {one.name}: {one.without:.0f} nT on parts left out without it, "
         f"{one.left_out:.0f} with it: {'taken' if one.taken else 'not worth it'}"

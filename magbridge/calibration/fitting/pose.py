@@ -1,7 +1,7 @@
-"""What is fitted: the samples with their monomials, and the prior of the coefficients.
+"""Inputs of a fit: the samples with their monomials, and the prior of the coefficients.
 
 The prior is one of physical widths (:mod:`magbridge.estimation.priors`), of dipoles at measured places
-(:mod:`.mounted_masses`), or what is known of this vehicle from before (:mod:`.known`).
+(:mod:`.mounted_masses`), or from earlier deployments of the vehicle (:mod:`.known`).
 """
 
 from __future__ import annotations

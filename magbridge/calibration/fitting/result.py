@@ -1,4 +1,4 @@
-"""The result of a fit: a calibration, its residuals, and what can be said of them."""
+"""The result of a fit: a calibration, its residuals, and its warnings."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Fit:
 
     @property
     def supported(self) -> bool:
-        """Whether the calibration is without doubts: ``--strict`` demands it.
+        """Return True without a reason against the calibration: ``--strict`` demands it.
 
         The error expected elsewhere is not large against the noise, and the headings have no wide gap.
         """
@@ -95,7 +95,7 @@ def assemble(
     Parameters
     ----------
     data, samples
-        The calibration runs, and what was fitted of them.
+        The calibration runs, and the samples used from them.
     parameters, exponents
         The positions that the coefficients depend on, and the m monomials in them.
     coefficients : (9 m,) array

@@ -73,7 +73,7 @@ class Answer:
 
 
 def start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float]:
-    """Return z (q,) near the answer, the rock taken for noise; and the size of that."""
+    """Return z (q,) near the solution, with the crustal field as noise, and the RMS of that noise."""
     samples, prior = survey.samples, family.at(family.centre)
     found: list[tuple[float, FloatArray]] = []
     for one in starts(samples):
@@ -91,7 +91,7 @@ def start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float
 # ---- The iterations ----
 
 GUESSED = 2
-"""Rounds before the field is searched: while the coefficients are far off, they look like rock and noise."""
+"""Iterations before the field is searched: coefficients far off look like crustal field and noise."""
 SEARCHES = 2
 """Rounds after that in which the search goes on."""
 ROUNDS = 40
@@ -99,7 +99,7 @@ ROUNDS = 40
 PATIENCE = 8
 """Rounds after the search within which they are expected to be at rest; a bent track takes more."""
 STILL = 0.05
-"""Of the noise: a round that moves no residual by more (RMS) is the last."""
+"""Fraction of the noise: an iteration that changes no residual by more (RMS) is the last."""
 OUTLIER = 5.0
 """Sigmas beyond which a sample is left out."""
 OVERSHOT = 10.0
@@ -110,7 +110,7 @@ SEARCHED, WIDE = 12_000, 5_000.0
 """Samples about the middle that the field's size and length are searched with; where there are more within so
 many m north and east, every second or third of these."""
 SETTLED = 50_000
-"""Samples with which the rounds come to rest, before those with all of a longer log."""
+"""Samples with which the iterations converge, before those with all of a longer log."""
 MOST = 40_000
 """Nodes about all samples, at most."""
 
@@ -137,7 +137,7 @@ class Rounds:
 
     @property
     def names(self) -> set[str]:
-        """Of the groups that are in the fit."""
+        """Names of the groups that are in the fit."""
         return {group.name for group in self.survey.groups}
 
     def worth(self, answer: Answer) -> float:
@@ -181,7 +181,7 @@ class Rounds:
             if self.offers and (still or turn == self.until + PATIENCE):
                 self._weigh_offers(turn)
         if moved > self.sigma:
-            raise NoSolutionError("the fit to the survey did not settle: the data contradict themselves")
+            raise NoSolutionError("the fit to the survey did not converge: the data contradict themselves")
         return answer
 
     def _round(self, turn: int) -> Answer:
@@ -232,9 +232,9 @@ class Rounds:
         return replace(choice, field=replace(field, nodes=nodes))
 
     def _weigh_offers(self, turn: int) -> None:
-        """Keep of what is offered what the log needs; where that is not all, the search goes on without.
+        """Keep the optional terms that the log needs; the search continues without the others.
 
-        Not before the rounds are at rest with all of it: until then they fit what is an outlier.
+        Wait until the iterations have converged with all terms: until then they fit outliers.
         """
         survey, choice = self.survey, self.choice
         self.offers = False

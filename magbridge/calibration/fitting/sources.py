@@ -58,14 +58,14 @@ def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]
 def heterogeneous_logs(
     logs: Sequence[xr.Dataset], data: Observations, found: Fit | None, refit: Callable[[Observations], Fit]
 ) -> str:
-    """Return why logs are not of one vehicle in one state; empty where nothing says so.
+    """Return why logs are not of one vehicle in one state; empty without such a reason.
 
     Parameters
     ----------
     logs : sequence of Dataset
         The logs of which `data` was made.
     data : Observations
-        What was fitted.
+        Samples of the fit.
     found : Fit or None
         The fit to all; None if it collapsed.
     refit : callable

@@ -39,9 +39,9 @@ class Drift(NamedTuple):
 
 
 def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> BoolArray:
-    """Say beside which samples (n,) a mass moves, by the bridge's own criterion (:mod:`magbridge.track`).
+    """Return True for samples (n,) next to a motion of a mass, as defined in :mod:`magbridge.track`.
 
-    Where one begins to move after its last report, no telemetry tells where it was.
+    When a mass begins to move after its last report, no telemetry gives its position.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> Bo
     values : (n, k) array
         Positions of the masses.
     spans : (k,) array
-        Of each, what it moves through.
+        Range of each mass.
     """
     fastest = Align().moving_rate * spans * np.maximum(np.diff(time), 1.0)[:, None]
     step = (np.abs(np.diff(values, axis=0)) > fastest).any(axis=1)
@@ -61,7 +61,7 @@ def beside_motion(time: FloatArray, values: FloatArray, spans: FloatArray) -> Bo
 
 
 def _at_rest(data: Observations) -> BoolArray:
-    """Say beside which samples (n,) no mass moves; all, where most do, as a current or a throttle."""
+    """Return True for samples (n,) without a motion of a mass; all True if most move, as with a current."""
     span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
     rest = ~beside_motion(data.time, data.parameters, span)
     return rest if rest.mean() > 0.5 else np.ones(len(data), bool)
@@ -75,9 +75,9 @@ class SurveySamples:
     data : Observations
         With places; where `unmapped` is 0 the reference is the true field.
     samples : Samples
-        The same, with the monomials of the positions.
+        The samples, with the monomials of the positions.
     groups : tuple of ParameterBlock
-        Unknowns beside the coefficients.
+        Unknowns in addition to the coefficients.
     drift : Drift, optional
         How positions may be off: further unknowns, which act through the field's slope.
     """
@@ -128,11 +128,11 @@ class SurveySamples:
         self.slopes = np.zeros((len(self.kept), 2 * many))
 
     def slow(self, latent: FloatArray) -> FloatArray:
-        """Return what the reference lacks beside the rock (n,), nT: its level and slow changes."""
+        """Return the missing part of the reference except the crustal field (n,), nT: level, slow changes."""
         return (self.steady @ latent[: len(self.steady)]) * self.unmapped
 
     def offset(self, latent: FloatArray, of: Sequence[OffsetBlock] | None = None) -> FloatArray:
-        """Return the sensor's offset (n, 3), nT, beside what depends on the positions.
+        """Return the sensor's offset (n, 3), nT, without its dependence on the positions.
 
         `latent` (p,) are the unknowns of all groups; `of` are the offsets that count, by default all.
         """

@@ -28,7 +28,7 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
     Parameters
     ----------
     calibration : Calibration
-        What is known so far.
+        Calibration so far.
     mission : Dataset (time)
         Attitude, position and masses as the mission will have them; magnetometer columns are not needed.
     runs : int
@@ -63,7 +63,7 @@ def survey_plan(
 ) -> list[Proposal]:
     """Propose surveys that calibrate themselves, of so many `hours`; arguments as for :func:`flight_plan`.
 
-    Without a calibration they are for a vehicle nobody knows, whose masses' positions are `parameters`.
+    Without a calibration they are for an unknown vehicle, whose masses' positions are `parameters`.
 
     CalibrationError, FormatError: as :func:`flight_plan`.
     """

@@ -38,7 +38,7 @@ class Limits:
     roll: tuple[float, float] = (-10.0, 10.0)
     """deg, banks that it can hold in a spiral."""
     pitch: tuple[float, float] = (14.0, 30.0)
-    """deg, smallest and largest, of dives and climbs alike."""
+    """Smallest and largest pitch of dives and climbs, deg."""
     parameters: tuple[tuple[float, float], ...] = ()
     """Ends of each position."""
     pitch_at: Callable[[FloatArray], float] | None = None
@@ -98,6 +98,6 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
 
 
 def _near(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
-    """Whether some flown positions differ by no more than REACH in any parameter."""
+    """Return True if some flown positions differ by no more than REACH in any parameter."""
     off = np.abs(positions - flown) / [parameter.scale for parameter in parameters]
     return bool((off.max(axis=1) <= REACH).any())

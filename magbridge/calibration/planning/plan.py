@@ -57,12 +57,12 @@ class Plan:
 def expected_calibration(
     parameters: tuple[Parameter, ...], field: float, order: int = 3, noise: float = 1.0
 ) -> Calibration:
-    """Return what is known of a vehicle before its first run: the physical widths of its coefficients.
+    """Return the prior of a vehicle before its first run: the physical widths of its coefficients.
 
     Parameters
     ----------
     parameters : tuple of Parameter
-        What moves, with the ranges to be seen.
+        Parameters that vary, with their ranges.
     field, noise : float
         nT, the field where runs are flown, and a sample's noise.
     order : int
@@ -168,7 +168,7 @@ def plan(
     Parameters
     ----------
     calibration : Calibration
-        What is known already; :func:`expected_calibration` before the first run.
+        Calibration so far; :func:`expected_calibration` before the first run.
     mission : Mission
         Where the error is to be small.
     field_ned : (3,) array

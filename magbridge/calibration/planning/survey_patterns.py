@@ -32,18 +32,18 @@ from magbridge.estimation.residual import jacobian
 __all__ = ["Proposal", "facts", "propose", "summary"]
 
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
-"""nT, m and power of the rock that is expected, as nobody has been there."""
+"""Amplitude (nT), length (m) and power of the expected crustal field, as the place is unmapped."""
 LEVEL = 145.0
 """nT, 1-sigma of the main field's level."""
 SAMPLES = 1_500
-"""Of a pattern: more are averaged."""
+"""Largest number of samples of a pattern: more are averaged."""
 SPIRAL = 1_800.0
 """s of a spiral at the end."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A pattern, what is expected after it, and what it leaves open."""
+    """A pattern, the expected accuracy, and the questions that it leaves open."""
 
     name: str
     rms: float
@@ -62,7 +62,7 @@ def propose(
     Parameters
     ----------
     calibration : Calibration
-        Where to linearise, with the noise of a sample: the one so far, or what is expected of any vehicle.
+        Where to linearise, with the noise of a sample: the calibration so far, or the prior of any vehicle.
     data : Observations
         The mission: attitude, position and masses as they will be.
     hours : float
@@ -105,7 +105,7 @@ def propose(
 def _patterns(
     n: int, interval: float, speed: float, roll: float
 ) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield name, course and bank (n,), rad, of every pattern of n samples, `interval` s apart."""
+    """Yield name, course and bank (n,), rad, of every pattern of n samples, at `interval` s."""
     share, level = (np.arange(n) + 0.5) / n, np.zeros(n)
     bank = np.radians(roll) * np.where(np.arange(n) * 24 // n % 2, 1.0, -1.0)
     yield "straight ahead", np.zeros(n), level
@@ -176,7 +176,7 @@ def summary(found: list[Proposal]) -> str:
     )
     lines = [f"{one.name:52} {one.crossings:9} {one.rms:48.2f} {one.worst:7.2f}" for one in found]
     note = (
-        f"over rock of {ROCK:.0f} nT and {LENGTH:.0f} m, nothing known of the vehicle, no calibration run, "
+        f"over a crustal field of {ROCK:.0f} nT and {LENGTH:.0f} m, an unknown vehicle, no calibration run, "
         "no map; the level stays as uncertain as the main field's"
     )
     return "\n".join([header, *lines, note])
