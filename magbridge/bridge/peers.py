@@ -16,7 +16,7 @@ from math import inf
 from magbridge.mavlink import BAD_DATA, Codec
 from magbridge.mavlink.framing import V2
 
-__all__ = ["ANSWERED", "TIMEOUT", "Peer", "Peers"]
+__all__ = ["ANSWERED", "SHARE", "TIMEOUT", "Peer", "Peers"]
 
 TIMEOUT = 30.0
 """s after its last valid frame at which a peer is no longer answered."""
