@@ -42,12 +42,6 @@ if TYPE_CHECKING:
 
 __all__ = ["diagnose"]
 
-FAMILIES = {
-    "map_error": "reference", "diurnal_variation": "reference", "reference_bias": "reference",
-    "temperature_offset": "temperature", "temperature_scale": "temperature",
-    "actuator_order": "mass", "clock_offset": "mass", "filter_lag": "mass",
-}  # fmt: skip
-"""Families of causes that describe each other's remnants: those of one family are one finding."""
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 SLOW = 0.5
@@ -266,9 +260,10 @@ def _findings(
 
 def _families(named: Sequence[Hypothesis]) -> list[list[int]]:
     """Return the places of the named causes, those of one family together, the strongest of each first."""
-    groups: dict[str, list[int]] = {}
+    rows, groups = known(), dict[str, list[int]]()
     for k in sorted(range(len(named)), key=lambda n: -named[n].signal_to_noise):
-        groups.setdefault(FAMILIES.get(named[k].candidate.cause, str(k)), []).append(k)
+        row = rows.get(named[k].candidate.cause)
+        groups.setdefault((row.family if row else "") or str(k), []).append(k)
     return sorted(groups.values(), key=lambda group: group[0])
 
 

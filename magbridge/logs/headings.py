@@ -146,7 +146,7 @@ def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str
         places = [only(word) for word in aliases_of]
         if name in PREFIXED_COLUMNS:
             places += [only(word, inner) for word in aliases_of]
-        there = [place for place in places if place is not None and place not in found]
+        there = [k for k in places if k is not None and k not in found and names[k] not in COLUMNS]
         if there:
             found[there[0]] = name
     return found

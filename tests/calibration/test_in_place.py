@@ -366,7 +366,7 @@ def test_a_creep_that_shaped_the_rock_for_itself_goes_where_a_search_without_doe
     def all_of_little_gain(*of: Any, price: float = 0.0) -> tuple[ParameterBlock, ...]:
         return tuple(one for one in of[2] if not (price and one.offered))
 
-    monkeypatch.setattr(rounds, "likeliest", all_of_little_gain)
+    monkeypatch.setattr(rounds, "select_blocks", all_of_little_gain)
     data, true = flown(legs=10)
     found = fit(slowly(data))
     assert found.creep is None

@@ -215,7 +215,7 @@ def test_a_channels_name_does_not_decide(
     renamed = ds.rename({written[1]: "zz"})
     found = diagnose([renamed], calibration)
     assert found.findings[0].candidate.channel == "zz"
-    assert "do not use it" in useful(replace(found, total=Improvement(1.0, 1.0, 1.0, (0.9, 1.1))))
+    assert "do not use it" in useful(replace(found, improvement=Improvement(1.0, 1.0, 1.0, (0.9, 1.1))))
     assert "It leaves" not in useful(found)
     first = found.findings[0]
     sun = replace(first.candidate, cause="diurnal_variation", channel=None, effects=())

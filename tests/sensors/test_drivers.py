@@ -152,7 +152,7 @@ def test_the_table_keeps_its_word(name: str) -> None:
     [
         ("fluxgate", {}, "sensor.driver: expected one of ascii, digitizer, hmr2300, twinleaf"),
         ("digitizer", {}, "sensor.options.sensitivity: missing key"),
-        ("digitizer", {"sensitivity": 0.0}, "sensor.options.sensitivity: expected `float` > 0.0"),
+        ("digitizer", {"sensitivity": 0.0}, "sensor.options.sensitivity: expected `float` >= 1e-12"),
         ("hmr2300", {"rate": 21}, "sensor.options.rate: invalid enum value 21"),
         ("hmr2300", {"speed": 21}, "sensor.options.speed: unknown key"),
         ("twinleaf", {"columns": ["x"]}, "sensor.options.columns: expected `array` of length 3"),

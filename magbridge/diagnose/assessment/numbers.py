@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
+from magbridge.diagnose.causes import known
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
 from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
@@ -128,7 +129,8 @@ def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | 
     None for other causes.
     """
     candidate = finding.candidate
-    if candidate.cause != "clock_offset":
+    row = known().get(candidate.cause)
+    if row is None or not row.delays_telemetry:
         return None
     delay = float(np.sum(finding.coefficients * candidate.width))
     sigma = float(np.sqrt(candidate.width @ finding.covariance @ candidate.width))
