@@ -39,7 +39,8 @@ class Sensor(Table, frozen=True):
     port: Name
     """A device, a pattern (``/dev/ttyUSB*``: the first on which a reading comes within `timeout`, so that a
     sensor that comes back under another name is found again; one that sends NMEA 0183 and no readings gets no
-    start-up commands) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``)."""
+    start-up commands) or a pyserial URL (``socket://``, ``rfc2217://``, ``loop://``),
+    or an RM3100 on a bus: ``i2c:1:0x20`` or ``spi:0.0``."""
     baudrate: Baudrate = 9600
     """bit/s."""
     timeout: Positive = 10.0

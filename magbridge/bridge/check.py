@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from magbridge.bridge.bus_port import sensor_port
 from magbridge.bridge.learning import first_calibration, open_learner
 from magbridge.bridge.links import LINKS, open_link
 from magbridge.bridge.needs import unmet
 from magbridge.bridge.nmea import nmea_port
-from magbridge.bridge.serial_port import serial_line
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, load
 from magbridge.errors import ConfigError, MagbridgeError
@@ -106,9 +106,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
         except MagbridgeError as error:
             yield ConfigFault(fatal=True, text=str(error))
     yield from _driver(config)
-    yield from _tried(
-        lambda: serial_line(config.sensor.port, config.sensor.baudrate, str(path), "sensor.port")
-    )
+    yield from _tried(lambda: sensor_port(config))
     yield from _device(config, "sensor.port", config.sensor.port)
     yield from _tried(lambda: open_link(config.link.url, config.link.baudrate, str(path)))
     if config.link.url.partition(":")[0] not in LINKS:

@@ -13,6 +13,7 @@ from pathlib import Path
 from threading import Thread
 
 from magbridge.bridge import states
+from magbridge.bridge.bus_port import sensor_port
 from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import HostClock
 from magbridge.bridge.file_server import FileServer
@@ -21,7 +22,6 @@ from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.nmea import NmeaOutput, nmea_port
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.bridge.serial_port import serial_line
 from magbridge.config import Config, load
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink.enums import MAV_SEVERITY
@@ -56,7 +56,7 @@ def run(path: Path) -> None:
     keeper = Keeper(config)
     clock = HostClock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
-    sensor = serial_line(config.sensor.port, config.sensor.baudrate, str(config.path), "sensor.port")
+    sensor = sensor_port(config)
     nmea = nmea_port(config)
     own = config.link
     who, signed = (own.system, own.autopilot), own.signing_key is not None

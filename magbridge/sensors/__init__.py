@@ -24,6 +24,7 @@ DRIVERS: dict[str, tuple[str, str]] = {
     "ascii": ("magbridge.sensors.ascii", "Ascii"),
     "digitizer": ("magbridge.sensors.digitizer", "Digitizer"),
     "hmr2300": ("magbridge.sensors.hmr2300", "Hmr2300"),
+    "rm3100": ("magbridge.sensors.rm3100", "Rm3100"),
     "twinleaf": ("magbridge.sensors.twinleaf", "Twinleaf"),
 }
 """Name: module and class; a module is imported when its driver is opened."""

@@ -27,9 +27,8 @@ A sentence like NMEA's, ``$PMAG,1234.500,12345.6,-234.5,43210.9*5A``::
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
 from math import inf, isfinite, nan
-from operator import itemgetter, xor
+from operator import itemgetter
 from typing import Annotated, Any, ClassVar, Literal
 from zlib import crc32
 
@@ -38,9 +37,9 @@ from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import BEYOND, MAX_DEVICE_TIME_S, Reading
-from magbridge.sensors.framing import Framer, saturated
+from magbridge.sensors.framing import Framer, nmea_checksum, saturated
 
-__all__ = ["CHECKSUMS", "Ascii", "AsciiOptions"]
+__all__ = ["CHECKSUMS", "Ascii", "AsciiOptions", "strip_checksum"]
 
 LIMIT = 512
 """Longest line, in bytes."""
@@ -54,8 +53,8 @@ Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 
 CHECKSUMS: dict[str, tuple[int, Callable[[bytes], int]]] = {
-    "nmea": (2, lambda text: reduce(xor, text[1:], 0)),
-    "xor": (2, lambda text: reduce(xor, text, 0)),
+    "nmea": (2, nmea_checksum),
+    "xor": (2, lambda text: text[0] ^ nmea_checksum(text) if text else 0),
     "sum": (2, lambda text: sum(text) & 0xFF),
     "crc32": (8, crc32),
 }
@@ -192,7 +191,7 @@ class Ascii:
         """Return the reading in a line; raise ValueError where the line does not hold one."""
         line = line.rstrip(b"\r")
         if self._options.checksum:
-            line = _checked(line, self._options.checksum)
+            line = strip_checksum(line, self._options.checksum)
         if not line.startswith(self._prefix) or b"_" in line:  # Python's numbers may hold underscores
             raise ValueError
         cells = line[len(self._prefix) :].split(self._separator)
@@ -219,7 +218,7 @@ class Ascii:
         )
 
 
-def _checked(line: bytes, checksum: str) -> bytes:
+def strip_checksum(line: bytes, checksum: str) -> bytes:
     """Return the part of `line` before its checksum; raise ValueError where the checksum is wrong."""
     digits, function = CHECKSUMS[checksum]
     text, star, stated = line[: -digits - 1], line[-digits - 1 : -digits], line[-digits:]

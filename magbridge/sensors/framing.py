@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-__all__ = ["CRC32_RESIDUE", "Framer", "cobs_decode", "cobs_encode", "saturated"]
+from functools import reduce
+from operator import xor
+
+__all__ = ["CRC32_RESIDUE", "Framer", "cobs_decode", "cobs_encode", "nmea_checksum", "saturated"]
 
 CRC32_RESIDUE = 0x2144DF1C
 """CRC-32 (IEEE 802.3) of any message followed by its own CRC-32 in little-endian order."""
@@ -94,6 +97,11 @@ def cobs_decode(frame: bytes) -> bytes:
         pieces.append(frame[at + 1 : at + step])
         at += step
     return b"\0".join(pieces) if at == end else b""
+
+
+def nmea_checksum(text: bytes) -> int:
+    """Return the exclusive or of all bytes but the first, the ``$``."""
+    return reduce(xor, text[1:], 0)
 
 
 def saturated(x: float, y: float, z: float, limit: float) -> bool:

@@ -18,6 +18,7 @@ from sitl.fluxgate.ascii import AsciiEncoder
 from sitl.fluxgate.digitizer import DigitizerEncoder
 from sitl.fluxgate.encoder import Encoder
 from sitl.fluxgate.hmr2300 import Hmr2300Encoder
+from sitl.fluxgate.rm3100 import Rm3100Encoder
 from sitl.fluxgate.twinleaf import TwinleafEncoder
 
 __all__ = ["ENCODERS", "Encoder", "open_encoder"]
@@ -26,6 +27,7 @@ ENCODERS: dict[str, type[Encoder]] = {
     "ascii": AsciiEncoder,
     "digitizer": DigitizerEncoder,
     "hmr2300": Hmr2300Encoder,
+    "rm3100": Rm3100Encoder,
     "twinleaf": TwinleafEncoder,
 }
 """Driver's name: the emulated instrument."""

@@ -26,6 +26,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "digitizer": ("digitizer", {"sensitivity": 5e-5}),
     "hmr2300 binary": ("hmr2300", {"output": "binary"}),
     "hmr2300 ascii": ("hmr2300", {"output": "ascii"}),
+    "rm3100": ("rm3100", {"cycle_count": 400}),
     "twinleaf 2": ("twinleaf", {"temperature": "therm"}),
     "twinleaf 1": ("twinleaf", {"route": "/0/2"}),
     "ascii blanks": ("ascii", {"columns": ["x", "y", "z", "temperature"], "unit": "G", "range": 65_000.0}),
@@ -150,7 +151,7 @@ def test_the_table_keeps_its_word(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "options", "line"),
     [
-        ("fluxgate", {}, "sensor.driver: expected one of ascii, digitizer, hmr2300, twinleaf"),
+        ("fluxgate", {}, "sensor.driver: expected one of ascii, digitizer, hmr2300, rm3100, twinleaf"),
         ("digitizer", {}, "sensor.options.sensitivity: missing key"),
         ("digitizer", {"sensitivity": 0.0}, "sensor.options.sensitivity: expected `float` >= 1e-12"),
         ("hmr2300", {"rate": 21}, "sensor.options.rate: invalid enum value 21"),

@@ -159,7 +159,7 @@ def test_twinleaf_says_no_to_other_requests() -> None:
 
 def test_wrong_options_name_the_key() -> None:
     with pytest.raises(
-        ConfigError, match=r"my.toml: sensor.driver: can emulate ascii, digitizer, hmr2300, twinleaf"
+        ConfigError, match=r"my.toml: sensor.driver: can emulate ascii, digitizer, hmr2300, rm3100, twinleaf"
     ):
         open_encoder("compass", {}, source="my.toml")
     with pytest.raises(ConfigError, match=r"bridge.toml: sensor.options.sensitivity: missing key"):

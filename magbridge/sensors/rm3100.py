@@ -1,0 +1,167 @@
+"""``rm3100``: PNI's magneto-inductive magnetometer on I2C or SPI.
+
+Facts from PNI's user manual (r07): cycle counts in 0x04 to 0x09, X first, high byte first; the gain in counts
+per microtesla is ``0.3671 cycle_count + 1.5``; results from 0x24, three times 24 bits, high byte first; the
+data are ready where bit 7 of 0x34 is set; 0x36 always reads 0x22. The part has no command for a reset: the
+bridge stops it and writes all registers again. The bus port polls; its lines of text go to the log.
+"""
+
+from __future__ import annotations
+
+from math import log2
+from time import monotonic
+from typing import Annotated, ClassVar, Literal, Protocol
+
+import msgspec
+from msgspec import Meta
+
+from magbridge.records import MAX_DEVICE_TIME_S, Reading
+from magbridge.sensors.ascii import strip_checksum
+from magbridge.sensors.framing import Framer, nmea_checksum, saturated
+
+__all__ = ["Bus", "Rm3100", "Rm3100Options", "nt_per_count"]
+
+POLL, CMM, CYCLE_COUNTS, TMRC, RESULTS, BIST, STATUS = 0x00, 0x01, 0x04, 0x0B, 0x24, 0x33, 0x34
+REVISION = 0x22
+ALL_AXES, CONTINUOUS, SELF_TEST = 0x70, 0x71, 0x8F
+FASTEST_TMRC, FASTEST_HZ = 0x92, 600.0
+SELF_TEST_S = 0.5
+"""s in which the self-test must complete."""
+CYCLES_PER_SECOND = 29_400
+"""Cycles of all three axes a second: 147 Hz at a cycle count of 200."""
+MAX_COUNT = 0x7FFFFF
+PREFIX = b"$RM3100,"
+
+
+class Bus(Protocol):
+    """Registers on a bus; each method raises OSError where the part does not answer."""
+
+    def read(self, register: int, count: int) -> bytes:
+        """Return `count` bytes from `register` on."""
+        ...
+
+    def write(self, register: int, data: bytes) -> None:
+        """Write bytes from `register` on."""
+        ...
+
+
+class Rm3100Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[sensor.options]`` of the RM3100."""
+
+    cycle_count: Annotated[int, Meta(ge=30, le=400)] = 200
+    """Cycles of each axis: more of them give a finer step (13.3 nT at 200) and a lower highest rate."""
+    rate: Annotated[float, Meta(ge=0.1, le=600)] = 37.0
+    """Readings per second; the part has 600 Hz divided by powers of two, and the nearest is used."""
+    mode: Literal["continuous", "single"] = "continuous"
+    """``single``: the bridge starts each measurement, so that the part rests in between."""
+    self_test: bool = True
+    """Test the three coils whenever the port is opened."""
+
+    def __post_init__(self) -> None:
+        if self.rate > (fastest := CYCLES_PER_SECOND / self.cycle_count):
+            raise ValueError(f"rate: expected at most {fastest:.0f} with cycle_count {self.cycle_count}")
+
+
+class Rm3100:
+    """Reads the registers, and parses the lines in which the readings are logged."""
+
+    Options: ClassVar = Rm3100Options
+    sequence_modulo, time_modulo = 0, 0.0
+
+    def __init__(self, options: Rm3100Options) -> None:
+        self._options = options
+        self._step = max(0, round(log2(FASTEST_HZ / options.rate)))
+        self.period = 2**self._step / FASTEST_HZ
+        self.nt_per_count = nt_per_count(options.cycle_count)
+        self.range_nt = MAX_COUNT * self.nt_per_count
+        self.frames_bad = 0
+        self._lines = Framer(b"\n", 64)
+
+    def configure(self, bus: Bus) -> None:
+        """Stop the part, write all registers, test it and start it; OSError: no RM3100, or a broken one."""
+        _check_revision(bus.read(STATUS, 3))
+        bus.write(CMM, b"\0")
+        bus.write(CYCLE_COUNTS, self._options.cycle_count.to_bytes(2, "big") * 3)
+        bus.write(TMRC, bytes([FASTEST_TMRC + self._step]))
+        if self._options.self_test:
+            bus.write(BIST, bytes([SELF_TEST]))
+            bus.write(POLL, bytes([ALL_AXES]))
+            end = monotonic() + SELF_TEST_S
+            while not _is_ready(bus):
+                if monotonic() > end:
+                    raise OSError("self-test: no measurement completes")
+            passed = bus.read(BIST, 1)[0]
+            bus.write(BIST, b"\0")
+            if failed := [axis for bit, axis in enumerate("xyz", 4) if not passed >> bit & 1]:
+                raise OSError(f"self-test failed: {' '.join(failed)}")
+        self.start_measurement(bus, first=True)
+
+    def start_measurement(self, bus: Bus, *, first: bool = False) -> None:
+        """Start the next measurement; in continuous mode only the `first` needs a start."""
+        if self._options.mode == "single":
+            bus.write(POLL, bytes([ALL_AXES]))
+        elif first:
+            bus.write(CMM, bytes([CONTINUOUS]))
+
+    def poll(self, bus: Bus, time: float) -> bytes:
+        """Return the line of the reading that is ready at `time` (s, any steady clock); empty if none is."""
+        if not _is_ready(bus):
+            return b""
+        line = encode_line(bus.read(RESULTS, 9), time)
+        self.start_measurement(bus)
+        return line
+
+    @property
+    def bytes_skipped(self) -> int:
+        """Bytes that belonged to no valid line."""
+        return self._lines.skipped
+
+    def start(self) -> tuple[bytes, ...]:
+        """Forget half a line; the bus port configures the part."""
+        self._lines.begin(inside=False)
+        return ()
+
+    def feed(self, data: bytes) -> list[Reading]:
+        """Take bytes as they came; return the readings that they complete."""
+        readings = []
+        for line in self._lines.split(data):
+            try:
+                readings.append(self._reading(strip_checksum(line, "nmea")))
+            except ValueError:
+                self._lines.skipped += len(line)
+                self.frames_bad += 1
+        return readings
+
+    def _reading(self, text: bytes) -> Reading:
+        """Return the reading in a line; ValueError: it does not hold one."""
+        time_text, digits = text.removeprefix(PREFIX).split(b",")
+        data, time = bytes.fromhex(digits.decode("ascii")), float(time_text)
+        if not text.startswith(PREFIX) or len(data) != 9 or not abs(time) < MAX_DEVICE_TIME_S:
+            raise ValueError
+        x, y, z = (int.from_bytes(data[i : i + 3], "big", signed=True) for i in (0, 3, 6))
+        field = (x * self.nt_per_count, y * self.nt_per_count, z * self.nt_per_count)
+        return Reading(field, (x, y, z), device_time=time, saturated=saturated(x, y, z, MAX_COUNT))
+
+
+def nt_per_count(cycle_count: int) -> float:
+    """Return nT per count at a cycle count."""
+    return 1e3 / (0.3671 * cycle_count + 1.5)
+
+
+def encode_line(results: bytes, time: float) -> bytes:
+    """Return the line of nine bytes of results, read at `time` (s)."""
+    text = b"%s%.6f,%s" % (PREFIX, time, results.hex().encode())
+    return b"%s*%02X\n" % (text, nmea_checksum(text))
+
+
+def _check_revision(status: bytes) -> None:
+    """Check three bytes from STATUS on; OSError: a bus without the part reads zeros or ones there."""
+    if len(status) != 3 or status[2] != REVISION:
+        raise OSError(f"no RM3100 answers: expected {REVISION:#x} in register 0x36, got 0x{status[2:].hex()}")
+
+
+def _is_ready(bus: Bus) -> bool:
+    """Return True if a measurement is complete; OSError: no RM3100 answers."""
+    status = bus.read(STATUS, 3)
+    _check_revision(status)
+    return bool(status[0] & 0x80)
