@@ -6,8 +6,7 @@ dipoles that move, the crustal field is a random Fourier sum over the plane, and
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -272,18 +271,6 @@ class Published:
         return np.asarray((self.quality.astype(int) & ~int(Quality.NO_BORESIGHT)) == 0)
 
 
-def telemetry_events(
-    track: Track, interval_s: float, lag_s: float, lost: FloatArray | None
-) -> Iterator[tuple[float, int]]:
-    """Yield time and row of each telemetry report; none where `lost` (n,) is true."""
-    step = float(track.time[1] - track.time[0])
-    every = max(round(interval_s / step), 1)
-    shift = round(lag_s / step)
-    for row in range(0, len(track.time), every):
-        if lost is None or not lost[row]:
-            yield float(track.time[max(row - shift, 0)]), row
-
-
 def correct_live(
     correction: Correction,
     track: Track,
@@ -326,8 +313,3 @@ def correct_live(
             notices += [(k, notice.text) for notice in correction.learner.notices]
             correction.learner.notices.clear()
     return Published(total, sigma, quality, notices)
-
-
-def with_masses(track: Track, **masses: FloatArray) -> Track:
-    """Return a track with other mass positions."""
-    return replace(track, masses=track.masses | masses)

@@ -18,14 +18,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from small import START, small_bridge
 
-from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.pipeline import Pipeline
-from magbridge.calibration.file import save
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.config import load
+from magbridge.calibration.model import Parameter
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.grid_netcdf import write as write_grid
 from magbridge.mavlink import Codec, spec
@@ -33,22 +30,9 @@ from magbridge.mavlink.messages import MESSAGES
 from magbridge.parts import OptionalParts
 from magbridge.records import Channel
 
-__all__ = ["START_US", "events", "make_bridge"]
+__all__ = ["events", "make_bridge"]
 
-START_US = 1_780_000_000_000_000
-CONFIG = """
-[sensor]
-driver = "ascii"
-port = "/dev/null"
-options = {columns = ["x", "y", "z", "temperature", "time", "sequence"]}
-[link]
-url = "udpout:127.0.0.1:14550"
-[calibration]
-file = "cal.json"
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {name = "battpos"}
-field = "value"
+CONFIG = """NAMED_VALUE_FLOAT = 1
 [telemetry.current]
 message = "SYS_STATUS"
 field = "current_battery"
@@ -58,13 +42,6 @@ unit = "A"
 enabled = true
 [navigation]
 map = "grid.nc"
-[log]
-directory = "logs"
-[publish]
-MAG_FIELD = 0
-MAG_RAW = 0
-HIGHRES_IMU = 0
-NAMED_VALUE_FLOAT = 1
 """
 FLOATS = (
     float("nan"), float("inf"), float("-inf"), 0.0, -0.0, 1e-45, -1e-45, 3.4e38, -3.4e38, 1e30, 1.0, -1.0,
@@ -82,23 +59,11 @@ SENDERS = (1, 1), (1, 1), (1, 1), (1, 25), (255, 190), (2, 1)
 
 def make_bridge(folder: Path) -> Pipeline:
     """Return a bridge in `folder` that corrects, learns and navigates."""
-    size = 4 * 9
-    battery = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
-    calibration = Calibration(
-        parameters=(battery,),
-        terms=(Polynomial(exponents=full_order(1, 3)),),
-        coefficients=np.random.default_rng(1).normal(size=size) * 300.0,
-        covariance=np.eye(size),
-        noise=Noise(1.0),
-        reference=Reference(50_000.0),
-        method="auto",
-    )
-    save(calibration, folder / "cal.json")
     longitude, latitude = np.linspace(-58.2, -57.6, 61), np.linspace(49.2, 49.8, 61)
     anomaly = 100.0 * np.sin(longitude[None] * 90.0) * np.cos(latitude[:, None] * 70.0)
     write_grid(AnomalyGrid(longitude, latitude, anomaly), folder / "grid.nc")
-    (folder / "bridge.toml").write_text(CONFIG, encoding="utf-8")
-    return set_up(load(folder / "bridge.toml"), Start(START_US))
+    battery = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
+    return small_bridge(folder, Start(START), battery, ("MAG_FIELD", "MAG_RAW", "HIGHRES_IMU"), CONFIG)
 
 
 def _number(code: str, rng: random.Random) -> float | int:
@@ -152,7 +117,7 @@ def events(count: int, seed: int) -> list[Event]:
     """Return seeded events: link frames, sensor lines, and pauses of up to an hour."""
     rng = random.Random(seed)
     codecs = {sender: Codec(*sender) for sender in SENDERS}
-    time_us, out = START_US, []
+    time_us, out = START, []
     for step in range(count):
         time_us += rng.choice((0, 4, 1000, 100_000, 1_000_000))
         if rng.random() < 0.001:

@@ -6,8 +6,8 @@ from math import isnan, nan
 from pathlib import Path
 
 import pytest
-from extremes import START_US, events, make_bridge
-from small import small_bridge
+from extremes import events, make_bridge
+from small import START, small_bridge
 
 from magbridge.bridge.events import Event, Start
 from magbridge.bridge.pipeline import Pipeline
@@ -44,9 +44,9 @@ def parsed(frame: bytes) -> Message:
 )
 def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[int, int]) -> None:
     position = Position(print)
-    position.update(parsed(global_position(lat=place[0], lon=place[1])), START_US)
+    position.update(parsed(global_position(lat=place[0], lon=place[1])), START)
     assert position.where is None
-    assert isnan(position.main_field(START_US, START_US))
+    assert isnan(position.main_field(START, START))
 
 
 def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
@@ -55,28 +55,28 @@ def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
     here, away = (495_000_000, -579_000_000), (500_000_000, -579_000_000)  # 56 km
     for second in range(900):
         lat, lon = away if 100 <= second < 700 else here
-        position.update(parsed(global_position(lat=lat, lon=lon)), START_US + second * 1_000_000)
-        field = position.main_field(START_US + second * 1_000_000, START_US + second * 1_000_000)
+        position.update(parsed(global_position(lat=lat, lon=lon)), START + second * 1_000_000)
+        field = position.main_field(START + second * 1_000_000, START + second * 1_000_000)
         assert isnan(field) == (100 <= second < 700)
     assert reports == ["the position jumps farther than the vehicle can move"]
 
 
 def bridge_of(folder: Path) -> Pipeline:
-    return small_bridge(folder, Start(START_US), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"])
+    return small_bridge(folder, Start(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"])
 
 
 def sent(bridge: Pipeline, second: int) -> list[Message]:
     line = b"1000 2000 50000 4 %d %d\n" % (second, second)
-    frames = bridge.feed(Event(START_US + second * 1_000_000, Channel.SENSOR, line))
+    frames = bridge.feed(Event(START + second * 1_000_000, Channel.SENSOR, line))
     ear = Codec(0, 0)
     return [message for _, frame in frames for message in ear.parse(frame)]
 
 
 def test_the_position_of_another_component_is_ignored_and_reported(tmp_path: Path) -> None:
     bridge = bridge_of(tmp_path)
-    bridge.feed(Event(START_US, Channel.LINK, global_position(lat=495_000_000, lon=-579_000_000)))
+    bridge.feed(Event(START, Channel.LINK, global_position(lat=495_000_000, lon=-579_000_000)))
     (before,) = (message for message in sent(bridge, 1) if message.name == "MAG_FIELD")
-    bridge.feed(Event(START_US + 1, Channel.LINK, global_position(25, lat=505_000_000, lon=-579_000_000)))
+    bridge.feed(Event(START + 1, Channel.LINK, global_position(25, lat=505_000_000, lon=-579_000_000)))
     messages = sent(bridge, 2)
     (after,) = (message for message in messages if message.name == "MAG_FIELD")
     assert after["anomaly"] == pytest.approx(before["anomaly"], abs=0.1)
@@ -114,7 +114,7 @@ def test_zero_counts_of_channels_sampled_in_turn() -> None:
 @pytest.mark.parametrize("device_time", [1e308, -1e308, float("inf"), 1e300])
 def test_an_absurd_device_time_dates_a_reading_by_its_arrival(device_time: float) -> None:
     clock = DeviceClock()
-    clock.update(10.0, START_US)
-    stamp = clock.update(device_time, START_US + 1_000_000)
-    assert stamp.time_us == pytest.approx(START_US + 1_000_000, abs=4)
-    assert clock.update(nan, START_US + 2_000_000).time_us == pytest.approx(START_US + 2_000_000, abs=4)
+    clock.update(10.0, START)
+    stamp = clock.update(device_time, START + 1_000_000)
+    assert stamp.time_us == pytest.approx(START + 1_000_000, abs=4)
+    assert clock.update(nan, START + 2_000_000).time_us == pytest.approx(START + 2_000_000, abs=4)

@@ -1,4 +1,4 @@
-"""A bridge without ports: line protocol, one mass, random coefficients; events are fed by hand."""
+"""A bridge without ports, for tests and studies: line protocol, one mass, random coefficients."""
 
 from __future__ import annotations
 
@@ -37,8 +37,24 @@ directory = "logs"
 """
 
 
-def small_bridge(folder: Path, start: Start, battery: Parameter, publish: Sequence[str]) -> Pipeline:
-    """Set one up in a folder; the messages of `publish` come with every sample."""
+def small_bridge(
+    folder: Path, start: Start, battery: Parameter, publish: Sequence[str], more: str = ""
+) -> Pipeline:
+    """Return a bridge that is configured in a folder; events are fed by hand.
+
+    Parameters
+    ----------
+    folder : path
+        Where its files are written.
+    start : Start
+        The run's start.
+    battery : Parameter
+        The mass, telemetry column ``battpos``.
+    publish : sequence of str
+        Messages that are sent with every sample.
+    more : str
+        Further lines of the configuration; first more keys of ``[publish]``, if any.
+    """
     size = 4 * 9
     cal = Calibration(
         parameters=(battery,),
@@ -51,5 +67,6 @@ def small_bridge(folder: Path, start: Start, battery: Parameter, publish: Sequen
     )
     save(cal, folder / "cal.json")
     config = folder / "bridge.toml"
-    config.write_text(CONFIG + "".join(f"{message} = 0\n" for message in publish), encoding="utf-8")
+    published = "".join(f"{message} = 0\n" for message in publish)
+    config.write_text(CONFIG + published + more, encoding="utf-8")
     return set_up(load(config), start)
