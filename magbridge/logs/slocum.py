@@ -9,6 +9,8 @@ values, 0 degC at 0 bar, which are not measured: they are left out.
 Angles are converted to degrees; ``heading`` is the compass's, magnetic. A Slocum logs no vector magnetometer
 of its own, so there is no ``mag_x``: the log can drive a simulated one. To correct the log of an instrument
 that was carried along, give both; to calibrate it, interpolate this log's columns to the instrument's times.
+
+Header and list of sensors are checked first: dbdreader never ends on a header that is cut off.
 """
 
 from __future__ import annotations
@@ -30,10 +32,16 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.registry import FLIGHT
 from magbridge.logs.resample import CIRCLES, degrees, linear
-from magbridge.logs.slocum_header import check_header
 
-__all__ = ["chunks"]
+__all__ = ["check_header", "chunks"]
 
+TAG = re.compile(rb"(\w+):\s*(.*)")
+SENSOR_LINE = re.compile(rb"s:\s+[TF]\s+-?\d+\s+-?\d+\s+[1248]\s+[!-~]+\s+[!-~]+\s*")
+"""``s: T 0 0 4 m_roll rad``: whether it is logged, two indices, bytes, name, unit."""
+MAX_HEADER_BYTES = 1 << 16
+"""Bytes, more than any header has."""
+CACHES = ".", "cac", "cache", "../cac", "../cache"
+"""Folders, seen from a file's, in which its list of sensors may be."""
 MAX_SENSOR_GAP_S = 300.0
 """s between two updates of a sensor across which nothing is interpolated."""
 Tracks = dict[str, tuple[FloatArray, FloatArray]]
@@ -189,3 +197,38 @@ def _read_ascii(path: Path) -> Tracks:
             there = np.isfinite(clock) & np.isfinite(track)
             tracks[ours] = (clock[there], track[there])
     return tracks
+
+
+def check_header(path: Path) -> list[Path]:
+    """Check the header of a Slocum's file, and the list of its sensors; return where that list may be.
+
+    FormatError: the header is cut off, or a line of the ``.cac`` is damaged. A compressed file is not looked
+    into.
+    """
+    with path.open("rb") as file:
+        lines = file.read(MAX_HEADER_BYTES).split(b"\n")
+    if not lines[0].startswith(b"dbd_label:"):
+        return list(_caches(path))
+    tags = {found[1]: found[2].strip() for line in lines[:40] if (found := TAG.fullmatch(line))}
+    count = tags.get(b"num_ascii_tags", b"")
+    if not count.isdigit() or not 3 <= int(count) < len(lines):
+        raise FormatError(path, "the header is cut off or damaged")
+    if tags.get(b"sensor_list_factored") == b"0":
+        return []
+    crc = tags.get(b"sensor_list_crc", b"").decode("ascii", "replace").lower()
+    lists = [cache for cache in _caches(path) if cache.stem.lower() == crc][:1]
+    for cache in lists:
+        _check_cache(cache)
+    return lists
+
+
+def _caches(path: Path) -> Iterator[Path]:
+    for folder in CACHES:
+        yield from (path.parent / folder).glob("*.[cC][aA][cC]")
+
+
+def _check_cache(cache: Path) -> None:
+    for row, line in enumerate(cache.read_bytes().splitlines(), 1):
+        if not SENSOR_LINE.fullmatch(line) and line.strip():
+            what = line[:40].decode("ascii", "backslashreplace")
+            raise FormatError(cache, f"expected a sensor, not {what!r}: damaged", row=row)

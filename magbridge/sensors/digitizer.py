@@ -44,14 +44,40 @@ from __future__ import annotations
 
 from math import nan
 from struct import Struct
-from typing import ClassVar, Final
+from typing import Annotated, ClassVar, Final
 from zlib import crc32
 
+import msgspec
+from msgspec import Meta
+
 from magbridge.records import Reading
-from magbridge.sensors.digitizer_options import FULL_SCALE, DigitizerOptions
 from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode, saturated
 
-__all__ = ["EXAMPLE", "Digitizer", "DigitizerOptions"]
+__all__ = ["EXAMPLE", "FULL_SCALE", "Digitizer", "DigitizerOptions"]
+
+FULL_SCALE = 1 << 23
+"""Counts at which the converter is at its reference voltage."""
+Positive = Annotated[float, Meta(ge=1e-12, le=1e9)]
+"""Bounded, because TOML allows ``inf``, but limits are converted to integer counts."""
+
+
+class DigitizerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``[sensor.options]`` of the digitizer."""
+
+    sensitivity: Positive
+    """V/nT of the fluxgate's outputs, from its certificate (50 mV/µT is 5e-5)."""
+    reference_voltage: Positive = 2.5
+    """V at which the converter is at full scale."""
+    gain: Positive = 1.0
+    """Gain of the amplifier between fluxgate and converter; below 1 for a divider."""
+    full_scale: Positive | None = None
+    """nT at which the fluxgate itself saturates, where that is before the converter."""
+
+    @property
+    def nt_per_count(self) -> float:
+        """Field of one count, in nT."""
+        return self.reference_voltage / self.gain / FULL_SCALE / self.sensitivity
+
 
 EXAMPLE: Final = bytes.fromhex(
     "04 01 24 07 02 03 04 40 42 0F 04 E0 C8 10 04 80 4F 12 05"

@@ -7,7 +7,7 @@ from zlib import crc32
 
 from magbridge.records import Reading
 from magbridge.sensors import digitizer as wire
-from magbridge.sensors.digitizer_options import FULL_SCALE, DigitizerOptions
+from magbridge.sensors.digitizer import FULL_SCALE, DigitizerOptions
 from magbridge.sensors.framing import cobs_encode
 from sitl.fluxgate.encoder import Encoder, clip
 
