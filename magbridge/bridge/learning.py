@@ -15,12 +15,10 @@ from magbridge.learning.causes import CAUSES
 from magbridge.learning.start import class_prior
 from magbridge.link.component import Component
 from magbridge.link.output import Rate
-from magbridge.mavlink import spec
 from magbridge.mavlink.enums import MAG_LEARNING_STATE, MAV_SEVERITY
 
 __all__ = ["Learning", "first_calibration", "keep", "kept_path", "open_learner"]
 
-LEARNING = spec("MAG_LEARNING")
 ACCEPT, FORGET = 1.0, 2.0
 KEEP_US = 600_000_000
 """µs between files of a calibration that is only renewed."""

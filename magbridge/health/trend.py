@@ -65,8 +65,6 @@ MAX_MOTION_HOLD_US: Final = 86_400_000_000
 """Time for which sigma remembers a jump that came back: at first, at most, and at most after motions."""
 CHECKPOINT_US: Final = 1_000_000
 CHECKPOINTS: Final = 64
-FORGIVING_LOG_RATIO: Final = -7.0
-"""Log-likelihood ratio of 'the jump is an offset' over 'it is not' below which it is discarded."""
 
 
 class State(NamedTuple):
@@ -119,7 +117,6 @@ class TrendCheck:
         self._accepted = 0
         self._unrest, self._decay, self._quiet = 0.0, SPIKE_DECAY, BURST_SAMPLES
         self._candidate, self._agreed, self._candidate_us = nan, 0, 0
-        self._offset_log_ratio = 0.0
 
     @property
     def is_established(self) -> bool:
@@ -274,7 +271,6 @@ class TrendCheck:
         since_us, until_us = now.since_us, now.until_us
         if now.jump_sum * now.jump_sum <= largest_zero:
             since_us = time_us
-            self._offset_log_ratio = 0.0
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
@@ -305,31 +301,8 @@ class TrendCheck:
             return 0.0
         return now.largest * now.largest
 
-    def weigh_turn(self, change: float, variance: float, turned: float) -> None:
-        """Test with a turn whether the jump is an offset: such an offset changes the field in every turn.
-
-        Parameters
-        ----------
-        change, variance : float
-            Change of the total field over the turn, nT, and its variance without an offset, nT².
-        turned : float
-            Change of the field's unit vector.
-        """
-        now = self._now
-        if now is None or not now.largest:
-            return
-        # an offset of the jump's amplitude, in a random direction
-        more = variance + (now.largest * turned) ** 2 / 3.0
-        self._offset_log_ratio += 0.5 * (
-            change * change * (1.0 / variance - 1.0 / more) - log(more / variance)
-        )
-        self._offset_log_ratio = min(self._offset_log_ratio, 10.0)
-        if self._offset_log_ratio < FORGIVING_LOG_RATIO:
-            self.forget()
-
     def forget(self) -> None:
         """Discard the jumps: another calibration, or the evidence since, explains them."""
         if self._now is not None:
             self._now = self._now._replace(jump_sum=0.0, largest=0.0, jumps=0, until_us=0)
         self._checkpoints.clear()
-        self._offset_log_ratio = 0.0

@@ -24,7 +24,6 @@ VALID = re.compile("(is|data|row|sample)?valid(ity)?")
 MAG_VALID = re.compile("(mag|field|tmi)(is)?valid(ity)?")
 QUALITY_OF = re.compile(r"(.+?)[ _.]?(QC|qc|quality_flag)")
 FLAG = re.compile("(mag|qc|quality|data)?flag")
-FIELD = (*CHANNELS, "total_field")
 BAD_QUALITY = frozenset({3.0, 4.0, 9.0})
 MAX_FLAGGED = 0.2
 """Largest fraction of rows that a column Flag may mark."""

@@ -18,13 +18,12 @@ from magbridge.mavlink.dialect import (
 from magbridge.mavlink.messages import MESSAGES, Message, spec
 
 __all__ = [
-    "EXTRA", "LAST", "MAGIC", "MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED", "V1", "V2", "checksum",
+    "EXTRA", "LAST", "MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED", "V1", "V2", "checksum",
     "find_magic", "frame_end", "is_signed", "message",
 ]  # fmt: skip
 
 V1: Final = PROTOCOL_MARKER_V1
 V2: Final = PROTOCOL_MARKER_V2
-MAGIC = bytes((V1, V2))
 SIGNED: Final = MAVLINK_IFLAG_SIGNED
 SIGNATURE: Final = MAVLINK_SIGNATURE_BLOCK_LEN
 """bytes: link id, 6 of time stamp, 6 of hash."""
