@@ -22,10 +22,19 @@ A sentence like NMEA's, ``$PMAG,1234.500,12345.6,-234.5,43210.9*5A``::
     separator = ","
     columns = ["time", "x", "y", "z"]
     checksum = "nmea"
+
+The JSON lines of runMag (HamSCI), with counts at a cycle count of 200::
+
+    [sensor.options]
+    columns = ["x", "y", "z", "temperature"]
+    keys = ["rx", "ry", "rz", "lt"]
+    unit = "counts"
+    scale = 13.333
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from math import inf, isfinite, nan
 from operator import itemgetter
@@ -48,6 +57,8 @@ COUNTS = 2**31
 MAX_COUNT = 2**63
 """Larger than any count that an instrument can hold."""
 ENCODING = "latin-1"
+NAMED_VALUE = re.compile(rb'(\w+)"?\s*:\s*"?([-+.\w]+)')
+"""A key with its number, both with or without quotation marks."""
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -101,6 +112,8 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     columns: list[str] = msgspec.field(default_factory=lambda: ["x", "y", "z"])
     """Meaning of each column: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-``
     for a column to ignore; ``*`` at the end for any number of further ones."""
+    keys: list[str] = msgspec.field(default_factory=list)
+    """For lines of JSON, or of text such as ``x:"14"``: the key of each column, in the order of `columns`."""
     separator: str = ""
     """Between columns; empty for any number of blanks or tabs."""
     prefix: str = ""
@@ -136,6 +149,8 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
                 raise ValueError(f"columns: {name!r} stands there twice")
         if not {"x", "y", "z"} <= set(named):
             raise ValueError("columns: x, y and z must be among them")
+        if self.keys and (len(self.keys) != len(self.columns) or "*" in self.columns):
+            raise ValueError(f"keys: expected one for each of the {len(self.columns)} columns, without *")
 
 
 class Ascii:
@@ -148,6 +163,7 @@ class Ascii:
         columns = options.columns
         self._more = columns[-1] == "*"
         self._width = len(columns) - self._more
+        self._keys = [key.encode(ENCODING) for key in options.keys]
         self._xyz = itemgetter(*(columns.index(axis) for axis in "xyz"))
         self._others = [(name, at, KINDS[name]) for at, name in enumerate(columns) if name in KINDS]
         self._prefix = options.prefix.encode(ENCODING)
@@ -187,6 +203,13 @@ class Ascii:
                 self.frames_bad += line != b"\r"
         return readings
 
+    def _cells(self, text: bytes) -> list[bytes]:
+        """Return the cells of a line, in the order of the columns."""
+        if not self._keys:
+            return text.split(self._separator)
+        found = dict(NAMED_VALUE.findall(text))
+        return [found[key] for key in self._keys if key in found]
+
     def _reading(self, line: bytes) -> Reading:
         """Return the reading in a line; raise ValueError where the line does not hold one."""
         line = line.rstrip(b"\r")
@@ -194,7 +217,7 @@ class Ascii:
             line = strip_checksum(line, self._options.checksum)
         if not line.startswith(self._prefix) or b"_" in line:  # Python's numbers may hold underscores
             raise ValueError
-        cells = line[len(self._prefix) :].split(self._separator)
+        cells = self._cells(line[len(self._prefix) :])
         if len(cells) != self._width and not (self._more and len(cells) > self._width):
             raise ValueError
         x, y, z = map(float, self._xyz(cells))

@@ -35,8 +35,13 @@ class AsciiEncoder(Encoder):
             scaled = clip(value, options.range or inf) / (options.scale * NT_PER_UNIT.get(options.unit, 1.0))
             values[axis] = round(scaled) if options.unit == "counts" else scaled
         self.sequence += 1
-        cells = (f"{values[name]:.13g}" for name in options.columns if name != "*")
-        text: bytes = (options.prefix + (options.separator or " ").join(cells)).encode(wire.ENCODING)
+        cells = [f"{values[name]:.13g}" for name in options.columns if name != "*"]
+        if options.keys:
+            pairs = zip(options.keys, cells, strict=True)
+            line = "{" + ", ".join(f'"{key}": {cell}' for key, cell in pairs) + "}"
+        else:
+            line = (options.separator or " ").join(cells)
+        text: bytes = (options.prefix + line).encode(wire.ENCODING)
         if options.checksum:
             digits, function = wire.CHECKSUMS[options.checksum]
             text += f"*{function(text):0{digits}X}".encode()

@@ -10,6 +10,7 @@ from zlib import crc32
 
 import pytest
 
+from magbridge.errors import ConfigError
 from magbridge.records import Reading
 from magbridge.sensors import open_driver
 
@@ -146,3 +147,31 @@ def test_what_tells_half_a_line_from_a_whole_one_costs_none() -> None:
     driver.start()  # the line was opened again
     assert [r.field for r in driver.feed(b"8 9\n$MAG 4 5 6\n")] == [(4, 5, 6)]
     assert (driver.frames_bad, driver.bytes_skipped) == (1, 11)
+
+
+RUNMAG = {"columns": ["x", "y", "z", "temperature"], "keys": ["rx", "ry", "rz", "lt"], "unit": "counts"}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{ ts:"03 May 2020 23:56:55",  lt:"24.62", x:"14" , y:"-11", rx:"1109", ry:"-844", rz:"3707" }',
+        b'{"ts": "2020-05-03T23:56:55Z", "rx": 1109, "ry": -844, "rz": 3707, "lt": 24.62}',
+    ],
+)
+def test_values_are_found_by_their_keys(line: bytes) -> None:
+    """Lines of runMag, from its README, and the same as strict JSON in another order."""
+    driver = open_driver("ascii", {**RUNMAG, "scale": 13.333})
+    driver.start()
+    (reading,) = driver.feed(b"rest of a line\n" + line + b"\n")
+    assert reading.counts == (1109, -844, 3707)
+    assert reading.field == pytest.approx((14_786.3, -11_253.1, 49_425.4), abs=0.1)
+    assert reading.temperature == 24.62
+    bad = driver.frames_bad
+    assert driver.feed(line.replace(b"rz", b"r_") + b"\n") == []
+    assert driver.frames_bad == bad + 1
+
+
+def test_a_key_for_each_column() -> None:
+    with pytest.raises(ConfigError, match="keys: expected one for each of the 4 columns"):
+        open_driver("ascii", {**RUNMAG, "keys": ["rx"]})

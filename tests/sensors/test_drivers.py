@@ -30,6 +30,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "twinleaf 2": ("twinleaf", {"temperature": "therm"}),
     "twinleaf 1": ("twinleaf", {"route": "/0/2"}),
     "ascii blanks": ("ascii", {"columns": ["x", "y", "z", "temperature"], "unit": "G", "range": 65_000.0}),
+    "ascii keys": ("ascii", {"columns": ["x", "y", "z", "time"], "keys": ["rx", "ry", "rz", "t"]}),
     "ascii nmea": (
         "ascii",
         {
