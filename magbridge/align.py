@@ -23,9 +23,9 @@ from magbridge.track import NEVER, Input, Track
 
 __all__ = ["Aligner", "Sample", "nearest"]
 
-STALE: Final = int(Quality.STALE_TELEMETRY)
+STALE_FLAG: Final = int(Quality.STALE_TELEMETRY)
 MOVING: Final = int(Quality.MOVING)
-SATURATED: Final = int(Quality.SATURATED)
+SATURATED_FLAG: Final = int(Quality.SATURATED)
 OFFSET_SUSPECT: Final = int(Quality.OFFSET_SUSPECT)
 GAP: Final = int(Quality.GAP)
 LATE_JOIN: Final = int(Quality.LATE_JOIN)
@@ -186,7 +186,7 @@ class Aligner:
             quality |= OFFSET_SUSPECT
             variance += settings.turn_on_sigma**2
         if reading.saturated:
-            quality |= SATURATED
+            quality |= SATURATED_FLAG
             variance = inf
 
         sample_us = time_us + nearest(first * 1e6) - nearest(settings.filter_delay * 1e6)
@@ -216,14 +216,14 @@ class Aligner:
                 what = track.input
                 values.append(0.5 * (what.low + what.high))
                 spans.append((index, what.low, what.high))
-                quality |= STALE
+                quality |= STALE_FLAG
                 oldest = inf
                 continue
             value, age, low, high = track.at(sample_us)
             values.append(value)
             oldest = max(oldest, age)
             if track.lacking or age > track.max_age:
-                quality |= STALE
+                quality |= STALE_FLAG
                 variance += (settings.stale_growth * age) ** 2
             if track.moved_us == track.last_us or sample_us - track.moved_us <= settle_us:
                 spans.append((index, low, high))

@@ -13,7 +13,7 @@ from typing import Any
 
 from magbridge.align import Aligner, Sample
 from magbridge.calibration.corrector import Corrector
-from magbridge.calibration.model import RAISED, Calibration, identity
+from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
@@ -21,7 +21,7 @@ from magbridge.health.consistency import MASS_FRACTION
 from magbridge.learning import Learner
 from magbridge.learning.model import TEMPERATURE
 from magbridge.parts import OptionalParts
-from magbridge.records import BEYOND, Corrected, Quality, Reading, Vector
+from magbridge.records import MAX_MEASURED_NT, Corrected, Quality, Reading, Vector
 from magbridge.toml import convert
 from magbridge.track import Input
 
@@ -256,13 +256,15 @@ class Correction:
         if self._raised is None:
             return nan
         raised = self._raised.numbers(sample.time_us, sample.field, sample.values, sample.quality)[0][0]
-        return abs(raised - corrected.total_field) / RAISED
+        return abs(raised - corrected.total_field) / LEVEL_STEP_SIGMA
 
     def _more(self, sample: Sample) -> float:
         """Return the variance to add: ``s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
         more = sample.sigma * sample.sigma
         for change in self._corrector.changes(sample.field, sample.values, sample.spans):
             more += 0.25 * change * change
-        if not more < BEYOND * BEYOND:  # also NaN, as where a parameter has neither value nor range
+        if (
+            not more < MAX_MEASURED_NT * MAX_MEASURED_NT
+        ):  # also NaN, as where a parameter has neither value nor range
             more = inf
         return more

@@ -14,7 +14,7 @@ from magbridge.errors import FormatError, MagbridgeError, WriteError
 
 __all__ = ["atomic_path", "digest", "existing", "new_folder", "systems_reason"]
 
-ROOM = 1 << 20
+PROBE_BYTES = 1 << 20
 """Bytes written to learn why a write failed: more than a library writes at a time."""
 
 
@@ -109,7 +109,7 @@ def systems_reason(path: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         with path.open("ab") as file:
-            file.write(bytes(ROOM))
+            file.write(bytes(PROBE_BYTES))
         raise OSError(str(error)) from error
 
 

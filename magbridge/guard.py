@@ -36,7 +36,7 @@ SECONDS, PER_MEGABYTE = 8.0, 0.2
 """s of processor time for a file, and for each MB of it: reading any format takes a tenth of that."""
 MEMORY, PER_BYTE = 500_000_000, 50
 """Bytes of memory for a file, and for each byte of it: compressed, a log may be thirty times smaller."""
-RESERVED = 8_000_000_000
+RESERVED_BYTES = 8_000_000_000
 """Bytes of address space beyond that: dbdreader asks for a GB, and uses little of it."""
 POLL = 0.1
 """s between two looks at a child's memory."""
@@ -245,7 +245,7 @@ def _limit(seconds: int, memory: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _set(resource.RLIMIT_CPU, round(used.ru_utime + used.ru_stime) + seconds)
     if size := _memory()[0]:
-        _set(resource.RLIMIT_AS, size + memory + RESERVED)
+        _set(resource.RLIMIT_AS, size + memory + RESERVED_BYTES)
 
 
 def _memory(process: int | str | None = "self") -> tuple[int, int]:

@@ -12,9 +12,9 @@ from typing import TypeVar
 __all__ = ["track", "waiting"]
 
 T = TypeVar("T")
-PATIENCE = 2.0
+BAR_DELAY_S = 2.0
 """s before a bar appears."""
-PAUSE = 0.1
+BAR_INTERVAL_S = 0.1
 """s between two updates of the bar: drawing takes longer than most items do."""
 
 
@@ -25,7 +25,7 @@ def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator
         for done, item in enumerate(items, 1):
             yield item
             now = time.monotonic()
-            if now - updated > PAUSE:
+            if now - updated > BAR_INTERVAL_S:
                 update(completed=done)
                 updated = now
 
@@ -52,7 +52,7 @@ def _bar(what: str, total: float | None = None) -> Iterator[Callable[..., object
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(what, total=total, visible=False)
-        appear = Timer(PATIENCE, progress.update, (task,), {"visible": True})
+        appear = Timer(BAR_DELAY_S, progress.update, (task,), {"visible": True})
         appear.daemon = True
         appear.start()
         try:

@@ -11,11 +11,11 @@ from typing import Final
 
 import msgspec
 
-__all__ = ["BEYOND", "MAX_DEVICE_TIME_S", "Channel", "Corrected", "Quality", "Reading", "Vector"]
+__all__ = ["MAX_DEVICE_TIME_S", "MAX_MEASURED_NT", "Channel", "Corrected", "Quality", "Reading", "Vector"]
 
 Vector = tuple[float, float, float]
 
-BEYOND: Final = 1e9
+MAX_MEASURED_NT: Final = 1e9
 """nT (1 T): a field or a sigma above it is not a measurement, but garbage that happens to be a number."""
 MAX_DEVICE_TIME_S: Final = 1e11
 """s: no instrument counts more than 3,000 years; such a time is an error of transmission."""

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 __all__ = ["NEVER", "Input", "Track"]
 
 NEVER: Final = -(1 << 62)
-HISTORY: Final = 1024
+TRACK_LENGTH: Final = 1024
 """Telemetry values kept for each parameter: enough for 20 s at 50 Hz."""
 
 
@@ -42,7 +42,7 @@ class Track:
 
     def __init__(self, what: Input) -> None:
         self.input, self.max_age = what, what.max_age
-        self.history: deque[tuple[int, float]] = deque(maxlen=HISTORY)
+        self.history: deque[tuple[int, float]] = deque(maxlen=TRACK_LENGTH)
         self.last_us, self.last, self.before = NEVER, nan, nan  # the newest, and the value before it
         self.first_us = NEVER
         # between these times its values are guessed, and lie between these

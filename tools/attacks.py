@@ -27,7 +27,7 @@ from rich.console import Console
 from rig import Rig
 from studies import table
 
-from magbridge.link.ftp import HEADER, Opcode
+from magbridge.link.ftp import FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, Signing
 
 KEY = bytes(range(1, 33))
@@ -88,7 +88,7 @@ def to_us(**fields: Any) -> dict[str, Any]:
 
 def ftp(opcode: int, data: bytes, sequence: int, size: int = 0) -> bytes:
     """Return a request for a file."""
-    header = HEADER.pack(sequence & 0xFFFF, sequence & 0xFF, opcode, size or len(data), 0, 0, 0)
+    header = FTP_HEADER.pack(sequence & 0xFFFF, sequence & 0xFF, opcode, size or len(data), 0, 0, 0)
     payload = (header + data).ljust(251, b"\0")
     return frame(255, 190, "FILE_TRANSFER_PROTOCOL", **to_us(payload=payload))
 

@@ -12,7 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.fit import LEVEL
+from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from sitl.dataset import channels
 from sitl.platform import HARD_IRON, MOMENT, SOFT_IRON, VOLUME_SPREAD, Vehicle
 
@@ -161,7 +161,7 @@ class SurveyBound:
         R = alike(n, step)
         np.fill_diagonal(R, alike(step, 1).mean())
         self._G = g * self._scale
-        self._K = floor * floor.T * R + self._alike(self._place, self._place) + LEVEL**2
+        self._K = floor * floor.T * R + self._alike(self._place, self._place) + MAIN_FIELD_SIGMA_NT**2
 
     def of_field(self, other: xr.Dataset) -> float:
         """Return the least error about its mean of another survey, over the noise floor."""

@@ -34,7 +34,7 @@ from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import rms
 from magbridge.fleet.learn import Lesson, learn_fleet
-from magbridge.fleet.variances import LEVELS
+from magbridge.fleet.variances import FLEET_LEVELS
 from sitl import Twin, load, segments, simulate
 from sitl.dataset import at_rest
 from sitl.platform import MOMENT, MOUNTINGS, Matrix, Vehicle, draw_vehicle
@@ -185,7 +185,7 @@ def main() -> None:
     widths = np.sqrt(np.median(fleet.population.variances.own, axis=1))
     console.print(
         f"learned in {fleet.population.rounds} iterations; median of the physical widths: "
-        + ", ".join(f"{name} {width:.2g}" for name, width in zip(LEVELS, widths, strict=True))
+        + ", ".join(f"{name} {width:.2g}" for name, width in zip(FLEET_LEVELS, widths, strict=True))
     )
     STUDY.main(f"{options.vehicles} vehicles, {options.deployments} deployments", cases, options)
 

@@ -14,7 +14,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
 from magbridge.config import Align
 from magbridge.field.geodesy import separation
-from magbridge.learning.doubt import LEAST
+from magbridge.learning.doubt import LEARNING_ALARM_LOG_RATIO
 from magbridge.learning.nuisance import STATES, Nuisance
 from sitl.dataset import channels, side_by_side
 
@@ -52,7 +52,7 @@ def best_delay(
             v, gain = float(effect[k] - h @ m), P @ h / S
             energy += 0.5 * v * v / S
             m, P, count = m + gain * v, P - np.outer(gain, h @ P), count + (k >= since)
-            if energy > LEAST:
+            if energy > LEARNING_ALARM_LOG_RATIO:
                 break
     return count
 

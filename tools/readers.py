@@ -63,21 +63,21 @@ def by_pyulog(paths: list[Path]) -> None:
     """Read the topics that magbridge reads."""
     from pyulog import ULog  # noqa: PLC0415
 
-    from magbridge.logs.px4 import NEEDED, PX4_FIELDS  # noqa: PLC0415
+    from magbridge.logs.px4 import NEEDED_FIELDS, PX4_FIELDS  # noqa: PLC0415
 
     for path in paths:
-        ULog(str(path), [*PX4_FIELDS, *NEEDED])
+        ULog(str(path), [*PX4_FIELDS, *NEEDED_FIELDS])
 
 
 def by_rosbags(paths: list[Path]) -> None:
     """Read and decode the types of messages that magbridge reads."""
     from rosbags.highlevel import AnyReader  # noqa: PLC0415
 
-    from magbridge.logs.ros_messages import KINDS  # noqa: PLC0415
+    from magbridge.logs.ros_messages import MESSAGE_KINDS  # noqa: PLC0415
 
     for path in paths:
         with AnyReader([path]) as bag:
-            wanted = [one for one in bag.connections if one.msgtype.replace("/msg/", "/") in KINDS]
+            wanted = [one for one in bag.connections if one.msgtype.replace("/msg/", "/") in MESSAGE_KINDS]
             for connection, _, data in bag.messages(connections=wanted):
                 bag.deserialize(data, connection.msgtype)
 

@@ -112,14 +112,14 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str
 def parameters() -> Iterator[str]:
     """Yield the page of the parameters on the link, for a bridge whose telemetry is ``battpos``."""
     from magbridge.config import Align, Telemetry  # noqa: PLC0415
-    from magbridge.link.message_rates import DEFAULTS, LIMITS  # noqa: PLC0415
+    from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS  # noqa: PLC0415
     from magbridge.link.parameters import alignment, file_rate, rates, telemetry_ages  # noqa: PLC0415
 
     table = (
         *alignment(Align()),
         *telemetry_ages({"battpos": Telemetry("NAMED_VALUE_FLOAT", "value")}),
         *file_rate(),
-        *rates(DEFAULTS, LIMITS),
+        *rates(DEFAULT_RATES_HZ, LIMITS),
     )
     yield "# MAVLink parameters\n"
     yield (

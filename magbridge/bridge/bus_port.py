@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from magbridge.bridge.port import CHUNK, Port
+from magbridge.bridge.port import READ_BYTES, Port
 from magbridge.bridge.serial_port import SerialPort, serial_line
 from magbridge.config import Config
 from magbridge.errors import ConfigError, PortError
@@ -133,7 +133,7 @@ class BusPort(Port):
     def read(self) -> bytes:
         """Return the lines that have come; an end of file is a lost bus."""
         try:
-            data = os.read(self._fd, CHUNK)
+            data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:
             return b""
         if not data:

@@ -29,8 +29,8 @@ from magbridge.toml import convert, load_toml
 
 __all__ = ["ConfigFault", "access", "findings"]
 
-CALIBRATIONS = ("calibration.file", "learning.prior")
-ROOM = 100e6
+CALIBRATION_KEYS = ("calibration.file", "learning.prior")
+MIN_FREE_BYTES = 100e6
 """Bytes that a log's disk should have."""
 
 
@@ -100,7 +100,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
     yield from _files(config)
     calibration = None
     names = config.files
-    if all(config.resolve(name).exists() for key in CALIBRATIONS if (name := names.get(key)) is not None):
+    if all(config.resolve(name).exists() for key in CALIBRATION_KEYS if (name := names.get(key)) is not None):
         try:
             calibration = first_calibration(config)
         except MagbridgeError as error:
@@ -225,5 +225,5 @@ def _log(config: Config) -> Iterator[ConfigFault]:
         yield ConfigFault(fatal=False, text=f"{key}: {there} is a file")
     elif not os.access(there, os.W_OK):
         yield ConfigFault(fatal=False, text=f"{key}: {there} cannot be written to")
-    elif (free := shutil.disk_usage(there).free) < ROOM:
+    elif (free := shutil.disk_usage(there).free) < MIN_FREE_BYTES:
         yield ConfigFault(fatal=False, text=f"{key}: {free / 1e6:.0f} MB are free")

@@ -32,7 +32,7 @@ BATCH = 4
 """Messages that are sent at once: some 0.1 ms of the live thread."""
 READY = 8
 """Messages that may wait to be sent; then nothing more is read."""
-PAUSE = 0.01
+POLL_INTERVAL_S = 0.01
 """s between two looks at whether the link takes more."""
 IDLE = 1.0
 """s between two looks for requests while nothing is under way."""
@@ -146,7 +146,7 @@ class FileServer:
             self._under_way.clear()
             return
         while len(self._ready) >= READY and not self._ending:  # the link is full, or the live thread busy
-            time.sleep(PAUSE)
+            time.sleep(POLL_INTERVAL_S)
             self._notify(b"")
         for _ in range(BATCH):
             if not self._under_way:

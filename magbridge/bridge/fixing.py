@@ -77,7 +77,7 @@ class Fixing:
     Parameters
     ----------
     kind : Kind
-        Of :data:`~magbridge.link.fixes.FIXES`.
+        Of :data:`~magbridge.link.fixes.FIX_MESSAGES`.
     component : Component
     frame : Frame
         Has received each message before.

@@ -11,7 +11,7 @@ from magbridge.mavlink import Message, by_id
 
 __all__ = ["Frame"]
 
-FRESH_US = 10_000_000
+MAX_STATE_AGE_US = 10_000_000
 """µs, for which a height or an attitude is the present one."""
 UNSET = (0, 0)
 """GPS_GLOBAL_ORIGIN's latitude and longitude of an autopilot without an origin."""
@@ -32,7 +32,7 @@ class Frame:
         self.origin: tuple[float, float, float] | None = None
         self.attitude = 1.0, 0.0, 0.0, 0.0
         self._altitude = self._down = nan
-        self._altitude_us = self._down_us = self._attitude_us = -FRESH_US
+        self._altitude_us = self._down_us = self._attitude_us = -MAX_STATE_AGE_US
         self._handlers = by_id(
             ATTITUDE=self._turn, GLOBAL_POSITION_INT=self._rise, GPS_GLOBAL_ORIGIN=self._set_origin,
             LOCAL_POSITION_NED=self._sink, ODOMETRY=self._sink,
@@ -45,24 +45,28 @@ class Frame:
 
     def altitude(self, time_us: int) -> float:
         """Return m above the sea; NaN where it is not known."""
-        if time_us - self._altitude_us < FRESH_US:
+        if time_us - self._altitude_us < MAX_STATE_AGE_US:
             return self._altitude
-        if self.origin is not None and time_us - self._down_us < FRESH_US:
+        if self.origin is not None and time_us - self._down_us < MAX_STATE_AGE_US:
             return self.origin[2] - self._down
         return nan
 
     def depth(self, time_us: int) -> float:
         """Return m below the sea; without an origin, a local height alone counts from there."""
         altitude = self.altitude(time_us)
-        return self._down if isnan(altitude) and time_us - self._down_us < FRESH_US else -altitude
+        return self._down if isnan(altitude) and time_us - self._down_us < MAX_STATE_AGE_US else -altitude
 
     def pose(self, time_us: int, latitude: float, longitude: float) -> Pose | str:
         """Return the pose of a vehicle at a position (deg), or the reason why there is none."""
         if self.origin is None:
             return "no origin of the autopilot's frame"
-        if time_us - self._attitude_us >= FRESH_US:
+        if time_us - self._attitude_us >= MAX_STATE_AGE_US:
             return "no attitude from the autopilot"
-        down = self._down if time_us - self._down_us < FRESH_US else self.origin[2] - self.altitude(time_us)
+        down = (
+            self._down
+            if time_us - self._down_us < MAX_STATE_AGE_US
+            else self.origin[2] - self.altitude(time_us)
+        )
         if isnan(down):
             return "no height from the autopilot"
         return Pose(*separation(*self.origin[:2], latitude, longitude), down, self.attitude)

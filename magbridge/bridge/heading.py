@@ -35,7 +35,9 @@ MAX_SENT_SIGMA_DEG: Final = 30.0
 """deg: a heading that is known less well is not sent to the autopilot."""
 MAX_WAITING: Final = 8
 """Sentences that wait at most."""
-UNUSABLE: Final = int(Quality.SATURATED | Quality.UNCALIBRATED | Quality.IMPLAUSIBLE | Quality.NO_BORESIGHT)
+NO_HEADING_FLAGS: Final = int(
+    Quality.SATURATED | Quality.UNCALIBRATED | Quality.IMPLAUSIBLE | Quality.NO_BORESIGHT
+)
 """Flags of samples whose heading is not sent to the autopilot or to NMEA receivers."""
 
 
@@ -150,7 +152,7 @@ class LiveHeading:
 
     def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
         """Send the heading of a sample where it is due and good enough; `time_us` is the sample's time."""
-        if not attitude.is_known or quality & UNUSABLE or attitude.sigma > MAX_SENT_SIGMA_DEG:
+        if not attitude.is_known or quality & NO_HEADING_FLAGS or attitude.sigma > MAX_SENT_SIGMA_DEG:
             return
         utc_us = time_us + self._component.codec.utc_offset_us
         is_true = isfinite(attitude.heading)

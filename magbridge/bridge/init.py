@@ -14,7 +14,7 @@ from magbridge.sensors.options import options_of
 
 __all__ = ["Answers", "bridge_toml"]
 
-NEEDED = "FILL IN"
+PLACEHOLDER = "FILL IN"
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _sensor(answers: Answers) -> list[str]:
         if one.name in answers.options:
             lines.append(f"{one.name} = {_value(answers.options[one.name])}    # {meaning}")
         elif one.required:
-            lines.append(f"# {one.name} =     # {NEEDED}: {meaning}")
+            lines.append(f"# {one.name} =     # {PLACEHOLDER}: {meaning}")
         elif one.default is not None:
             lines.append(f"# {one.name} = {_value(one.default)}    # {meaning}")
         else:

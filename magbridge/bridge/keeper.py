@@ -18,7 +18,7 @@ from magbridge.mavlink.enums import MAV_SEVERITY
 
 __all__ = ["Keeper"]
 
-KEEP_US = 60_000_000
+STAMP_INTERVAL_US = 60_000_000
 """µs between two savings of the signing time stamps."""
 SAVE_US = 1_000_000
 """µs between two savings of parameters: each waits for the disk, and the sensor for it."""
@@ -27,7 +27,7 @@ SAVE_US = 1_000_000
 class Keeper:
     """Saves it while the bridge runs, and when it ends."""
 
-    AHEAD = 2 * KEEP_US // 10
+    AHEAD = 2 * STAMP_INTERVAL_US // 10
     """Units of 10 µs for which stamps are reserved at each saving, lest the next run use them again."""
 
     def __init__(self, config: Config) -> None:
@@ -66,12 +66,12 @@ class Keeper:
         if learning is not None and path is not None and (why := keep(learning, path)):
             self._notify(states.notice(why))
         revision = pipeline.component.parameters.revision
-        due = self._key is not None and time_us - self._saved_us > KEEP_US
+        due = self._key is not None and time_us - self._saved_us > STAMP_INTERVAL_US
         if time_us < self._retry_us or (revision == self._revision and not due):
             return
         self._revision, self._saved_us, self._retry_us = revision, time_us, time_us + SAVE_US
         if not self.save(pipeline):
-            self._revision, self._retry_us = -1, time_us + KEEP_US
+            self._revision, self._retry_us = -1, time_us + STAMP_INTERVAL_US
 
     def save(self, pipeline: Pipeline, *, last: bool = False) -> bool:
         """Write the file if its content has changed; return False, the old file kept, where that fails.

@@ -11,7 +11,7 @@ from magbridge.calibration.model import Calibration, Parameter
 from magbridge.config import Config
 from magbridge.errors import CalibrationError, ConfigError, WriteError
 from magbridge.learning import Learner
-from magbridge.learning.causes import CAUSES
+from magbridge.learning.causes import CAUSE_UNITS
 from magbridge.learning.start import class_prior
 from magbridge.link.component import Component
 from magbridge.link.output import Rate
@@ -20,7 +20,7 @@ from magbridge.mavlink.enums import MAG_LEARNING_STATE, MAV_SEVERITY
 __all__ = ["Learning", "first_calibration", "keep", "kept_path", "open_learner"]
 
 ACCEPT, FORGET = 1.0, 2.0
-KEEP_US = 600_000_000
+FILE_INTERVAL_US = 600_000_000
 """µs between files of a calibration that is only renewed."""
 
 
@@ -141,7 +141,7 @@ class Learning:
             self._published = learner.calibration
             self._id = calibration_id(learner.calibration)
             component.use_calibration(self._id)
-            if not learner.renewed or time_us - self._kept_us > KEEP_US:
+            if not learner.renewed or time_us - self._kept_us > FILE_INTERVAL_US:
                 self._kept_us = time_us
                 self.to_keep.append(learner.calibration)
         if learner.first is not self._first:
@@ -165,7 +165,7 @@ class Learning:
             rms_learned=state.rms[2],
             better=state.better,
             alarm_amplitude=state.size,
-            causes=sum(1 << bit for bit, name in enumerate(CAUSES) if name in state.causes),
+            causes=sum(1 << bit for bit, name in enumerate(CAUSE_UNITS) if name in state.causes),
             state=MAG_LEARNING_STATE.FROZEN if learner.frozen else going,
         )
 

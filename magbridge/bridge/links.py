@@ -13,7 +13,7 @@ from magbridge.errors import ConfigError
 
 __all__ = ["LINKS", "open_link"]
 
-OWN: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpClient}
+CLIENT_LINKS: dict[str, Callable[[str, tuple[str, int]], Port]] = {"udpout": UdpPort, "tcp": TcpClient}
 """Kinds of link that go to one peer, by the first part of the URL, as in the MAVLink world."""
 SHARED: dict[str, Callable[[str, tuple[str, int], Peers, bool], Port]] = {
     "udpin": lambda name, address, peers, _: UdpPort(name, address, peers),
@@ -68,6 +68,6 @@ def open_link(
             raise ValueError(url)  # noqa: TRY301 - as `parse_address` does
     except ValueError as error:
         raise ConfigError(source, key, f"expected HOST:PORT or [IPV6]:PORT, got {url!r}") from error
-    if kind in OWN:
-        return OWN[kind](url, (host, port))
+    if kind in CLIENT_LINKS:
+        return CLIENT_LINKS[kind](url, (host, port))
     return SHARED[kind](url, (host, port), Peers(autopilot, budget=budget, signed=signed), signed)

@@ -21,13 +21,13 @@ from magbridge.records import Channel
 
 __all__ = ["LiveEdge"]
 
-RETRY = 0.25
+PORT_RETRY_S = 0.25
 """s between attempts to open a port that is down."""
-PATIENCE = 2.0
+CLOSE_TIMEOUT_S = 2.0
 """s that :meth:`LiveEdge.close` waits for an attempt under way to open a port."""
 SLOW_US = 10_000_000
 """µs between two reports that the link is too slow; repeated, because one may be lost as well."""
-LOOK_US = 100_000
+CLOCK_CHECK_INTERVAL_US = 100_000
 """µs between two checks for a step of the host's clock, and for a link that is too slow."""
 BACKLOG = 1 << 20
 """Bytes of a link's backlog that are read at once after the process was held up."""
@@ -60,12 +60,12 @@ class LiveEdge:
             )
             self._openers[channel] = opener
             opener.start()
-            tried.wait(RETRY)  # so that a report on the next port can go out over this one
+            tried.wait(PORT_RETRY_S)  # so that a report on the next port can go out over this one
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield events until :meth:`stop`, and an empty one whenever `deadline` (µs) has passed."""
         turned_us = self._clock.now_us()
-        look_us = turned_us + LOOK_US
+        look_us = turned_us + CLOCK_CHECK_INTERVAL_US
         while not self._stopping:
             wait = (min(deadline(), look_us) - self._clock.now_us()) * 1e-6
             lines = {fd: channel for channel, port in self._ports.items() for fd in port.fds()}
@@ -89,7 +89,7 @@ class LiveEdge:
                 if fd != self._woken and (data := self._waiting(lines[fd], fd, held)):
                     yield Event(now_us, lines[fd], data)
             if now_us >= look_us:
-                look_us = now_us + LOOK_US
+                look_us = now_us + CLOCK_CHECK_INTERVAL_US
                 for state in self._look(now_us):
                     yield Event(now_us, Channel.STATE, state)
             if now_us >= deadline():
@@ -150,7 +150,7 @@ class LiveEdge:
         """Close the ports; one that is still being opened is left to the end of the process."""
         self._stopping = True
         for channel, opener in self._openers.items():
-            opener.join(PATIENCE)
+            opener.join(CLOSE_TIMEOUT_S)
             if not opener.is_alive():
                 self._ports[channel].close()
         if not any(opener.is_alive() for opener in self._openers.values()):
@@ -205,4 +205,4 @@ class LiveEdge:
                     self.notify(states.port(channel, port, reason))
                 reported = reason
             tried.set()
-            time.sleep(RETRY)
+            time.sleep(PORT_RETRY_S)

@@ -22,11 +22,11 @@ from magbridge.navigate.deadreckoning import GLIDE
 
 __all__ = ["Motion", "Source"]
 
-FRESH_US = 30_000_000
+MAX_SOURCE_AGE_US = 30_000_000
 """µs without it, after which the next best source is used."""
 GLIDING_US = 600_000_000
 """µs since the vehicle was last steep, for which it counts as a glider."""
-LEARNING = 0.1
+SPEED_WEIGHT = 0.1
 """Share of each new speed in the mean that is kept for when nothing else is known."""
 EQUAL_M_S = 0.011
 """m/s: an airspeed this near to the speed over ground is that speed (``GCS_Common.cpp``, vfr_hud_airspeed, of
@@ -86,7 +86,9 @@ class Motion:
         self._heading = self._pitch = self._last = nan
         self._steep_us = -GLIDING_US
         self._ground_speed, self._equal = nan, 0  # m/s, by GPS; airspeeds in a row that were equal to it
-        self._unvouched_us = -FRESH_US  # when the autopilot last reported that its velocity does not hold
+        self._unvouched_us = (
+            -MAX_SOURCE_AGE_US
+        )  # when the autopilot last reported that its velocity does not hold
         self._stream: tuple[int, int] | None = None  # component and message that the track comes from
         self._step: tuple[int, float, float, int] | None = None  # µs, m, m, resets of that message
         self._jumps = 0.0, 0.0
@@ -116,7 +118,7 @@ class Motion:
         self._heading, self._pitch = degrees(message["yaw"]) % 360.0, degrees(message["pitch"])
         if abs(self._pitch) >= GLIDE:
             self._steep_us = time_us
-        if self.source is Source.SPEED and time_us - self._received_us < FRESH_US:
+        if self.source is Source.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
             self._pass(time_us, heading=self._heading, pitch=self._pitch)
         elif time_us - self._steep_us < GLIDING_US and isfinite(self._frame.depth(time_us)):
             if self._use(Source.GLIDE, time_us, "heading, pitch and depth"):
@@ -150,7 +152,7 @@ class Motion:
         if message.component == self._component.peer[1]:
             flags = message["flags"]
             holds = flags & VELOCITY_HORIZ and not flags & CONST_POS_MODE
-            self._unvouched_us = -FRESH_US if holds else time_us
+            self._unvouched_us = -MAX_SOURCE_AGE_US if holds else time_us
 
     def _global(self, message: Message, time_us: int) -> None:
         self._pass(time_us, depth=self._frame.depth(time_us))
@@ -177,13 +179,13 @@ class Motion:
     ) -> None:
         """Process an estimate of position (m, north and east) and velocity (m/s)."""
         stream, own = (message.component, message.id), message.component == self._component.peer[1]
-        if own and (not self.gps_trusted or time_us - self._unvouched_us < FRESH_US):
+        if own and (not self.gps_trusted or time_us - self._unvouched_us < MAX_SOURCE_AGE_US):
             return
         if isfinite(hypot(*velocity)) and velocity != (0.0, 0.0):
             self._measured.add(stream)
             if own and not self.fed_back:
                 last, speed = self._last, hypot(*velocity)
-                self._last = last + LEARNING * (speed - last) if isfinite(last) else speed
+                self._last = last + SPEED_WEIGHT * (speed - last) if isfinite(last) else speed
         measured = stream in self._measured
         source = Source.TRACK if own else Source.OTHER
         clean = not (own and self.fed_back)
@@ -214,7 +216,7 @@ class Motion:
     def _use(self, source: Source, time_us: int, words: str, stream: tuple[int, int] | None = None) -> bool:
         """Return whether dead reckoning follows a source, as it does if no better one is fresh."""
         same = (source, stream) == (self.source, self._stream)
-        if not same and source >= self.source and time_us - self._received_us < FRESH_US:
+        if not same and source >= self.source and time_us - self._received_us < MAX_SOURCE_AGE_US:
             return False
         if not same:
             self._navigator.new_motion(time_us)

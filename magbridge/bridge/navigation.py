@@ -17,7 +17,7 @@ from magbridge.errors import ConfigError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.read import read_grid
 from magbridge.link.component import Component
-from magbridge.link.fixes import FIXES, Kind
+from magbridge.link.fixes import FIX_MESSAGES, Kind
 from magbridge.link.output import Rate
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_SEVERITY
@@ -31,7 +31,7 @@ from magbridge.toml import convert
 __all__ = ["Navigation", "open_navigation"]
 
 GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
-WORDS = {
+STATE_TEXTS = {
     State.OFF: "waiting for a first position",
     State.SEARCHING: "searching",
     State.TRACKING: "tracking",
@@ -49,7 +49,7 @@ GPS_REASONS = {
     GnssReason.FIELD: "the map does not describe the field at its position",
 }
 
-ALIKE = (
+COPIED_FIELDS = (
     *("covariance_nn", "covariance_ne", "covariance_ee", "innovation", "innovation_variance", "gate"),
     *("bias", "bias_sigma", "current_north", "current_east"),
 )
@@ -64,7 +64,7 @@ class Navigation:
     grid : AnomalyGrid
     options : Options
     fix : Kind
-        Of :data:`~magbridge.link.fixes.FIXES`.
+        Of :data:`~magbridge.link.fixes.FIX_MESSAGES`.
     component : Component
     """
 
@@ -128,7 +128,7 @@ class Navigation:
         if record.state is not self._state:
             self._state = record.state
             severity = MAV_SEVERITY.WARNING if record.state is State.LOST else MAV_SEVERITY.INFO
-            component.announcer.state("navigation", f"navigation: {WORDS[record.state]}", severity)
+            component.announcer.state("navigation", f"navigation: {STATE_TEXTS[record.state]}", severity)
         offset_us = component.codec.utc_offset_us
         if self._rate.due(record.time_us):
             component.outbox.send(
@@ -136,7 +136,7 @@ class Navigation:
                 time_usec=record.time_us + offset_us,
                 lat=round(record.latitude * 1e7),
                 lon=round(record.longitude * 1e7),
-                **{name: getattr(record, name) for name in ALIKE},
+                **{name: getattr(record, name) for name in COPIED_FIELDS},
                 state=int(record.state),
                 accepted=int(record.accepted),
                 gps_state=int(self.navigator.gnss.state),
@@ -165,12 +165,12 @@ def open_navigation(
     ConfigError: a fix message or an option that does not exist, or a rate too low for the receiver.
     FormatError, OutOfRange: the map cannot be read.
     """
-    if wanted.fix not in FIXES:
-        raise ConfigError(config.path, "navigation.fix", f"expected one of {', '.join(FIXES)}")
+    if wanted.fix not in FIX_MESSAGES:
+        raise ConfigError(config.path, "navigation.fix", f"expected one of {', '.join(FIX_MESSAGES)}")
     options = convert(wanted.options, Options, config.path, "navigation.options.")
     if calibration is not None and not wanted.options.keys() & {"noise", "bias_sigma"}:
         options = informed(options, calibration, calibration.noise.sensor)
-    kind = FIXES[wanted.fix]
+    kind = FIX_MESSAGES[wanted.fix]
     if wanted.rate is not None:
         if wanted.rate < kind.least:
             expected = (

@@ -13,7 +13,7 @@ from magbridge.errors import PortError
 
 __all__ = ["NmeaOutput", "nmea_port"]
 
-RETRY_US = 1_000_000
+NMEA_RETRY_US = 1_000_000
 """µs between two attempts to open the port."""
 
 
@@ -54,7 +54,7 @@ class NmeaOutput:
             if not self._port.is_open:
                 if time_us < self._retry_us:
                     return
-                self._retry_us = time_us + RETRY_US
+                self._retry_us = time_us + NMEA_RETRY_US
                 self._port.open()
                 self._reported = ""
             self._port.write(data)

@@ -16,15 +16,15 @@ from math import inf
 from magbridge.mavlink import BAD_DATA, Codec
 from magbridge.mavlink.framing import V2
 
-__all__ = ["ANSWERED", "SHARE", "TIMEOUT", "Peer", "Peers"]
+__all__ = ["ANSWERED", "PEER_READ_BYTES", "TIMEOUT", "Peer", "Peers"]
 
 TIMEOUT = 30.0
 """s after its last valid frame at which a peer is no longer answered."""
 ANSWERED = 8
 """Most peers that are answered; of more, the autopilot's and then those that came first."""
-KNOWN = 64
+MAX_PARSED_PEERS = 64
 """Most peers of which there is a parser."""
-SHARE = 8192
+PEER_READ_BYTES = 8192
 """Bytes of one peer that are looked at before the sensor's turn; the autopilot's are looked at whole."""
 STRANGERS = 8192
 """Bytes, likewise, of all peers together that have not yet sent anything valid."""
@@ -98,7 +98,9 @@ class Peers:
         known = now - peer.genuine < TIMEOUT
         peer.share += len(data)
         self._strangers += 0 if known else len(data)
-        if now - peer.pilot > TIMEOUT and (peer.share > SHARE or (not known and self._strangers > STRANGERS)):
+        if now - peer.pilot > TIMEOUT and (
+            peer.share > PEER_READ_BYTES or (not known and self._strangers > STRANGERS)
+        ):
             self.ignored += len(data)
             return
         for message in peer.codec.parse(data):
@@ -171,7 +173,7 @@ class Peers:
         return peer if peer in self.answered() else None
 
     def _meet(self, address: Hashable) -> Peer:
-        if len(self._peers) >= KNOWN:
+        if len(self._peers) >= MAX_PARSED_PEERS:
             least = min(self._peers.values(), key=lambda peer: (peer.pilot, peer.genuine))
             del self._peers[least.address]
         peer = self._peers[address] = Peer(address)

@@ -46,12 +46,12 @@ __all__ = ["Pipeline"]
 
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
-ATTITUDE: Final = spec("ATTITUDE").id
-HEADING_INPUTS: Final = frozenset((ATTITUDE, spec("HEARTBEAT").id))
+ATTITUDE_ID: Final = spec("ATTITUDE").id
+HEADING_INPUTS: Final = frozenset((ATTITUDE_ID, spec("HEARTBEAT").id))
 """Messages from which the heading is computed and sent."""
 LATELY = 64
 """Samples over which the sample rate is computed."""
-DOUBTFUL = int(
+ANNOUNCED_FLAGS = int(
     Quality.STALE_TELEMETRY
     | Quality.SATURATED
     | Quality.UNCALIBRATED
@@ -245,7 +245,7 @@ class Pipeline:
         )
         if self._notices:
             self._report_implausible()
-        doubtful = corrected.quality & DOUBTFUL
+        doubtful = corrected.quality & ANNOUNCED_FLAGS
         if doubtful != self._quality:
             self._report_doubtful(doubtful)
         anomaly = corrected.total_field - main_field
@@ -286,7 +286,7 @@ class Pipeline:
                 continue
             if message.id == Position.MESSAGE:
                 self._locate(message, time_us)
-            elif message.id == ATTITUDE and self._is_autopilot(message):
+            elif message.id == ATTITUDE_ID and self._is_autopilot(message):
                 self._parts.call("direction check", None, self._turn, message, time_us)
             if self.heading is not None and message.id in HEADING_INPUTS and self._is_autopilot(message):
                 self.heading.receive(message, time_us)

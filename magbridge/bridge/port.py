@@ -19,9 +19,9 @@ from magbridge.link.message_rates import LIMITS
 from magbridge.mavlink import spec
 from magbridge.mavlink.framing import SIGNATURE, V2, is_signed
 
-__all__ = ["CHUNK", "MAX_WAITING_MESSAGES", "MAX_WAIT_S", "PacedPort", "Port", "cut"]
+__all__ = ["MAX_WAITING_MESSAGES", "MAX_WAIT_S", "READ_BYTES", "PacedPort", "Port", "cut"]
 
-CHUNK = 65536
+READ_BYTES = 65536
 """Bytes read at once."""
 MAX_WAIT_S = 0.1
 """s after which a message that waits is dropped, if a newer one of its kind waits as well."""

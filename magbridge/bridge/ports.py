@@ -18,12 +18,12 @@ __all__ = ["BAUDRATES", "Recognised", "SerialDevice", "listen", "ports", "recogn
 
 BAUDRATES = (115_200, 57_600, 9_600, 38_400, 230_400, 19_200, 921_600)
 """Bit/s at which a line is listened to, the most usual first."""
-SENTENCE = re.compile(rb"[$!][A-Z]{5},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
-LINE = re.compile(rb"[^\r\n]+[\r\n]")
-NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
+NMEA_0183 = re.compile(rb"[$!][A-Z]{5},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
+TEXT_LINE = re.compile(rb"[^\r\n]+[\r\n]")
+TEXT_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
 SHOWN = 60
 """Characters shown of a line that is not understood."""
-ENOUGH = 3
+MIN_RECOGNISED = 3
 """Readings or frames by which a sender is known."""
 
 
@@ -104,13 +104,13 @@ def recognise(data: bytes, seconds: float) -> Recognised:
     for known in (_mavlink(data), _nmea(data), *_drivers(data, seconds)):
         if known is not None:
             return known
-    lines = LINE.findall(data)
+    lines = TEXT_LINE.findall(data)
     printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) / len(data)
     if printable < 0.9 or not lines:
         return Recognised("bytes", f"not understood: {data[:24].hex(' ')}")
     line = lines[len(lines) // 2]
     shown = line.decode("ascii", "replace").strip()[:SHOWN]
-    numbers = len(NUMBER.findall(line))
+    numbers = len(TEXT_NUMBER.findall(line))
     hint = " (driver ascii reads it, if x y z are among these)" if numbers >= 3 else ""
     return Recognised("text", f"not understood: {shown!r}{hint}")
 
@@ -118,7 +118,7 @@ def recognise(data: bytes, seconds: float) -> Recognised:
 def _mavlink(data: bytes) -> Recognised | None:
     codec = Codec(255, 190)
     frames = [one for one in codec.parse(data) if one.id != BAD_DATA and one.known]
-    if len(frames) < ENOUGH:
+    if len(frames) < MIN_RECOGNISED:
         return None
     senders = sorted({(one.system, one.component) for one in frames})
     return Recognised(
@@ -127,8 +127,8 @@ def _mavlink(data: bytes) -> Recognised | None:
 
 
 def _nmea(data: bytes) -> Recognised | None:
-    valid = [line for line in SENTENCE.findall(data) if _checked(line)]
-    if len(valid) < ENOUGH:
+    valid = [line for line in NMEA_0183.findall(data) if _checked(line)]
+    if len(valid) < MIN_RECOGNISED:
         return None
     kinds = sorted({line[1:6].decode() for line in valid})
     return Recognised("nmea", f"NMEA 0183: {' '.join(kinds)}")
@@ -151,7 +151,7 @@ def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
             driver.start()
             readings = driver.feed(data)
             wasted = driver.bytes_skipped / len(data)
-            if len(readings) >= ENOUGH and wasted < 0.5:
+            if len(readings) >= MIN_RECOGNISED and wasted < 0.5:
                 texts = ", ".join(
                     f"{key} = {value!r}" for key, value in options.items() if key != "sensitivity"
                 )

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 __all__ = ["CLOCK_SET_US", "Position"]
 
 POSITION = spec("GLOBAL_POSITION_INT")
-MAX_AGE_US: Final = 60_000_000
+MAX_POSITION_AGE_US: Final = 60_000_000
 """µs: a glider makes 20 m in a minute, over which the main field changes by less than 0.1 nT."""
 CLOCK_SET_US: Final = 10**15
 """µs since 1970, in 2001: a host whose clock says less has none that was set, and the date is not known."""
-REPEAT_US: Final = 1_000_000
+FIELD_INTERVAL_US: Final = 1_000_000
 """µs after which the bridge computes the main field again."""
-MAX_SPEED_M_S: Final = 350.0
+MAX_VEHICLE_SPEED_M_S: Final = 350.0
 """m/s: no vehicle that carries a fluxgate is faster."""
 MAX_JUMP_M: Final = 10_000.0
 """m beyond what MAX_SPEED_M_S allows: the main field changes by 50 nT at most over that, so that a correction
@@ -99,7 +99,7 @@ class Position:
         """Return True if the vehicle can have come from a position (deg) to the present one."""
         assert self._where is not None
         north, east = separation(*trusted, *self._where)
-        return hypot(north, east) < MAX_JUMP_M + MAX_SPEED_M_S * abs(elapsed_us) * 1e-6
+        return hypot(north, east) < MAX_JUMP_M + MAX_VEHICLE_SPEED_M_S * abs(elapsed_us) * 1e-6
 
     def main_field(self, time_us: int, utc_us: int) -> float:
         """Return the IGRF's total field in nT; NaN where position or date is not known, or no model holds.
@@ -109,9 +109,9 @@ class Position:
         time_us, utc_us : int
             µs of event time, and of UNIX time by the host's clock as it is set now.
         """
-        if self.where is None or utc_us < CLOCK_SET_US or abs(time_us - self._when_us) > MAX_AGE_US:
+        if self.where is None or utc_us < CLOCK_SET_US or abs(time_us - self._when_us) > MAX_POSITION_AGE_US:
             return nan
-        if abs(utc_us - self._evaluated_us) > REPEAT_US:
+        if abs(utc_us - self._evaluated_us) > FIELD_INTERVAL_US:
             self._evaluated_us = utc_us
             self._field = self._evaluate(utc_us)
         return self._field
@@ -120,7 +120,7 @@ class Position:
         """Return the IGRF's vector in nT, north-east-down, of the last minute; NaN as :meth:`main_field`."""
         if isnan(self.main_field(time_us, utc_us)):
             return nan, nan, nan
-        if abs(utc_us - self._vector_us) > MAX_AGE_US:
+        if abs(utc_us - self._vector_us) > MAX_POSITION_AGE_US:
             from magbridge.field.igrf import igrf  # noqa: PLC0415 - the field model is optional live
 
             assert self._where is not None

@@ -12,9 +12,9 @@ __all__ = ["Recorder"]
 
 BYTES: Final = spec("MAG_SENSOR_BYTES")
 RAW: Final = spec("MAG_RAW")
-HEADER: Final = Struct("<BB")
+BYTES_HEADER: Final = Struct("<BB")
 """The fields of MAG_SENSOR_BYTES before its data: sensor_id, length."""
-SIZE: Final = BYTES.fields["data"].count
+RECORDED_BYTES: Final = BYTES.fields["data"].count
 SENT, LINK, SENSOR, STATE = Channel
 
 
@@ -51,8 +51,8 @@ class Recorder:
         if not self.active:
             return
         while data:
-            piece, data = data[:SIZE], data[SIZE:]
-            frame = self._scribe.frame(BYTES, HEADER.pack(0, len(piece)) + piece)
+            piece, data = data[:RECORDED_BYTES], data[RECORDED_BYTES:]
+            frame = self._scribe.frame(BYTES, BYTES_HEADER.pack(0, len(piece)) + piece)
             self._add(time_us, SENSOR, frame)
 
     def state(self, time_us: int, frame: bytes) -> None:

@@ -17,17 +17,17 @@ COMMAND_GAP_US = 100_000
 """µs between two commands to a sensor."""
 LISTEN_US = 1_200_000
 """µs for which a line that may be another instrument's is listened to: a GPS sends every second."""
-NMEA = re.compile(rb"[$!][A-OQ-Z][A-Z]{4},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
+NMEA_SENTENCE = re.compile(rb"[$!][A-OQ-Z][A-Z]{4},[ -~]*\*[0-9A-Fa-f]{2}\r?\n")
 """A sentence of NMEA 0183, but none that a maker has defined (``$P...``)."""
-SENTENCE = 128
+MAX_SENTENCE_BYTES = 128
 """Bytes, the longest sentence and a margin."""
-TEXT = re.compile(rb"[\t\r\n -~]+")
+TEXT_BYTES = re.compile(rb"[\t\r\n -~]+")
 NOT_A_NUMBER = re.compile(rb"\bnan\b", re.IGNORECASE)
 SAME_US: Final = 60_000_000
-SAME: Final = 10
+MIN_REPEATED_READINGS: Final = 10
 """µs, and number of readings, after which one that repeats is announced: the sensor may hang. It has no flag,
 because one that counts in steps of 100 nT may as well be at rest."""
-LOOK_US = 1_000_000
+LINE_CHECK_INTERVAL_US = 1_000_000
 """µs between two checks that readings still come."""
 
 
@@ -85,7 +85,7 @@ class SensorLine:
         self._field: Vector | None = None
         self._repeats = self._since_us = 0
         self._hangs = False
-        timers.every("sensor", LOOK_US, self._look, start_us + LOOK_US)
+        timers.every("sensor", LINE_CHECK_INTERVAL_US, self._look, start_us + LINE_CHECK_INTERVAL_US)
 
     def on_reading(self, time_us: int) -> None:
         """Record a reading."""
@@ -103,7 +103,7 @@ class SensorLine:
                 self._announcer.state("reading", f"{self._name}'s readings change again")
             return
         self._repeats += 1
-        if not self._hangs and self._repeats >= SAME and time_us - self._since_us >= SAME_US:
+        if not self._hangs and self._repeats >= MIN_REPEATED_READINGS and time_us - self._since_us >= SAME_US:
             self._hangs = True
             text = f"{self._name} sends the same reading for {SAME_US // 1_000_000} s"
             self._announcer.state("reading", text, MAV_SEVERITY.WARNING)
@@ -112,8 +112,8 @@ class SensorLine:
         """Record bytes that complete no reading."""
         self._unparsed_us = time_us
         received = self._tail + data
-        self._tail = received[-SENTENCE:]
-        if self._listen_us and not self._known and NMEA.search(received):
+        self._tail = received[-MAX_SENTENCE_BYTES:]
+        if self._listen_us and not self._known and NMEA_SENTENCE.search(received):
             self._commands, self.wrong_device = (), True
             self._timers.cancel("command")
 
@@ -139,7 +139,7 @@ class SensorLine:
 
     def _unparsed(self) -> str:
         """Return a description of the bytes without readings: at a wrong baud rate, they are not text."""
-        if not TEXT.fullmatch(self._tail):
+        if not TEXT_BYTES.fullmatch(self._tail):
             return "sends, but no readings: baud rate?"
         if NOT_A_NUMBER.search(self._tail):
             return "sends NaN, but no readings"

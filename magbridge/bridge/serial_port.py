@@ -17,19 +17,19 @@ from urllib.parse import urlsplit
 
 import serial
 
-from magbridge.bridge.port import CHUNK, PacedPort
+from magbridge.bridge.port import READ_BYTES, PacedPort
 from magbridge.errors import ConfigError, PortError
 
 __all__ = ["SerialPort", "may_be_device", "serial_line"]
 
-PIECE = 4095
+MAX_READ_BYTES = 4095
 """Bytes that one read of a terminal device returns at most, however many are waiting."""
-SOON = 0.02
+BACKLOG_WAIT_S = 0.02
 """s within which the next piece of a backlog can be read, even on a busy computer."""
 
 LEAD = 0.05
 """s of the line's time that are handed to the system at once."""
-HELD = 20_000
+LINE_BUFFER_BYTES = 20_000
 """Bytes that a line which does not say how much waits in it holds when it is full: a pseudo-terminal does."""
 
 
@@ -37,7 +37,7 @@ class SerialPort(PacedPort):
     """A serial line by device name, pattern (``/dev/ttyUSB*``) or pyserial URL."""
 
     def __init__(self, name: str, baudrate: int) -> None:
-        super().__init__(name, round(baudrate / 10 * LEAD), CHUNK, "hung up")
+        super().__init__(name, round(baudrate / 10 * LEAD), READ_BYTES, "hung up")
         self.baudrate = baudrate
         self._last = self._passed = ""
         self._idle_at = -inf
@@ -87,14 +87,14 @@ class SerialPort(PacedPort):
         arrival says when it was sent.
         """
         data = super().read()
-        return data if len(data) < PIECE else data + self._backlog()
+        return data if len(data) < MAX_READ_BYTES else data + self._backlog()
 
     def _backlog(self) -> bytes:
         """Return the bytes after a first piece; the next :meth:`read` finds an end of file or error."""
         data = b""
         with suppress(OSError):
-            while len(data) < CHUNK and select.select([self._fd], [], [], SOON)[0]:
-                piece = os.read(self._fd, CHUNK)
+            while len(data) < READ_BYTES and select.select([self._fd], [], [], BACKLOG_WAIT_S)[0]:
+                piece = os.read(self._fd, READ_BYTES)
                 if not piece:
                     break
                 data += piece
@@ -118,7 +118,7 @@ class SerialPort(PacedPort):
         room = bool(select.select([], [self._fd], [], 0)[1])
         with suppress(OSError):  # just unplugged: writing will tell
             if not room and getattr(self._serial, "out_waiting", -1) == 0:
-                self._idle_at = now + HELD * 10 / self.baudrate
+                self._idle_at = now + LINE_BUFFER_BYTES * 10 / self.baudrate
         return room
 
     def _put(self, data: bytes | bytearray) -> int:

@@ -14,8 +14,8 @@ from ipaddress import IPv6Address
 from operator import itemgetter
 from typing import Any, cast
 
-from magbridge.bridge.peers import SHARE, Peer, Peers
-from magbridge.bridge.port import CHUNK, PacedPort, Port, cut
+from magbridge.bridge.peers import PEER_READ_BYTES, Peer, Peers
+from magbridge.bridge.port import READ_BYTES, PacedPort, Port, cut
 from magbridge.errors import PortError
 
 __all__ = ["TcpClient", "TcpServer", "UdpPort", "parse_address"]
@@ -35,7 +35,7 @@ DATAGRAM = 1400
 """Bytes that a packet carries on any usual network: more is split on the way, and 64 kB are refused."""
 DATAGRAMS = 512
 """Most that are read before the sensor's turn: empty ones could keep it waiting for ever."""
-AWAY = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
+NO_LISTENER_ERRORS = (errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.EPERM)
 """What a UDP socket reports when no program listens (yet): not a fault of the port."""
 
 
@@ -62,7 +62,7 @@ class _Connection(PacedPort):
     """One TCP connection."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(name, UNSENT, SHARE, "closed by the other end")
+        super().__init__(name, UNSENT, PEER_READ_BYTES, "closed by the other end")
         self._connection: socket.socket | None = None
 
     def write(self, data: bytes) -> None:
@@ -314,13 +314,13 @@ class UdpPort(Port):
         assert self._socket is not None
         datagrams: list[bytes] = []
         size = 0
-        while size < CHUNK and len(datagrams) < DATAGRAMS:
+        while size < READ_BYTES and len(datagrams) < DATAGRAMS:
             try:
-                datagram, peer = self._socket.recvfrom(CHUNK)
+                datagram, peer = self._socket.recvfrom(READ_BYTES)
             except BlockingIOError:
                 break
             except OSError as error:
-                if datagrams or error.errno in AWAY:
+                if datagrams or error.errno in NO_LISTENER_ERRORS:
                     break  # first return the received bytes
                 raise self.lost(error.strerror) from error
             size += len(datagram)
@@ -364,7 +364,7 @@ class UdpPort(Port):
             self.dropped += len(data)
             if self._peers is not None:  # an impossible address, as one with port 0, is not a fault
                 self._peers.forget(peer)
-            elif error.errno not in AWAY:
+            elif error.errno not in NO_LISTENER_ERRORS:
                 raise self.lost(error.strerror) from error
 
     def close(self) -> None:

@@ -22,11 +22,11 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Series, Step
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
-from magbridge.records import BEYOND
+from magbridge.records import MAX_MEASURED_NT
 
 __all__ = ["CorrectedArrays", "correct", "regressors", "vector_covariance"]
 
-CHUNK = 4096
+CORRECTED_AT_ONCE = 4096
 """Samples at a time: enough to outweigh the overhead of a call, few enough for a core's cache."""
 
 
@@ -80,8 +80,8 @@ def correct(
     kernel, turn = calibration.kernel, omega(calibration)
     steps = begun(calibration)
     with np.errstate(all="ignore"):  # NaN in, NaN out: flagged below
-        for start in range(0, n, CHUNK):
-            part = slice(start, start + CHUNK)
+        for start in range(0, n, CORRECTED_AT_ONCE):
+            part = slice(start, start + CORRECTED_AT_ONCE)
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             prepared = _prepare_many(kernel, phi)
             hx, hy, hz = field[part].T
@@ -90,8 +90,8 @@ def correct(
         for value, (low, high) in zip(channels.T, ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
             quality |= np.where(np.isnan(value), STALE_TELEMETRY, 0)
-        lost = ~(out[0] < BEYOND)
-        measured = np.abs(field).sum(axis=1) < BEYOND
+        lost = ~(out[0] < MAX_MEASURED_NT)
+        measured = np.abs(field).sum(axis=1) < MAX_MEASURED_NT
         quality |= np.where(lost, np.where(measured, STALE_TELEMETRY, GAP), 0)
     out[np.ix_([0, 2, 3, 4], lost)] = np.nan
     out[np.ix_([1, 5, 6, 7], lost)] = inf
@@ -111,8 +111,8 @@ def vector_covariance(
     """
     kernel, steps, out = calibration.kernel, begun(calibration), np.empty((len(field), 3, 3))
     with np.errstate(all="ignore"):
-        for start in range(0, len(field), CHUNK):
-            part = slice(start, start + CHUNK)
+        for start in range(0, len(field), CORRECTED_AT_ONCE):
+            part = slice(start, start + CORRECTED_AT_ONCE)
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             linear, V = _prepare_many(kernel, phi)
             d = field[part].T - np.stack(linear[9:12])

@@ -1,9 +1,9 @@
 """Correct one sample after the other, as the bridge does.
 
 Where a channel of the field or a position is NaN, or so large that the total field exceeds
-:data:`~magbridge.records.BEYOND`, total and vector are NaN and the sigmas infinite. The flag is ``gap`` if
-the field's channels are the reason, else ``stale_telemetry``. The total is never a guess. The equations stand
-in :mod:`.kernel`.
+:data:`~magbridge.records.MAX_MEASURED_NT`, total and vector are NaN and the sigmas infinite. The flag is
+``gap`` if the field's channels are the reason, else ``stale_telemetry``. The total is never a guess. The
+equations stand in :mod:`.kernel`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from magbridge.calibration.kernel import Linear, Numbers, Prepared, apply, linea
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
 from magbridge.errors import CalibrationError
-from magbridge.records import BEYOND, Corrected, Quality
+from magbridge.records import MAX_MEASURED_NT, Corrected, Quality
 
 __all__ = ["EXTRAPOLATED", "GAP", "STALE_TELEMETRY", "Corrector", "base_flags", "begun", "omega", "ranges"]
 
@@ -24,7 +24,7 @@ Span = tuple[int, float, float]
 GAP: Final = int(Quality.GAP)
 STALE_TELEMETRY: Final = int(Quality.STALE_TELEMETRY)
 EXTRAPOLATED: Final = int(Quality.EXTRAPOLATED)
-MARGIN = 0.02
+RANGE_MARGIN_FRACTION = 0.02
 """Share of the half range: telemetry that jitters at the end of its range is not extrapolated."""
 
 
@@ -141,8 +141,8 @@ class Corrector:
                 self._prepared = prepare(self._kernel.sums_of_one(regressors))
         F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega)
         quality |= self._flags
-        if not F < BEYOND:  # also NaN
-            quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < BEYOND else GAP
+        if not F < MAX_MEASURED_NT:  # also NaN
+            quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < MAX_MEASURED_NT else GAP
             F = x = y = z = nan
             sigma = sx = sy = sz = inf
         return (F, sigma, x, y, z, sx, sy, sz), quality
@@ -224,6 +224,9 @@ def base_flags(calibration: Calibration) -> int:
 def ranges(calibration: Calibration) -> list[tuple[float, float]]:
     """Return the lowest and the highest value of each parameter that is not extrapolated."""
     return [
-        (parameter.low - MARGIN * parameter.scale, parameter.high + MARGIN * parameter.scale)
+        (
+            parameter.low - RANGE_MARGIN_FRACTION * parameter.scale,
+            parameter.high + RANGE_MARGIN_FRACTION * parameter.scale,
+        )
         for parameter in calibration.parameters
     ]

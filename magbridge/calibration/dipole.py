@@ -13,7 +13,7 @@ alone and is left to the polynomial term. Moments are stored as the field they m
 nT: ``m / |r_0|^3`` and ``chi F_0 / |r_0|^3``.
 
 Along a line that is short against the distance, G is a rapidly converging power series in p. So the term is
-expanded into a polynomial (order :data:`ORDER`) and costs no more than one.
+expanded into a polynomial (order :data:`SERIES_ORDER`) and costs no more than one.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from magbridge.calibration.terms import Expansion, Parameter, PositionTerm
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
 
-__all__ = ["ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
+__all__ = ["SERIES_ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
 
 Vector = tuple[float, float, float]
 
-ORDER = 8
+SERIES_ORDER = 8
 """With a travel of a fifth of the distance either way the series is good to 1e-4; with a tenth, to 1e-7."""
 
 
@@ -146,7 +146,7 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
         names = [parameter.name for parameter in parameters]
         k = names.index(self.parameter)
         parameter = parameters[k]
-        p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * ORDER)
+        p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * SERIES_ORDER)
         r = np.array(self.at) + p[:, None] * np.array(self.travel)
         if np.linalg.norm(r, axis=1).min() < 3.0 * parameter.scale * np.linalg.norm(self.travel):
             raise CalibrationError(
@@ -156,6 +156,6 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
         r_0 = float(np.linalg.norm(self.at))
         columns = dipole_columns(r, np.array(self.moment), np.array(self.induced), r_0)
         exponents = tuple(
-            tuple(power if i == k else 0 for i in range(len(names))) for power in range(ORDER + 1)
+            tuple(power if i == k else 0 for i in range(len(names))) for power in range(SERIES_ORDER + 1)
         )
-        return Expansion(exponents, expand_dipole(columns, ORDER))
+        return Expansion(exponents, expand_dipole(columns, SERIES_ORDER))

@@ -27,11 +27,11 @@ from magbridge.columns import NT_PER_UNIT, usual
 
 __all__ = ["Compass", "ardupilot", "compass_of", "px4"]
 
-AXES = "X", "Y", "Z"
+AUTOPILOT_AXES = "X", "Y", "Z"
 OFF = (0, 1), (0, 2), (1, 2)
 FLOAT, INTEGER = 9, 6
 """MAV_PARAM_TYPE of a QGroundControl parameter file."""
-LIMIT = 1_800.0
+MAX_OFFSET_MG = 1_800.0
 """mG: ArduPilot refuses to arm with longer offsets (COMPASS_OFFS_MAX)."""
 
 
@@ -94,31 +94,39 @@ def ardupilot(compass: Compass, number: int = 0) -> tuple[str, list[str]]:
     mG = NT_PER_UNIT["mG"]
     n = "" if number == 0 else str(number + 1)
     offset = -compass.offset / mG
-    values = {f"COMPASS_OFS{n}_{axis}": offset[k] for k, axis in enumerate(AXES)}
-    values |= {f"COMPASS_DIA{n}_{axis}": compass.matrix[k, k] for k, axis in enumerate(AXES)}
-    values |= {f"COMPASS_ODI{n}_{axis}": compass.matrix[pair] for axis, pair in zip(AXES, OFF, strict=True)}
+    values = {f"COMPASS_OFS{n}_{axis}": offset[k] for k, axis in enumerate(AUTOPILOT_AXES)}
+    values |= {f"COMPASS_DIA{n}_{axis}": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
+    values |= {
+        f"COMPASS_ODI{n}_{axis}": compass.matrix[pair] for axis, pair in zip(AUTOPILOT_AXES, OFF, strict=True)
+    }
     values[f"COMPASS_SCALE{n}"] = 1.0
     if compass.current is not None:
         motor = -(compass.matrix @ compass.current) / mG
-        values |= {"COMPASS_MOTCT": 2.0} | {f"COMPASS_MOT{n}_{axis}": motor[k] for k, axis in enumerate(AXES)}
+        values |= {"COMPASS_MOTCT": 2.0} | {
+            f"COMPASS_MOT{n}_{axis}": motor[k] for k, axis in enumerate(AUTOPILOT_AXES)
+        }
     text = "".join(f"{name},{float(value):.9g}\n" for name, value in values.items())
     length = float(np.linalg.norm(offset))
-    long = [f"offsets of {length:.0f} mG: ArduPilot does not arm beyond COMPASS_OFFS_MAX, {LIMIT:.0f}"]
-    return text, long if length > LIMIT else []
+    long = [
+        f"offsets of {length:.0f} mG: ArduPilot does not arm beyond COMPASS_OFFS_MAX, {MAX_OFFSET_MG:.0f}"
+    ]
+    return text, long if length > MAX_OFFSET_MG else []
 
 
 def px4(compass: Compass, number: int = 0) -> str:
     """Return the text of a QGroundControl parameter file for PX4's compass `number` (from 0)."""
     G = NT_PER_UNIT["G"]
-    values = {f"CAL_MAG{number}_{axis}OFF": compass.offset[k] / G for k, axis in enumerate(AXES)}
-    values |= {f"CAL_MAG{number}_{axis}SCALE": compass.matrix[k, k] for k, axis in enumerate(AXES)}
+    values = {f"CAL_MAG{number}_{axis}OFF": compass.offset[k] / G for k, axis in enumerate(AUTOPILOT_AXES)}
+    values |= {f"CAL_MAG{number}_{axis}SCALE": compass.matrix[k, k] for k, axis in enumerate(AUTOPILOT_AXES)}
     values |= {
-        f"CAL_MAG{number}_{axis}ODIAG": compass.matrix[pair] for axis, pair in zip(AXES, OFF, strict=True)
+        f"CAL_MAG{number}_{axis}ODIAG": compass.matrix[pair]
+        for axis, pair in zip(AUTOPILOT_AXES, OFF, strict=True)
     }
     lines = ["# Vehicle-Id Component-Id Name Value Type"]
     if compass.current is not None:
         values |= {
-            f"CAL_MAG{number}_{axis}COMP": -1e3 * compass.current[k] / G for k, axis in enumerate(AXES)
+            f"CAL_MAG{number}_{axis}COMP": -1e3 * compass.current[k] / G
+            for k, axis in enumerate(AUTOPILOT_AXES)
         }
         lines.append(f"1\t1\tCAL_MAG_COMP_TYP\t2\t{INTEGER}")
     lines += [f"1\t1\t{name}\t{float(value):.9g}\t{FLOAT}" for name, value in values.items()]

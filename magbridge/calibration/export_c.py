@@ -18,7 +18,7 @@ from magbridge.estimation.residual import PAIRS
 
 __all__ = ["c_header", "c_source"]
 
-HEADER = Template("""/* Made by magbridge export from calibration $id: do not edit.
+C_HEADER = Template("""/* Made by magbridge export from calibration $id: do not edit.
  *
  * Compile with -DMAGBRIDGE_FLOAT for float; otherwise double. No allocation, no state, no other library than
  * sqrt() of the mathematical one.
@@ -143,7 +143,7 @@ def c_header(calibration: Calibration) -> str:
     for k, one in enumerate(calibration.parameters):
         listed = f"{k}: {one.name} [{one.unit or '1'}], from {one.low!r} to {one.high!r}"
         lines.append(f"/* parameter {listed.replace('*/', '')} */")
-    return HEADER.substitute(
+    return C_HEADER.substitute(
         id=f"{calibration_id(calibration):08x}",
         count=len(calibration.parameters),
         names="\n".join(lines),

@@ -19,14 +19,14 @@ from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.files import atomic_path
 
-__all__ = ["FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
+__all__ = ["CALIBRATION_FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
-FORMAT = 4
+CALIBRATION_FORMAT = 4
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
 ``white`` share, ``level`` and the reference's ``level_sigma``: each is written only where there is any."""
 
-MAX_SIGMA = 1e15
+MAX_STATED_SIGMA = 1e15
 """The largest noise (nT) or standard deviation of a coefficient that is accepted: its square is a float32."""
 
 AS_IN_MEMORY = (
@@ -103,9 +103,10 @@ def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibratio
     """
     try:
         version = msgspec.json.decode(data, type=_Version).format
-        if version > FORMAT:
+        if version > CALIBRATION_FORMAT:
             raise FormatError(
-                file, f"written by a newer magbridge (format {version}; this one reads up to {FORMAT})"
+                file,
+                f"written by a newer magbridge (format {version}; this one reads up to {CALIBRATION_FORMAT})",
             )
         raw = msgspec.json.decode(data)
         if version < 2 and isinstance(raw.get("noise"), dict) and "memory" in raw["noise"]:
@@ -202,16 +203,16 @@ def _check_settings(content: _File) -> None:
             raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
     if not content.reference.field > 0.0:
         raise CalibrationError("reference: field: expected nT, > 0")
-    if not 0.0 <= content.noise.sensor <= MAX_SIGMA:
-        raise CalibrationError(f"noise: sensor: expected nT, 0 to {MAX_SIGMA:g}")
+    if not 0.0 <= content.noise.sensor <= MAX_STATED_SIGMA:
+        raise CalibrationError(f"noise: sensor: expected nT, 0 to {MAX_STATED_SIGMA:g}")
     if not 0.0 <= content.noise.white <= 1.0:
         raise CalibrationError("noise: white: expected a share, 0 to 1")
 
 
 def _check_covariance(covariance: FloatArray, whose: str = "") -> None:
     """Symmetric and positive semidefinite, up to rounding."""
-    if np.abs(covariance).max(initial=0.0) > MAX_SIGMA**2:
-        raise CalibrationError(f"{whose}covariance: expected standard deviations up to {MAX_SIGMA:g}")
+    if np.abs(covariance).max(initial=0.0) > MAX_STATED_SIGMA**2:
+        raise CalibrationError(f"{whose}covariance: expected standard deviations up to {MAX_STATED_SIGMA:g}")
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     with np.errstate(over="ignore"):  # a covariance with a variance of zero: rejected below
         correlation = covariance / scale / scale[:, None]

@@ -12,7 +12,7 @@ from msgspec import Meta
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, offsets, powers
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import HIGHEST, Effect, Power, Series, Step, Width
+from magbridge.calibration.terms import MAX_ORDER, Effect, Power, Series, Step, Width
 
 __all__ = ["RateEffect", "ResponseEffect", "TimeEffect"]
 
@@ -146,7 +146,7 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
     remembers: ClassVar[bool] = False
     unit: Annotated[float, Meta(ge=1.0, le=1e9)]
     """Unit of the coefficients, nT."""
-    power: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
+    power: Annotated[int, Meta(ge=0, le=MAX_ORDER)] = 0
     """``T_i += c_i (H_i / unit)^power``: three coefficients, nT. 0: the response has a knee instead."""
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
     """Index of the channel that has the knee."""

@@ -13,7 +13,7 @@ from numpy.polynomial.legendre import leg2poly
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import SingleChannelEffect, held, offsets, powers
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import HIGHEST, Effect, Exponents, Power, Series, Step, Width
+from magbridge.calibration.terms import MAX_ORDER, Effect, Exponents, Power, Series, Step, Width
 from magbridge.errors import CalibrationError
 
 __all__ = ["LegendreEffect", "MassEffect", "PathEffect", "PowersEffect", "SourcesEffect"]
@@ -133,8 +133,8 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
         """Require one exponent for each parameter."""
         if len(self.exponents) != len(parameters):
             raise CalibrationError(f"legendre: expected {len(parameters)} exponents, one for each parameter")
-        if min(self.exponents, default=0) < 0 or sum(self.exponents) > HIGHEST:
-            raise CalibrationError(f"legendre: expected exponents >= 0, together at most {HIGHEST}")
+        if min(self.exponents, default=0) < 0 or sum(self.exponents) > MAX_ORDER:
+            raise CalibrationError(f"legendre: expected exponents >= 0, together at most {MAX_ORDER}")
 
     def columns(self, field: float) -> FloatArray:
         """Offsets."""

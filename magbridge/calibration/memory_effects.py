@@ -14,7 +14,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, held, powers
 from magbridge.calibration.kernel import Kernel
 from magbridge.calibration.mass_effects import MassEffect
-from magbridge.calibration.terms import HIGHEST, Effect, Series, Step, Width
+from magbridge.calibration.terms import MAX_ORDER, Effect, Series, Step, Width
 
 __all__ = ["ClockEffect", "PlayEffect", "play"]
 
@@ -42,7 +42,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
     kind: ClassVar[str] = "play"
     width: Width
-    order: Annotated[int, Meta(ge=0, le=HIGHEST)] = 0
+    order: Annotated[int, Meta(ge=0, le=MAX_ORDER)] = 0
 
     @property
     def size(self) -> int:

@@ -31,11 +31,12 @@ from magbridge.estimation.residual import symmetric
 from magbridge.wording import counted
 
 __all__ = [
-    "RAISED", "Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor", "identity",
+    "LEVEL_STEP_SIGMA", "Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor",
+    "identity",
 ]  # fmt: skip
 
 
-RAISED = 0.01
+LEVEL_STEP_SIGMA = 0.01
 """Of its 1-sigma, by which the level is raised to see what that does."""
 
 
@@ -188,13 +189,13 @@ class Calibration:
         )  # fmt: skip
 
     def at_level(self) -> Calibration:
-        """Return the calibration with its reference's level, and all that follows, :data:`RAISED` 1-sigma up.
+        """Return the calibration with its level, and all that follows, :data:`LEVEL_STEP_SIGMA` 1-sigma up.
 
         A whole one may move the offset by 100 nT across the field: the total field is not linear in that.
         """
         moved = self.coefficients.copy()
         many = min(len(moved), len(self.level))
-        moved[:many] += RAISED * np.asarray(self.level[:many])
+        moved[:many] += LEVEL_STEP_SIGMA * np.asarray(self.level[:many])
         return replace(self, coefficients=moved)
 
     def matrices(self, positions: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -24,7 +24,7 @@ from magbridge.errors import CalibrationError
 from magbridge.plugins import load, plugins
 
 __all__ = [
-    "HIGHEST", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "Parameter", "Polynomial",
+    "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "Parameter", "Polynomial",
     "PositionTerm", "Power", "Series", "Step", "Term", "Width", "full_order", "term_class",
 ]  # fmt: skip
 
@@ -32,9 +32,9 @@ Exponents = tuple[int, ...]
 Step = Callable[[int, float, float, float, Sequence[float]], tuple[float, ...]]
 """One sample into an effect: time (µs), the raw channels (nT), the values -> its regressors."""
 
-HIGHEST = 30
+MAX_ORDER = 30
 """Highest total degree: beyond, powers are noise."""
-Power = Annotated[int, Meta(ge=1, le=HIGHEST)]
+Power = Annotated[int, Meta(ge=1, le=MAX_ORDER)]
 Width = Annotated[float, Meta(ge=1e-9, le=1e12)]
 """A divisor, in any unit."""
 
@@ -124,10 +124,10 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
     def check(self, parameters: tuple[str, ...]) -> None:
         """Require one exponent for each parameter, a total degree of at most 30, and no monomial twice."""
         for exponent in self.exponents:
-            if len(exponent) != len(parameters) or min(exponent, default=0) < 0 or sum(exponent) > HIGHEST:
+            if len(exponent) != len(parameters) or min(exponent, default=0) < 0 or sum(exponent) > MAX_ORDER:
                 raise CalibrationError(
                     f"exponents {list(exponent)}: expected {len(parameters)} numbers >= 0, one for each "
-                    f"parameter, of {HIGHEST} in all at most"
+                    f"parameter, of {MAX_ORDER} in all at most"
                 )
         if len(set(self.exponents)) != len(self.exponents):
             raise CalibrationError("exponents: a monomial stands there twice")

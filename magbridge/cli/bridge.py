@@ -26,7 +26,7 @@ from magbridge.errors import DataError, WrongUse
 from magbridge.files import new_folder
 from magbridge.wording import counted
 
-SLOWEST = 1e-3
+MIN_REPLAY_SPEED = 1e-3
 """Lowest replay speed, relative to real time: a log of an hour then takes six weeks."""
 
 
@@ -225,6 +225,6 @@ def speed_of(text: str) -> float:
         speed = inf if text == "max" else float(text)
     except ValueError:
         speed = nan
-    if not speed >= SLOWEST:
-        raise WrongUse(f"--speed {text}: expected a positive number, {SLOWEST:g} or more, or max")
+    if not speed >= MIN_REPLAY_SPEED:
+        raise WrongUse(f"--speed {text}: expected a positive number, {MIN_REPLAY_SPEED:g} or more, or max")
     return speed

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.calibration.fitting.observations import Observations
 
-ALL = "all"
+ALL_COMPASSES = "all"
 """``--compass all``: a calibration for each compass."""
 
 
@@ -127,7 +127,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     masses = Path(vehicle) if vehicle and not fleet else None
     logs_to_read(files, output, masses, grid, base)
     check_inputs((*files, output), plot)
-    if reading.compass == ALL:
+    if reading.compass == ALL_COMPASSES:
         _each_compass(**given)
         return
 

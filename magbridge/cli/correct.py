@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from magbridge.correction import Correction
     from magbridge.learning import Learner
 
-KEPT = (
+COPIED_COLUMNS = (
     *("latitude", "longitude", "depth", "roll", "pitch", "heading", "run", "dive", "line", "line_type"),
     *("sensor_temperature", "reference_field", "velocity_north", "velocity_east", "water_speed"),
     *("local_north", "local_east", "dr_latitude", "dr_longitude", "gps_latitude", "gps_longitude"),
@@ -231,12 +231,12 @@ def _keep_learned(learner: Learner, known: Calibration, facts: dict[str, Any], f
 def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Path) -> xr.Dataset:
     """Return the corrected columns with those of the log that say where and in what state they were taken."""
     from magbridge.calibration.file import calibration_id
-    from magbridge.logs.deployment import HISTORY, MEANING, lasting
+    from magbridge.logs.deployment import HISTORY_ATTRIBUTE, MEANING, lasting
 
-    names = [name for name in (*KEPT, *known.channels) if name in log and name not in corrected]
+    names = [name for name in (*COPIED_COLUMNS, *known.channels) if name in log and name not in corrected]
     made = f"corrected with {file.name}, calibration {calibration_id(known):08x}"
-    history = [*str(log.attrs.get(HISTORY, "")).splitlines(), made]
-    attrs = {"calibration_id": f"{calibration_id(known):08x}", HISTORY: "\n".join(history)}
+    history = [*str(log.attrs.get(HISTORY_ATTRIBUTE, "")).splitlines(), made]
+    attrs = {"calibration_id": f"{calibration_id(known):08x}", HISTORY_ATTRIBUTE: "\n".join(history)}
     meaning = {name: value for name, value in lasting(log.attrs).items() if name in MEANING}
     kept = {name: log[name] for name in names}
     if "heading" in corrected and "heading" in log:

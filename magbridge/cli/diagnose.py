@@ -25,7 +25,7 @@ from magbridge.progress import waiting
 if TYPE_CHECKING:
     import xarray as xr
 
-NOTHING = (-9999.0, -99999.0)
+FILL_VALUES = (-9999.0, -99999.0)
 """Numbers that logs commonly use for "not known", in any unit."""
 ITSELF = (
     "the calibration was fitted to this log and has absorbed part of its errors, so that the remaining part "
@@ -174,7 +174,7 @@ def _suspect(log: xr.Dataset) -> Iterator[str]:
     """Yield warnings of isolated values that may be codes for 'not known': they would look like an effect."""
     for name, column in log.data_vars.items():
         values = column.to_numpy()
-        for nothing in NOTHING:
+        for nothing in FILL_VALUES:
             alone = values == nothing
             if alone.any() and not (values[~alone] < 0.1 * nothing).any():
                 yield (

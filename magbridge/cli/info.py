@@ -14,7 +14,7 @@ from magbridge.wording import counted
 if TYPE_CHECKING:
     from rich.table import Table
 
-WIDE = 110
+WIDE_TERMINAL = 110
 """Characters of a terminal from which on the meanings are shown."""
 
 
@@ -65,7 +65,7 @@ def _show(file: str, facts: dict[str, Any]) -> None:
     for compass in facts["compasses"]:
         one = convert(compass, LogCompass)
         console.print(_plain(f"  {one.words}{', read as mag_x mag_y mag_z' * one.chosen}"))
-    console.print(_columns(facts, meanings=console.width >= WIDE))
+    console.print(_columns(facts, meanings=console.width >= WIDE_TERMINAL))
     console.print(_uses(facts))
     for hint in facts["hints"]:
         complain(f"{file}: {hint}")

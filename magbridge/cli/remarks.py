@@ -20,7 +20,7 @@ __all__ = [
     "note_unused_grid", "refuse_unsuited", "warnings_of",
 ]  # fmt: skip
 
-NAMED = 5
+MAX_NAMED_LOSSES = 5
 """Losses that are named, a line each; the others are counted."""
 
 
@@ -32,9 +32,9 @@ def warnings_of(calibration: Calibration, file: Path) -> list[str]:
 
 def note_losses(*pieces: Mapping[str, Any]) -> None:
     """Report on stderr what reading skipped, from the attributes of a deployment or of its pieces."""
-    from magbridge.logs.deployment import COUNTERS, GUESSED, named_losses, noted, passed_over
+    from magbridge.logs.deployment import COUNTERS, GUESSED_ATTRIBUTE, named_losses, noted, passed_over
 
-    for guess in dict.fromkeys(str(attrs.get(GUESSED, "")) for attrs in pieces):
+    for guess in dict.fromkeys(str(attrs.get(GUESSED_ATTRIBUTE, "")) for attrs in pieces):
         if guess:
             complain(f"guessed: {guess}")
     if counts := passed_over(*pieces):
@@ -43,10 +43,10 @@ def note_losses(*pieces: Mapping[str, Any]) -> None:
     for note in dict.fromkeys(noted(*pieces)):
         complain(note)
     lines = named_losses(*pieces)
-    for line in lines[:NAMED]:
+    for line in lines[:MAX_NAMED_LOSSES]:
         complain(line)
-    if len(lines) > NAMED:
-        complain(f"and in {counted(len(lines) - NAMED, 'place')} more")
+    if len(lines) > MAX_NAMED_LOSSES:
+        complain(f"and in {counted(len(lines) - MAX_NAMED_LOSSES, 'place')} more")
 
 
 def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Dataset]:
@@ -123,10 +123,10 @@ def note_no_date(deployment: xr.Dataset) -> None:
 
 def note_settings(*pieces: Mapping[str, Any]) -> None:
     """Warn on stderr where a bridge was tuned in the course of its log, from the attributes of its pieces."""
-    from magbridge.logs.deployment import CHANGES
+    from magbridge.logs.deployment import CHANGES_SETTING
 
     for attrs in pieces:
-        if times := int(attrs.get(CHANGES, 0)):
+        if times := int(attrs.get(CHANGES_SETTING, 0)):
             often = "once" if times == 1 else f"{times} times"
             complain(
                 f"{attrs['source']}: MB_* parameters were set {often} in the course of the log; it is "

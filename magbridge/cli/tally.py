@@ -32,7 +32,7 @@ class Tally:
 
     def add(self, corrected: xr.Dataset, rows: int) -> None:
         """Count a piece of the log that had so many rows, with its samples corrected."""
-        from magbridge.field.reference import EARTHS
+        from magbridge.field.reference import MAIN_FIELD_RANGE_NT
 
         self.samples += corrected.sizes["time"]
         self.left_out += rows - corrected.sizes["time"]
@@ -41,15 +41,15 @@ class Tally:
         self.flagged += int((quality & doubtful != 0).sum())
         self.flags.update({flag.names(): int((quality & flag != 0).sum()) for flag in doubtful})
         total = corrected["total_field"]
-        self.unearthly += int(((total < EARTHS[0]) | (total > EARTHS[1])).sum())
+        self.unearthly += int(((total < MAIN_FIELD_RANGE_NT[0]) | (total > MAIN_FIELD_RANGE_NT[1])).sum())
 
     def doubt(self) -> str:
         """Return why the calibration may be another vehicle's; empty without such an indication."""
-        from magbridge.field.reference import EARTHS
+        from magbridge.field.reference import MAIN_FIELD_RANGE_NT
 
         if self.unearthly <= self.samples / 2:
             return ""
-        low, high = (f"{limit:,.0f}" for limit in EARTHS)
+        low, high = (f"{limit:,.0f}" for limit in MAIN_FIELD_RANGE_NT)
         return (
             f"another vehicle's? {self.unearthly} of {self.samples} corrected total fields are none of the "
             f"Earth's, {low} to {high} nT"

@@ -27,9 +27,9 @@ from magbridge.diagnose.unexplained.leftover import Leftover
 from magbridge.diagnose.unexplained.unlisted import far_from_white
 from magbridge.estimation.residual import rms
 
-__all__ = ["WORTH", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
+__all__ = ["MIN_RMS_REDUCTION", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
 
-WORTH = 0.01
+MIN_RMS_REDUCTION = 0.01
 """Least fraction of the refitted calibration's RMS that the findings have to remove."""
 
 
@@ -162,7 +162,9 @@ class Diagnosis:
 
 def small(problem: Problem, residual: FloatArray, rest: Leftover | None) -> bool:
     """Return True if the unnamed remainder is negligible, too, and the residual (n,), nT, is noise."""
-    if rest is not None and (rest.size is None or rest.size**2 > 2.0 * WORTH * rms(residual) ** 2):
+    if rest is not None and (
+        rest.size is None or rest.size**2 > 2.0 * MIN_RMS_REDUCTION * rms(residual) ** 2
+    ):
         return False
     return not far_from_white(problem, memory(problem, residual / problem.reference_jacobian))
 

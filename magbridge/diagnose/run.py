@@ -22,7 +22,7 @@ from magbridge.diagnose.compare.dives import days_of
 from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
-from magbridge.diagnose.diagnosis import WORTH, Diagnosis, Finding, counted, small, verdict_of
+from magbridge.diagnose.diagnosis import MIN_RMS_REDUCTION, Diagnosis, Finding, counted, small, verdict_of
 from magbridge.diagnose.improvement import Extension, check_written, corrected, error_without, extension_of
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.evidence import ODDS, REMNANT
@@ -44,7 +44,7 @@ __all__ = ["diagnose"]
 
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
-SLOW = 0.5
+MIN_SLOW_FRACTION = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
 
 
@@ -151,7 +151,7 @@ def _examine(
     other_day = None
     if stands and day is not None and extension.day_error is not None:
         other_day = paired(before, extension.day_error, day, counts)
-    negligible = bool(named) and wrong is None and beyond.ratio > 1.0 - WORTH
+    negligible = bool(named) and wrong is None and beyond.ratio > 1.0 - MIN_RMS_REDUCTION
     return Diagnosis(
         problem=problem, outcome=outcome,
         findings=_findings(problem, named, competing, extension, refit, counts, outcome),
@@ -270,4 +270,4 @@ def _families(named: Sequence[Hypothesis]) -> list[list[int]]:
 def _is_slow(problem: Problem, one: Hypothesis) -> bool:
     """Return True for a slow cause: most of its power is left in means over many samples."""
     added = one.candidate.columns(slice(0, len(problem))) @ one.fit.coefficients[-one.candidate.size :]
-    return memory(problem, added).slow >= SLOW
+    return memory(problem, added).slow >= MIN_SLOW_FRACTION

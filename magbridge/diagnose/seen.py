@@ -23,18 +23,18 @@ from scipy.special import fdtrc
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import lagged
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import LEVEL
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE
 from magbridge.estimation.residual import rms
 
 __all__ = ["WHITE", "Memory", "Seen", "memory", "seen"]
 
-LAGS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 700.0, 1700.0, 4000.0, 10000.0)
+CORRELATION_LAGS_S = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 700.0, 1700.0, 4000.0, 10000.0)
 """Lags that are tried, s."""
-LEAST = 0.1
+MIN_EXPLAINED_FRACTION = 0.1
 """Least fraction of a signal's power that a series must explain to be reported."""
-MOSTLY = 0.8
+MIN_AXIS_FRACTION = 0.8
 """Least fraction, of the part that all axes explain, that one axis must explain alone to be reported."""
-WORTH = 0.02
+MIN_LAG_GAIN = 0.02
 """Share of the signal's power that a lag must add over none."""
 CLEARLY = 0.1
 """Least fraction of the unexplained part by which an axis must beat the next to be reported."""
@@ -44,8 +44,8 @@ power, constants aside, that they must explain."""
 WHITE = 0.9
 """Share of a residual's RMS that changes from one sample to the next, from which on it lasts no time."""
 EVERY = slice(None)
-AXES = ("field", "x", "y", "z")
-ROWS = 20_000
+FIELD_AND_AXES = ("field", "x", "y", "z")
+CORRELATION_ROWS = 20_000
 """Rows that are looked at."""
 
 
@@ -91,7 +91,7 @@ def seen(problem: Problem, signal: FloatArray, of: FloatArray | None = None) -> 
 
     If only its part `of` (n,) is of interest, this part must follow the series, too.
     """
-    part = slice(None, None, -(-len(signal) // ROWS))
+    part = slice(None, None, -(-len(signal) // CORRELATION_ROWS))
     u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
     axes = np.column_stack([np.ones(len(u)), u])
     y = signal[part] - signal[part].mean()
@@ -113,16 +113,16 @@ def seen(problem: Problem, signal: FloatArray, of: FloatArray | None = None) -> 
         return float(y @ fitted(q, some)) / total
 
     def axis(q: FloatArray, whole: float) -> str | None:
-        alone = [explained(q, slice(k, k + 1)) for k in range(len(AXES))]
+        alone = [explained(q, slice(k, k + 1)) for k in range(len(FIELD_AND_AXES))]
         *_, second, k = np.argsort(alone)
-        clear = alone[k] >= MOSTLY * whole and alone[k] - alone[second] >= CLEARLY * (1.0 - whole)
-        return AXES[k] if clear else None
+        clear = alone[k] >= MIN_AXIS_FRACTION * whole and alone[k] - alone[second] >= CLEARLY * (1.0 - whole)
+        return FIELD_AND_AXES[k] if clear else None
 
     found = [(explained(q), name, lag, q) for name, lag, q in _series(problem, part)]
-    share, name, lag, q = max(found, key=lambda one: one[0] - WORTH * (one[2] > 0.0))
+    share, name, lag, q = max(found, key=lambda one: one[0] - MIN_LAG_GAIN * (one[2] > 0.0))
     apart = float(own @ fitted(q, EVERY, own)) / (float(own @ own) + 1e-300)
-    chance = _by_chance(share, q.shape[1] * len(AXES), (y - fitted(q, EVERY))[:, None] * axes)
-    if min(share, apart) >= LEAST and len(found) * chance < LEVEL:
+    chance = _by_chance(share, q.shape[1] * len(FIELD_AND_AXES), (y - fitted(q, EVERY))[:, None] * axes)
+    if min(share, apart) >= MIN_EXPLAINED_FRACTION and len(found) * chance < FALSE_ALARM_RATE:
         return Seen(name, lag, axis(q, share), size, share)
     waves = _waves(problem.survey.time[part])
     slow = explained(waves)
@@ -136,7 +136,7 @@ def _by_chance(share: float, terms: int, residual: FloatArray) -> float:
     memory allows (Bartlett 1946).
     """
     n = len(residual)
-    freedom = max(n / (1.0 + 2.0 * max(map(_remembered, residual.T))) - terms - len(AXES), 1.0)
+    freedom = max(n / (1.0 + 2.0 * max(map(_remembered, residual.T))) - terms - len(FIELD_AND_AXES), 1.0)
     return float(fdtrc(terms, freedom, share / terms / max((1.0 - share) / freedom, 1e-300)))
 
 
@@ -158,7 +158,7 @@ def _series(problem: Problem, part: slice) -> Iterator[tuple[str, float, FloatAr
     """Yield each series' name, lag, and functions (m, k), about their means."""
     survey = problem.survey
     longest, shortest = 0.5 * float(np.ptp(survey.time)), 0.5 * survey.interval
-    lags = [lag for lag in LAGS if not lag or shortest <= lag <= longest]
+    lags = [lag for lag in CORRELATION_LAGS_S if not lag or shortest <= lag <= longest]
     for name, channel in survey.channels.items():
         if name not in survey.still:
             for lag in lags:

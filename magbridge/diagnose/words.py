@@ -16,12 +16,12 @@ from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.seen import Seen
 
 __all__ = [
-    "MANY", "bold", "chance", "figure", "goes_with", "label", "listed", "measured", "names_of", "number",
-    "physics", "row", "series_of", "sizes", "table",
+    "MAX_UNFOLDED_NUMBERS", "bold", "chance", "figure", "goes_with", "label", "listed", "measured",
+    "names_of", "number", "physics", "row", "series_of", "sizes", "table",
 ]  # fmt: skip
 
-RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-MANY = 12
+SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+MAX_UNFOLDED_NUMBERS = 12
 """Numbers that a table shows unfolded."""
 
 
@@ -113,13 +113,13 @@ def chance(p_value: float) -> str:
     if p_value > 1e-4:
         return f"{p_value:.1g}"
     digit, power = f"{max(p_value, 1e-99):.0e}".split("e-")
-    return ("" if p_value > 1e-99 else "below ") + f"{digit}·10⁻{power.lstrip('0').translate(RAISED)}"
+    return ("" if p_value > 1e-99 else "below ") + f"{digit}·10⁻{power.lstrip('0').translate(SUPERSCRIPTS)}"
 
 
 def sizes(smallest: Mapping[str, tuple[float, str]]) -> str:
     """Return sizes in words from values and units by name; an infinite one is left out."""
     seen = [(name, size, unit) for name, (size, unit) in smallest.items() if isfinite(size)]
-    shown = seen if len(seen) <= MANY else seen[:3]
+    shown = seen if len(seen) <= MAX_UNFOLDED_NUMBERS else seen[:3]
     texts = [
         ", ".join(f"{escape(name)} {number(size)}" for name, size, _ in same) + f" {escape(unit)}"
         for unit, same in groupby(shown, key=itemgetter(2))

@@ -21,11 +21,11 @@ __all__ = [
     "in_chunks", "slow_functions", "with_blocks",
 ]  # fmt: skip
 
-APART = 3.0 * 3600.0
+MAX_PAUSE_S = 3.0 * 3600.0
 """Time without a sample after which slow changes restart, s."""
-FASTEST = 1.5 * 3600.0
+SHORTEST_CHANGE_HALF_PERIOD_S = 1.5 * 3600.0
 """s, half the period of the fastest slow change."""
-MOST = 60
+MAX_SLOW_FUNCTIONS = 60
 """Slow functions of one stretch of a log, at most."""
 BLOCK_ROWS = 16_384
 """Rows at a time."""
@@ -75,7 +75,7 @@ class SlowFunctions:
         _, first, size = np.unique(self.stretch, return_index=True, return_counts=True)
         self.start = time[first]
         self.span = np.maximum(time[first + size - 1] - self.start, 1e-9)
-        self.count = np.minimum(self.span / fastest, MOST).astype(int)
+        self.count = np.minimum(self.span / fastest, MAX_SLOW_FUNCTIONS).astype(int)
         self.levels = len(first) > 1
         """True if each has a level against the others, too."""
         self.edges = np.cumsum([0, *(self.count + self.levels)])
@@ -119,13 +119,15 @@ class BlockColumns:
         return np.asarray(sum(part @ mine for part, mine in pieces))
 
 
-def slow_functions(time: FloatArray, fastest: float = FASTEST) -> tuple[SlowFunctions, FloatArray]:
+def slow_functions(
+    time: FloatArray, fastest: float = SHORTEST_CHANGE_HALF_PERIOD_S
+) -> tuple[SlowFunctions, FloatArray]:
     """Return functions of time that change slowly (n, r), and their widths (r,) as those of a random walk.
 
     Notes
     -----
     A random walk over a time T is the sum of ``sqrt(2) cos(pi k t/T)`` with independent weights that fall
-    as 1/k (Karhunen-Loeve), and of its start. After a gap of :data:`APART` it restarts.
+    as 1/k (Karhunen-Loeve), and of its start. After a gap of :data:`MAX_PAUSE_S` it restarts.
     """
     waves = SlowFunctions(time, fastest)
     return waves, waves.shape
@@ -140,7 +142,7 @@ def in_chunks(n: int, made: Callable[[slice], FloatArray]) -> FloatArray:
 
 def stretches(time: FloatArray) -> IndexArray:
     """Return the number of the stretch without a gap that each sample (n,) belongs to."""
-    return np.cumsum(np.diff(time, prepend=time[:1]) > APART)
+    return np.cumsum(np.diff(time, prepend=time[:1]) > MAX_PAUSE_S)
 
 
 def with_blocks(family: PriorFamily, groups: tuple[ParameterBlock, ...]) -> PriorFamily:

@@ -48,7 +48,7 @@ SPLINE, FALLING = 4, 8
 """Strips of nodes that a spline reaches across, and one that falls off upwards."""
 POLE = 0.2
 """p: the approximation is best where the field's power ends, at about a node's spacing."""
-HIGHEST = 8.0
+MAX_LAPLACIAN_EIGENVALUE = 8.0
 """The Laplacian's largest eigenvalue."""
 DEPTHS = 33
 """Depths at which b is found, between the shallowest and the deepest."""
@@ -121,8 +121,8 @@ class GaussianField:
     @property
     def condition(self) -> float:
         """The precision's largest eigenvalue over its smallest."""
-        lifted = (1.0 + HIGHEST / POLE) ** 2 if self.harmonic else 1.0
-        return float(np.prod(1.0 + HIGHEST / self._kappa2)) * lifted
+        lifted = (1.0 + MAX_LAPLACIAN_EIGENVALUE / POLE) ** 2 if self.harmonic else 1.0
+        return float(np.prod(1.0 + MAX_LAPLACIAN_EIGENVALUE / self._kappa2)) * lifted
 
     @cached_property
     def _lift(self) -> csr_array:

@@ -14,9 +14,9 @@ from magbridge.field.spline import weights
 
 __all__ = ["Nodes", "nodes_near"]
 
-BLOCK = 96
+MIN_BLOCK_NODES = 96
 """Fewest nodes of a block: smaller ones cost more in calls than in arithmetic."""
-MOST = 4_000_000
+MAX_BOX_CELLS = 4_000_000
 """Cells of the box that holds a track, at most: beyond, the nodes are too fine for it."""
 
 
@@ -54,7 +54,7 @@ class Nodes:
         edges, nodes, strips = [0], 0, 0
         for here in count[count > 0].tolist():
             nodes, strips = nodes + here, strips + 1
-            if strips >= reach and nodes >= BLOCK:
+            if strips >= reach and nodes >= MIN_BLOCK_NODES:
                 edges.append(edges[-1] + nodes)
                 nodes = strips = 0
         if nodes:  # a last block too narrow would couple beyond its neighbour
@@ -110,7 +110,7 @@ def nodes_near(place: FloatArray, spacing: float, pad: float) -> Nodes:
     turned = bool(np.ptp(cells[:, 1]) > np.ptp(cells[:, 0]))
     at = cells - low
     shape = at.max(axis=0) + around + 3
-    if int(shape[0]) * int(shape[1]) > MOST:
+    if int(shape[0]) * int(shape[1]) > MAX_BOX_CELLS:
         raise ValueError("nodes are too fine for so large an area")
     near = np.zeros(shape, bool)
     near[at[:, 0], at[:, 1]] = True

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["apart", "with_daily_variation"]
 
-BEYOND = 600.0
+MAX_EXTRAPOLATION_S = 600.0
 """s beyond the station's log, for which its last value is held."""
 
 
@@ -55,7 +55,7 @@ def with_daily_variation(logs: Sequence[xr.Dataset], base: xr.Dataset) -> list[x
     found = []
     for log in logs:
         t = log["time"].to_numpy()
-        if not len(time) or t[0] < time[0] - BEYOND or t[-1] > time[-1] + BEYOND:
+        if not len(time) or t[0] < time[0] - MAX_EXTRAPOLATION_S or t[-1] > time[-1] + MAX_EXTRAPOLATION_S:
             source = base.attrs.get("source", "the base station's log")
             raise DataError(f"{source}: does not cover the time of {log.attrs.get('source', 'the log')}")
         found.append(log.assign(daily_variation=("time", np.interp(t, time, varied), {"units": "nT"})))

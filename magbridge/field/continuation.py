@@ -31,7 +31,7 @@ __all__ = ["Continued", "continued", "raised", "smoothed"]
 SURE, TERMS = 3, 10
 """Terms of the series that are used, and terms that stand for the true field when the error is estimated:
 later ones are waves that no survey from above resolves."""
-LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
+DEPTH_QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Quantiles of the depth at which the error is estimated."""
 
 
@@ -72,9 +72,9 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
     surveyed = dctn(filled(grid.anomaly), norm="ortho")
     gain = _growth(k, height, SURE)
     error2 = np.zeros_like(k)
-    for below in np.quantile(used, LEVELS) - level:
+    for below in np.quantile(used, DEPTH_QUANTILES) - level:
         linear = gain * (1 + k * below)
-        error2 += (surveyed * (_growth(k, height + below, TERMS) - linear)) ** 2 / len(LEVELS)
+        error2 += (surveyed * (_growth(k, height + below, TERMS) - linear)) ** 2 / len(DEPTH_QUANTILES)
     hole = np.isnan(grid.anomaly)
     anomaly, vertical = (np.where(hole, np.nan, idctn(surveyed * g, norm="ortho")) for g in (gain, k * gain))
     there = grid.replaced(anomaly=anomaly, altitude=-level, vertical=filled(vertical))
@@ -90,7 +90,7 @@ def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatAr
     return lambda values: np.asarray(idctn(dctn(filled(values), norm="ortho") * gain, norm="ortho"))
 
 
-ALIKE = 0.25
+SIGN_WAVELENGTH_FRACTION = 0.25
 """Fraction of the smoothed wavelength within which the removed part has one sign."""
 
 
@@ -116,7 +116,7 @@ def smoothed(grid: AnomalyGrid, wavelength: float) -> AnomalyGrid:
     anomaly = np.where(hole, np.nan, idctn(dctn(filled(grid.anomaly), norm="ortho") * gain, norm="ortho"))
     removed = np.sqrt(np.nanmean((grid.anomaly - anomaly) ** 2))
     sigma = np.hypot(np.nan_to_num(grid.sigma), removed)
-    length = max(grid.sigma_length, ALIKE * wavelength)
+    length = max(grid.sigma_length, SIGN_WAVELENGTH_FRACTION * wavelength)
     return grid.replaced(anomaly=anomaly, sigma=sigma, vertical=None, sigma_length=length)
 
 

@@ -31,7 +31,7 @@ METRES = {
     **dict.fromkeys(("us-ft", "ftus", "us_survey_foot"), 1200.0 / 3937.0),
 }
 """Metres in a unit of length."""
-MOST = 10_000_000
+MAX_REPROJECTED_NODES = 10_000_000
 """Nodes of a grid that is reprojected."""
 EVEN = 1e-3
 """Share of a step by which rounded coordinates may deviate from an even spacing."""
@@ -144,8 +144,8 @@ def _reprojected(
     per_latitude, per_longitude = metres_per_degree(float(lat.mean()))
     steps = step / per_longitude, step / per_latitude
     spans = np.ptp(lon), np.ptp(lat)
-    if not (spans[0] / steps[0]) * (spans[1] / steps[1]) < MOST:
-        raise FormatError(path, f"reprojected it would have more than {MOST} nodes")
+    if not (spans[0] / steps[0]) * (spans[1] / steps[1]) < MAX_REPROJECTED_NODES:
+        raise FormatError(path, f"reprojected it would have more than {MAX_REPROJECTED_NODES} nodes")
     longitude, latitude = (
         float(values.min()) + d * np.arange(int(span / d) + 1)
         for values, d, span in zip((lon, lat), steps, spans, strict=True)

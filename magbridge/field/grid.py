@@ -28,7 +28,7 @@ EVEN = 1e-3
 """Share of a step by which rounded coordinates may deviate from an even spacing."""
 HOLE = 9.9e4
 """nT: beyond any anomaly; 99999 and 1.7e38 are how formats without NaN write a hole."""
-FLAT = 1e-6
+PLANE_TOLERANCE_NT = 1e-6
 """nT: what rounding leaves of a plane."""
 NOT_AN_ANOMALY = 15_000.0
 """nT: a median this large is the total field, not an anomaly."""
@@ -267,7 +267,7 @@ class AnomalyGrid:
         north, east = np.gradient(self.anomaly, self._dy * per_latitude, self._dx * per_longitude)
         flat = north - np.nanmean(north), east - np.nanmean(east)
         slope = sqrt(float(np.nanmean(flat[0] ** 2 + flat[1] ** 2)))
-        return sqrt(2.0) * self.rms / slope if self.rms > FLAT else inf
+        return sqrt(2.0) * self.rms / slope if self.rms > PLANE_TOLERANCE_NT else inf
 
     @cached_property
     def interpolation_sigma(self) -> float:
@@ -287,7 +287,7 @@ class AnomalyGrid:
         if min(values.shape) < FEWEST or known.sum() < known.size / 2:
             return 0.0
         finer, coarser = (_left_out(values, known, step) for step in (2, 4))
-        at_middle = finer * min(finer / coarser, 1.0) ** 2 if coarser > FLAT else 0.0
+        at_middle = finer * min(finer / coarser, 1.0) ** 2 if coarser > PLANE_TOLERANCE_NT else 0.0
         return at_middle * sqrt(0.5)
 
     def save(self, path: str | Path) -> None:

@@ -18,15 +18,15 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.field.coordinates import Axes
 from magbridge.field.grid_netcdf import Parts, netcdf
 
-__all__ = ["TEXT", "ascii_grid", "folder", "geotiff", "grd", "libraries"]
+__all__ = ["TEXT_OPTIONS", "ascii_grid", "folder", "geotiff", "grd", "libraries"]
 
 BAD_GEOSOFT = (ValueError, NotImplementedError, OSError, IndexError, UnboundLocalError, OverflowError)
 """Exceptions that harmonica raises for a file of another format or a damaged one, in addition to zlib's."""
 BAD_TIFF = (OSError, KeyError, AttributeError, TypeError, ValueError)
 """What Pillow, or a tag that is not as it should be, raises."""
-TEXT: Any = {"encoding": "utf-8-sig", "errors": "replace"}
+TEXT_OPTIONS: Any = {"encoding": "utf-8-sig", "errors": "replace"}
 """How a text is opened: with a byte order mark or without, and whatever its comments are written in."""
-LENGTHS = {9001: "m", 9002: "ft", 9003: "us-ft", 9036: "km"}
+LENGTH_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft", 9036: "km"}
 """Units of a GeoTIFF's coordinates, by EPSG's numbers."""
 NETCDF = (b"CDF\x01", b"CDF\x02", b"\x89HDF")
 
@@ -70,7 +70,7 @@ Surfer = tuple[int, int, tuple[float, float], tuple[float, float], RealArray]
 
 
 def _surfer_text(path: Path) -> Surfer:
-    words = path.read_text(**TEXT).split()
+    words = path.read_text(**TEXT_OPTIONS).split()
     nx, ny = int(words[1]), int(words[2])
     limits = [float(word) for word in words[3:9]]
     return nx, ny, (limits[0], limits[1]), (limits[2], limits[3]), np.array(words[9:], float)
@@ -127,7 +127,7 @@ def ascii_grid(path: Path) -> Parts:
 
     FormatError: a header or a number is missing.
     """
-    words = path.read_text(**TEXT).split()
+    words = path.read_text(**TEXT_OPTIONS).split()
     header: dict[str, float] = {}
     at = 0
     try:
@@ -190,7 +190,7 @@ def geotiff(path: Path) -> Parts:
     x = x0 + (np.arange(values.shape[1]) + half - column) * dx
     y = y0 - (np.arange(values.shape[0]) + half - row) * dy
     kind, code = settings.get(1024), settings.get(3072, 0)
-    unit_of_length = LENGTHS.get(settings.get(3076, 0), "unknown" if 3076 in settings else "")
+    unit_of_length = LENGTH_UNITS.get(settings.get(3076, 0), "unknown" if 3076 in settings else "")
     projected = Axes(unit_of_length, f"EPSG:{code}") if 1024 <= code < 32767 else Axes("m")
     axes = projected if kind == 1 else Axes("deg" if kind == 2 else "")
     return x, y, values * scale + offset, {"axes": axes, "unit": unit}

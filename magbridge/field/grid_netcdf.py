@@ -16,12 +16,12 @@ from magbridge.files import atomic_path, systems_reason
 if TYPE_CHECKING:
     from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["ANOMALY", "Parts", "netcdf", "write"]
+__all__ = ["ANOMALY_VARIABLES", "Parts", "netcdf", "write"]
 
 Parts = tuple[RealArray, RealArray, RealArray, dict[str, Any]]
 """Coordinates x and y of the nodes, values, options of AnomalyGrid; among them ``unit``, that of the values,
 and ``axes``, what the file states of x and y (:class:`~magbridge.field.coordinates.Axes`)."""
-ANOMALY = (
+ANOMALY_VARIABLES = (
     "anomaly", "magnetic_anomaly", "mag_anomaly", "mag_anom", "total_field_anomaly", "tfa",
     "tmi_anomaly", "tmi", "mag", "residual", "nt", "value", "z",
 )  # fmt: skip
@@ -45,7 +45,7 @@ def netcdf(path: Path) -> Parts:
     flat = {str(name): da.squeeze(drop=True) for name, da in data.data_vars.items()}
     flat = {name: da for name, da in flat.items() if da.ndim == 2 and da.dtype.kind in "fiu"}
     flat = {name: da for name, da in flat.items() if not _names(name, da.attrs) & {*LONGITUDE, *LATITUDE}}
-    named = [name for name in ANOMALY if name in {n.lower() for n in flat}]
+    named = [name for name in ANOMALY_VARIABLES if name in {n.lower() for n in flat}]
     sigmas = [name for name in flat if name.lower() in SIGMA]
     choices = [n for n in flat if named and n.lower() == named[0]] or [n for n in flat if n not in sigmas]
     if len(choices) != 1:

@@ -12,16 +12,16 @@ import numpy as np
 from magbridge.arrays import RealArray
 from magbridge.errors import FormatError
 from magbridge.field.coordinates import LATITUDE, LONGITUDE, PROJECTED, Axes, stated
-from magbridge.field.grid_formats import TEXT
-from magbridge.field.grid_netcdf import ANOMALY, Parts
+from magbridge.field.grid_formats import TEXT_OPTIONS
+from magbridge.field.grid_netcdf import ANOMALY_VARIABLES, Parts
 from magbridge.wording import counted
 
 __all__ = ["table"]
 
 REMARK = re.compile(r"\s*([#%/]|(line|tie)[\s:]*[\w.:]+\s*$|$)", re.IGNORECASE)
 """A comment, or what Geosoft writes above the rows of a line."""
-NUMBERS = re.compile(r"[-+.\deinfa]+")
-UNITS = ("nt", "ut", "µt", "deg", "m", "km")
+NUMBER_PATTERN = re.compile(r"[-+.\deinfa]+")
+UNIT_SUFFIXES = ("nt", "ut", "µt", "deg", "m", "km")
 """What a column's name may end in, after an underscore, to tell its unit."""
 OTHERS = (
     "sigma",
@@ -39,7 +39,7 @@ OTHERS = (
     "elev",
 )
 """Columns that are not an anomaly, whatever other columns there are."""
-HEADER = "name the columns in the first row: longitude,latitude,anomaly"
+HEADER_HINT = "name the columns in the first row: longitude,latitude,anomaly"
 
 
 class Column(NamedTuple):
@@ -56,7 +56,7 @@ def table(path: Path) -> Parts:
     FormatError: no such columns, columns that may be this or that, or nodes that form no grid.
     """
     words, delimiter, skip = _beginning(path)
-    header = not all(NUMBERS.fullmatch(word) for word in words)
+    header = not all(NUMBER_PATTERN.fullmatch(word) for word in words)
     unit, axes = "", Axes()
     if header:
         x, y, z = _named(path, words)
@@ -65,7 +65,7 @@ def table(path: Path) -> Parts:
     elif len(words) == 3:
         places = 0, 1, 2
     else:
-        raise FormatError(path, f"{counted(len(words), 'column')} without names: {HEADER}", row=1)
+        raise FormatError(path, f"{counted(len(words), 'column')} without names: {HEADER_HINT}", row=1)
     rows = _numbers(path, delimiter, skip, places)
     if not header:
         rows = rows[:, _order(path, rows)]
@@ -84,7 +84,7 @@ def table(path: Path) -> Parts:
 def _beginning(path: Path) -> tuple[list[str], str | None, int]:
     """Return the words of the headings or of the first row, the separator, and how many lines to skip."""
     remarks: list[str] = []
-    with path.open(**TEXT) as file:
+    with path.open(**TEXT_OPTIONS) as file:
         first = next((line for line in file if not _is_remark(line, remarks)), "")
     delimiter = next((mark for mark in ",;\t" if mark in first), None)
     candidates = [first, *(line.strip().lstrip("#%/") for line in reversed(remarks))]
@@ -93,7 +93,7 @@ def _beginning(path: Path) -> tuple[list[str], str | None, int]:
     alike = (row for row in rows[1:] if len(row) == len(rows[0]))
     named = (row for row in alike if any(_column(0, word).name in eastward for word in row))
     words = rows[0]
-    if all(NUMBERS.fullmatch(word) for word in words):
+    if all(NUMBER_PATTERN.fullmatch(word) for word in words):
         return next(named, words), delimiter, len(remarks)
     return words, delimiter, len(remarks) + 1
 
@@ -111,7 +111,7 @@ def _named(path: Path, words: list[str]) -> tuple[Column, Column, Column]:
     columns = [_column(place, word) for place, word in enumerate(words)]
     x, y, z = (
         next((c for name in names for c in columns if c.name == name), None)
-        for names in ((*LONGITUDE, *PROJECTED[0]), (*LATITUDE, *PROJECTED[1]), ANOMALY)
+        for names in ((*LONGITUDE, *PROJECTED[0]), (*LATITUDE, *PROJECTED[1]), ANOMALY_VARIABLES)
     )
     if x is None or y is None:
         raise FormatError(path, "expected the columns longitude, latitude, anomaly", row=1)
@@ -131,7 +131,7 @@ def _column(place: int, word: str) -> Column:
     name = re.sub(r"_(dd|wgs84|decimal_degrees)$", "", name.strip().replace(" ", "_"))
     unit = inside[0].rstrip("]) ") if inside else ""
     stem, _, ending = name.rpartition("_")
-    if not unit and stem and ending in UNITS:
+    if not unit and stem and ending in UNIT_SUFFIXES:
         name, unit = stem, ending
     return Column(place, name, unit)
 
@@ -143,14 +143,14 @@ def _order(path: Path, rows: RealArray) -> list[int]:
         return [1, 0, 2]
     if first > 90.0 >= second:
         return [0, 1, 2]
-    raise FormatError(path, f"longitude or latitude first? {HEADER}", row=1)
+    raise FormatError(path, f"longitude or latitude first? {HEADER_HINT}", row=1)
 
 
 def _numbers(path: Path, delimiter: str | None, skip: int, places: tuple[int, int, int]) -> RealArray:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a file without rows, which is seen below
-            with path.open(**TEXT) as file:  # not numpy's: it takes a byte order mark for a number
+            with path.open(**TEXT_OPTIONS) as file:  # not numpy's: it takes a byte order mark for a number
                 rows = np.loadtxt(file, delimiter=delimiter, skiprows=skip, usecols=places, ndmin=2)
     except ValueError as error:
         # numpy counts rows from 0 below the header

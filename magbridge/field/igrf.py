@@ -26,7 +26,7 @@ __all__ = ["coverage", "igrf", "magnitude", "total_field"]
 
 REFERENCE_RADIUS = 6_371_200.0
 """Radius of the model's sphere, m."""
-BLOCK = 2048
+IGRF_BLOCK_SAMPLES = 2048
 """Samples; the working arrays of a block stay in the cache."""
 
 
@@ -77,8 +77,8 @@ def igrf(longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike, time: Arra
     if bad := _outside(at, start, end):
         raise OutOfRange("time", _date(bad[0]), f"the IGRF covers {_date(start)} to {_date(end)}")
     field = np.empty((lat.size, 3))
-    for i in range(0, lat.size, BLOCK):
-        part = slice(i, i + BLOCK)
+    for i in range(0, lat.size, IGRF_BLOCK_SAMPLES):
+        part = slice(i, i + IGRF_BLOCK_SAMPLES)
         field[part] = _block(model, lon[part], lat[part], down[part], at[part])
     return field
 

@@ -16,15 +16,15 @@ from magbridge.field.igrf import coverage, total_field
 __all__ = ["HeldField", "NearbyField"]
 
 
-REACH = 20_000.0
+BOX_HALF_WIDTH_M = 20_000.0
 """m from the middle of the box to its edge."""
 DEEP = 2_000.0
 """m, depth up to which it is fitted."""
-LONG = 20 * 86_400.0
+FITTED_TIME_S = 20 * 86_400.0
 """s before and after the time that it is fitted at."""
 
 
-REPEAT_US = 1_000_000
+CACHE_TIME_US = 1_000_000
 """Time after which the field at the same place is computed again, µs."""
 
 
@@ -51,7 +51,7 @@ class HeldField:
         OutOfRange
             As :func:`~magbridge.field.igrf.total_field`.
         """
-        if where != self._where or abs(utc_us - self._when_us) > REPEAT_US:
+        if where != self._where or abs(utc_us - self._when_us) > CACHE_TIME_US:
             self._field = self._model.at(*where, utc_us * 1e-6)[0]
             self._where, self._when_us = where, utc_us
         return self._field
@@ -83,26 +83,32 @@ class NearbyField:
         """
         north, east = separation(self._middle[0], self._middle[1], latitude, longitude)
         later = time - self._middle[2]
-        if not (abs(north) < REACH and abs(east) < REACH and abs(later) < LONG):
+        if not (
+            abs(north) < BOX_HALF_WIDTH_M and abs(east) < BOX_HALF_WIDTH_M and abs(later) < FITTED_TIME_S
+        ):
             self._fit(latitude, longitude, time)
             north = east = later = 0.0
-        n, e, d, t = north / REACH, east / REACH, depth / DEEP, later / LONG
+        n, e, d, t = north / BOX_HALF_WIDTH_M, east / BOX_HALF_WIDTH_M, depth / DEEP, later / FITTED_TIME_S
         c0, cn, ce, cd, ct, cnn, cee, cdd, cne, cnd, ced = self._c
         field = (
             c0 + n * (cn + n * cnn + e * cne + d * cnd) + e * (ce + e * cee + d * ced) + d * (cd + d * cdd)
         )
         slope_north = cn + 2.0 * n * cnn + e * cne + d * cnd
         slope_east = ce + 2.0 * e * cee + n * cne + d * ced
-        return field + t * ct, slope_north / REACH, slope_east / REACH
+        return field + t * ct, slope_north / BOX_HALF_WIDTH_M, slope_east / BOX_HALF_WIDTH_M
 
     def _fit(self, latitude: float, longitude: float, time: float) -> None:
         """Fit the eleven coefficients to the series on 81 nodes."""
         nodes = np.array(list(product((-1.0, 0.0, 1.0), repeat=4)))
         n, e, d, t = nodes.T
-        places = np.array([offset(latitude, longitude, a * REACH, b * REACH) for a, b in nodes[:, :2]])
-        times = np.clip(time + t * LONG, *coverage()) if coverage()[0] <= time <= coverage()[1] else time
+        places = np.array(
+            [offset(latitude, longitude, a * BOX_HALF_WIDTH_M, b * BOX_HALF_WIDTH_M) for a, b in nodes[:, :2]]
+        )
+        times = (
+            np.clip(time + t * FITTED_TIME_S, *coverage()) if coverage()[0] <= time <= coverage()[1] else time
+        )
         field = total_field(places[:, 1], np.clip(places[:, 0], -90.0, 90.0), d * DEEP, times)
-        later = (times - time) / LONG
+        later = (times - time) / FITTED_TIME_S
         design = np.stack([n**0, n, e, d, later, n * n, e * e, d * d, n * e, n * d, e * d], axis=1)
         self._c = np.linalg.lstsq(design, field, rcond=None)[0].tolist()
         self._middle = (latitude, longitude, time)

@@ -22,7 +22,7 @@ from magbridge.files import atomic_path
 
 __all__ = ["Step", "continue_upward", "draw_steps", "merge", "prepare", "surveyed_at"]
 
-MOST = 10_000_000
+MAX_MERGED_NODES = 10_000_000
 """Nodes of a merged map. As many, from two surveys that overlap, take 2 GB."""
 
 
@@ -60,7 +60,7 @@ def prepare(
     OutOfRange
         An altitude below a grid's: continuing downward amplifies what the survey did not resolve. A grid of
         unknown altitude that is to be continued, or merged with one of known altitude. More than
-        :data:`MOST` nodes.
+        :data:`MAX_MERGED_NODES` nodes.
     """
     steps = [Step(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
     known = [grid.altitude for grid in grids if isfinite(grid.altitude)]
@@ -126,7 +126,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
 
     And by how many nT RMS two of them differ where they overlap; NaN where none do. The differences show
     their errors: the mean of their variances is taken as at least half of the mean squared difference.
-    OutOfRange: more than :data:`MOST` nodes.
+    OutOfRange: more than :data:`MAX_MERGED_NODES` nodes.
     """
     first = grids[0]
     if len(grids) == 1 and spacing is None:
@@ -136,9 +136,11 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
     longitude = _cover([g.longitude + turn for g, turn in near], step)
     latitude = _cover([g.latitude for g in grids], step)
     size = longitude.size * latitude.size
-    if size > MOST:
-        wide = 1.05 * step * sqrt(size / MOST)
-        raise OutOfRange("map", f"{size} nodes", f"at most {MOST}: set a spacing of {wide:.2g} deg or more")
+    if size > MAX_MERGED_NODES:
+        wide = 1.05 * step * sqrt(size / MAX_MERGED_NODES)
+        raise OutOfRange(
+            "map", f"{size} nodes", f"at most {MAX_MERGED_NODES}: set a spacing of {wide:.2g} deg or more"
+        )
     total, squares, variance, count = np.zeros((4, latitude.size, longitude.size))
     for grid, turn in near:
         columns = _reach(longitude, grid.longitude + turn)

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
-    "EARTHS", "about_mean", "earth_field", "main_field", "other_units", "placed", "positions",
+    "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "other_units", "placed", "positions",
     "reference_field", "require_date", "sphere_radius",
 ]  # fmt: skip
 
-EARTHS = 20_000.0, 70_000.0
+MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0
 """nT: the main field at the surface is 22,000 to 67,000 (IGRF), and the crust adds thousands at most."""
 SPHERE_TOLERANCE = 0.3
 """Relative difference of the radius of the sphere through the readings from the field, at most: soft iron and
@@ -105,7 +105,7 @@ def about_mean(deployment: xr.Dataset) -> xr.Dataset:
     """
     raw = np.column_stack([deployment[f"mag_{axis}"].to_numpy() for axis in "xyz"])
     radius = sphere_radius(raw[np.isfinite(raw).all(axis=1)])
-    if not EARTHS[0] < radius < EARTHS[1]:
+    if not MAIN_FIELD_RANGE_NT[0] < radius < MAIN_FIELD_RANGE_NT[1]:
         source = deployment.attrs.get("source", "deployment")
         how = f"a sphere of {radius:.0f} nT through its readings: too few attitudes, or another unit"
         raise FormatError(source, f"expected a field of the Earth's size, not {how}")

@@ -8,14 +8,14 @@ from magbridge.arrays import FloatArray
 
 __all__ = ["WEIGHTS", "coefficients", "filled", "weights"]
 
-PAD = 16
+PAD_NODES = 16
 """Nodes: that far inside, the influence of a cubic spline's end has fallen to 1e-9."""
 
 # Cubic B-spline on a uniform axis: weights of four nodes as cubics in the fraction t, powers t⁰ t¹ t² t³.
 VALUE = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
-SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
-CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
-WEIGHTS = np.concatenate([VALUE, SLOPE, CURVATURE])
+SPLINE_SLOPE = np.array([[-3, 6, -3, 0], [0, -12, 9, 0], [3, 6, -9, 0], [0, 0, 3, 0]]) / 6.0
+SPLINE_CURVATURE = np.array([[6, -6, 0, 0], [-12, 18, 0, 0], [6, -18, 0, 0], [0, 6, 0, 0]]) / 6.0
+WEIGHTS = np.concatenate([VALUE, SPLINE_SLOPE, SPLINE_CURVATURE])
 """Weights of four nodes for value, slope and curvature, (12, 4), times powers of t."""
 
 
@@ -35,7 +35,7 @@ def coefficients(values: FloatArray) -> FloatArray:
     """Return B-spline coefficients (ny + 2, nx + 2) of values (ny, nx), without curvature at the edges."""
     from scipy.ndimage import spline_filter  # noqa: PLC0415  the live path runs without scipy
 
-    pad = [(min(PAD, n - 1),) * 2 for n in values.shape]
+    pad = [(min(PAD_NODES, n - 1),) * 2 for n in values.shape]
     padded = np.pad(values, pad, mode="reflect", reflect_type="odd")
     found: FloatArray = spline_filter(padded, order=3, mode="mirror")
     (a, _), (b, _) = pad

@@ -19,16 +19,16 @@ import polars as pl
 from magbridge.arrays import plain
 from magbridge.errors import FormatError, MissingExtra
 
-__all__ = ["FORMAT", "TABLES", "TEXT", "Catalogue", "Row", "open_catalogue"]
+__all__ = ["CATALOGUE_FORMAT", "CATALOGUE_TABLES", "TEXT", "Catalogue", "Row", "open_catalogue"]
 
 Row = dict[str, Any]
-FORMAT = 1
+CATALOGUE_FORMAT = 1
 """Version of the written catalogues; newer ones are refused."""
 SERVERS = ("postgresql://", "postgres://")
 TEXT, NUMBER, COUNT, TEXTS, NUMBERS, PACKED = (
     pl.String(), pl.Float64(), pl.Int64(), pl.List(pl.String()), pl.List(pl.Float64()), pl.Binary(),
 )  # fmt: skip
-TABLES: dict[str, dict[str, pl.DataType]] = {
+CATALOGUE_TABLES: dict[str, dict[str, pl.DataType]] = {
     "vehicles": {
         "vehicle": TEXT, "serial": TEXT, "sensor": TEXT, "parameters": TEXTS, "order": COUNT, "mass": TEXT,
         "version": COUNT,
@@ -81,7 +81,7 @@ class Catalogue(ABC):
         Parameters
         ----------
         table : str
-            One of :data:`TABLES`.
+            One of :data:`CATALOGUE_TABLES`.
         columns : sequence of str
             Those that are wanted; all, if none is named.
 
@@ -99,7 +99,7 @@ class Catalogue(ABC):
         WriteError: the disk is full, or the folder may not be written to. PortError: the server does not
         answer, or refuses to write.
         """
-        keyed = {_key(row): {name: row[name] for name in TABLES[table]} for row in rows}
+        keyed = {_key(row): {name: row[name] for name in CATALOGUE_TABLES[table]} for row in rows}
         return self._insert(table, dict(sorted(keyed.items()))) if keyed else 0
 
     def compact(self) -> None:  # noqa: B027  most need not
@@ -110,9 +110,10 @@ class Catalogue(ABC):
         """Add rows by their keys, unless those are there; return how many were not."""
 
     def _check_format(self, found: int) -> None:
-        if found > FORMAT:
+        if found > CATALOGUE_FORMAT:
             raise FormatError(
-                self.name, f"a catalogue of format {found}; this magbridge reads up to {FORMAT}: update it"
+                self.name,
+                f"a catalogue of format {found}; this magbridge reads up to {CATALOGUE_FORMAT}: update it",
             )
 
 

@@ -25,7 +25,7 @@ import polars as pl
 
 from magbridge.errors import FormatError
 from magbridge.files import atomic_path
-from magbridge.fleet.catalogue import FORMAT, TABLES, TEXT, Catalogue, Row
+from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, TEXT, Catalogue, Row
 
 __all__ = ["FolderCatalogue"]
 
@@ -44,28 +44,28 @@ class FolderCatalogue(Catalogue):
         if create and not mark.exists():
             with atomic_path(mark) as temporary:
                 folder.mkdir(parents=True, exist_ok=True)
-                temporary.write_bytes(msgspec.json.encode({"format": FORMAT}))
+                temporary.write_bytes(msgspec.json.encode({"format": CATALOGUE_FORMAT}))
         if not mark.is_file():
             raise FormatError(folder, "expected a fleet's catalogue (magbridge fleet add makes one)")
         try:
             self._check_format(msgspec.json.decode(mark.read_bytes(), type=dict[str, int])["format"])
         except (msgspec.DecodeError, KeyError) as error:
-            raise FormatError(mark, f'expected {{"format": {FORMAT}}}') from error
+            raise FormatError(mark, f'expected {{"format": {CATALOGUE_FORMAT}}}') from error
 
     def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:  # noqa: D102  as the catalogue's
-        return self._read(table, columns or tuple(TABLES[table])).drop("key").to_dicts()
+        return self._read(table, columns or tuple(CATALOGUE_TABLES[table])).drop("key").to_dicts()
 
     def compact(self) -> None:
         """Make one file of each table's many small ones.
 
         The removed rows are in the file just written, so rows are never lost, even if others do so.
         """
-        for table in TABLES:
+        for table in CATALOGUE_TABLES:
             with suppress(FileNotFoundError):  # another writer does the same
                 files = [path for path in self._files(table) if len(self._keys(path)) < SMALL]
                 if len(files) < MANY:
                     continue
-                written = self._write(table, self._joined(table, files, tuple(TABLES[table])))
+                written = self._write(table, self._joined(table, files, tuple(CATALOGUE_TABLES[table])))
                 for path in files:
                     if path != written:
                         path.unlink(missing_ok=True)
@@ -77,7 +77,7 @@ class FolderCatalogue(Catalogue):
                 known |= keyed.keys() & self._keys(path)
         fresh = [{"key": key, **row} for key, row in keyed.items() if key not in known]
         if fresh:
-            self._write(table, pl.DataFrame(fresh, schema={"key": TEXT, **TABLES[table]}))
+            self._write(table, pl.DataFrame(fresh, schema={"key": TEXT, **CATALOGUE_TABLES[table]}))
         return len(fresh)
 
     def _keys(self, path: Path) -> frozenset[str]:
@@ -92,7 +92,7 @@ class FolderCatalogue(Catalogue):
 
     def _joined(self, table: str, files: Sequence[Path], columns: Sequence[str]) -> pl.DataFrame:
         """Return the rows of files, each once, in the order of their keys."""
-        schema = {"key": TEXT, **{name: TABLES[table][name] for name in columns}}
+        schema = {"key": TEXT, **{name: CATALOGUE_TABLES[table][name] for name in columns}}
         parts = [pl.DataFrame(schema=schema)]
         for path in files:
             try:

@@ -43,7 +43,16 @@ from scipy.linalg import cho_factor, cho_solve
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.estimation.information import GaussianInformation
-from magbridge.fleet.variances import NONE, Shapes, Spread, Sums, Variances, log_prior, renewed, spreads_of
+from magbridge.fleet.variances import (
+    NO_SHAPES,
+    Shapes,
+    Spread,
+    Sums,
+    Variances,
+    log_prior,
+    renewed,
+    spreads_of,
+)
 
 __all__ = ["Observed", "Population", "learn"]
 
@@ -118,7 +127,7 @@ class _Passed:
 def learn(
     observed: Sequence[Observed],
     groups: IndexArray,
-    shapes: Shapes = NONE,
+    shapes: Shapes = NO_SHAPES,
     variances: Variances | None = None,
 ) -> Population:
     """Learn the variances of a fleet.
@@ -148,7 +157,7 @@ def learn(
 
 
 def _round(
-    variances: Variances, observed: Sequence[Observed], groups: IndexArray, shapes: Shapes = NONE
+    variances: Variances, observed: Sequence[Observed], groups: IndexArray, shapes: Shapes = NO_SHAPES
 ) -> tuple[Population, Sums]:
     """Go up and down the tree once."""
     K = len(groups)

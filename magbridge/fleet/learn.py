@@ -24,14 +24,14 @@ from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.priors import polynomial_prior
 from magbridge.fleet.hierarchy import Observed, Population, learn
 from magbridge.fleet.shapes import shape_groups, shapes_of
-from magbridge.fleet.variances import NONE, Shapes, Variances
+from magbridge.fleet.variances import NO_SHAPES, Shapes, Variances
 
 __all__ = ["Fleet", "Lesson", "learn_fleet", "packed", "unpacked"]
 
 REST = 0.01
 """Share of the physical widths that a refit of a mounted mass moves besides what a dipole does."""
 NOWHERE: Mapping[str, Mapping[str, Mounting]] = {}
-FIELD = 50_000.0
+REFERENCE_FIELD_NT = 50_000.0
 """nT, the F_0 that a fleet's coefficients refer to."""
 
 
@@ -58,11 +58,11 @@ class Lesson(NamedTuple):
         Parameters
         ----------
         parameters : tuple of Parameter
-            The scales of the positions to bring it to; the F_0 is :data:`FIELD`.
+            The scales of the positions to bring it to; the F_0 is :data:`REFERENCE_FIELD_NT`.
         basis : (9 m, q) array
             nT, coefficients there of z.
         """
-        B = rescaling(self.exponents, parameters, self.parameters, FIELD, self.field) @ basis
+        B = rescaling(self.exponents, parameters, self.parameters, REFERENCE_FIELD_NT, self.field) @ basis
         return GaussianInformation(B.T @ self.information.precision @ B, B.T @ self.information.vector)
 
 
@@ -117,7 +117,7 @@ class Fleet:
         ]
         mean, P = self.population.expected(vehicle, past, refit)
         E = self.basis
-        return Known(self.parameters, self.exponents, FIELD, E @ mean, E @ P @ E.T)
+        return Known(self.parameters, self.exponents, REFERENCE_FIELD_NT, E @ mean, E @ P @ E.T)
 
 
 def learn_fleet(
@@ -146,7 +146,7 @@ def learn_fleet(
     lessons = sorted(lessons, key=lambda one: (one.time, one.vehicle, one.deployment))
     exponents = lessons[0].exponents
     parameters = _whole_range(lessons)
-    family = polynomial_prior(exponents, tuple(one.name for one in parameters), FIELD)
+    family = polynomial_prior(exponents, tuple(one.name for one in parameters), REFERENCE_FIELD_NT)
     basis = np.asarray(family.E * family.widths(family.centre))
     with threadpool_limits(1, "blas"):
         observed = tuple(Observed(one.vehicle, one.refit, one.brought(parameters, basis)) for one in lessons)
@@ -168,18 +168,18 @@ def _shapes(
     names = {one.name for one in parameters}
     whole = {vehicle: where for vehicle, where in mounted.items() if where.keys() == names}
     if not whole:
-        return NONE
-    first = learn(observed, groups, variances=Variances.expected(len(groups), NONE))
+        return NO_SHAPES
+    first = learn(observed, groups, variances=Variances.expected(len(groups), NO_SHAPES))
     found = {}
     for vehicle, where in whole.items():
         past = [one for one in observed if one.vehicle == vehicle]
         if not past:
             continue
         mean, P = first.expected(vehicle, past, past[-1].refit)
-        D = shapes_of(where, exponents, parameters, FIELD, basis @ mean, basis @ P @ basis.T)
+        D = shapes_of(where, exponents, parameters, REFERENCE_FIELD_NT, basis @ mean, basis @ P @ basis.T)
         found[vehicle] = np.asarray(np.linalg.solve(basis, D))
     moves = np.repeat([sum(powers) > 0 for powers in exponents], 9)
-    return Shapes(found, shape_groups(len(parameters)), np.where(moves, REST, NONE.rest))
+    return Shapes(found, shape_groups(len(parameters)), np.where(moves, REST, NO_SHAPES.rest))
 
 
 def _whole_range(lessons: Sequence[Lesson]) -> tuple[Parameter, ...]:

@@ -17,7 +17,7 @@ from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.fleet.job import GIVEN, jobs, last_attempts
 from magbridge.fleet.learn import Fleet, Lesson, learn_fleet, unpacked
 from magbridge.fleet.register import current_files, masses, vehicle_named, vehicles
-from magbridge.fleet.variances import LEVELS, Variances
+from magbridge.fleet.variances import FLEET_LEVELS, Variances
 
 __all__ = ["current", "findings", "fleet_of", "fleets", "lessons", "owner", "remember"]
 
@@ -90,7 +90,7 @@ def fleet_of(catalogue: Catalogue, vehicle: str, without: Collection[str] = ()) 
     mounted = {name: masses(row) for name, row in vehicles(catalogue).items()}
     of = _name(found, mounted)
     stored = {
-        row["of"]: Variances(np.reshape(row["own"], (len(LEVELS), -1)), np.array(row["shaped"]))
+        row["of"]: Variances(np.reshape(row["own"], (len(FLEET_LEVELS), -1)), np.array(row["shaped"]))
         for row in catalogue.rows("populations")
     }
     return learn_fleet(found, mounted, stored.get(of))

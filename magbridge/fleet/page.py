@@ -26,12 +26,12 @@ __all__ = ["write_page", "write_pages"]
 
 INK, BAND, CHANGED, REFIT = "#010101", "#020202", "#030303", "#040404"
 """Stand-ins in the pictures, for the page's own colours."""
-COLOURS = {INK: "var(--ink)", BAND: "var(--band)", CHANGED: "var(--changed)", REFIT: "var(--faint)"}
-DRAWN: Any = {
+PAGE_COLOURS = {INK: "var(--ink)", BAND: "var(--band)", CHANGED: "var(--changed)", REFIT: "var(--faint)"}
+SVG_SETTINGS: Any = {
     "svg.hashsalt": "fleet", "svg.fonttype": "none", "font.size": 8.0, "text.color": INK,
     "axes.labelcolor": INK, "axes.edgecolor": REFIT, "xtick.color": INK, "ytick.color": INK,
 }  # fmt: skip
-STYLE = """
+FLEET_STYLE = """
 :root {color-scheme: light dark;
   --ink: #22303c; --paper: #fff; --faint: #9aa5b1; --band: #9db4c0; --changed: #b3261e}
 @media (prefers-color-scheme: dark) {
@@ -98,7 +98,7 @@ def _write(path: Path, title: str, body: Sequence[str]) -> None:
     text = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
-        f"<style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
+        f"<style>{FLEET_STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -165,7 +165,7 @@ def _found(row: Mapping[str, Any]) -> str:
 
 def _panel(one: History, k: int) -> str:
     """Return the picture of one coefficient from deployment to deployment."""
-    with rc_context(DRAWN):
+    with rc_context(SVG_SETTINGS):
         figure = Figure(figsize=(3.4, 2.0))
         figure.subplots_adjust(0.15, 0.2, 0.98, 0.88)
         ax = figure.subplots()
@@ -190,7 +190,7 @@ def _panel(one: History, k: int) -> str:
         drawn = StringIO()
         figure.savefig(drawn, format="svg", transparent=True, metadata={"Date": None})
     text = drawn.getvalue()
-    for stand_in, colour in COLOURS.items():
+    for stand_in, colour in PAGE_COLOURS.items():
         text = text.replace(stand_in, colour)
     return text[text.index("<svg") :]
 

@@ -17,12 +17,12 @@ from psycopg import sql
 from psycopg.rows import dict_row
 
 from magbridge.errors import FormatError, PortError
-from magbridge.fleet.catalogue import FORMAT, TABLES, Catalogue, Row
+from magbridge.fleet.catalogue import CATALOGUE_FORMAT, CATALOGUE_TABLES, Catalogue, Row
 
 __all__ = ["PostgresCatalogue"]
 
 SCHEMA = sql.Identifier("magbridge_fleet")
-PATIENCE = 10
+CONNECT_TIMEOUT_S = 10
 """s until a server that does not answer is given up."""
 MAKING = 0x6D616762
 """Number of the lock that one holds who makes the tables."""
@@ -56,13 +56,15 @@ class PostgresCatalogue(Catalogue):
 
     def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:  # noqa: D102  as the catalogue's
         query = sql.SQL('select {} from {}.{} order by key collate "C"').format(
-            sql.SQL(", ").join(map(sql.Identifier, columns or TABLES[table])), SCHEMA, sql.Identifier(table)
+            sql.SQL(", ").join(map(sql.Identifier, columns or CATALOGUE_TABLES[table])),
+            SCHEMA,
+            sql.Identifier(table),
         )
         with self._connected() as connection, connection.cursor(row_factory=dict_row, binary=True) as cursor:
             return cursor.execute(query).fetchall()
 
     def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
-        names = ("key", *TABLES[table])
+        names = ("key", *CATALOGUE_TABLES[table])
         query = sql.SQL("insert into {}.{} ({}) values ({}) on conflict (key) do nothing").format(
             SCHEMA,
             sql.Identifier(table),
@@ -77,7 +79,7 @@ class PostgresCatalogue(Catalogue):
     def _connected(self) -> Iterator[psycopg.Connection]:
         """Connect for one transaction."""
         try:
-            with psycopg.connect(self._url, connect_timeout=PATIENCE) as connection:
+            with psycopg.connect(self._url, connect_timeout=CONNECT_TIMEOUT_S) as connection:
                 yield connection
         except psycopg.Error as error:
             raise PortError(self.name, " ".join(str(error).split())) from error
@@ -93,9 +95,9 @@ class PostgresCatalogue(Catalogue):
             sql.SQL(
                 "insert into {0}.catalogue select %s where not exists (select from {0}.catalogue)"
             ).format(SCHEMA),
-            (FORMAT,),
+            (CATALOGUE_FORMAT,),
         )
-        for table, columns in TABLES.items():
+        for table, columns in CATALOGUE_TABLES.items():
             typed = [
                 sql.SQL("{} {}").format(sql.Identifier(name), sql.SQL(TYPES[kind]))
                 for name, kind in columns.items()

@@ -22,7 +22,7 @@ START = "120s"
 """Until processes of this machine are up: they import much, and it may be busy."""
 PACE = 64
 """Deployments after which the catalogue is rearranged."""
-PATIENCE = "20s"
+SCHEDULER_TIMEOUT = "20s"
 """Until a scheduler that does not answer is given up."""
 
 
@@ -56,7 +56,7 @@ def client_of(scheduler: str, workers: int, memory: str) -> Iterator[Client]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler:
         try:
-            client = Client(scheduler, timeout=PATIENCE)
+            client = Client(scheduler, timeout=SCHEDULER_TIMEOUT)
         except (OSError, ValueError, TimeoutError) as error:
             raise PortError(scheduler, f"no dask scheduler answers: {error}") from error
         with client:

@@ -39,7 +39,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-SAME = "serial", "parameters"
+FIXED_KEYS = "serial", "parameters"
 """What a vehicle keeps; all else about it may be corrected, and the newest counts."""
 
 
@@ -82,7 +82,7 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
     found: dict[str, Row] = {}
     for row in sorted(catalogue.rows("vehicles"), key=lambda row: row["version"]):
         last = found.get(row["vehicle"], row)
-        if any(last[key] != row[key] for key in SAME):
+        if any(last[key] != row[key] for key in FIXED_KEYS):
             both = " and ".join(_described(one) for one in (last, row))
             raise FormatError(
                 catalogue.name,
@@ -117,7 +117,7 @@ def add_vehicle(catalogue: Catalogue, name: str, vehicle: Vehicle) -> int:
     row["parameters"] = list(vehicle.parameters)
     row["mass"] = msgspec.json.encode(vehicle.mass, order="sorted").decode()
     known = vehicles(catalogue).get(name, {**row, "version": 0})
-    if any(known[key] != row[key] for key in SAME):
+    if any(known[key] != row[key] for key in FIXED_KEYS):
         raise WrongUse(
             f"{name}: {catalogue.name} has another vehicle of that name: {_described(known)}, "
             f"not {_described(row)}"

@@ -6,7 +6,7 @@ needs the moment: so a dipole is first fitted to what the vehicle's deployments 
 
 .. math:: l = \arg\min\ (c(l) - m)^T P^{-1} (c(l) - m) + l^T W^{-1} l,
 
-with W the dipole's usual widths, linearised again in each of :data:`ROUNDS`.
+with W the dipole's usual widths, linearised again in each of :data:`SHAPE_ITERATIONS`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from magbridge.estimation.priors import polynomial_prior
 
 __all__ = ["shape_groups", "shapes_of"]
 
-ROUNDS = 4
-KINDS = 3
+SHAPE_ITERATIONS = 4
+SHAPE_KINDS = 3
 """Of shapes of a mass: moment, susceptibility, place; three numbers each."""
 
 
@@ -50,14 +50,14 @@ def shapes_of(
     free = polynomial_prior(exponents, tuple(one.name for one in parameters), field)
     family = mounted_prior(free, exponents, parameters, mounted)
     weight = np.linalg.inv(covariance)
-    for _ in range(ROUNDS):
+    for _ in range(SHAPE_ITERATIONS):
         prior = family.at(family.centre)
         pull = prior.E.T @ weight
         z = np.asarray(np.linalg.solve(pull @ prior.E + prior.precision, pull @ (mean - prior.offset)))
         assert family.renew is not None
         family = family.renew(z)
     size, order = len(mean), max(map(sum, exponents))
-    shapes = np.zeros((len(exponents), 9, len(mounted), 3 * KINDS))
+    shapes = np.zeros((len(exponents), 9, len(mounted), 3 * SHAPE_KINDS))
     latents = z[size:].reshape(-1, LATENT), family.widths(family.centre)[size:].reshape(-1, LATENT)
     for i, (name, mass, latent, width) in enumerate(
         zip(mounted.keys(), mounted.values(), *latents, strict=True)
@@ -66,10 +66,10 @@ def shapes_of(
         by = mass_columns(np.array(mass.at), np.array(mass.travel), parameters[k], order, latent) * width
         for n in range(order + 1):
             row = exponents.index(tuple(n * (j == k) for j in range(len(parameters))))
-            shapes[row, :, i] = by[n, :, : 3 * KINDS]
+            shapes[row, :, i] = by[n, :, : 3 * SHAPE_KINDS]
     return shapes.reshape(size, -1)
 
 
 def shape_groups(masses: int) -> IndexArray:
     """Return the number of the group of each shape (9 n,): kinds of a mass have a variance each."""
-    return np.repeat(np.arange(KINDS * masses), 3)
+    return np.repeat(np.arange(SHAPE_KINDS * masses), 3)

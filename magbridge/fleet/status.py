@@ -10,7 +10,7 @@ from magbridge.fleet.job import GIVEN, jobs, last_attempts, new_jobs
 
 __all__ = ["status"]
 
-COUNTED = (
+STATUS_COLUMNS = (
     "deployments", "logs", "calibrated", "unsupported", "failed", "new", "given", "diagnosed", "mapped"
 )  # fmt: skip
 """Of each vehicle; `given` are calibrations made elsewhere."""
@@ -47,7 +47,8 @@ def status(catalogue: Catalogue) -> dict[str, Any]:
         sensors.setdefault(row["sensor"], set()).add(row["vehicle"])
     return {
         "vehicles": [
-            {"vehicle": name, **{key: one[key] for key in COUNTED}} for name, one in sorted(counts.items())
+            {"vehicle": name, **{key: one[key] for key in STATUS_COLUMNS}}
+            for name, one in sorted(counts.items())
         ],
         "sensors": [{"sensor": name, "vehicles": sorted(on)} for name, on in sorted(sensors.items())],
         "failures": failures,

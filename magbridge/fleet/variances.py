@@ -14,13 +14,23 @@ from scipy.linalg import cho_factor, cho_solve
 
 from magbridge.arrays import FloatArray, IndexArray
 
-__all__ = ["LEVELS", "NONE", "Shapes", "Spread", "Sums", "Variances", "log_prior", "renewed", "spreads_of"]
+__all__ = [
+    "FLEET_LEVELS",
+    "NO_SHAPES",
+    "Shapes",
+    "Spread",
+    "Sums",
+    "Variances",
+    "log_prior",
+    "renewed",
+    "spreads_of",
+]
 
-LEVELS = ("vehicle", "refit", "power-up")
+FLEET_LEVELS = ("vehicle", "refit", "power-up")
 """What coefficients vary with, from the root down."""
-EXPECTED = (1.0, 0.1, 0.02)
+VARIATION_FRACTIONS = (1.0, 0.1, 0.02)
 """Shares of the physical widths by which they are expected to vary with each, before any fleet is seen."""
-WORTH = 2.0
+PRIOR_DIFFERENCES = 2.0
 """Differences that this expectation is worth."""
 
 
@@ -32,26 +42,28 @@ class Shapes:
     """Vehicle -> D (K, s); one that is not there has none."""
     groups: IndexArray
     """(s,): Number of the group that each column shares its variance with."""
-    rest: FloatArray | float = EXPECTED[1]
+    rest: FloatArray | float = VARIATION_FRACTIONS[1]
     """(K,): Share of the physical widths by which coefficients are expected to vary besides."""
 
     def expected(self, K: int) -> FloatArray:
         """Return the shares (3, K) by which coefficients are expected to vary, before any fleet is seen."""
-        return np.stack([np.broadcast_to(size, K) for size in (EXPECTED[0], self.rest, EXPECTED[2])])
+        return np.stack(
+            [np.broadcast_to(size, K) for size in (VARIATION_FRACTIONS[0], self.rest, VARIATION_FRACTIONS[2])]
+        )
 
 
 class Variances(NamedTuple):
     """How far members differ from their parents."""
 
     own: FloatArray
-    """(3, K): Of each coefficient, at each of :data:`LEVELS`."""
+    """(3, K): Of each coefficient, at each of :data:`FLEET_LEVELS`."""
     shaped: FloatArray
     """(s,): Variances of the amplitude of each shape, from refit to refit."""
 
     @classmethod
     def expected(cls, K: int, shapes: Shapes) -> Variances:
         """Return the prediction before any fleet is seen."""
-        return cls(np.square(shapes.expected(K)), np.full(len(shapes.groups), EXPECTED[1] ** 2))
+        return cls(np.square(shapes.expected(K)), np.full(len(shapes.groups), VARIATION_FRACTIONS[1] ** 2))
 
 
 class Spread(NamedTuple):
@@ -67,8 +79,8 @@ class Sums:
     """Expected squares of all differences at each level, and of all shapes' sizes; how many there are."""
 
     def __init__(self, K: int, s: int) -> None:
-        self.own, self.shaped = np.zeros((len(LEVELS), K)), np.zeros(s)
-        self.counts = [0] * len(LEVELS)
+        self.own, self.shaped = np.zeros((len(FLEET_LEVELS), K)), np.zeros(s)
+        self.counts = [0] * len(FLEET_LEVELS)
         self.refits = 0
 
     def add(self, level: int, dd: FloatArray, spread: Spread) -> None:
@@ -84,7 +96,7 @@ class Sums:
             self.refits += 1
 
 
-NONE = Shapes({}, np.zeros(0, np.intp))
+NO_SHAPES = Shapes({}, np.zeros(0, np.intp))
 """Nothing is known of how refits move coefficients."""
 
 
@@ -93,14 +105,14 @@ def renewed(sums: Sums, groups: IndexArray, shapes: Shapes) -> Variances:
 
     def mode(squares: FloatArray, count: int, of: IndexArray, expected: FloatArray) -> FloatArray:
         members = np.bincount(of)
-        inner = np.bincount(of, squares) + WORTH * np.bincount(of, expected**2) / members
-        return np.asarray((inner / (count * members + WORTH + 2.0))[of])
+        inner = np.bincount(of, squares) + PRIOR_DIFFERENCES * np.bincount(of, expected**2) / members
+        return np.asarray((inner / (count * members + PRIOR_DIFFERENCES + 2.0))[of])
 
     own = [
         mode(squares, count, groups, size)
         for squares, count, size in zip(sums.own, sums.counts, shapes.expected(len(groups)), strict=True)
     ]
-    sizes = np.full(len(shapes.groups), EXPECTED[1])
+    sizes = np.full(len(shapes.groups), VARIATION_FRACTIONS[1])
     return Variances(np.array(own), mode(sums.shaped, sums.refits, shapes.groups, sizes))
 
 
@@ -130,5 +142,7 @@ def log_prior(variances: Variances, groups: IndexArray, shapes: Shapes) -> float
     _, one = np.unique(shapes.groups, return_index=True)
     v = np.append(variances.own[:, first], variances.shaped[one])
     own = np.square(shapes.expected(len(groups)))[:, first]
-    expected = np.append(own, np.full(len(one), EXPECTED[1] ** 2))
-    return float(-np.sum((0.5 * WORTH + 1.0) * np.log(v) + 0.5 * WORTH * expected / v))
+    expected = np.append(own, np.full(len(one), VARIATION_FRACTIONS[1] ** 2))
+    return float(
+        -np.sum((0.5 * PRIOR_DIFFERENCES + 1.0) * np.log(v) + 0.5 * PRIOR_DIFFERENCES * expected / v)
+    )

@@ -27,7 +27,7 @@ from magbridge.files import digest
 from magbridge.fleet.learn import packed
 from magbridge.logs import Writer, read
 from magbridge.logs.deployment import join, passed_over, sliced
-from magbridge.logs.info import GAP
+from magbridge.logs.info import INFO_GAP_INTERVALS
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 from magbridge.survey.maps import anomaly_map
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Done", "work"]
 
-PIECE = 20_000
+PIECE_ROWS = 20_000
 """Rows that are corrected at a time."""
 
 
@@ -135,7 +135,7 @@ def _log(log: xr.Dataset, sha: str) -> Row:
     return {
         "sha256": sha, "start": float(time[0]), "end": float(time[-1]), "rows": len(time),
         "samples": int(log[list(CHANNELS)].to_array().notnull().all("variable").sum()),
-        "gaps": int((steps > GAP * np.median(steps)).sum()) if len(steps) else 0,
+        "gaps": int((steps > INFO_GAP_INTERVALS * np.median(steps)).sum()) if len(steps) else 0,
         "losses": sum(passed_over(log.attrs).values()), "sensor": str(log.attrs.get("sensor", "")), **middle,
     }  # fmt: skip
 
@@ -159,7 +159,7 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) ->
     correction = Correction(calibration)
     samples, flagged, variances = 0, 0, 0.0
     with Writer(path) as writer:
-        for piece in sliced(log, PIECE):
+        for piece in sliced(log, PIECE_ROWS):
             fixed = correct_rows(correction, piece)
             writer.append(fixed)
             doubtful = fixed["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT) != 0

@@ -21,10 +21,10 @@ LEARNING_SAMPLES: Final = 256
 """Samples over which the fraction of repeated readings is learned."""
 MAX_PROBABILITY: Final = 1e-9
 """Probability of a run of repeated readings that a healthy channel does not show."""
-MIN_FRACTION: Final = 1e-3
+MIN_STUCK_FRACTION: Final = 1e-3
 MIN_RUN: Final = 4
 MIN_COMMON_RUN: Final = 3
-AXES: Final = "xyz"
+AXIS_NAMES: Final = "xyz"
 
 
 class Repetition:
@@ -40,7 +40,7 @@ class Repetition:
     def change(self) -> None:
         """Record that the reading has changed."""
         self.run = 0
-        self.fraction += (MIN_FRACTION - self.fraction) / LEARNING_SAMPLES
+        self.fraction += (MIN_STUCK_FRACTION - self.fraction) / LEARNING_SAMPLES
 
     def repeat(self, probability: float, min_run: int) -> bool:
         """Record a repetition; return True if a healthy channel does not repeat its reading so often."""
@@ -105,5 +105,5 @@ class RepetitionCheck:
         elif not axis.repeat(0.0, MIN_RUN):
             return False
         axis.limit, self._has_limit = abs(value), True
-        self._messages.report("axis", f"axis {AXES[number]} stuck at {value:.0f} nT, or clipped there")
+        self._messages.report("axis", f"axis {AXIS_NAMES[number]} stuck at {value:.0f} nT, or clipped there")
         return True

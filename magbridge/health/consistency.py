@@ -50,7 +50,7 @@ MASS_FRACTION: Final = 0.03
 telemetry as a fraction of the calibrated range."""
 RETENTION_SAMPLES: Final = 2000.0
 """Tested samples over which evidence is forgotten."""
-ALARM_LOG_RATIO: Final = 15.0
+CONSISTENCY_ALARM_LOG_RATIO: Final = 15.0
 """L above which an alarm begins: by chance once in a million tested samples at most."""
 NOISE_DOF: Final = 8.0
 """Degrees of freedom with which the noise of the innovations is known."""
@@ -59,18 +59,18 @@ CLEAR_LOG_RATIO: Final = 4.0
 COMPETING_LOG_RATIO: Final = 5.0
 """Distance from the largest L within which an error and an onset count."""
 MAX_PENDING: Final = 64
-MAX_INNOVATION_SIGMA: Final = 5.0
+MAX_CONSISTENT_SIGMA: Final = 5.0
 AGREEING: Final = 3
 """An innovation beyond so many sigmas is ignored, unless it is the third in a row."""
-STRAIGHT: Final = 0.05
+STRAIGHT_CHANGE: Final = 0.05
 """Change of the unit vector within which the attitude is the same."""
 MIN_STRAIGHT_SAMPLES: Final = 8
 """Samples of one attitude from which the roughness is known."""
 ADAPTATION: Final = 0.02
-MAX_SQUARE: Final = 4.0
+MAX_CONSISTENCY_SQUARE: Final = 4.0
 MAX_LOG_ROUGHNESS: Final = 5.0
 """How the logarithm of the crust's roughness follows a normalised squared innovation; its bounds."""
-KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
+ERROR_KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain", "telemetry of a mass")
 DEGENERATE_NT: Final = 1e-6
 
 
@@ -176,7 +176,7 @@ class ConsistencyCheck:
         absorbed[:] = np.tensordot(F, absorbed, axes=1)
         v = self._filter.innovate(total - self._level, self._process.row(1.0), self._process.white_variance)
         normalised = v / self._filter.sigma
-        self._outliers = self._outliers + 1 if abs(normalised) > MAX_INNOVATION_SIGMA else 0
+        self._outliers = self._outliers + 1 if abs(normalised) > MAX_CONSISTENT_SIGMA else 0
         if 0 < self._outliers < AGREEING and not self.is_wrong:
             return
         begins = self._test.begin(1e-6 * time_us, normalised)
@@ -191,9 +191,9 @@ class ConsistencyCheck:
         """Update the crustal field's curvature from the innovations while the attitude stays the same."""
         turned = float(np.abs(unit - self._last_unit).max())
         self._last_unit = unit
-        if turned < STRAIGHT and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:
+        if turned < STRAIGHT_CHANGE and self._filter.covariance[3, 3] < 0.5 * CONSTANT_SIGMA_NT**2:
             self._straight_samples += 1
-            self._log_roughness += ADAPTATION * (min(squared, MAX_SQUARE) - 1.0)
+            self._log_roughness += ADAPTATION * (min(squared, MAX_CONSISTENCY_SQUARE) - 1.0)
             self._log_roughness = min(max(self._log_roughness, -MAX_LOG_ROUGHNESS), MAX_LOG_ROUGHNESS)
 
     def _null(self, systematic: float) -> Any:
@@ -234,7 +234,7 @@ class ConsistencyCheck:
         if self.is_wrong:
             self.is_wrong = largest > CLEAR_LOG_RATIO
         else:
-            self.is_wrong = matters and largest > ALARM_LOG_RATIO
+            self.is_wrong = matters and largest > CONSISTENCY_ALARM_LOG_RATIO
         self._weights = []
         if not self.is_wrong:
             return
@@ -242,7 +242,7 @@ class ConsistencyCheck:
         shares = [exp(float(statistic[row]) - largest) for row in rows]
         total = sum(shares)
         self._weights = [(row, share / total) for row, share in zip(rows, shares, strict=True)]
-        kind = KINDS[min(int(self._test.kind[best]), len(KINDS) - 1)]
+        kind = ERROR_KINDS[min(int(self._test.kind[best]), len(ERROR_KINDS) - 1)]
         text = f"field depends on the attitude or a mass, {size:.0f} nT: {kind} wrong"
         self._messages.report("consistency", text)
 

@@ -7,8 +7,8 @@ forward and starboard in the horizontal plane, gives the declination ``D = yaw -
 
 Roll and pitch come from gravity, and have errors of a degree or two: an inclination error above
 :data:`INCLINED` is flagged. The heading of an autopilot may come from a compass near the same iron, or be
-missing before a flight. If it and the vector differ by more than :data:`TURNED`, one of them is wrong, and
-the check cannot decide which. It reports the difference, and the vector's sigma includes it.
+missing before a flight. If it and the vector differ by more than :data:`MAX_HEADING_ERROR`, one of them is
+wrong, and the check cannot decide which. It reports the difference, and the vector's sigma includes it.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ __all__ = ["DirectionCheck"]
 
 INCLINED: Final = radians(10.0)
 """Five sigmas of 2 deg: attitude 1.5, boresight 1, main field 0.2 (Chulliat et al. 2020, table 14), crust."""
-TURNED: Final = radians(60.0)
+MAX_HEADING_ERROR: Final = radians(60.0)
 """Five sigmas of a compass that is off by 12 deg."""
-STEEP: Final = 0.2
+MIN_HORIZONTAL_FRACTION: Final = 0.2
 """Share of the field that is horizontal, below which no heading is read from it."""
 EVERY_US: Final = 1_000_000
 """µs from one look to the next: a mounting does not change from sample to sample."""
-FRESH_US: Final = 5_000_000
+MAX_DIRECTION_AGE_US: Final = 5_000_000
 """µs for which an attitude is the present one."""
-LASTING: Final = 8
+MIN_DIFFERING_CHECKS: Final = 8
 """Looks in a row that differ: what a manoeuvre does to an attitude is over by then."""
 LONG_US: Final = 3_600_000_000
 """Time for which a disagreement is remembered, µs: at some headings a reversed axis looks right."""
@@ -57,7 +57,7 @@ class DirectionCheck:
         self._messages = messages or Messages()
         self.messages = self._messages.lines
         self._roll = self._pitch = self._yaw = nan
-        self._attitude_us = -FRESH_US
+        self._attitude_us = -MAX_DIRECTION_AGE_US
         self._inclination = self._declination = nan
         self._next_us = 0
         self._tilted = self._turned = 0
@@ -88,7 +88,7 @@ class DirectionCheck:
             return self._variance
         self._next_us = time_us + EVERY_US
         field = sqrt(x * x + y * y + z * z)
-        known = abs(time_us - self._attitude_us) < FRESH_US
+        known = abs(time_us - self._attitude_us) < MAX_DIRECTION_AGE_US
         if not known or not 0.0 < field < inf or self._inclination != self._inclination:
             return self._variance
         cr, sr, cp, sp = cos(self._roll), sin(self._roll), cos(self._pitch), sin(self._pitch)
@@ -98,8 +98,10 @@ class DirectionCheck:
         tilt = inclination - self._inclination
         turn = remainder(self._yaw + atan2(starboard, forward) - self._declination, 2.0 * pi)
         level = min(cos(inclination), cos(self._inclination))
-        self._judge(time_us, tilt, turn if level > STEEP else 0.0)
-        if self._tilted >= LASTING or self._turned >= LASTING:  # the chord between both directions
+        self._judge(time_us, tilt, turn if level > MIN_HORIZONTAL_FRACTION else 0.0)
+        if (
+            self._tilted >= MIN_DIFFERING_CHECKS or self._turned >= MIN_DIFFERING_CHECKS
+        ):  # the chord between both directions
             horizontal = 2.0 * level * sin(0.5 * turn)
             chord = field * field * (4.0 * sin(0.5 * tilt) ** 2 + horizontal * horizontal)
             self._variance, self._until_us = max(self._variance, chord), time_us + LONG_US
@@ -110,12 +112,12 @@ class DirectionCheck:
     def _judge(self, time_us: int, tilt: float, turn: float) -> None:
         """Count looks that differ, by `tilt` in inclination and by `turn` in heading, rad."""
         self._tilted = self._tilted + 1 if abs(tilt) > INCLINED else 0
-        self._turned = self._turned + 1 if abs(turn) > TURNED else 0
-        if self._tilted >= LASTING:
+        self._turned = self._turned + 1 if abs(turn) > MAX_HEADING_ERROR else 0
+        if self._tilted >= MIN_DIFFERING_CHECKS:
             self._tilted_until_us = time_us + LONG_US
             text = f"inclination off by {degrees(tilt):+.0f} deg: axes or mounting wrong"
             self._messages.report("inclination", text)
-        if self._turned >= LASTING:
+        if self._turned >= MIN_DIFFERING_CHECKS:
             text = f"vector {degrees(turn):+.0f} deg off the heading: axes or compass wrong"
             self._messages.report("heading", text)
         self.flags = IMPLAUSIBLE if time_us < self._tilted_until_us else 0

@@ -4,7 +4,7 @@ The Earth's total field is the sum of the main field and the crustal field. The 
 nT (1-sigma over the Earth, crustal field and disturbances included: the error model of Chulliat et al. 2020,
 *The US/UK World Magnetic Model for 2020-2025*), or by ``align.reference_sigma``. A total field further off
 than
-:data:`MAX_SIGMA` is not the Earth's. Without a position, it is compared with the extremes on the Earth.
+:data:`MAX_LEVEL_SIGMA` is not the Earth's. Without a position, it is compared with the extremes on the Earth.
 
 The reference bounds every error: while the field is more than :data:`FAR_SIGMA` off, sigma includes the
 difference, until it is less than :data:`NEAR_SIGMA`.
@@ -17,9 +17,9 @@ from typing import Final
 
 from magbridge.health.messages import Messages
 
-__all__ = ["FAR_SIGMA", "MAX_SIGMA", "NEAR_SIGMA", "LevelCheck"]
+__all__ = ["FAR_SIGMA", "MAX_LEVEL_SIGMA", "NEAR_SIGMA", "LevelCheck"]
 
-MAX_SIGMA: Final = 5.0
+MAX_LEVEL_SIGMA: Final = 5.0
 FAR_SIGMA: Final = 3.0
 NEAR_SIGMA: Final = 1.0
 """Sigmas of the total field about the main field."""
@@ -29,7 +29,7 @@ MAX_FIELD_NT: Final = 72_000.0
 MIN_WRONG_SAMPLES: Final = 3
 MIN_WRONG_US: Final = 8_000_000
 """Samples and time after which a wrong field is not a burst of bad readings."""
-HOLD_US: Final = 3_600_000_000
+LEVEL_HOLD_US: Final = 3_600_000_000
 """Time for which a wrong field that is over is remembered."""
 
 
@@ -63,7 +63,7 @@ class LevelCheck:
             return 0.0
         difference = total - reference
         squared = difference * difference / (reference_sigma * reference_sigma + sigma * sigma)
-        self._record(time_us, total, reference, squared > MAX_SIGMA * MAX_SIGMA)
+        self._record(time_us, total, reference, squared > MAX_LEVEL_SIGMA * MAX_LEVEL_SIGMA)
         if self._is_far and steady:
             self._is_far = squared > NEAR_SIGMA * NEAR_SIGMA
         self._is_far = self._is_far or squared > FAR_SIGMA * FAR_SIGMA
@@ -85,7 +85,7 @@ class LevelCheck:
         if self._wrong_samples == 1:
             self._since_us = time_us
         if self._wrong_samples >= MIN_WRONG_SAMPLES and time_us - self._since_us >= MIN_WRONG_US:
-            self.until_us = time_us + HOLD_US
+            self.until_us = time_us + LEVEL_HOLD_US
             expected = f"{MIN_FIELD_NT:.0f} to {MAX_FIELD_NT:.0f}" if isnan(reference) else f"{reference:.0f}"
             self._messages.report(
                 "level", f"field of {total:.0f} nT, expected {expected}: sensor or calibration"

@@ -29,7 +29,7 @@ __all__ = ["MIN_NOISE_NT", "Scatter"]
 
 MIN_NOISE_NT: Final = 0.1
 """No fluxgate's noise is lower."""
-STEP: Final = 1.02
+MEDIAN_FACTOR: Final = 1.02
 """Factor by which a sample moves the median of the second differences."""
 RUN_SAMPLES: Final = 6
 MAX_STEPS: Final = 12
@@ -54,8 +54,8 @@ FLOOR: Final = 1.125
 MAX_QUIET_RATIO: Final = 2.5
 """Ratio of the noise to the calibration's from which it is added to sigma, until it is half of that."""
 REPORTED_RATIO: Final = 5.0
-LAGS: Final = (1, 2, 4, 8)
-STORED: Final = 2 * LAGS[-1] + 1
+SCATTER_LAGS: Final = (1, 2, 4, 8)
+STORED: Final = 2 * SCATTER_LAGS[-1] + 1
 """Lags in intervals, of which the longest lag has eight, and samples stored for them."""
 TRAVEL_M: Final = 12.0
 """Distance that a vehicle covers within the longest lag, at most."""
@@ -85,7 +85,7 @@ class MedianDifference:
         self.run = self.run + weight if rising == self.is_rising else 0
         self.is_rising = rising
         steps = max(min(max(self.run - RUN_SAMPLES, 1), MAX_STEPS), START_STEPS // (self.count + 1))
-        self.median *= STEP**steps if rising else STEP**-steps
+        self.median *= MEDIAN_FACTOR**steps if rising else MEDIAN_FACTOR**-steps
         self.count += 1
 
     @property
@@ -124,7 +124,7 @@ class Scatter:
         self._next = MedianDifference()  # from sample to sample
         self._last = self._last_but_one = nan
         self._last_us = self._step_us = 0
-        self._lagged = tuple(MedianDifference() for _ in LAGS)
+        self._lagged = tuple(MedianDifference() for _ in SCATTER_LAGS)
         self._fields, self._times = [nan] * STORED, [0] * STORED
         self._place = 0
         self._ratio = 0.0  # of the lagged differences' variance to the model's
@@ -191,7 +191,7 @@ class Scatter:
         self._place = place = (self._place + 1) % STORED
         self._fields[place], self._times[place] = total, time_us
         self._ratio = 0.0
-        for lag, differences in zip(LAGS, self._lagged, strict=True):
+        for lag, differences in zip(SCATTER_LAGS, self._lagged, strict=True):
             middle, first = (place - lag) % STORED, (place - 2 * lag) % STORED
             late_us = time_us - self._times[middle]
             early_us = self._times[middle] - self._times[first]
@@ -201,7 +201,7 @@ class Scatter:
                     differences.update(difference)
             if differences.count >= MIN_COUNT:
                 certain = 1.0 + UNCERTAINTY / differences.count
-                crust = (MEDIAN_TO_SIGMA * CRUST_NT * (lag / LAGS[-1]) ** 2) ** 2
+                crust = (MEDIAN_TO_SIGMA * CRUST_NT * (lag / SCATTER_LAGS[-1]) ** 2) ** 2
                 excess = differences.variance / certain**2 - crust
                 self._ratio = max(self._ratio, excess / self._expected(late_us))
 

@@ -36,7 +36,7 @@ GATE_SIGMA: Final = 7.0
 GATE: Final = GATE_SIGMA * GATE_SIGMA
 CRUST_SIGMA_NT: Final = 145.0
 CRUST_LENGTH_M: Final = 1000.0
-CURVATURE: Final = 4.0 * (3.0**0.5 / CRUST_LENGTH_M) ** 3 * CRUST_SIGMA_NT**2
+CURVATURE_PER_SPEED_CUBED: Final = 4.0 * (3.0**0.5 / CRUST_LENGTH_M) ** 3 * CRUST_SIGMA_NT**2
 """nT²/m³: q is this times the speed cubed."""
 MIN_INTENSITY: Final = 1e-4
 """nT²/s³, q where the speed is not known: a slope of 0.05 nT/s that is forgotten within half a minute."""
@@ -44,7 +44,7 @@ SLOPE_NT_PER_S: Final = 0.5
 """1-sigma of the slope at the start."""
 ADAPTATION: Final = 0.02
 """By how much log q follows one normalised squared innovation."""
-MAX_SQUARE: Final = 16.0
+MAX_TREND_SQUARE: Final = 16.0
 """Normalised squared innovation that counts, at most."""
 AGREEING: Final = 3
 """Outliers that agree with each other are a jump; so many samples establish the trend at the start."""
@@ -59,7 +59,7 @@ BURST_SAMPLES: Final = 8
 samples of another is rather noise than a spike: the next sample is as bad."""
 LASTING_US: Final = 120_000_000
 """Duration after which a jump is not transient."""
-HOLD_US: Final = 60_000_000
+TREND_HOLD_US: Final = 60_000_000
 MAX_HOLD_US: Final = 3_600_000_000
 MAX_MOTION_HOLD_US: Final = 86_400_000_000
 """Time for which sigma remembers a jump that came back: at first, at most, and at most after motions."""
@@ -126,11 +126,11 @@ class TrendCheck:
     @property
     def crossing_speed(self) -> float:
         """Speed (m/s) at which a vehicle would cross a crustal field that changes as this one does."""
-        return float((exp(max(self._log_q, self._min_log_q)) / CURVATURE) ** (1.0 / 3.0))
+        return float((exp(max(self._log_q, self._min_log_q)) / CURVATURE_PER_SPEED_CUBED) ** (1.0 / 3.0))
 
     def set_speed(self, speed: float) -> None:
         """Record the vehicle's speed, m/s."""
-        floor = log(max(CURVATURE * min(speed, 300.0) ** 3, 0.1 * MIN_INTENSITY))
+        floor = log(max(CURVATURE_PER_SPEED_CUBED * min(speed, 300.0) ** 3, 0.1 * MIN_INTENSITY))
         if floor < self._min_log_q - LARGE_CHANGE:  # nothing was learned under the speed supposed so far
             self._log_q = floor + LARGE_CHANGE
         self._min_log_q, self._has_speed = floor, True
@@ -185,7 +185,7 @@ class TrendCheck:
             self._accepted = 0
             return 0.0
         self._now = predicted
-        self._adapt(MAX_SQUARE)
+        self._adapt(MAX_TREND_SQUARE)
         self._unrest = min(e * e, 16.0 * GATE * S)
         self._decay = BURST_DECAY if self._quiet < BURST_SAMPLES else SPIKE_DECAY
         self._quiet = 0
@@ -207,7 +207,7 @@ class TrendCheck:
             p_slope=max(predicted.p_slope - k_slope * predicted.p_cross, 0.0),
         )
         self._sigma, self.has_moved = sigma, False
-        self._adapt(min(e * e / S, MAX_SQUARE))
+        self._adapt(min(e * e / S, MAX_TREND_SQUARE))
         checkpoints = self._checkpoints
         if not checkpoints or not 0 <= predicted.time_us - checkpoints[-1].time_us < CHECKPOINT_US:
             checkpoints.append(self._now)
@@ -274,7 +274,7 @@ class TrendCheck:
         elif time_us - since_us > LASTING_US:
             until_us = max(until_us, time_us + min(time_us - since_us, MAX_HOLD_US))
         total = now.jump_sum + jump
-        hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (HOLD_US, MAX_HOLD_US)
+        hold, most = (MAX_HOLD_US, MAX_MOTION_HOLD_US) if by_motion else (TREND_HOLD_US, MAX_HOLD_US)
         until_us = max(until_us, time_us + min(hold << min(2 * now.jumps, 20), most))
         self._now = now._replace(
             jump_sum=total,

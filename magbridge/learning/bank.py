@@ -25,7 +25,7 @@ from typing import Final
 
 from magbridge.arrays import FloatArray
 from magbridge.learning.causes import Alarm
-from magbridge.learning.doubt import LEAST
+from magbridge.learning.doubt import LEARNING_ALARM_LOG_RATIO
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.judge import BEYOND_CHANCE
 from magbridge.learning.model import TEMPERATURE, Model
@@ -33,20 +33,20 @@ from magbridge.learning.nuisance import Nuisance
 
 __all__ = ["Bank"]
 
-MEMORY: Final = 2000.0
+BANK_MEMORY_SAMPLES: Final = 2000.0
 """Samples over which predictions are weighted (exponential forgetting)."""
 AHEAD: Final = 3.0
 """Lead in log w that changes the selected estimator. To leave the baseline estimator the lead has to reach
 :data:`BEYOND_CHANCE`, because quantities that no test observes, as the level, depend on the hypothesis."""
-MOST: Final = 25.0
+MAX_BANK_SQUARE: Final = 25.0
 """Largest v²/S that one sample contributes: an outlier does not distinguish the estimators."""
 CLOSE: Final = 10.0
 """Largest deficit in log w against an alarm's, which is the best of dozens of onsets and causes."""
 PER_DEGREE: Final = 2.0
 """Prior 1-sigma of the offset's change with temperature, nT/degC an axis."""
-RATE: Final = 5.0 / 3600.0
+DRIFT_SIGMA_NT_S: Final = 5.0 / 3600.0
 """Prior 1-sigma of the offset's drift, nT/s an axis."""
-CHANGES: Final = 2.0 * 3600.0
+DRIFT_CORRELATION_TIME_S: Final = 2.0 * 3600.0
 """Correlation time of the drift rate, s."""
 
 
@@ -98,7 +98,7 @@ class Bank:
             self._warm = len(self.all)
             self.all.append(warm)
         drifting = deepcopy(self.quiet)
-        drifting.drift(RATE, CHANGES)
+        drifting.drift(DRIFT_SIGMA_NT_S, DRIFT_CORRELATION_TIME_S)
         self.all.append(drifting)
         if self._mapless is not None:
             self.without_map = deepcopy(self.quiet)
@@ -115,8 +115,8 @@ class Bank:
         """Score each estimator's prediction at a time (s); return the map alarm, if there is one."""
         for k, one in enumerate(self.all):
             S = one.variance
-            self._weights[k] *= 1.0 - 1.0 / MEMORY
-            self._weights[k] -= 0.5 * (min(one.residual * one.residual / S, MOST) + log(S))
+            self._weights[k] *= 1.0 - 1.0 / BANK_MEMORY_SAMPLES
+            self._weights[k] -= 0.5 * (min(one.residual * one.residual / S, MAX_BANK_SQUARE) + log(S))
         with_map = [k for k, one in enumerate(self.all) if one is not self.without_map]
         ahead = max(with_map, key=self._weights.__getitem__)
         if self._weights[ahead] > self._weights[self._best] + (AHEAD if self._best else BEYOND_CHANCE):
@@ -127,7 +127,7 @@ class Bank:
         lead = self._weights[-1] - self._weights[best_with]
         if lead <= 0.0:
             self.map_doubted, self._since = False, time
-        self.map_doubted = self.map_doubted or lead > LEAST
+        self.map_doubted = self.map_doubted or lead > LEARNING_ALARM_LOG_RATIO
         if not self.map_doubted:
             return None
         return Alarm(("map_error",), ("",), self._since, abs(without.rock), lead, mapless=True)

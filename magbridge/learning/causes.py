@@ -7,9 +7,9 @@ from typing import Final, NamedTuple
 
 from magbridge.arrays import FloatArray, IndexArray
 
-__all__ = ["CAUSES", "FROM_ZERO", "NO_COEFFICIENT", "Alarm", "Cause", "Signs", "named"]
+__all__ = ["CAUSE_UNITS", "FROM_ZERO", "NO_COEFFICIENT", "Alarm", "Cause", "Signs", "named"]
 
-CAUSES: Final = {
+CAUSE_UNITS: Final = {
     "offset_step": 20.0,
     "offset_drift": 20.0,
     "temperature_offset": 2.0,

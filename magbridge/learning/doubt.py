@@ -30,23 +30,23 @@ from typing import Final
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.learning.causes import CAUSES, FROM_ZERO, NO_COEFFICIENT, Alarm, Cause, Signs
+from magbridge.learning.causes import CAUSE_UNITS, FROM_ZERO, NO_COEFFICIENT, Alarm, Cause, Signs
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.model import TEMPERATURE, Model
 
-__all__ = ["LEAST", "Doubt"]
+__all__ = ["LEARNING_ALARM_LOG_RATIO", "Doubt"]
 
-LEAST: Final = 18.0
+LEARNING_ALARM_LOG_RATIO: Final = 18.0
 """Alarm threshold h of the log-likelihood ratio. With eight causes there are 2.7 onsets a sample, so false
 alarms come at most once in ``e^18 / 2.7`` samples (3 years of 0.25 Hz) if the noise is as stated.
 ``tools/live.py`` counts them."""
-PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
+ONSET_PERIODS: Final = np.array([4, 16, 64, 256, 1024, 4096])
 """Samples after which an onset is replaced by a new one."""
 PROMISING: Final = 6.0
 """Log-likelihood ratio L from which on an onset is kept."""
 STANDS_OUT: Final = 3.0
 """Size of an innovation, in sigma, at which the first onset restarts."""
-COMPETING: Final = log(20.0)
+MAX_CAUSE_LOG_RATIO: Final = log(20.0)
 """Largest difference of L from the best cause at which another cause still fits."""
 NOISIER_OVER: Final = 3000
 """Averaging length, in samples, of the ratio of the innovations' variance to the predicted one."""
@@ -73,10 +73,10 @@ class Doubt:
             Cause("clock_offset", "", None),
             Cause("map_error", "", None),
         ]
-        self._causes = [cause for cause in causes for _ in PERIODS]
+        self._causes = [cause for cause in causes for _ in ONSET_PERIODS]
         names = [cause.name for cause in self._causes]
-        self._period = np.tile(PERIODS, len(causes))
-        self._unit = np.array([CAUSES[name] for name in names])
+        self._period = np.tile(ONSET_PERIODS, len(causes))
+        self._unit = np.array([CAUSE_UNITS[name] for name in names])
         self._since_onset = np.array([name not in FROM_ZERO for name in names], float)
         self._no_vector = np.array([name in NO_COEFFICIENT for name in names])
         self._noisier = 1.0
@@ -115,7 +115,7 @@ class Doubt:
         W = self._M + np.eye(3)
         self._amplitude = np.asarray(np.linalg.solve(W, self._y[:, :, None])[:, :, 0])
         self.statistic = 0.5 * np.sum(self._y * self._amplitude, axis=1) - 0.5 * np.log(np.linalg.det(W))
-        return self._alarm() if float(self.statistic.max()) > LEAST else None
+        return self._alarm() if float(self.statistic.max()) > LEARNING_ALARM_LOG_RATIO else None
 
     def updated(self, gain: FloatArray) -> None:
         """Subtract the part that the estimator absorbed in its update with `gain` (n,)."""
@@ -125,11 +125,11 @@ class Doubt:
         """Return (rows, 3) residual of one unit of each cause; restart the onsets that have expired."""
         self._now = signs.time
         now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
-        regressor = np.repeat(np.nan_to_num(np.array(now)), len(PERIODS))
+        regressor = np.repeat(np.nan_to_num(np.array(now)), len(ONSET_PERIODS))
         self._count += 1
         over = (self._count > self._period) & (self.statistic < PROMISING)
         if stands_out:
-            over[:: len(PERIODS)] |= self.statistic[:: len(PERIODS)] < PROMISING
+            over[:: len(ONSET_PERIODS)] |= self.statistic[:: len(ONSET_PERIODS)] < PROMISING
         begins = np.flatnonzero(over)
         if begins.size:
             self._M[begins] = self._raw[begins] = 0.0
@@ -146,7 +146,7 @@ class Doubt:
     def _fitting(self) -> list[int]:
         """The rows that fit, the likeliest first."""
         order = np.argsort(-self.statistic, kind="stable").tolist()
-        return [row for row in order if self.statistic[row] > self.statistic[order[0]] - COMPETING]
+        return [row for row in order if self.statistic[row] > self.statistic[order[0]] - MAX_CAUSE_LOG_RATIO]
 
     def _alarm(self) -> Alarm:
         fits = self._fitting

@@ -23,23 +23,23 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.learning.nuisance import STATES, Nuisance
 
-__all__ = ["BESIDE", "SLOPE", "Estimator"]
+__all__ = ["BESIDE", "SLOPE_STATES", "Estimator"]
 
-SLOPE: Final = 3
+SLOPE_STATES: Final = 3
 """States of the offset's slope."""
-BESIDE: Final = SLOPE + STATES
+BESIDE: Final = SLOPE_STATES + STATES
 """Number of states that are not coefficients."""
 TELLING: Final = 0.01
 """Fraction of a prediction's variance that comes from the coefficients and varies along the track: from here
 on the sample is informative about the coefficients."""
-NEAR: Final = 250.0
+AVERAGING_DISTANCE_M: Final = 250.0
 """Averaging distance of the mean derivative, m: a quarter of the crustal field's correlation length. Faster
 variations are not attributed to the crustal field."""
-LONG: Final = 1000
+MEAN_SAMPLES: Final = 1000
 """Samples over which the mean derivative of the total field is averaged."""
 CHANGED: Final = 2.0
 """Change of the level, in sigma, from which on it counts as a change."""
-LASTING: Final = 24.0 * 3600.0
+SLOPE_MEMORY_S: Final = 24.0 * 3600.0
 """Time in which the variance of a drift's slope grows by a factor of e, s. A drift changes, but a drift that
 was estimated as zero does not restart by itself."""
 STEEPEST: Final = 20.0 / 3600.0
@@ -83,9 +83,9 @@ class Estimator:
         self._P = np.zeros((self.states, self.states))
         self._P[:K, :K] = covariance
         self._P[-STATES:, -STATES:] = nuisance.initial
-        self.offsets, self.slope = offsets, np.arange(K, K + SLOPE)
+        self.offsets, self.slope = offsets, np.arange(K, K + SLOPE_STATES)
         self._nuisance, self._creep = nuisance, creep
-        self._sloping, self._lasting = False, LASTING
+        self._sloping, self._lasting = False, SLOPE_MEMORY_S
         self._near: FloatArray | None = None
         self._mean, self._share, self._kept = np.zeros(K), 0.0, np.zeros(K)
         self._stay = 1.0
@@ -120,8 +120,8 @@ class Estimator:
 
     def follow(self, s: float) -> None:
         """Follow how the total field changes with the coefficients; s is the last residual's scale."""
-        self._mean += (s * self._h[: self.size] - self._mean) / LONG
-        self._share += (1.0 - self._share) / LONG
+        self._mean += (s * self._h[: self.size] - self._mean) / MEAN_SAMPLES
+        self._share += (1.0 - self._share) / MEAN_SAMPLES
 
     @property
     def mean(self) -> FloatArray:
@@ -190,7 +190,7 @@ class Estimator:
                 known < STEEPEST * STEEPEST, known * (1.0 + seconds / self._lasting), known
             )
         self.open(self._creep * self._creep * seconds)
-        self._stay = exp(-metres / NEAR)
+        self._stay = exp(-metres / AVERAGING_DISTANCE_M)
         return F
 
     def predict(self, e: float, s: float, by_coefficients: FloatArray) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.learning.causes import Alarm
-from magbridge.learning.doubt import LEAST
+from magbridge.learning.doubt import LEARNING_ALARM_LOG_RATIO
 from magbridge.learning.observation import Observation
 from magbridge.records import Vector
 
@@ -31,13 +31,13 @@ __all__ = ["Hindsight", "Kept"]
 
 LATE_US: Final = (8_000_000, 16_000_000, 32_000_000)
 """µs, d: shorter ones are those of telemetry that comes seldom."""
-NEAR: Final = 0.25
+MAX_DELAY_ERROR: Final = 0.25
 """By how much of d a later report may be off."""
-SHARE: Final = 0.4
+DELAY_UNCERTAINTY: Final = 0.4
 """w: the next d is the double."""
-MOST: Final = 36.0
+MAX_HINDSIGHT_SQUARE: Final = 36.0
 """v²/S at most: two samples are needed in any case, and the last before a motion is none of them."""
-MANY: Final = 41
+MAX_STORED_SAMPLES: Final = 41
 """Samples kept, at most one a second."""
 MOVED: Final = 0.01
 """Of its scale, by which a parameter has moved."""
@@ -63,7 +63,7 @@ class Hindsight:
 
     def restart(self) -> None:
         """Forget all evidence."""
-        self._kept: deque[Kept] = deque(maxlen=MANY)
+        self._kept: deque[Kept] = deque(maxlen=MAX_STORED_SAMPLES)
         self._ratio = [0.0] * len(LATE_US)
         self._square = [0.0] * len(LATE_US)
         self._count = [0] * len(LATE_US)
@@ -96,14 +96,14 @@ class Hindsight:
                 continue
             then, now = (observe(one.field, at, one.reference).e for at in (one.phi, phi))
             S = one.variance
-            more = S + (SHARE * (now - then)) ** 2
-            v = min(one.innovation**2 / S, MOST)
+            more = S + (DELAY_UNCERTAINTY * (now - then)) ** 2
+            v = min(one.innovation**2 / S, MAX_HINDSIGHT_SQUARE)
             late = (one.innovation + now - then) ** 2 / more + log(more / S)
             if self._ratio[k] == 0.0:
                 self._square[k], self._count[k], self._since_us[k] = 0.0, 1, one.time_us
             self._ratio[k] = max(0.0, self._ratio[k] + 0.5 * (v - late))
             self._square[k] += (now - then) ** 2 * (v > late)
-            if self._ratio[k] > LEAST:
+            if self._ratio[k] > LEARNING_ALARM_LOG_RATIO:
                 size = sqrt(self._square[k] / self._count[k])
                 return Alarm(("clock_offset",), ("",), self._since_us[k] * 1e-6, size, self._ratio[k])
         return None
@@ -112,6 +112,6 @@ class Hindsight:
         """Return the stored sample that the present report would match at the k-th d, or None."""
         late_us = LATE_US[k]
         one = min(self._kept, key=lambda one: abs(time_us - one.time_us - late_us), default=None)
-        if one is None or abs(time_us - one.time_us - late_us) > NEAR * late_us:
+        if one is None or abs(time_us - one.time_us - late_us) > MAX_DELAY_ERROR * late_us:
             return None
         return one if one.time_us > self._tested_us[k] else None

@@ -27,14 +27,14 @@ __all__ = ["BEYOND_CHANCE", "FIRST", "LEARNED", "Judge"]
 FIRST, LEARNED = range(2)
 BEYOND_CHANCE: Final = 13.5
 """h: once in 30 days of 0.25 Hz."""
-MOST: Final = 4.0
+MAX_JUDGE_SQUARE: Final = 4.0
 """Largest contribution of one sample: an outlier does not distinguish the calibrations."""
-MARGIN: Final = 0.01
+MIN_ADVANTAGE: Final = 0.01
 """Least advantage of the learned calibration for each sample: an error of 0.14 sigma that only the first
 calibration makes. No calibration is exact. A smaller advantage becomes significant over thousands of similar
 samples, but does not hold for different ones, and quantities that predictions do not show, as the level, may
 get worse."""
-MEMORY: Final = 500
+JUDGE_MEMORY_SAMPLES: Final = 500
 """Samples over which mean squares are followed."""
 
 
@@ -95,14 +95,14 @@ class Judge:
             self._fresh = False
             return
         self._judged += 1
-        share = 1.0 / min(self._judged, MEMORY)
+        share = 1.0 / min(self._judged, JUDGE_MEMORY_SAMPLES)
         square = np.array([v * v, innovation * innovation])
         self.mean_square += share * (square - self.mean_square)
         square /= (S, variance)
         self._noisier += share * (np.minimum(square, 25.0) - self._noisier)
         first, learned = (square / max(1.0, float(self._noisier.min()))).tolist()
-        won = min(max(0.5 * (first - learned + log(S / variance)), -MOST), MOST)
-        self.better = max(0.0, self.better + won - MARGIN)
+        won = min(max(0.5 * (first - learned + log(S / variance)), -MAX_JUDGE_SQUARE), MAX_JUDGE_SQUARE)
+        self.better = max(0.0, self.better + won - MIN_ADVANTAGE)
         self.worse = max(0.0, self.worse - won)
 
     @property

@@ -28,7 +28,7 @@ LINEAR: Final = 300.0
 """Offset uncertainty from which on the batch fit repeats the whole estimate, nT, 1-sigma of an axis."""
 CREEP: Final = 3.0 / 86_400.0**0.5
 """nT per square root of a second: an offset walks by 3 nT a day."""
-OUTLIER: Final = 5.0
+LEARNING_OUTLIER_SIGMA: Final = 5.0
 AGREE: Final = 3
 """An innovation beyond so many sigmas says nothing, unless it is the third in a row."""
 
@@ -143,7 +143,7 @@ class Knowledge:
         if self.start is not None:
             return False
         best = self.bank.best
-        far = abs(best.residual) > OUTLIER * best.sigma
+        far = abs(best.residual) > LEARNING_OUTLIER_SIGMA * best.sigma
         self._outliers = self._outliers + 1 if far else 0
         return far and self._outliers < AGREE and not learnable
 

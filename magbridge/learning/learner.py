@@ -15,7 +15,7 @@ from magbridge.learning.judge import FIRST, LEARNED
 from magbridge.learning.knowledge import Knowledge
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
-from magbridge.learning.publication import NONE, Publication
+from magbridge.learning.publication import NO_METHOD, Publication
 from magbridge.learning.report import Notice, State
 from magbridge.learning.standing import Standing
 from magbridge.records import Quality, Vector
@@ -79,7 +79,7 @@ class Learner:
     ) -> None:
         self._model = Model(calibration, currents)
         self.watched = self._model.watched
-        self._unfit = UNFIT if calibration.method == NONE else UNFIT | int(Quality.UNCALIBRATED)
+        self._unfit = UNFIT if calibration.method == NO_METHOD else UNFIT | int(Quality.UNCALIBRATED)
         self._grid, self._max_rate, self._turn_on = grid, max_rate, turn_on
         self.enabled, self.frozen = True, False
         self.notices: list[Notice] = []

@@ -16,11 +16,11 @@ from magbridge.learning.judge import FIRST, LEARNED, Judge
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
 
-__all__ = ["NONE", "Publication"]
+__all__ = ["NO_METHOD", "Publication"]
 
-NONE: Final = "none"
+NO_METHOD: Final = "none"
 """The method of a calibration that is none."""
-APART: Final = 0.3
+MAX_PUBLISHED_DIFFERENCE: Final = 0.3
 """Difference of learned and published total field that causes an update, as a fraction of the noise."""
 RENEW: Final = 32, 256
 """Samples after which it may be, and is in any case."""
@@ -75,7 +75,7 @@ class Publication:
         first, coefficients, method = self.first, estimator.coefficients, self.first.method
         covariance, level = estimator.covariance, first.level
         reference = first.reference
-        if first.method == NONE:
+        if first.method == NO_METHOD:
             method = "learned"
             if self.learned:
                 coefficients = estimator.at_level_of(self.coefficients)
@@ -95,7 +95,7 @@ class Publication:
     def stale(self, apart: float) -> bool:
         """Return True if `apart`, learned less published total field (nT), requires an update."""
         least, most = RENEW
-        far = abs(apart) > APART * self.calibration.noise.sensor
+        far = abs(apart) > MAX_PUBLISHED_DIFFERENCE * self.calibration.noise.sensor
         return self.learned and ((far and self.age >= least) or self.age >= most)
 
     def renew(self, calibration: Calibration) -> None:
@@ -130,6 +130,6 @@ class Publication:
         self.renewed = False
         rms = np.sqrt(self.judge.mean_square)
         said = f"{how} {calibration_id(self.calibration):08x}"
-        if before == FIRST and self.first.method == NONE:  # no errors to compare with
+        if before == FIRST and self.first.method == NO_METHOD:  # no errors to compare with
             return f"{said} from nothing"
         return f"{said}: {rms[before]:.1f} to {rms[after]:.1f} nT"

@@ -11,12 +11,12 @@ __all__ = ["Standing"]
 
 SURE: Final = 6.0
 """Least growth of an alarm's log-likelihood ratio before its cause is learned (6 = a factor of 400)."""
-COMPETING: Final = 3.0
+LOG_RATIO_PER_CAUSE: Final = 3.0
 """Additional growth required for each further cause that fits: more evidence often excludes causes, whereas
 separating them after all were learned takes hours."""
-PATIENCE: Final = 128
+MAX_WAIT_SAMPLES: Final = 128
 """Informative samples for each cause that fits, after which the decision is made at the latest."""
-MORE: Final = 2.0
+MIN_ALARM_GROWTH: Final = 2.0
 """Least growth of an alarm's log-likelihood ratio that updates the alarm."""
 QUIET: Final = 300
 """Informative samples without an alarm after which its cause is cleared."""
@@ -24,7 +24,7 @@ QUIET: Final = 300
 
 SLOWER: Final = 4
 """Factor by which each relapse multiplies the evidence and the samples required."""
-SEEN: Final = 16.0
+SIGNIFICANT_SQUARE: Final = 16.0
 """Squared normalised error from which on a prediction error is significant."""
 
 
@@ -74,7 +74,7 @@ class Standing:
             if alarm.mapless and before.causes == alarm.causes:
                 self.alarm, self._quiet = alarm, 0
             return ""  # a map error explains every further alarm
-        if before is not None and not anew and alarm.strength < before.strength + MORE:
+        if before is not None and not anew and alarm.strength < before.strength + MIN_ALARM_GROWTH:
             return ""
         if anew and self._explained <= QUIET:
             self.relapses += 1
@@ -110,7 +110,7 @@ class Standing:
         self._quiet += telling
         self._doubted += telling
         self._explained += telling
-        seen = error * error - SEEN * variance
+        seen = error * error - SIGNIFICANT_SQUARE * variance
         self._peak = max(self._peak * (1.0 - telling / QUIET), seen)
         if self.relapses and seen > 0.0:
             self._quiet = 0
@@ -142,7 +142,7 @@ class Standing:
         if self.alarm is None or self.tried or not self.learnable:
             return False
         fit, slower = len(self.alarm.channels), self._slower
-        sure = self.alarm.strength > self._sure + slower * COMPETING * (fit - 1)
+        sure = self.alarm.strength > self._sure + slower * LOG_RATIO_PER_CAUSE * (fit - 1)
         if self._mapped and "map_error" in self.alarm.causes:
             sure = False  # maps have sheets: the attitudes to come tell an offset from another level
-        return sure or self._doubted > slower * PATIENCE * fit
+        return sure or self._doubted > slower * MAX_WAIT_SAMPLES * fit

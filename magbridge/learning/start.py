@@ -23,18 +23,18 @@ from magbridge.learning.nuisance import STATES, Nuisance
 from magbridge.learning.observation import Observation, observe
 from magbridge.records import Vector
 
-__all__ = ["LAST", "Fitted", "Start", "class_prior"]
+__all__ = ["LAST_FIT_SAMPLES", "Fitted", "Start", "class_prior"]
 
 FIRST: Final = 32
-LAST: Final = 4096
+LAST_FIT_SAMPLES: Final = 4096
 """Samples at which they are fitted first and last: 2 minutes and 4.5 hours of 0.25 Hz."""
-STEPS: Final = 12
+MAX_GAUSS_NEWTON_STEPS: Final = 12
 """Of Gauss-Newton, at most."""
-SMALL: Final = 0.01
+MIN_STEP_SIGMA: Final = 0.01
 """Prior sigmas: a step this small is the last."""
 NOISE: Final = 2.0
 """nT, 1-sigma of a channel's noise, until the samples say more."""
-ENOUGH: Final = 256
+MIN_SAMPLES_FOR_NOISE: Final = 256
 """Samples from which on they do."""
 
 
@@ -119,22 +119,22 @@ class Start:
     @property
     def over(self) -> bool:
         """Whether a filter can go on alone."""
-        return len(self._samples) >= LAST
+        return len(self._samples) >= LAST_FIT_SAMPLES
 
     def fit(self, coefficients: FloatArray, nuisance: Nuisance) -> Fitted:
         """Fit all samples, beginning at `coefficients` (K,)."""
         c, z = coefficients, np.full(self._root.shape[1], np.inf)
-        for _ in range(STEPS):
+        for _ in range(MAX_GAUSS_NEWTON_STEPS):
             r, J, nuisances, B, Pb = self._whitened(c, nuisance)
             JL = J @ self._root
             H = np.eye(JL.shape[1]) + JL.T @ JL
             before, z = z, np.asarray(np.linalg.solve(H, -JL.T @ (r + J @ (self._prior - c))))
             step = self._prior + self._root @ z - c
             c, nuisances, r = c + step, nuisances + B @ step, r + J @ step
-            if float(np.abs(z - before).max()) < SMALL:
+            if float(np.abs(z - before).max()) < MIN_STEP_SIGMA:
                 break
         rms = float(np.sqrt(np.mean(r * r)))
-        noise = float(np.sqrt(nuisance.white_variance)) * (rms if len(r) >= ENOUGH else 1.0)
+        noise = float(np.sqrt(nuisance.white_variance)) * (rms if len(r) >= MIN_SAMPLES_FOR_NOISE else 1.0)
         both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
         covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
         covariance[-STATES:, -STATES:] += Pb

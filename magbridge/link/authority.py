@@ -11,7 +11,7 @@ from magbridge.mavlink.enums import MAV_SEVERITY, MAV_TYPE
 
 __all__ = ["Authority", "Sources"]
 
-REMEMBERED = 64
+MAX_COMPONENTS = 64
 """Components whose kind is remembered."""
 
 
@@ -36,7 +36,7 @@ class Authority:
         kind: int = message["type"]
         self._kinds.pop((message.system, message.component), None)
         self._kinds[message.system, message.component] = kind
-        if len(self._kinds) > REMEMBERED:
+        if len(self._kinds) > MAX_COMPONENTS:
             del self._kinds[next(iter(self._kinds))]
         return kind == MAV_TYPE.GCS
 

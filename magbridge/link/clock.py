@@ -7,7 +7,7 @@ from math import nan, sqrt
 
 __all__ = ["VehicleClock"]
 
-WINDOW = 32
+CLOCK_EXCHANGES = 32
 """Latest exchanges that are used."""
 JITTER_US = 200.0
 """µs, the uncertainty of even the fastest exchange."""
@@ -37,7 +37,7 @@ class VehicleClock:
     def reset(self) -> None:
         """Forget everything: the vehicle's clock restarted or was set."""
         self._asked: deque[int] = deque(maxlen=PENDING)
-        self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=WINDOW)
+        self._exchanges: deque[tuple[int, int, int]] = deque(maxlen=CLOCK_EXCHANGES)
         self._base_us = self._middle_us = 0
         self._offset, self._slope = 0.0, 0.0
         self.sigma = nan

@@ -12,7 +12,7 @@ from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
 __all__ = ["Commands"]
 
-OURS = 60100
+FIRST_DIALECT_ID = 60100
 """The first message id of our dialect: no other component of the vehicle has these messages."""
 CALIBRATES = {MAV_CMD.PREFLIGHT_CALIBRATION, *(one for one in MAV_CMD if "MAG_CAL" in one.name)}
 ABOUT_MESSAGES = MAV_CMD.REQUEST_MESSAGE, MAV_CMD.SET_MESSAGE_INTERVAL, MAV_CMD.GET_MESSAGE_INTERVAL
@@ -115,7 +115,7 @@ class Commands:
 
     def _only_us(self, number: int, first: float) -> bool:
         about_message = number in ABOUT_MESSAGES
-        return about_message and first >= OURS and first in self._messages
+        return about_message and first >= FIRST_DIALECT_ID and first in self._messages
 
     def _request(self, values: list[float]) -> MAV_RESULT:
         if values[0] == MESSAGE_INTERVAL:  # the successor of GET_MESSAGE_INTERVAL

@@ -10,7 +10,7 @@ from magbridge.config import Link
 from magbridge.link import metadata
 from magbridge.link.authority import Authority
 from magbridge.link.commands import Commands
-from magbridge.link.message_rates import DEFAULTS, LIMITS, MessageRates
+from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS, MessageRates
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.link.parameter_service import ParameterService
 from magbridge.link.parameters import Parameters, Tunable, rates
@@ -104,7 +104,7 @@ class Component:
             (link.system, link.autopilot), streams or {}, self.outbox, self.timers, self.announcer
         )
         self.vehicle.on_reboot = self.streams.rebooted
-        self.parameters = Parameters([*rates({**DEFAULTS, **publish}, LIMITS), *tunables])
+        self.parameters = Parameters([*rates({**DEFAULT_RATES_HZ, **publish}, LIMITS), *tunables])
         for name in self.parameters.restore(kept or {}):
             self.announcer.send_statustext(
                 f"kept parameter {name} does not fit: default", MAV_SEVERITY.WARNING

@@ -16,7 +16,7 @@ from magbridge.link.output import Outbox
 from magbridge.mavlink.enums import GLOBAL_POSITION_SRC, MAV_AUTOPILOT, MAV_CMD, MAV_ESTIMATOR_TYPE, MAV_FRAME
 from magbridge.mavlink.messages import east_e7
 
-__all__ = ["FIXES", "SENSOR_ID", "Fix", "Kind", "Pose", "widened"]
+__all__ = ["FIX_MESSAGES", "SENSOR_ID", "Fix", "Kind", "Pose", "widened"]
 
 SENSOR_ID = 1
 """GLOBAL_POSITION_SENSOR.id; PX4 takes the one that ``EKF2_AGPn_ID`` names, and 0 is off."""
@@ -201,7 +201,7 @@ class Kind(NamedTuple):
         return widened(fix, 1.0 / max(self.rate, self.least)).sigma > self.trusted_to
 
 
-FIXES: dict[str, Kind] = {
+FIX_MESSAGES: dict[str, Kind] = {
     "EXTERNAL_POSITION_ESTIMATE": Kind(external_position, 0.0, {}, fused=False),
     "GLOBAL_POSITION_SENSOR": Kind(
         global_position,

@@ -17,17 +17,17 @@ from magbridge.link.tree import Entry, Tree
 
 __all__ = ["DATA", "Error", "FtpServer", "Opcode", "Request"]
 
-HEADER = Struct("<HBBBBBxI")
+FTP_HEADER = Struct("<HBBBBBxI")
 """Sequence, session, opcode, size, opcode replied to, whether the burst is complete, offset."""
 DATA = 239
 """Most bytes of data in a message."""
 SESSIONS, EACH = 16, 8
 """Most files open at once, and most of one station."""
-STALE = 10.0
+SESSION_TIMEOUT_S = 10.0
 """s after its last request at which a session may be closed, when another is wanted."""
 BURST = 256
 """Most messages of a burst; the station then asks for the next."""
-BLOCK = 1 << 20
+FTP_BLOCK_BYTES = 1 << 20
 
 Sender = tuple[int, int]
 """System and component."""
@@ -86,8 +86,8 @@ class Request(NamedTuple):
     @classmethod
     def of(cls, payload: bytes) -> Request:
         """Parse the payload of a FILE_TRANSFER_PROTOCOL."""
-        sequence, session, opcode, size, _, _, offset = HEADER.unpack_from(payload)
-        return cls(sequence, session, opcode, size, offset, payload[HEADER.size : HEADER.size + DATA])
+        sequence, session, opcode, size, _, _, offset = FTP_HEADER.unpack_from(payload)
+        return cls(sequence, session, opcode, size, offset, payload[FTP_HEADER.size : FTP_HEADER.size + DATA])
 
     @property
     def path(self) -> str:
@@ -99,11 +99,11 @@ class Request(NamedTuple):
         offset: int | None = None, complete: bool = False,
     ) -> bytes:  # fmt: skip
         """Return the payload of a reply, the `ahead`-th to this request."""
-        header = HEADER.pack(
+        header = FTP_HEADER.pack(
             (self.sequence + ahead) & 0xFFFF, self.session if session is None else session, opcode, len(data),
             self.opcode, complete, self.offset if offset is None else offset,
         )  # fmt: skip
-        return (header + data).ljust(HEADER.size + DATA, b"\0")
+        return (header + data).ljust(FTP_HEADER.size + DATA, b"\0")
 
 
 class Session:
@@ -170,9 +170,9 @@ class FtpServer:
     @staticmethod
     def refusal(reply: bytes) -> str:
         """Return in words why a reply refuses; empty where it grants, or the end of a file was reached."""
-        if reply[3] != Opcode.NAK or reply[HEADER.size] == Error.END_OF_FILE:
+        if reply[3] != Opcode.NAK or reply[FTP_HEADER.size] == Error.END_OF_FILE:
             return ""
-        return Error(reply[HEADER.size]).name.lower().replace("_", " ")
+        return Error(reply[FTP_HEADER.size]).name.lower().replace("_", " ")
 
     def close(self) -> None:
         """Close all files."""
@@ -231,7 +231,7 @@ class FtpServer:
             file, _size = self._tree.open(request.path)
         total = 0
         with file:
-            while data := file.read(BLOCK):
+            while data := file.read(FTP_BLOCK_BYTES):
                 total = crc32(data, total)
         return request.reply(Opcode.ACK, total.to_bytes(4, "little"))
 
@@ -274,7 +274,7 @@ class FtpServer:
         crowd = own if len(own) >= EACH else list(self._sessions) if len(self._sessions) >= SESSIONS else []
         if crowd:
             oldest: tuple[Sender, int] = min(crowd, key=lambda key: self._sessions[key].used)
-            if self._now() - self._sessions[oldest].used < STALE:
+            if self._now() - self._sessions[oldest].used < SESSION_TIMEOUT_S:
                 raise Refused(Error.NO_SESSIONS)
             self._close(oldest)
         taken = {number for who, number in self._sessions if who == sender}

@@ -11,9 +11,9 @@ from magbridge.mavlink import Spec, spec
 __all__ = ["LogTransfer"]
 
 ENTRY, DATA = spec("LOG_ENTRY"), spec("LOG_DATA")
-SIZE = DATA.fields["data"].count
-BLOCK = 256 * SIZE
-LAST = 0xFFFF
+LOG_DATA_BYTES = DATA.fields["data"].count
+LOG_BLOCK_BYTES = 256 * LOG_DATA_BYTES
+LAST_LOG_ID = 0xFFFF
 
 
 class LogTransfer:
@@ -29,7 +29,7 @@ class LogTransfer:
     def entries(self, start: int, end: int) -> Iterator[tuple[Spec, bytes]]:
         """Yield the LOG_ENTRY of each log from `start` to `end`; one with no logs where there are none."""
         with suppress(OSError):
-            self._logs = self._tree.logs()[-LAST:]
+            self._logs = self._tree.logs()[-LAST_LOG_ID:]
         count = len(self._logs)
         if not count:
             yield ENTRY, ENTRY.payload()
@@ -45,7 +45,7 @@ class LogTransfer:
         """
         if not self._logs:
             with suppress(OSError):
-                self._logs = self._tree.logs()[-LAST:]
+                self._logs = self._tree.logs()[-LAST_LOG_ID:]
         end = offset + count
         try:
             name = self._logs[number - 1].name if 0 < number <= len(self._logs) else ""
@@ -56,13 +56,13 @@ class LogTransfer:
         with file:
             while offset < end:
                 file.seek(offset)
-                block = file.read(min(BLOCK, end - offset)) or b""
-                for at in range(0, len(block), SIZE):
-                    piece = block[at : at + SIZE]
+                block = file.read(min(LOG_BLOCK_BYTES, end - offset)) or b""
+                for at in range(0, len(block), LOG_DATA_BYTES):
+                    piece = block[at : at + LOG_DATA_BYTES]
                     fields = {"id": number, "ofs": offset + at, "count": len(piece)}
-                    yield DATA, DATA.payload(**fields, data=piece.ljust(SIZE, b"\0"))
+                    yield DATA, DATA.payload(**fields, data=piece.ljust(LOG_DATA_BYTES, b"\0"))
                 offset += len(block)
-                if len(block) < BLOCK and offset < end:
-                    if not len(block) % SIZE:
+                if len(block) < LOG_BLOCK_BYTES and offset < end:
+                    if not len(block) % LOG_DATA_BYTES:
                         yield DATA, DATA.payload(id=number, ofs=offset)
                     return

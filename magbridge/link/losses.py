@@ -9,10 +9,10 @@ from magbridge.mavlink.enums import MAV_SEVERITY
 
 __all__ = ["Losses", "Numbers"]
 
-WINDOW: Final = 64
+LATE_FRAMES: Final = 64
 """Frames by which one may come late and no longer count as lost."""
-ALL: Final = (1 << WINDOW) - 1
-LOOK_US = 10_000_000
+ALL_FRAMES: Final = (1 << LATE_FRAMES) - 1
+LOSS_INTERVAL_US = 10_000_000
 """µs over which a share is computed."""
 MANY, LEAST = 0.01, 3
 """The share, and the number, of lost frames above which it is announced."""
@@ -40,14 +40,14 @@ class Numbers:
         """Count a frame; one that comes late is no longer lost, and a duplicate changes nothing."""
         self.received += 1
         ahead = (number - self._last + 128) % 256 - 128
-        if -WINDOW < ahead <= 0:
+        if -LATE_FRAMES < ahead <= 0:
             late = self._missing & 1 << -ahead
             self.lost -= late != 0
             self._missing ^= late
             return
         # far behind: the sender restarted
         self.lost += max(ahead - 1, 0)
-        self._missing = (self._missing << ahead | (1 << ahead) - 2) & ALL if ahead > 0 else 0
+        self._missing = (self._missing << ahead | (1 << ahead) - 2) & ALL_FRAMES if ahead > 0 else 0
         self._last = number
 
 
@@ -73,7 +73,7 @@ class Losses:
             if len(self._numbers) >= WATCHED:
                 return
             if not self._numbers:
-                self._timers.every("losses", LOOK_US, self._look, t_us + LOOK_US)
+                self._timers.every("losses", LOSS_INTERVAL_US, self._look, t_us + LOSS_INTERVAL_US)
             numbers = self._numbers[component] = Numbers(number)
         numbers.count(number)
 

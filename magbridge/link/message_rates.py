@@ -11,7 +11,7 @@ from magbridge.link.parameters import Parameters, rate_name
 from magbridge.link.publish import PUBLISHED
 from magbridge.mavlink import Codec, spec
 
-__all__ = ["DEFAULTS", "LIMITS", "MessageRates", "check_publish"]
+__all__ = ["DEFAULT_RATES_HZ", "LIMITS", "MessageRates", "check_publish"]
 
 LIMITS = {
     "HEARTBEAT": (0.2, 10.0),
@@ -21,7 +21,7 @@ LIMITS = {
     **dict.fromkeys(PUBLISHED, (-1.0, 1000.0)),
 }
 """The messages whose rate (Hz) can be set, and within which limits."""
-DEFAULTS = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
+DEFAULT_RATES_HZ = {"HEARTBEAT": 1.0, "MAG_STATUS": 1.0, "MAG_NAVIGATION": 0.0, "MAG_LEARNING": 0.1}
 LONGEST_US = 0x7FFFFFFF
 """µs, 36 min: the longest interval that a MESSAGE_INTERVAL holds."""
 

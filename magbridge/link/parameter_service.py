@@ -12,7 +12,7 @@ __all__ = ["ParameterService"]
 
 PACE_US = 20_000
 """µs between the values of a list: 50 a second, which a slow radio can carry."""
-REPEAT_US = 10_000_000
+LIST_INTERVAL_US = 10_000_000
 """µs between two lists that no station requested."""
 FORGOTTEN_US = 60_000_000
 """µs without a heartbeat after which a station is new again."""
@@ -75,7 +75,7 @@ class ParameterService:
         self._unasked -= 1
         if self._unasked:
             self._begin()
-            self._timers.once("parameters unasked", time_us + REPEAT_US, self._list_unasked)
+            self._timers.once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
         """Begin to send all parameters, one every `PACE_US`; of a list under way, the rest comes first."""

@@ -17,7 +17,7 @@ from magbridge.records import Corrected
 __all__ = ["PUBLISHED", "Publisher"]
 
 RAW: Final = spec("MAG_RAW")
-FIELD: Final = spec("MAG_FIELD")
+FIELD_MESSAGE: Final = spec("MAG_FIELD")
 IMU: Final = spec("HIGHRES_IMU")
 IMU_FIELD: Final = Struct("<Q24x3f16xHB")
 """HIGHRES_IMU without accelerations, rotations, pressures, altitude and temperature, which are zero."""
@@ -25,11 +25,11 @@ NAMED: Final = spec("NAMED_VALUE_FLOAT")
 VECTOR: Final = spec("DEBUG_VECT")
 MAGNETOMETER: Final = 0x1C0
 """HIGHRES_IMU.fields_updated: xmag, ymag, zmag."""
-GAUSS: Final = 1e-5
+GAUSS_PER_NT: Final = 1e-5
 """Gauss in 1 nT."""
 MASK: Final = 0xFFFFFFFF
-SATURATED: Final = int(MAG_RAW_FLAGS.SATURATED)
-COUNTS: Final = int(MAG_RAW_FLAGS.COUNTS)
+RAW_SATURATED_FLAG: Final = int(MAG_RAW_FLAGS.SATURATED)
+COUNTS_FLAG: Final = int(MAG_RAW_FLAGS.COUNTS)
 SEQUENCE: Final = int(MAG_RAW_FLAGS.SEQUENCE)
 POWER_CYCLE: Final = int(MAG_RAW_FLAGS.POWER_CYCLE)
 NO_COUNTS: Final = (0, 0, 0)
@@ -98,9 +98,9 @@ class Publisher:
         """Return the payload of a sample's MAG_RAW."""
         reading = sample.reading
         counts, sequence, cycle = reading.counts, reading.sequence, reading.power_cycle
-        flags = SATURATED if reading.saturated else 0
+        flags = RAW_SATURATED_FLAG if reading.saturated else 0
         if counts is not None:
-            flags |= COUNTS
+            flags |= COUNTS_FLAG
         if sequence is not None:
             flags |= SEQUENCE
         if cycle is not None:
@@ -118,19 +118,21 @@ class Publisher:
     def _field(self, sample: Sample, corrected: Corrected, anomaly: float, attitude: Attitude) -> None:
         x, y, z = corrected.field
         x_sigma, y_sigma, z_sigma = corrected.field_sigma
-        payload = FIELD.struct.pack(
+        payload = FIELD_MESSAGE.struct.pack(
             max(sample.time_us + self._codec.utc_offset_us, 0), corrected.total_field,
             self.samples & MASK, self.calibration_id, corrected.total_field_sigma,
             x, y, z, x_sigma, y_sigma, z_sigma, anomaly, sample.age,
             (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
             *(attitude.heading_fields if attitude.is_known else NO_HEADING),
         )  # fmt: skip
-        self._outbox.put(FIELD, payload)
+        self._outbox.put(FIELD_MESSAGE, payload)
 
     def _imu(self, sample: Sample, corrected: Corrected, *_: object) -> None:
         x, y, z = corrected.field
         time_us = max(sample.time_us + self._codec.utc_offset_us, 0)
-        payload = IMU_FIELD.pack(time_us, x * GAUSS, y * GAUSS, z * GAUSS, MAGNETOMETER, 0)
+        payload = IMU_FIELD.pack(
+            time_us, x * GAUSS_PER_NT, y * GAUSS_PER_NT, z * GAUSS_PER_NT, MAGNETOMETER, 0
+        )
         self._outbox.put(IMU, payload)
 
     def _named(self, sample: Sample, corrected: Corrected, anomaly: float, _: Attitude) -> None:

@@ -14,11 +14,11 @@ __all__ = ["AIRCRAFT", "StreamRequests", "needed_rates"]
 
 AIRCRAFT: Final = frozenset((1, 2, 3, 4, 13, 14, 15, 19, 20, 21, 22, 23, 24, 25, 29, 35))
 """MAV_TYPE of vehicles that turn by tens of degrees a second: fixed and rotary wings."""
-LOOK_US: Final = 10_000_000
+RATE_INTERVAL_US: Final = 10_000_000
 """µs over which the bridge measures at which rate each message arrives."""
 ANSWER_US: Final = 2_000_000
 """µs that the bridge waits for the answer to one request."""
-MIN_FRACTION: Final = 0.7
+MIN_RATE_FRACTION: Final = 0.7
 """Fraction of the needed rate below which the bridge requests it. A higher rate, which another client may
 have requested, stays as it is."""
 MAX_ATTEMPTS: Final = 3
@@ -81,7 +81,7 @@ class StreamRequests:
         self._asked: int | None = None
         self._present = self._is_aircraft = False
         self.measured: dict[str, float] = {}
-        """Rate in Hz at which each needed message arrived in the last :data:`LOOK_US`."""
+        """Rate in Hz at which each needed message arrived in the last :data:`RATE_INTERVAL_US`."""
 
     def receive(self, message: Message, time_us: int) -> None:
         """Count a message of the autopilot; handle the answer to a request."""
@@ -91,7 +91,7 @@ class StreamRequests:
             self._is_aircraft = message["type"] in AIRCRAFT
             if not self._present:
                 self._present = True
-                self._timers.every("streams", LOOK_US, self._look, time_us + LOOK_US)
+                self._timers.every("streams", RATE_INTERVAL_US, self._look, time_us + RATE_INTERVAL_US)
         elif message.id == ACK:
             if message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL and self._asked is not None:
                 self._answered(message["result"])
@@ -110,9 +110,9 @@ class StreamRequests:
     def _look(self, _: int) -> None:
         """Queue requests for the messages that arrived too rarely since the last call."""
         for number in self._needed:
-            rate = self._received[number] * 1e6 / LOOK_US
+            rate = self._received[number] * 1e6 / RATE_INTERVAL_US
             self.measured[spec(number).name] = rate
-            rare = rate < MIN_FRACTION * self.rate_of(number)
+            rare = rate < MIN_RATE_FRACTION * self.rate_of(number)
             if rare and self._attempts[number] < MAX_ATTEMPTS and number not in self._queue:
                 self._queue.append(number)
         self._received.clear()

@@ -11,7 +11,7 @@ from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
 from magbridge.link.clock import VehicleClock
 from magbridge.mavlink import Message, Spec, spec
-from magbridge.mavlink.messages import IDS, Field, nearest_name, split_index
+from magbridge.mavlink.messages import MESSAGE_IDS, Field, nearest_name, split_index
 
 __all__ = ["TelemetryMap", "own_time", "sent_us"]
 
@@ -113,7 +113,7 @@ class TelemetryMap:
             try:
                 layout = spec(what.message)
             except KeyError:
-                near = nearest_name(what.message, IDS)
+                near = nearest_name(what.message, MESSAGE_IDS)
                 hint = f"; did you mean {near}?" if near else ""
                 raise ConfigError(
                     path, f"telemetry.{name}.message", f"unknown MAVLink message {what.message!r}{hint}"

@@ -12,7 +12,7 @@ __all__ = ["is_possible"]
 MAX_ANGLE_RAD: Final = 2.0 * pi + 0.1
 MAX_DISTANCE_M: Final = 4e7
 """m: the Earth's circumference."""
-MAX_SPEED_M_S: Final = 1e4
+MAX_VALID_SPEED_M_S: Final = 1e4
 LATITUDE_E7, LONGITUDE_E7 = 900_000_000, 1_800_000_000
 """1e-7 deg."""
 
@@ -26,13 +26,13 @@ REQUIRED: dict[int, dict[str, float]] = by_id(
 LIMITED: dict[int, dict[str, float]] = by_id(
     LOCAL_POSITION_NED={
         **dict.fromkeys(("x", "y", "z"), MAX_DISTANCE_M),
-        **dict.fromkeys(("vx", "vy", "vz"), MAX_SPEED_M_S),
+        **dict.fromkeys(("vx", "vy", "vz"), MAX_VALID_SPEED_M_S),
     },
     ODOMETRY={
         **dict.fromkeys(("x", "y", "z"), MAX_DISTANCE_M),
-        **dict.fromkeys(("vx", "vy", "vz"), MAX_SPEED_M_S),
+        **dict.fromkeys(("vx", "vy", "vz"), MAX_VALID_SPEED_M_S),
     },
-    VFR_HUD={"airspeed": MAX_SPEED_M_S, "groundspeed": MAX_SPEED_M_S},
+    VFR_HUD={"airspeed": MAX_VALID_SPEED_M_S, "groundspeed": MAX_VALID_SPEED_M_S},
 )
 """Fields that may be NaN, which means unknown, and their largest magnitudes."""
 MAX_QUATERNION: Final = 1.1

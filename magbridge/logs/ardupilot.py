@@ -53,10 +53,10 @@ __all__ = ["chunks"]
 
 MIN_GPS_STATUS = 3
 """Least ``GPS.Status`` of a fix in three dimensions."""
-TABLES = 8
+MAX_KIND_NUMBER = 8
 """Highest number in the name of a kind, as ``ESC8``."""
 DIAGONAL, OFF = ("DIA_X", "DIA_Y", "DIA_Z"), ("ODI_X", "ODI_Y", "ODI_Z")
-IDS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
+ID_PARAMETERS = ("COMPASS_PRIO{}_ID", "COMPASS_DEV_ID{}")
 """Parameters that hold a compass' device id, the first that is there; the second has no number 1."""
 
 
@@ -157,7 +157,7 @@ def _magnetometer(
     if (matrix := _soft_iron(parameters, _numbered(number))) is not None:
         field = np.asarray(np.linalg.solve(matrix, field), dtype=np.float64)
     field -= np.stack([fields.get(f"Ofs{axis}", none) for axis in "XYZ"])
-    names = (IDS[0].format(number + 1), IDS[1].format(_numbered(number)))
+    names = (ID_PARAMETERS[0].format(number + 1), ID_PARAMETERS[1].format(_numbered(number)))
     device = next((parameters[name] for name in names if parameters.get(name)), 0.0)
     use = parameters.get(f"COMPASS_USE{_numbered(number)}")
     health = fields.get("Health")
@@ -221,7 +221,7 @@ def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
 def _instances(records: dict[str, Records], kind: str) -> dict[int, Records]:
     """Return each instance of a kind, also if its number is in the name (``MAG2``)."""
     found: dict[int, Records] = {}
-    for number, name in enumerate((kind, *(f"{kind}{k}" for k in range(2, TABLES + 1)))):
+    for number, name in enumerate((kind, *(f"{kind}{k}" for k in range(2, MAX_KIND_NUMBER + 1)))):
         if (one := records.get(name)) is None or "TimeUS" not in one.fields or not len(one.at):
             continue
         which = next((one.fields[field] for field in INSTANCE if field in one.fields), None)

@@ -54,7 +54,7 @@ TIME_FIELDS = ("TimeUS", "TimeMS")
 """s since the boot in µs, or in ms up to ArduPilot 3.2."""
 SURVEY, SURVEY_ID, SURVEY_AXES = "MAGH", ("Node", "Sensor", "Bus"), ("Mx", "My", "Mz")
 """Record of a survey magnetometer, what distinguishes several, and their axes in G."""
-POWER = "CURR", "BAT"
+POWER_MESSAGES = "CURR", "BAT"
 MAX_VOLTAGE_V = 100.0
 """Larger integers in a log that does not declare its units are in hundredths of V and A."""
 NUMBERED = 8
@@ -80,7 +80,7 @@ WANTED: dict[str, set[str]] = {
 for _gps in ("GPS", "GPS2"):
     WANTED[_gps] |= {"GWk", "GMS", "Status", "Week", "T"}
 
-OURS = {
+UNIT_FACTORS = {
     **{label: (label, 1.0) for label in ("deg", "m", "A", "V", "rpm", "%")},
     **dict.fromkeys(("degheading", "deglatitude", "deglongitude"), ("deg", 1.0)),
     "rad": ("deg", 57.29577951308232),
@@ -110,7 +110,7 @@ def in_hundredths(flash: Flash, fields: Fields) -> tuple[Fields, list[str]]:
     """
     found, notes = dict(fields), []
     declared = _declared(flash)
-    for name in POWER:
+    for name in POWER_MESSAGES:
         table = flash.records[name].fields if name in flash.records else {}
         volts = table.get("Volt", np.empty(0))
         is_whole = bool((volts == np.round(volts)).all())
@@ -130,9 +130,9 @@ def _converted(
 ) -> tuple[str, str, str, float]:
     """Return the row of a column with the declared unit, where that is one of its kind."""
     column, field, unit, factor = row
-    if declared is None or declared[0] not in OURS:
+    if declared is None or declared[0] not in UNIT_FACTORS:
         return row
-    ours, scale = OURS[declared[0]]
+    ours, scale = UNIT_FACTORS[declared[0]]
     if unit not in (ours, "1"):
         return row
     return column, field, ours, float(np.copysign(scale * declared[1], factor))

@@ -28,7 +28,7 @@ Fields = dict[str, tuple[tuple[str, str, str, float], ...]]
 """Record: (column, field, unit, factor); ``#`` is the number of the instance where it is not the first."""
 Series = tuple[FloatArray, str, str, FloatArray]
 """Times (m,), s; column, unit and values (m,)."""
-BETWEEN = 60.0
+MIN_BOOT_INTERVAL_S = 60.0
 """s between two boots whose times would overlap: no value is carried from one to the other."""
 
 
@@ -119,7 +119,7 @@ def _one_after_the_other(runs: list[xr.Dataset]) -> list[str]:
         time = run["time"].values
         kept = time[in_order(time)]
         if len(kept) and kept[0] <= ended:
-            later = ended + BETWEEN - float(kept[0])
+            later = ended + MIN_BOOT_INTERVAL_S - float(kept[0])
             runs[k] = run.assign_coords(time=run["time"].copy(data=time + later))
             notes.append(
                 f"boot {k + 1} begins by its own clock before the end of the last: moved by {later:.0f} s"

@@ -28,13 +28,15 @@ import xarray as xr
 
 from magbridge.columns import CHANNELS, NT_PER_UNIT
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import GUESSED, HISTORY, deployment, with_losses
+from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, with_losses
 
 __all__ = ["as_table", "reader"]
 
-RATE = 100.0
+CAPTURE_RATE_HZ = 100.0
 """Lines a second that MotionCal's senders write."""
-LINE = re.compile(r"(Raw|Uni):\s*(" + r",\s*".join([r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"] * 9) + r")\s*")
+CAPTURE_LINE = re.compile(
+    r"(Raw|Uni):\s*(" + r",\s*".join([r"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"] * 9) + r")\s*"
+)
 OTHER_PREFIXES = "Uni:", "Ori:", "Cal1:", "Cal2:"
 """What else these senders write."""
 COUNT = {"Raw": 0.1 * NT_PER_UNIT["uT"], "Uni": NT_PER_UNIT["uT"]}
@@ -45,14 +47,14 @@ EXPLORER = re.compile(
 )
 """A sentence: year and day of the year, time, field in nT, signal strength, depth and altitude in m."""
 EXPLORER_HEADINGS = "time,total_field [nT],signal,depth [m],altitude [m]\n"
-MIN_FRACTION = 0.5
+MIN_LINE_FRACTION = 0.5
 """Least fraction of the first lines that are of a form."""
 Pieces = Iterator[tuple[xr.Dataset, Sequence[int]]]
 
 
 def reader(header: Sequence[str]) -> Callable[[Path, Iterator[str], int], Pieces] | None:
     """Return the reader of a capture that begins with these lines; None: it is none that is known."""
-    kinds = [match[1] for line in header if (match := LINE.fullmatch(line.strip()))]
+    kinds = [match[1] for line in header if (match := CAPTURE_LINE.fullmatch(line.strip()))]
     if not kinds or len(kinds) < len(header) / 4:
         return None
     kind = "Uni" if "Uni" in kinds else "Raw"
@@ -65,10 +67,10 @@ def as_table(header: Sequence[str]) -> Callable[[Iterator[str]], Iterator[str]] 
     None: the lines are of no such form. A line that is damaged stays as it is, and is counted by the reader.
     """
     lines = [line.strip() for line in header if line.strip()]
-    if sum(EXPLORER.fullmatch(line) is not None for line in lines) > MIN_FRACTION * len(lines):
+    if sum(EXPLORER.fullmatch(line) is not None for line in lines) > MIN_LINE_FRACTION * len(lines):
         return _explorer
     objects = [one for line in lines if (one := _json(line)) is not None]
-    if len(objects) > MIN_FRACTION * len(lines):
+    if len(objects) > MIN_LINE_FRACTION * len(lines):
         names = list(dict.fromkeys(name for one in objects for name in one))
         return lambda lines: _json_lines(names, lines)
     return None
@@ -115,14 +117,18 @@ def _motioncal(path: Path, lines: Iterator[str], rows: int, kind: str) -> Pieces
     def wanted() -> Iterator[tuple[int, str]]:
         nonlocal damaged
         for number, line in enumerate(lines, 1):
-            match = LINE.fullmatch(line.strip())
+            match = CAPTURE_LINE.fullmatch(line.strip())
             if match and match[1] == kind:
                 yield number, match[2]
             elif not match and line.strip() and not line.startswith(OTHER_PREFIXES):
                 damaged += 1
 
-    note = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {RATE:g} lines a second"
-    attrs = {"time_reference": "boot", GUESSED: note, HISTORY: f"{path.name} was read with: {note}"}
+    note = f"MotionCal's {kind}: lines, {COUNT[kind]:g} nT a count; time: {CAPTURE_RATE_HZ:g} lines a second"
+    attrs = {
+        "time_reference": "boot",
+        GUESSED_ATTRIBUTE: note,
+        HISTORY_ATTRIBUTE: f"{path.name} was read with: {note}",
+    }
     found, done = wanted(), 0
     block = list(islice(found, rows))
     if not block:
@@ -132,6 +138,6 @@ def _motioncal(path: Path, lines: Iterator[str], rows: int, kind: str) -> Pieces
         lost, damaged = damaged, 0
         values = np.array([[float(text) for text in numbers.split(",")] for _, numbers in block])
         axes = dict(zip(CHANNELS, COUNT[kind] * values[:, 6:].T, strict=True))
-        piece = deployment(path, (done + np.arange(len(block))) / RATE, axes, attrs=attrs)
+        piece = deployment(path, (done + np.arange(len(block))) / CAPTURE_RATE_HZ, axes, attrs=attrs)
         yield with_losses(piece, {"rows_dropped": lost}), [number for number, _ in block]
         done, block = done + len(block), following

@@ -24,7 +24,7 @@ except ImportError:
 
 __all__ = ["EPOCH", "epoch", "floats"]
 
-ALL = slice(None)
+WHOLE_AXIS = slice(None)
 EPOCH = "seconds since 1970-01-01T00:00:00Z"
 NANOSECONDS = re.compile(r"(nanosecond|nanosec|nsec|ns)s?(?= since)")
 
@@ -48,7 +48,7 @@ def epoch(path: Path, variable: Any) -> tuple[float, float]:
     return float(-zero * scale), float(scale) * unit
 
 
-def floats(variable: Any, rows: slice | tuple[slice, ...] = ALL) -> FloatArray:
+def floats(variable: Any, rows: slice | tuple[slice, ...] = WHOLE_AXIS) -> FloatArray:
     """Return rows of a variable, in its shape, NaN where a value is missing.
 
     Missing are the values that the variable declares as missing, compared as stored, before unpacking, and

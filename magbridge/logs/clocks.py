@@ -39,12 +39,12 @@ EPOCHS = {
 SUMS = {"seconds and nanoseconds": (0.0, 1.0, 1e-9), "GPS week and seconds": (GPS_EPOCH, WEEK, 1.0)}
 """Kind of two numbers, joined -> s since 1970 of their zero, and s in the unit of each."""
 SECONDS_OF_DAY = "date and seconds of the day"
-WORDS = {
+HEADING_WORDS = {
     "ms": r"milli|[_ .]ms$", "us": r"micro|[_ .]us$|time_?us$", "ns": r"nano|[_ .]ns$", "excel": "excel",
     "mjd": "mjd|modified", "julian": "julian|^jd$",
 }  # fmt: skip
 """Kind -> words in a heading."""
-SIZES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e6))
+DAY_COUNT_RANGES = (("excel", 3e4, 6e4), ("matlab", 7.1e5, 7.6e5), ("julian", 2.44e6, 2.48e6))
 """Kinds that count days, and between which numbers their times lie (1982 to 2064, 1943 to 2080, 1968 to
 2077)."""
 STEP, CERTAIN = 5e-4, 1e-4
@@ -53,10 +53,10 @@ larger ones; and by which it is under our own name, where they would be 10,000 a
 UNIX_TIME_RANGE_S = 3e8, 4.2e9
 """s since 1970 of 1979 and 2103, between which a count is known by its size."""
 YEAR_1980 = 315_532_800.0
-SLOW = 10.0
+MIN_CLOCK_STEP = 10.0
 """Median step of whole numbers from which on they hardly are seconds since a boot: of milliseconds it is a
 hundred a second."""
-ORDER = re.compile(r"\b(yyyy|yy|mm|dd)\W?(mm|dd)\W?(yyyy|yy|dd)\b", re.IGNORECASE)
+DATE_ORDER = re.compile(r"\b(yyyy|yy|mm|dd)\W?(mm|dd)\W?(yyyy|yy|dd)\b", re.IGNORECASE)
 """What in a heading states in which order a date is written."""
 MIN_RUN_ROWS = 3
 """Fewest rows after a step back in a count, by which it is a start of the clock and not a wrong value."""
@@ -131,7 +131,7 @@ class CountState(NamedTuple):
 
 def date_order(headings: Sequence[str]) -> str:
     """Return the heading that states in which order a date is written, as mm/dd/yyyy; "" for none."""
-    return next((heading for heading in headings if ORDER.search(heading)), "")
+    return next((heading for heading in headings if DATE_ORDER.search(heading)), "")
 
 
 def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) -> TimeFormat:
@@ -179,7 +179,7 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> Ti
         kind == "s"
         and not unit
         and whole
-        and step >= SLOW
+        and step >= MIN_CLOCK_STEP
         and not (dated and since < UNIX_TIME_RANGE_S[1] and step < DAY)
     ):
         ways = " or ".join(f'--column time="{heading} [{one}]"' for one in ("ms", "us", "ns", "s"))
@@ -196,7 +196,7 @@ def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, st
     Under our own name, ``time``, it is in seconds, unless these would be of another age of the Earth.
     """
     ours = declared or heading == "time"
-    for kind, words in WORDS.items():
+    for kind, words in HEADING_WORDS.items():
         if re.search(words, heading.lower()) and not declared:
             return kind, f"{kind}, by its heading"
     if re.search("gps|gnss", heading.lower()) and len(numbers) and 1e8 < numbers.max() < 2e9:
@@ -208,7 +208,7 @@ def _kind(heading: str, numbers: FloatArray, *, declared: bool) -> tuple[str, st
         if UNIX_TIME_RANGE_S[0] <= middle * EPOCHS[kind][1] < UNIX_TIME_RANGE_S[1] and not declared:
             return kind, f"{kind} since 1970, by its size"
     step = float(np.median(np.diff(numbers))) if len(numbers) > 1 else 0.0
-    for kind, low, high in SIZES:
+    for kind, low, high in DAY_COUNT_RANGES:
         if low <= middle < high and 0.0 < step < (CERTAIN if ours else STEP) and not declared:
             return kind, f"{kind} days, by its size"
     return "s", "" if ours else "seconds"
@@ -222,7 +222,7 @@ def _written(heading: str, texts: Sequence[str], zone: str | None, *, of_day: bo
     if dated and pd.to_datetime(times, format="ISO8601", utc=True, errors="coerce").notna().all():
         return TimeFormat("iso", zone_note)
     fit = [pattern for pattern in patterns(texts) if pattern.endswith(SECONDS_SUFFIX) == of_day]
-    if order := ORDER.search(heading):
+    if order := DATE_ORDER.search(heading):
         letters = [part[0].lower() for part in order.groups()]
         fit = [pattern for pattern in fit if re.findall("%([ymd])", pattern.lower())[:3] == letters] or fit
     if not fit:

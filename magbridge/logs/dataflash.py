@@ -42,7 +42,8 @@ LETTERS = {
 }  # fmt: skip
 OWN_SCALE = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 """Letters of fields that hold the value times this."""
-LAYOUT = np.dtype([("", "u1", RECORD_HEADER_BYTES), *zip(("type", "length", "name", "letters", "columns"),
+FORMAT_LAYOUT = np.dtype([("", "u1", RECORD_HEADER_BYTES),
+                          *zip(("type", "length", "name", "letters", "columns"),
                                            ("u1", "u1", "S4", "S16", "S64"), strict=True)])  # fmt: skip
 
 
@@ -117,10 +118,10 @@ def _headers(data: Bytes) -> IndexArray:
 
 def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
     """Return what the log describes, in the order of the file; what contradicts itself is left out."""
-    at = headers[(headers <= data.size - LAYOUT.itemsize)]
+    at = headers[(headers <= data.size - FORMAT_LAYOUT.itemsize)]
     at = at[data[at + 2] == FMT]
     kinds = []
-    for start, one in zip(at, _gather(data, at, LAYOUT), strict=True):
+    for start, one in zip(at, _gather(data, at, FORMAT_LAYOUT), strict=True):
         name, letters, columns = (one[field].decode("latin-1") for field in ("name", "letters", "columns"))
         known = all(letter in LETTERS for letter in letters)
         size = (

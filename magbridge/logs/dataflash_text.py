@@ -15,7 +15,7 @@ from magbridge.logs.dataflash import Flash, Records, number_of
 
 __all__ = ["read_text"]
 
-TEXT = frozenset("nNZaM")
+TEXT_TYPES = frozenset("nNZaM")
 
 
 def read_text(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
@@ -52,7 +52,7 @@ def _records(
 ) -> Records:
     fields, texts = {}, {}
     for name, letter, values in zip(columns, letters, zip(*rows, strict=True), strict=False):
-        if name in wanted and letter in TEXT:
+        if name in wanted and letter in TEXT_TYPES:
             texts[name] = list(values)
         elif name in wanted:
             try:

@@ -16,7 +16,8 @@ from magbridge.errors import FormatError
 from magbridge.records import Quality
 
 __all__ = [
-    "CHANGES", "COUNTERS", "GUESSED", "HISTORY", "LOSSES", "MEANING", "NOTES", "SETTINGS", "deployment",
+    "CHANGES_SETTING", "COUNTERS", "GUESSED_ATTRIBUTE", "HISTORY_ATTRIBUTE", "LOSSES_ATTRIBUTE",
+    "MEANING", "NOTES", "SETTINGS", "deployment",
     "join", "join_attrs", "lasting", "merged", "named_losses", "noted", "passed_over", "plain_attrs",
     "same_columns", "sliced", "uncounted", "with_losses",
 ]  # fmt: skip
@@ -25,7 +26,7 @@ MEANING = {"heading_reference": "true", "time_reference": "utc"}
 """Attributes that change what values mean, and their defaults."""
 SETTINGS = "align.", "telemetry."
 """What the names of the numbers begin with by which a bridge corrected, as its log declares them."""
-CHANGES = "align.changes"
+CHANGES_SETTING = "align.changes"
 """Setting that counts how often a setting was changed in the course of the log; the others are of its
 start."""
 COUNTERS = {
@@ -42,11 +43,11 @@ COUNTERS = {
 }
 """Attributes that count what reading skipped, with singular and plural. They are summed over pieces, and are
 not copied to a file that is written."""
-GUESSED = "guessed"
+GUESSED_ATTRIBUTE = "guessed"
 """Attribute that says what a file left open and was taken for granted; it goes the way of the counts, too."""
-HISTORY = "history"
+HISTORY_ATTRIBUTE = "history"
 """Attribute that keeps assumptions in files that are written, a line for each."""
-LOSSES = "losses"
+LOSSES_ATTRIBUTE = "losses"
 """Attribute that names the losses, a line for each file and column. It goes the way of the counts."""
 NOTES = "notes"
 """Attribute with a line for each choice that reading made: which of several compasses, a name, a unit."""
@@ -198,7 +199,7 @@ def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[
         name: int(dataset.attrs.get(name, 0)) + count for name, count in counts.items() if count
     }
     if named := [*named_losses(dataset.attrs), *lines]:
-        raised[LOSSES] = "\n".join(named)
+        raised[LOSSES_ATTRIBUTE] = "\n".join(named)
     return dataset.assign_attrs(raised)
 
 
@@ -217,9 +218,9 @@ def plain_attrs(attrs: Mapping[Any, Any]) -> dict[str, str | int | float]:
 
 
 def uncounted(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the deployment without the attributes of :data:`COUNTERS`, :data:`LOSSES`, :data:`NOTES`."""
+    """Return the deployment without :data:`COUNTERS`, :data:`LOSSES_ATTRIBUTE` and :data:`NOTES`."""
     bare = dataset.copy(deep=False)
-    counted = {GUESSED, LOSSES, NOTES, *COUNTERS}
+    counted = {GUESSED_ATTRIBUTE, LOSSES_ATTRIBUTE, NOTES, *COUNTERS}
     bare.attrs = {name: value for name, value in dataset.attrs.items() if name not in counted}
     return bare
 
@@ -232,7 +233,7 @@ def passed_over(*pieces: Mapping[str, Any]) -> dict[str, int]:
 
 def named_losses(*pieces: Mapping[str, Any]) -> list[str]:
     """Return the lines that name the losses in the pieces of a deployment."""
-    return [line for attrs in pieces for line in str(attrs.get(LOSSES, "")).splitlines()]
+    return [line for attrs in pieces for line in str(attrs.get(LOSSES_ATTRIBUTE, "")).splitlines()]
 
 
 def noted(*pieces: Mapping[str, Any]) -> list[str]:
@@ -277,7 +278,7 @@ def join_attrs(parts: Sequence[xr.Dataset]) -> dict[str, Any]:
                 joined[key] += value
             else:
                 joined.setdefault(key, value)
-    for key in (GUESSED, HISTORY, LOSSES, NOTES):
+    for key in (GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, LOSSES_ATTRIBUTE, NOTES):
         joined_lines = [line for attrs in all_attrs for line in str(attrs.get(key, "")).splitlines()]
         if joined_lines:
             joined[key] = "\n".join(dict.fromkeys(joined_lines))

@@ -14,7 +14,7 @@ from magbridge.records import Quality
 
 __all__ = ["corrected_panel", "draw_corrected"]
 
-POINTS = 20_000
+DRAWN_SAMPLES = 20_000
 """Samples drawn; more only make a blot."""
 LABELS = {"total_field": "total field, nT", "anomaly": "anomaly, nT", "total_field_sigma": "1-sigma, nT"}
 
@@ -62,7 +62,7 @@ def corrected_panel(axis: Axes, log: xr.Dataset, name: str) -> None:
     name : str
         ``total_field``, ``anomaly``, ``total_field_sigma`` or ``level_sigma``.
     """
-    log = log.isel(time=slice(None, None, max(1, log.sizes["time"] // POINTS)))
+    log = log.isel(time=slice(None, None, max(1, log.sizes["time"] // DRAWN_SAMPLES)))
     time = np.array(log["time"].to_numpy() * 1e6, "datetime64[us]")
     values, sigma = log[name].to_numpy(), log["total_field_sigma"].to_numpy()
     doubtful = (log["quality"].to_numpy().astype(int) & ~int(Quality.NO_BORESIGHT)) != 0

@@ -9,7 +9,7 @@ from magbridge.errors import FormatError
 
 __all__ = ["Faults"]
 
-REFUSED = 0.5
+MAX_WRONG_FRACTION = 0.5
 """Share of the rows, or of a column's values, that are wrong in a file that is refused."""
 
 
@@ -71,5 +71,5 @@ class Faults:
     def finish(self) -> None:
         """FormatError: half of the rows, or of a column's values, are wrong."""
         for column, error in self._first.items():
-            if self._wrong[column] >= REFUSED * (self._known[column] or self.rows):
+            if self._wrong[column] >= MAX_WRONG_FRACTION * (self._known[column] or self.rows):
                 raise error

@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 from magbridge.columns import COLUMNS, NT_PER_UNIT, usual
 
-__all__ = ["NUMBER", "WITH_UNIT", "aliases", "bare", "is_unit", "split"]
+__all__ = ["CELL_NUMBER", "WITH_UNIT", "aliases", "bare", "is_unit", "split"]
 
 HEADING = re.compile(r"(?P<name>.*?)\s*(?:\[(?!\d+\])(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\))?")
-NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
+CELL_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([ed][-+]?\d+)?|[-+]?(nan|inf)|", re.IGNORECASE)
 """A cell that is a number, or empty; Fortran writes 1.5D+03."""
 WITH_UNIT = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)) ?([a-zA-Z°µ%/]+)")
 """A cell that is a number with its unit."""

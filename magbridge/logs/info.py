@@ -13,9 +13,9 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_b
 from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
-from magbridge.logs.magnetic import EARTHS
+from magbridge.logs.magnetic import READING_RANGE_NT
 
-__all__ = ["GAP", "USES", "info", "lacking", "movers", "telemetry"]
+__all__ = ["INFO_GAP_INTERVALS", "USES", "info", "lacking", "movers", "telemetry"]
 
 HORIZONTAL_POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")
@@ -39,7 +39,7 @@ USES: dict[str, Needs] = {
     "simulate --trajectory-from": ((ATTITUDE,), (HORIZONTAL_POSITION,)),
 }
 """Command -> its needs: of each group, one of the alternatives, each a set of columns."""
-GAP = 2.5
+INFO_GAP_INTERVALS = 2.5
 """A pause longer than this many sampling intervals is a gap."""
 ABOVE = 2.0
 """m above the surface, from which on a vehicle that has a depth at all is hardly there."""
@@ -69,7 +69,7 @@ def info(log: xr.Dataset) -> dict[str, Any]:
     time = log["time"].to_numpy().astype(float)
     steps = np.diff(time)
     interval = float(np.median(steps)) if len(steps) else None
-    gaps = steps[steps > GAP * interval] if interval else steps
+    gaps = steps[steps > INFO_GAP_INTERVALS * interval] if interval else steps
     columns = [_column(str(name), log[name], time) for name in log.data_vars]
     return {
         "source": str(log.attrs.get("source", "")),
@@ -147,9 +147,11 @@ def _hints(log: xr.Dataset, columns: list[dict[str, Any]]) -> list[str]:
     if set(CHANNELS) <= set(log.data_vars):
         lengths = magnitude(log[list(CHANNELS)].to_array().to_numpy().T)
         length = float(np.median(lengths)) if len(lengths := lengths[np.isfinite(lengths)]) else 0.0
-        if length and not EARTHS[0] < length < EARTHS[1]:
+        if length and not READING_RANGE_NT[0] < length < READING_RANGE_NT[1]:
             fitting = [
-                unit for unit, factor in NT_PER_UNIT.items() if EARTHS[0] < length * factor < EARTHS[1]
+                unit
+                for unit, factor in NT_PER_UNIT.items()
+                if READING_RANGE_NT[0] < length * factor < READING_RANGE_NT[1]
             ]
             lines = [
                 f'; in {unit} it would be the Earth\'s: --column mag_x="THEIRS [{unit}]" and so on'

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import SETTINGS
-from magbridge.logs.headings import NUMBER, is_unit
+from magbridge.logs.headings import CELL_NUMBER, is_unit
 from magbridge.logs.magnetic import units_of_angles
 from magbridge.logs.makers import declared_by_maker
 from magbridge.logs.mapping import ColumnMapping
@@ -40,7 +40,7 @@ survey."""
 SEPARATORS = ";", "\t", "|", ","
 BLANKS = " "
 """Stands for any number of blanks between fields."""
-NMEA = "GgaSentence"
+NMEA_HEADING = "GgaSentence"
 """Heading of the first field that may hold separators of its own."""
 DECIMAL_COMMA = re.compile(r"[-+]?(\d{1,3}(\.\d{3})+|\d+),\d+([eE][-+]?\d+)?")
 THOUSANDS = re.compile(r"[-+]?\d{1,3}(,\d{3})+\.\d*")
@@ -133,8 +133,8 @@ def layout_of(
         headings = [*headings, "(nothing)"]  # each row ends in a separator
         units = [*units, ""] if units else units
     found.decimal = declared.decimal or _decimal(rows, found)
-    if NMEA in headings:  # MagArrow: sentences with commas of their own, at the end of some rows
-        found.open_ended, headings = True, headings[: headings.index(NMEA)]
+    if NMEA_HEADING in headings:  # MagArrow: sentences with commas of their own, at the end of some rows
+        found.open_ended, headings = True, headings[: headings.index(NMEA_HEADING)]
     maker, found.declared = declared_by_maker(headings, declared)
     if maker:
         found.guesses.append(f"columns as {maker} writes them")
@@ -151,7 +151,7 @@ def layout_of(
 def _are_values(row: Sequence[str]) -> bool:
     """Return True if a row holds values: all cells are numbers, or most begin with a digit."""
     there = [cell for cell in row if cell]
-    return all(map(NUMBER.fullmatch, there)) or (there[0][0].isdigit() and _mostly_digits(there))
+    return all(map(CELL_NUMBER.fullmatch, there)) or (there[0][0].isdigit() and _mostly_digits(there))
 
 
 def _mostly_digits(row: Sequence[str]) -> bool:
@@ -239,7 +239,7 @@ def _units_row(lines: Sequence[str], found: Layout) -> list[str]:
     if found.first >= len(lines):
         return []
     row = cells(lines[found.first], found.separator)
-    if any(cell and NUMBER.fullmatch(cell) for cell in row) or not any(map(is_unit, row)):
+    if any(cell and CELL_NUMBER.fullmatch(cell) for cell in row) or not any(map(is_unit, row)):
         return []
     found.first += 1
     return [cell.strip("[]()") for cell in row]

@@ -16,9 +16,9 @@ from magbridge.logs.headings import bare
 if TYPE_CHECKING:
     from magbridge.logs.layout import Layout
 
-__all__ = ["EARTHS", "find_total", "units_of_angles", "units_of_axes"]
+__all__ = ["READING_RANGE_NT", "find_total", "units_of_angles", "units_of_axes"]
 
-EARTHS = 15_000.0, 90_000.0
+READING_RANGE_NT = 15_000.0, 90_000.0
 """nT, within which the Earth's field lies, with a vehicle's own."""
 TOTAL_NAME = re.compile(
     "f|nt|mag|tm[fi]|field(mag1?)?|(mag|b)total|magtot1?|total(magnetic)?(field|intensity)|magneticfield"
@@ -76,10 +76,12 @@ def units_of_axes(found: Layout, rows: Sequence[Sequence[str]]) -> None:
 def _unit_by_length(found: Layout, rows: Sequence[Sequence[str]]) -> str:
     """Return the unit in which the field has the length of the Earth's; "" for nT, or where there is none."""
     length = _length(found, rows, [found.names.index(name) for name in CHANNELS])
-    if EARTHS[0] < length < EARTHS[1]:
+    if READING_RANGE_NT[0] < length < READING_RANGE_NT[1]:
         return ""
     factors = ((unit, factor) for unit, factor in NT_PER_UNIT.items() if unit != "nT")
-    return next((unit for unit, factor in factors if EARTHS[0] < length * factor < EARTHS[1]), "")
+    return next(
+        (unit for unit, factor in factors if READING_RANGE_NT[0] < length * factor < READING_RANGE_NT[1]), ""
+    )
 
 
 def find_total(found: Layout, rows: Sequence[Sequence[str]]) -> None:
@@ -94,7 +96,7 @@ def find_total(found: Layout, rows: Sequence[Sequence[str]]) -> None:
     if len(fields) == 1:
         name = found.names[fields[0]]
         factor = NT_PER_UNIT.get(usual(found.units.get(name, "nT")), 0.0)
-        if EARTHS[0] < _length(found, rows, fields) * factor < EARTHS[1]:
+        if READING_RANGE_NT[0] < _length(found, rows, fields) * factor < READING_RANGE_NT[1]:
             found.names[fields[0]] = "total_field"
             found.units["total_field"] = found.units.pop(name, "nT")
             found.guesses.append(f"total_field is {found.headings[fields[0]]!r}")

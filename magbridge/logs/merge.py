@@ -17,7 +17,7 @@ __all__ = ["merge"]
 Open = Callable[[int], Iterator[xr.Dataset]]
 Opened = tuple[xr.Dataset, Iterator[xr.Dataset]]
 """A piece of a log, and those after it."""
-ROOM = 1 << 28
+MAX_BUFFERED_BYTES = 1 << 28
 """Bytes of first pieces that are kept while the others are opened: of small logs, all."""
 
 
@@ -35,7 +35,7 @@ def merge(
     """
     firsts: dict[int, xr.Dataset] = {}
     opened: dict[int, Opened] = {}
-    room = ROOM
+    room = MAX_BUFFERED_BYTES
     for k, source in enumerate(sources):
         pieces = source(rows)
         if (first := next(pieces, None)) is None:

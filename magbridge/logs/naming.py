@@ -13,7 +13,7 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs.clocks import SECONDS_OF_DAY
-from magbridge.logs.headings import NUMBER, WITH_UNIT, aliases, bare, is_unit, split
+from magbridge.logs.headings import CELL_NUMBER, WITH_UNIT, aliases, bare, is_unit, split
 from magbridge.logs.magnetic import find_total, units_of_axes
 from magbridge.logs.stamps import DAY
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HEMISPHERES", "name_columns", "on_side"]
 
-COUNTED = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
+ROW_COUNT = re.compile(r"row \[(\d+\.?\d*|\.\d+) ?Hz\]")
 """Declaration of the time where a file has none: the rows, so many a second."""
 HOUR = re.compile(
     r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?( ?[AP]M)?|[0-2]\d[0-5]\d[0-5]\d([.,]\d*)?", re.IGNORECASE
@@ -35,7 +35,7 @@ TIMED = re.compile("time|stamp|clock|millis|epoch|zeit|heure|hora", re.IGNORECAS
 """What in a heading says that the column holds times, if it is the only one."""
 REMARKS = "raw", "mag", "true", "cal", "uncal", "measured", "compass"
 """Words in brackets behind a heading that are not a unit."""
-MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
+DATE_AND_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d.*)?")
 """A cell that is a date with its time of day."""
 CLOCK = re.compile(r"\d{1,2}:\d{2}:\d{2}([.,]\d+)?")
 """A cell that is a time of day."""
@@ -56,7 +56,7 @@ JOINED = {
     ),
 }  # fmt: skip
 """What several columns are together -> what they are called, with neither capitals nor punctuation."""
-LENGTHS = "depth", "total_field", "sensor_temperature"
+UNIT_CELL_COLUMNS = "depth", "total_field", "sensor_temperature"
 """Columns of ours before whose cells a unit may stand, as in 5.8m; a position has its own letters."""
 HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 
@@ -145,7 +145,7 @@ def _declared(path: Path, found: Layout, names: Sequence[str]) -> dict[int, str]
     taken: dict[int, str] = {}
     for name, source in found.declared.columns.items():
         theirs = source.heading or name
-        if name == "time" and (match := COUNTED.fullmatch(theirs)):
+        if name == "time" and (match := ROW_COUNT.fullmatch(theirs)):
             found.rate = float(match[1])
             if not found.rate:
                 raise FormatError(path, "expected a rate other than 0 Hz", column="time")
@@ -218,7 +218,7 @@ def _by_hour(cells: Sequence[str]) -> bool:
 def _find_calendar(found: Layout, rows: Sequence[Sequence[str]]) -> None:
     """Find the fields, other than those of the time, that give date and time of day."""
     others = [k for k in range(len(found.headings)) if k not in found.stamp]
-    moments = [k for k in others if _all_match(MOMENT, rows, k)]
+    moments = [k for k in others if _all_match(DATE_AND_TIME, rows, k)]
     dates = [k for k in others if DATED.search(found.headings[k])]
     clocks = [k for k in others if _all_match(CLOCK, rows, k)]
     if len(moments) == 1:
@@ -239,10 +239,10 @@ def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
     left = []
     for k, name in enumerate(found.names):
         values = {row[k] for row in rows if k < len(row) and row[k]}
-        if not name or (name in COLUMNS and name not in LENGTHS) or not values:
+        if not name or (name in COLUMNS and name not in UNIT_CELL_COLUMNS) or not values:
             continue
         text = [cell.replace(",", ".") if found.decimal == "," else cell for cell in values]
-        if any(NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
+        if any(CELL_NUMBER.fullmatch(cell) or cell.lower() in {"true", "false"} for cell in text):
             continue
         if found.foreign and (unit := _unit_behind(text)):
             found.units.setdefault(name, unit)

@@ -56,7 +56,7 @@ CF_ATTRIBUTES: dict[str, dict[str, Any]] = {
 COORDINATES = "time", "latitude", "longitude", "depth"
 NO_FLAGS = -1
 """Stands for flags that are not known."""
-CHUNK = 8192
+STORED_ROWS = 8192
 """Rows stored together."""
 
 
@@ -151,7 +151,7 @@ class FileWriter:
             fill = {"time": None, "quality": NO_FLAGS}.get(name, np.nan)
             variable = file.createVariable(
                 written, "i4" if flags else "f8", (self._dimension,), fill_value=fill, zlib=True, complevel=1,
-                chunksizes=(CHUNK,),
+                chunksizes=(STORED_ROWS,),
             )  # fmt: skip
             if flags:
                 attrs["flag_masks"] = np.array([int(flag) for flag in Quality], np.int32)

@@ -55,7 +55,7 @@ OG1_POSITIONS = {
 }
 MEASURED = ("MAG_X", "MAG_Y", "MAG_Z", "TOTAL_FIELD", "FIELD_X", "FIELD_Y", "FIELD_Z", "ANOMALY")
 """Variables that the magnetometer gives."""
-FIXES = {"LATITUDE": "gps_latitude", "LONGITUDE": "gps_longitude"}
+FIX_COLUMNS = {"LATITUDE": "gps_latitude", "LONGITUDE": "gps_longitude"}
 NO_FIXES = "the log does not say which positions are fixes"
 
 
@@ -132,7 +132,7 @@ def _deployed(file: Any, known: dict[str, Any]) -> None:
 
 def _fixes(file: Any, known: dict[str, Any]) -> None:
     """Add the places of the GPS fixes, with their times; unknown where the log has no separate ones."""
-    there = {name: file.variables.get(column.upper()) for name, column in FIXES.items()}
+    there = {name: file.variables.get(column.upper()) for name, column in FIX_COLUMNS.items()}
     nothing = np.full(len(known["TIME"]), np.nan)
     fixed = {name: nothing if one is None else floats(one) for name, one in there.items()}
     when = np.where(np.isfinite(fixed["LATITUDE"]), known["TIME"], np.nan)

@@ -11,7 +11,7 @@ from magbridge.arrays import FloatArray, IndexArray
 
 __all__ = ["MEDIAN_ROWS", "boots", "in_order"]
 
-BACK = 1.0
+MIN_SET_BACK_S = 1.0
 """s by which times are set back where a vehicle was switched on again: records of one moment, which tasks of
 their own write, differ by less."""
 MEDIAN_ROWS = 5
@@ -72,8 +72,8 @@ def boots(time: FloatArray) -> IndexArray:
         s since the boot, in the order of the file.
     """
     found = [0]
-    for k in (1 + np.flatnonzero(np.diff(time) < -BACK)).tolist():
+    for k in (1 + np.flatnonzero(np.diff(time) < -MIN_SET_BACK_S)).tolist():
         before, after = time[max(found[-1], k - MEDIAN_ROWS) : k], time[k : k + MEDIAN_ROWS]
-        if np.median(after) < np.median(before) - BACK:
+        if np.median(after) < np.median(before) - MIN_SET_BACK_S:
             found.append(k)
     return np.array(found, dtype=np.intp)

@@ -17,7 +17,7 @@ from magbridge.arrays import FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.clocks import TimeFormat, clock_of, seconds
-from magbridge.logs.deployment import GUESSED, HISTORY, deployment, plain_attrs
+from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, plain_attrs
 from magbridge.logs.layout import LAYOUT_LINES, Layout
 from magbridge.logs.naming import name_columns, on_side
 from magbridge.logs.unknown import known
@@ -102,7 +102,7 @@ def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TimeFormat
         layout.attrs |= {"time_reference": "boot"} if clock.boot else {}
     if foreign and layout.guesses:
         note = "; ".join(layout.guesses)
-        layout.attrs |= {GUESSED: note, HISTORY: f"{path.name} was read with: {note}"}
+        layout.attrs |= {GUESSED_ATTRIBUTE: note, HISTORY_ATTRIBUTE: f"{path.name} was read with: {note}"}
     return layout, clock
 
 

@@ -81,12 +81,12 @@ PX4_FIELDS: Fields = {
 PX4_FIELDS["vehicle_gps_position"] = PX4_FIELDS["sensor_gps"]
 # heights are above the sea; that of the local position is above the start, and the last choice
 PX4_FIELDS["vehicle_local_position"] = (("depth", "z", "m", 1.0),)
-GAUSS = tuple(f"magnetometer_ga[{k}]" for k in range(3))
+GAUSS_AXES = tuple(f"magnetometer_ga[{k}]" for k in range(3))
 """The three axes in ``vehicle_magnetometer`` and ``sensor_combined``."""
-NEEDED = {
+NEEDED_FIELDS = {
     "sensor_mag": {"timestamp", "x", "y", "z"},
-    "vehicle_magnetometer": {"timestamp", *GAUSS},
-    "sensor_combined": {"timestamp", *GAUSS},
+    "vehicle_magnetometer": {"timestamp", *GAUSS_AXES},
+    "sensor_combined": {"timestamp", *GAUSS_AXES},
     "vehicle_attitude": {"timestamp", "q[0]", "q[1]", "q[2]", "q[3]"},
     "debug_key_value": {"timestamp", "value", "key[0]"},
 }
@@ -95,7 +95,7 @@ UNUSED = ("servo", "esc", "motor")
 GPS = ("vehicle_gps_position", "sensor_gps")
 MIN_FIX_TYPE = 3
 """Least ``fix_type`` of a fix in three dimensions."""
-CALIBRATIONS = 4
+MAX_CALIBRATIONS = 4
 FASTER = 1.5
 """Times the rate of ``sensor_mag`` from which ``vehicle_magnetometer`` is read instead."""
 
@@ -107,13 +107,13 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
     """
     try:
         with path.open("rb") as file, redirect_stdout(None):  # pyulog prints a line for each damage
-            log = ULog(file, [*PX4_FIELDS, *NEEDED])
+            log = ULog(file, [*PX4_FIELDS, *NEEDED_FIELDS])
     except (ULogException, ValueError, KeyError, IndexError, TypeError) as error:
         raise FormatError(path, f"expected a PX4 log: {error}") from None
     topics: Topics = {}
     for one in log.data_list:
         fields = {name: values.astype(np.float64) for name, values in one.data.items()}
-        if NEEDED.get(one.name, {"timestamp"}) <= fields.keys() and len(fields["timestamp"]):
+        if NEEDED_FIELDS.get(one.name, {"timestamp"}) <= fields.keys() and len(fields["timestamp"]):
             topics.setdefault(one.name, {})[one.multi_id] = fields
     mags = _magnetometers(topics, log.initial_parameters)
     if not mags:
@@ -149,7 +149,7 @@ def _magnetometers(topics: Topics, parameters: Parameters) -> list[Magnetometer]
             found.append(_uncalibrated(number, device, part, parameters, in_use=device == current))
     if not found:
         found = [
-            _magnetometer(number, 0.0, table, GAUSS, parameters, True)
+            _magnetometer(number, 0.0, table, GAUSS_AXES, parameters, True)
             for number, table in topics.get("sensor_combined", {}).items()
         ]
     return found
@@ -210,14 +210,14 @@ def _uncalibrated(
         xy, xz, yz = (parameters.get(f"{header}{axis}ODIAG", 0.0) for axis in "XYZ")
         matrix = np.array([[x, xy, xz], [xy, y, yz], [xz, yz, z]])
         offset = np.array([[parameters.get(f"{header}{axis}OFF", 0.0)] for axis in "XYZ"])
-        raw = np.linalg.solve(matrix, np.stack([table[axis] for axis in GAUSS])) + offset
-        table = {**table, **dict(zip(GAUSS, raw, strict=True))}
-    return _magnetometer(number, device, table, GAUSS, parameters, in_use)
+        raw = np.linalg.solve(matrix, np.stack([table[axis] for axis in GAUSS_AXES])) + offset
+        table = {**table, **dict(zip(GAUSS_AXES, raw, strict=True))}
+    return _magnetometer(number, device, table, GAUSS_AXES, parameters, in_use)
 
 
 def _calibration(device: float, parameters: Parameters) -> int | None:
     """Return the n of the ``CAL_MAGn`` that belong to a device; None where none does."""
-    slots = (k for k in range(CALIBRATIONS) if device and parameters.get(f"CAL_MAG{k}_ID") == device)
+    slots = (k for k in range(MAX_CALIBRATIONS) if device and parameters.get(f"CAL_MAG{k}_ID") == device)
     return next(slots, None)
 
 

@@ -31,7 +31,7 @@ __all__ = ["read", "read_chunks", "read_each"]
 Paths = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 ALL_ROWS = 1 << 40
 """Rows: more than any file has."""
-SMALL = 4_000_000
+MAX_SHARED_BYTES = 4_000_000
 """Bytes of a file below which one child process reads several."""
 DEFAULTS = Options()
 
@@ -181,7 +181,9 @@ def _with_another(path: Path, given: Collection[Path]) -> bool:
 
 def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[int, Iterator[Any]]:
     """Return the contents of the small files that need a child process, by their places: one for all."""
-    small = [k for k, path in enumerate(paths) if path.is_file() and 0 < path.stat().st_size < SMALL]
+    small = [
+        k for k, path in enumerate(paths) if path.is_file() and 0 < path.stat().st_size < MAX_SHARED_BYTES
+    ]
     formats = {k: form for k in small if (form := format_of(paths[k])).guarded}
     if len(formats) < 2:
         return {}

@@ -20,7 +20,7 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["FRAMES_HISTORY", "KINDS", "MAGNETIC_FIELD", "MessageKind"]
+__all__ = ["FRAMES_HISTORY", "MAGNETIC_FIELD", "MESSAGE_KINDS", "MessageKind"]
 
 FRAMES_HISTORY = (
     "ROS frames turned: ENU to NED, FLU to FRD; BatteryState.current counted positive when discharging"
@@ -152,7 +152,7 @@ def _nothing(_: str, __: int, ___: Values) -> Columns:
     yield from ()
 
 
-KINDS = {
+MESSAGE_KINDS = {
     kind.name: kind
     for kind in (
         MessageKind(MAGNETIC_FIELD, lambda m: _axes("", m.magnetic_field), _nothing, doubles=12),

@@ -28,7 +28,7 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
 from magbridge.logs.compasses import LogCompass, rate
 from magbridge.logs.deployment import NOTES, noted
-from magbridge.logs.ros_messages import FRAMES_HISTORY, KINDS, MAGNETIC_FIELD, MessageKind
+from magbridge.logs.ros_messages import FRAMES_HISTORY, MAGNETIC_FIELD, MESSAGE_KINDS, MessageKind
 
 try:
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -49,7 +49,7 @@ __all__ = ["chunks"]
 STORAGES = {".mcap": McapReader, ".db3": Sqlite3Reader}
 """Readers of one file of a ROS 2 bag, without its folder."""
 ROSBAG_ERRORS = (AnyReaderError, ReaderError, SerdeError, TypesysError, sqlite3.Error)
-STAMP = np.dtype([("", "V4"), ("s", "<i4"), ("ns", "<u4")])
+ROS_STAMP = np.dtype([("", "V4"), ("s", "<i4"), ("ns", "<u4")])
 """Where both ROS 1 (after the sequence number) and ROS 2 (after the encapsulation) have a header's stamp."""
 LITTLE = b"\x00\x01"
 MIN_REAL_TIME_S = 315_532_800.0
@@ -85,7 +85,7 @@ def chunks(path: Path, rows: int, options: Options | None = None) -> Iterator[xr
         raise FormatError(
             path, f"expected a ROS bag; it is damaged: {str(error) or type(error).__name__}"
         ) from None
-    fields = [stream for stream in streams if stream.kind is KINDS[MAGNETIC_FIELD]]
+    fields = [stream for stream in streams if stream.kind is MESSAGE_KINDS[MAGNETIC_FIELD]]
     if not fields:
         topics = " ".join(stream.topic for stream in streams) or "nothing that is read"
         raise FormatError(path, f"expected sensor_msgs/MagneticField; there is: {topics}")
@@ -121,7 +121,7 @@ def _unit(length: float) -> str:
 def _telemetry(streams: Sequence[_Stream]) -> Iterator[Series]:
     seen: dict[str, int] = {}
     for stream in streams:
-        if stream.kind is not KINDS[MAGNETIC_FIELD]:
+        if stream.kind is not MESSAGE_KINDS[MAGNETIC_FIELD]:
             number = seen.setdefault(stream.kind.name, 0)
             seen[stream.kind.name] += 1
             for column, unit, values in stream.kind.columns(stream.topic, number, stream.values):
@@ -161,7 +161,7 @@ def _opened(path: Path) -> Iterator[_Bag]:
 
 def _streams(bag: _Bag) -> tuple[list[_Stream], int]:
     """Return the topics that are read, and how many messages could not be."""
-    wanted = [one for one in bag.connections if _short(one.msgtype) in KINDS]
+    wanted = [one for one in bag.connections if _short(one.msgtype) in MESSAGE_KINDS]
     raw: dict[str, tuple[Any, list[int], list[bytes]]] = {one.topic: (one, [], []) for one in wanted}
     for connection, stamp, data in bag.messages(connections=wanted) if wanted else ():
         _, stamps, messages = raw[connection.topic]
@@ -170,7 +170,7 @@ def _streams(bag: _Bag) -> tuple[list[_Stream], int]:
     found, lost = [], 0
     for topic, (connection, stamps, messages) in raw.items():
         if messages:
-            kind = KINDS[_short(connection.msgtype)]
+            kind = MESSAGE_KINDS[_short(connection.msgtype)]
             good, values = _decoded(bag, connection.msgtype, kind, messages)
             lost += len(messages) - len(good)
             if len(good):
@@ -189,7 +189,7 @@ def _times(kind: MessageKind, recorded: FloatArray, messages: Sequence[bytes]) -
     """Return the stamps of the headers, s; the recorder's without a header, or where it is empty."""
     if not kind.header:
         return recorded
-    stamps = np.frombuffer(b"".join(one[: STAMP.itemsize] for one in messages), STAMP)
+    stamps = np.frombuffer(b"".join(one[: ROS_STAMP.itemsize] for one in messages), ROS_STAMP)
     header = stamps["s"] + stamps["ns"] * 1e-9
     return np.where(header > 0, header, recorded)
 
@@ -220,7 +220,7 @@ def _doubles(
     reads them prove the layout.
     """
     size = 8 * kind.doubles
-    if not kind.doubles or any(len(one) < size + STAMP.itemsize for one in messages):
+    if not kind.doubles or any(len(one) < size + ROS_STAMP.itemsize for one in messages):
         return None
     if bag.ros2 and any(one[:2] != LITTLE for one in messages):
         return None

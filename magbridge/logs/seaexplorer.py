@@ -27,7 +27,7 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
-from magbridge.logs.deployment import HISTORY, deployment, named_losses, sliced, with_losses
+from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, named_losses, sliced, with_losses
 from magbridge.logs.headings import aliases
 from magbridge.logs.packed import opened
 from magbridge.logs.resample import CIRCLES, degrees, linear
@@ -106,7 +106,7 @@ def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) ->
             taken[str(name)] = ("time", values, column.attrs)
     note = f"{' '.join(taken)} between the samples of {path.name}"
     remarks = [line for line in named_losses(navigation.attrs) if "heading" in line]
-    return with_losses(payload.assign(taken).assign_attrs({HISTORY: note}), {}, remarks)
+    return with_losses(payload.assign(taken).assign_attrs({HISTORY_ATTRIBUTE: note}), {}, remarks)
 
 
 def _read(path: Path) -> xr.Dataset:

@@ -6,8 +6,8 @@ the IGRF rotated by the logged attitude, dives of SG167, SG171, SG180, SG236, SG
 
 - ``mag_x/y/z`` are x forward, y starboard, z down, as ours: the 3x3 matrix of that regression is the identity
   to 5 % with few elements off the diagonal above 0.05;
-- what a count is worth, the compass's type says (:data:`NT_PER_COUNT`). The matrix's diagonal is 0.95 to 1.04
-  counts/mG for the types 1, 2 and 6, and 1.75 to 1.91 for type 4;
+- what a count is worth, the compass's type says (:data:`COMPASS_NT_PER_COUNT`). The matrix's diagonal is
+  0.95 to 1.04 counts/mG for the types 1, 2 and 6, and 1.75 to 1.91 for type 4;
 - ``head`` is magnetic (the file states it, and with that the matrix's elements between x and y vanish);
   ``magnetic_variation`` is kept as an attribute, 0.1 deg coarse;
 - ``pitchCtl`` is in cm, ``rollCtl`` in deg, ``vbdCC`` in cc: ``(AD - centre) * CNV`` of each mass's
@@ -38,12 +38,12 @@ from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, with_losses
 from magbridge.logs.resample import CIRCLES, linear
 
-__all__ = ["DIMENSION", "NT_PER_COUNT", "Dive", "dive", "read_netcdf"]
+__all__ = ["COMPASS_NT_PER_COUNT", "DIMENSION", "Dive", "dive", "read_netcdf"]
 
 DIMENSION = "sg_data_point"
-NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
+COMPASS_NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
 """nT in a count, by the type of the compass: ``COMPASS_DEVICE`` is 16 times the type, and the port."""
-SECOND = 2048
+SECOND_COMPASS_BIT = 2048
 """Bit of ``COMPASS_USE``: the second compass is in use."""
 MAX_CTD_GAP_S = 120.0
 """s between CTD_COLUMNS samples across which nothing is interpolated."""
@@ -137,13 +137,13 @@ def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[
     calibration's scales are free to differ from it.
     """
     use = known.settings.get("COMPASS_USE", 0.0)
-    name = "COMPASS2_DEVICE" if np.isfinite(use) and int(use) & SECOND else "COMPASS_DEVICE"
+    name = "COMPASS2_DEVICE" if np.isfinite(use) and int(use) & SECOND_COMPASS_BIT else "COMPASS_DEVICE"
     device = known.settings.get(name)
     if device is None or not np.isfinite(device):
-        return NT_PER_COUNT[2], [f"{path}: no {name}: a count of the compass is taken as 100 nT"]
+        return COMPASS_NT_PER_COUNT[2], [f"{path}: no {name}: a count of the compass is taken as 100 nT"]
     kind = int(device) // 16
-    if kind in NT_PER_COUNT:
-        return NT_PER_COUNT[kind], []
+    if kind in COMPASS_NT_PER_COUNT:
+        return COMPASS_NT_PER_COUNT[kind], []
     estimated = _by_length(known.time, columns)
     unknown = f"{path}: {name} {int(device)} is not known: counts of unknown size"
     return estimated, [f"{unknown}, taken as {estimated:.3g} nT, with which they are as long as the field"]
@@ -155,7 +155,7 @@ def _by_length(time: FloatArray, columns: Mapping[str, FloatArray]) -> float:
     counts = counts[np.isfinite(counts).all(axis=1)]
     place = [columns[name][np.isfinite(columns[name])][:1] for name in PLACE if name in columns]
     if len(counts) < 4 or sum(map(len, place)) < 2:
-        return NT_PER_COUNT[2]
+        return COMPASS_NT_PER_COUNT[2]
     return float(total_field(place[0], place[1], 0.0, time[0])[0]) / sphere_radius(counts)
 
 

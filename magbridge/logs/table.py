@@ -19,13 +19,13 @@ from magbridge.logs.faults import Faults
 from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.logs.stamps import DAY
-from magbridge.logs.unknown import EXPECTED, unknown
+from magbridge.logs.unknown import EXPECTED_VALUE, unknown
 from magbridge.records import Quality
 from magbridge.wording import counted
 
 __all__ = ["TextTable"]
 
-NOTHING = "-", "--", "*", "---"
+EMPTY_CELLS = "-", "--", "*", "---"
 """Cells without a value, in addition to those of pandas (an empty field, NaN, NA, null ...)."""
 
 
@@ -134,7 +134,7 @@ class TextTable:
                 self._note(name, unsure, kept, expected, wrong=False)
         for name, codes in (unknown(columns) if self._layout.foreign else {}).items():
             value = float(columns[name][int(codes.argmax())])
-            self._note(name, codes, kept, f"{EXPECTED}{value!r}", wrong=False)
+            self._note(name, codes, kept, f"{EXPECTED_VALUE}{value!r}", wrong=False)
             columns[name][codes] = np.nan
         for name, source in self._declared.columns.items():
             if name in columns and source.valid in columns:
@@ -220,7 +220,7 @@ class TextTable:
             usecols=kept,
             index_col=False,
             dtype=dict.fromkeys(texts, "str"),
-            na_values=list(NOTHING),
+            na_values=list(EMPTY_CELLS),
             skipinitialspace=True,
             skip_blank_lines=False,
             low_memory=False,

@@ -60,7 +60,7 @@ __all__ = ["FileWriter", "chunks", "read_at_once"]
 NAMED = spec("NAMED_VALUE_FLOAT")
 Part = tuple[IndexArray, IndexArray, FloatArray]
 """Places in the file (m,), µs (m,) and values (m,)."""
-MAX_AGE_US = round(MAX_AGE * 1e6)
+MAX_TELEMETRY_AGE_US = round(MAX_AGE * 1e6)
 NEVER = -(1 << 62)
 SINGLE = 1e-7
 """Relative error of a float32; counts that differ from the channel by more belong to another sensor."""
@@ -191,7 +191,7 @@ class TelemetryRows:
             }
             columns |= {name: at_us / 1e6 for name, at_us in later.items()}
         time = columns["time"]
-        oldest = time_us - MAX_AGE_US
+        oldest = time_us - MAX_TELEMETRY_AGE_US
         row = [v if t >= oldest else nan for v, t in zip(self._values, self._stamps, strict=True)]
         for slot, of in self._aged:
             row[slot] = (time_us - self._stamps[of]) * 1e-6 if self._stamps[of] >= oldest else nan

@@ -16,7 +16,7 @@ from magbridge.arrays import IndexArray
 from magbridge.columns import AGE, CHANNELS
 from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass
-from magbridge.logs.deployment import CHANGES
+from magbridge.logs.deployment import CHANGES_SETTING
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, DeclaredField, Value, correction, sample
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.tlog import Block, blocks
@@ -29,12 +29,12 @@ START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED = spec("NAMED_VALUE_FLOAT")
 BRIDGE_UNITS = {"sensor_supply": "V"}
-NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
+COMPASS_NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
 """Message to the number of the compass whose field it holds; of several for one, the first is read."""
 AUTOPILOT = 1
 GIMBALS = {154, 171, 172, 173, 174, 175}
 """Components whose attitude is their own, and not the vehicle's."""
-RESERVED = {"time", *CHANNELS}
+RESERVED_COLUMNS = {"time", *CHANNELS}
 """Columns that a named value never is."""
 
 
@@ -101,7 +101,7 @@ class LogContents:
     def compasses(self) -> list[LogCompass]:
         """The compasses whose field messages of the sender hold: ``RAW_IMU`` has the first."""
         found = {}
-        for message, number in NUMBERS.items():
+        for message, number in COMPASS_NUMBERS.items():
             n = self._senders.get(spec(message).id, Counter())[self.system, self.component]
             if n and number not in found:
                 found[number] = LogCompass(number, n, 0.0, message)
@@ -157,7 +157,7 @@ class LogContents:
                 self.named.setdefault(letters, []).append((one.column, one.scale, one.offset))
         for letters, name in self._named.get(self.system, {}).items():
             if letters not in self.named:
-                own = f"named_{name}" if name in self.columns or name in RESERVED else name
+                own = f"named_{name}" if name in self.columns or name in RESERVED_COLUMNS else name
                 if own != name:
                     notes.append(
                         f"NAMED_VALUE_FLOAT {name!r} is read as {own}: the log has a {name} of its own"
@@ -199,7 +199,7 @@ class LogContents:
                 aligns = name.startswith("MB_") and not name.startswith(
                     "MB_R_"
                 )  # which are rates of messages
-                self.attrs[CHANGES] = self.attrs.get(CHANGES, 0) + aligns
+                self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
 
     def _look(self, block: Block, number: int, which: IndexArray) -> bool:
         """Record new facts in messages of one kind; return whether further ones can add nothing."""

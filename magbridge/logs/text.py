@@ -33,7 +33,7 @@ import xarray as xr
 from magbridge.columns import COLUMNS
 from magbridge.errors import FormatError
 from magbridge.logs import captures
-from magbridge.logs.deployment import GUESSED, HISTORY, deployment, lasting, with_losses
+from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, lasting, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, is_remark, layout_of
 from magbridge.logs.options import Options
 from magbridge.logs.packed import opened
@@ -46,9 +46,9 @@ __all__ = ["FileWriter", "chunks"]
 DEFAULTS = Options()
 FURTHER = 3_000
 """Lines behind the first ones by whose values units are found."""
-LONGEST = 1 << 20
+MAX_LINE_CHARACTERS = 1 << 20
 """Characters of the longest line that is read whole."""
-KEPT = 1000
+MAX_QUOTED_CHARACTERS = 1000
 """Characters that are kept of a longer one: a row that is dropped, and counted."""
 LOOKED_AT, LINE = 1 << 16, 256
 """Bytes by which the encoding is found, and of the first line, which holds no zero in a text."""
@@ -116,8 +116,11 @@ def _chunks(
     attrs = {**beside, **layout.attrs, **table.attrs}
     if guesses := [*guess, *layout.guesses, *table.guesses]:
         note = "; ".join(guesses)
-        before = [str(attrs[HISTORY])] if HISTORY in attrs else []
-        attrs |= {GUESSED: note, HISTORY: "\n".join([*before, f"{path.name} was read with: {note}"])}
+        before = [str(attrs[HISTORY_ATTRIBUTE])] if HISTORY_ATTRIBUTE in attrs else []
+        attrs |= {
+            GUESSED_ATTRIBUTE: note,
+            HISTORY_ATTRIBUTE: "\n".join([*before, f"{path.name} was read with: {note}"]),
+        }
     numbered = enumerate(chain(header[layout.first :], further, lines), layout.first + 1 - added)
     wanted = ((row, line) for row, line in numbered if line.strip() and not is_remark(line))
     while block := list(islice(wanted, rows)):
@@ -131,12 +134,12 @@ def _chunks(
 
 def _lines(file: TextIO) -> Iterator[str]:
     """Yield the lines; of an endless one, as of the zeros that a crash leaves, the beginning."""
-    while line := file.readline(LONGEST):
-        if len(line) == LONGEST:
+    while line := file.readline(MAX_LINE_CHARACTERS):
+        if len(line) == MAX_LINE_CHARACTERS:
             rest = line
             while rest and not rest.endswith("\n"):
-                rest = file.readline(LONGEST)
-            line = line[:KEPT]
+                rest = file.readline(MAX_LINE_CHARACTERS)
+            line = line[:MAX_QUOTED_CHARACTERS]
         yield line if line.endswith("\n") else f"{line}\n"
 
 
@@ -178,8 +181,8 @@ def _heading(dataset: xr.Dataset, name: str) -> str:
 
 def _metadata(dataset: xr.Dataset, headings: Sequence[str]) -> bytes:
     attrs: dict[str, str | float] = lasting(dataset.attrs)
-    if history := dataset.attrs.get(HISTORY):
-        attrs[HISTORY] = str(history)
+    if history := dataset.attrs.get(HISTORY_ATTRIBUTE):
+        attrs[HISTORY_ATTRIBUTE] = str(history)
     document = {
         "@context": "http://www.w3.org/ns/csvw",
         "notes": [attrs],

@@ -30,13 +30,13 @@ __all__ = ["TlogWriter"]
 Record = tuple[int, int, bytes]
 """µs of the event, channel, frame."""
 
-WINDOW = 0.005
+WRITE_INTERVAL_S = 0.005
 """s between two writes: up to 200 events a second each is written at once, and ``kill -9`` costs at most the
 last one; at higher rates it costs the events of 5 ms. The latency is the same; the writing thread takes 66 us
 per sample at 100 Hz, where every event has a write of its own, and 19 us at 1,000 Hz."""
 QUEUE = 50_000
 """Events (some 10 MB) whose records wait for a stalled disk; those that follow are dropped."""
-RETRY_US = 2_000_000
+LOG_RETRY_US = 2_000_000
 """µs of the events' time after which a log that failed is tried again, in a new file."""
 SYNC_US = 5_000_000
 """µs of the events' time between two syncs: no more is lost when the power fails or somebody deletes the
@@ -127,7 +127,7 @@ class TlogWriter:
             events += [self._queue.get() for _ in range(self._queue.qsize())]
             if records := [record for event in events for record in event]:
                 self._put_all(records)
-            time.sleep(WINDOW)
+            time.sleep(WRITE_INTERVAL_S)
         self._end_file()
 
     def _put_all(self, records: list[Record]) -> None:
@@ -153,7 +153,7 @@ class TlogWriter:
         )
 
     def _begin_file(self, time_us: int) -> bool:
-        if self.failure and 0 <= time_us - self._failed_us < RETRY_US:
+        if self.failure and 0 <= time_us - self._failed_us < LOG_RETRY_US:
             return False
         begin_s = self._begin_s or time_us // 1_000_000
         try:

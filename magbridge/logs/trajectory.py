@@ -57,7 +57,7 @@ MEANINGS = {
 }
 OG1_COLUMNS = {"temp": "water_temperature", "pres": "water_pressure"}
 """OG1.0's names, in small letters, of columns whose name is not simply ours in capitals."""
-FLAGS = re.compile(r"(.+)_(?:qc|qartod_\w*|flag)", re.IGNORECASE)
+FLAG_VARIABLE = re.compile(r"(.+)_(?:qc|qartod_\w*|flag)", re.IGNORECASE)
 """Name of a variable with the flags of another."""
 BAD = re.compile(r"bad|fail|missing|reject|erroneous|not_used")
 BAD_CODES = (3, 4, 9)
@@ -201,7 +201,7 @@ def _flags(file: Any, name: str) -> Any | None:
         one = file.variables.get(other)
         if one is None or one.shape != file[name].shape:
             continue
-        if FLAGS.fullmatch(other) or hasattr(one, "flag_meanings"):
+        if FLAG_VARIABLE.fullmatch(other) or hasattr(one, "flag_meanings"):
             return one
     return None
 

@@ -12,9 +12,9 @@ from magbridge.columns import CHANNELS
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import with_losses
 
-__all__ = ["EXPECTED", "known", "unknown"]
+__all__ = ["EXPECTED_VALUE", "known", "unknown"]
 
-EXPECTED = "expected a value, or nothing where it is not known, not "
+EXPECTED_VALUE = "expected a value, or nothing where it is not known, not "
 
 CODES = np.outer([-1.0, 1.0], [
     9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
@@ -23,7 +23,7 @@ CODES = np.outer([-1.0, 1.0], [
 """As they are met, with either sign."""
 ONLY_AMONG_OTHERS = 1_000.0
 """Smaller codes count only where the column has other values, too."""
-HUGE = 1e30
+MIN_FILL_VALUE = 1e30
 """A larger number is one, too, whatever it measures: 1e31, 1e34, 9.97e36."""
 
 
@@ -44,7 +44,7 @@ def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
 
 
 def _is_code(values: FloatArray) -> BoolArray:
-    wrong: BoolArray = np.abs(values) > HUGE
+    wrong: BoolArray = np.abs(values) > MIN_FILL_VALUE
     codes = np.isin(values, CODES)
     others = values[np.isfinite(values) & ~codes & ~wrong]
     if not len(others):
@@ -61,6 +61,6 @@ def known(path: Path, dataset: xr.Dataset) -> xr.Dataset:
     lines = []
     for name, wrong in codes.items():
         values = dataset[name].to_numpy()
-        lines.append(str(FormatError(path, f"{EXPECTED}{float(values[wrong][0])!r}", column=name)))
+        lines.append(str(FormatError(path, f"{EXPECTED_VALUE}{float(values[wrong][0])!r}", column=name)))
         dataset = dataset.assign({name: dataset[name].copy(data=np.where(wrong, np.nan, values))})
     return with_losses(dataset, {"values_dropped": sum(int(wrong.sum()) for wrong in codes.values())}, lines)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any, Final
 
 from magbridge.mavlink import dialect
-from magbridge.mavlink.framing import MORE, find_magic, frame_end, message
+from magbridge.mavlink.framing import NEEDS_MORE, find_magic, frame_end, message
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, spec
 from magbridge.mavlink.secrets import SECRET, without_secret
 from magbridge.mavlink.signing import Signing
 
-__all__ = ["WINDOW", "Codec"]
+__all__ = ["MAX_PENDING_BYTES", "Codec"]
 
-WINDOW: Final = 4096
+MAX_PENDING_BYTES: Final = 4096
 """Most bytes that are kept without a whole frame; then they are skipped, even if a frame may have begun in
 them, so that memory stays bounded."""
 
@@ -86,18 +86,18 @@ class Codec:
         found: list[Message] = []
         begin, at = 0, self._looked  # begin: end of the last frame; at: no frame begins before
         while begin < len(data):
-            stop = min(len(data), begin + WINDOW)
+            stop = min(len(data), begin + MAX_PENDING_BYTES)
             start = find_magic(data, at, stop)
             last = whole and stop == len(data)
-            end = frame_end(data, start, stop, last=last) if start < stop else MORE
+            end = frame_end(data, start, stop, last=last) if start < stop else NEEDS_MORE
             if end > 0:
                 if begin < start:
                     found.append(self._skip(data[begin:start]))
                 found.append(self._accept(message(data[start:end])))
                 begin = at = end
-            elif end != MORE or (last and start < stop):
+            elif end != NEEDS_MORE or (last and start < stop):
                 at = start + 1
-            elif stop == begin + WINDOW or last:
+            elif stop == begin + MAX_PENDING_BYTES or last:
                 found.append(self._skip(data[begin:stop]))
                 begin = at = stop
             else:

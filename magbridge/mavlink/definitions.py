@@ -11,10 +11,10 @@ from magbridge.errors import DataError
 
 __all__ = ["write_definitions"]
 
-OURS = Path(__file__).with_name("magbridge.xml")
+DIALECT_XML = Path(__file__).with_name("magbridge.xml")
 WITH_ARDUPILOT = "magbridge_ardupilotmega.xml"
 """For stations of ArduPilot, whose own messages are more than the common ones."""
-DIALECTS = {OURS.name: "magbridge_dialect.py", WITH_ARDUPILOT: "magbridge_ardupilotmega.py"}
+DIALECTS = {DIALECT_XML.name: "magbridge_dialect.py", WITH_ARDUPILOT: "magbridge_ardupilotmega.py"}
 """The XML of each dialect, and its module; a module named magbridge would hide the package."""
 BOTH = """<?xml version="1.0"?>
 <!-- ArduPilot's messages and those of magbridge. -->
@@ -50,7 +50,7 @@ def write_definitions(folder: Path) -> list[Path]:
     from pymavlink.generator import mavgen, mavparse  # noqa: PLC0415
 
     shipped = Path(pymavlink.__file__).parent / "dialects" / "v20"
-    shutil.copyfile(OURS, folder / OURS.name)
+    shutil.copyfile(DIALECT_XML, folder / DIALECT_XML.name)
     (folder / WITH_ARDUPILOT).write_text(BOTH, encoding="utf-8")
     wanted = list(DIALECTS)
     for name in wanted:  # grows by what each includes

@@ -18,7 +18,7 @@ from magbridge.mavlink.secrets import without_secrets
 __all__ = ["FrameLogReader", "FrameLogWriter"]
 
 WRAPPER = spec("MAG_LINK_BYTES")
-SIZE = WRAPPER.fields["data"].count
+WRAPPED_BYTES = WRAPPER.fields["data"].count
 
 
 class FrameLogWriter:
@@ -41,7 +41,7 @@ class FrameLogWriter:
 
     def _wrap(self, data: bytes, ahead: int) -> list[bytes]:
         data = without_secrets(data)
-        pieces = [data[i : i + SIZE] for i in range(0, len(data), SIZE)]
+        pieces = [data[i : i + WRAPPED_BYTES] for i in range(0, len(data), WRAPPED_BYTES)]
         return [
             self._codec.pack(WRAPPER.name, ahead=ahead, length=len(piece), data=piece) for piece in pieces
         ]

@@ -18,7 +18,7 @@ from magbridge.mavlink.dialect import (
 from magbridge.mavlink.messages import MESSAGES, Message, spec
 
 __all__ = [
-    "EXTRA", "LAST", "MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED", "V1", "V2", "checksum",
+    "EXTRA", "MAX_MESSAGE_ID", "NEEDS_MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED", "V1", "V2", "checksum",
     "find_magic", "frame_end", "is_signed", "message",
 ]  # fmt: skip
 
@@ -28,8 +28,8 @@ SIGNED: Final = MAVLINK_IFLAG_SIGNED
 SIGNATURE: Final = MAVLINK_SIGNATURE_BLOCK_LEN
 """bytes: link id, 6 of time stamp, 6 of hash."""
 NOT_A_FRAME: Final = 0
-MORE: Final = -1
-LAST: Final = 0xFFFF
+NEEDS_MORE: Final = -1
+MAX_MESSAGE_ID: Final = 0xFFFF
 """The last message id that a message outside the dialect may have."""
 EXTRA: Final = {number: bytes((layout.crc_extra,)) for number, layout in MESSAGES.items()}
 """CRC_EXTRA of each message, the last byte that its checksum covers."""
@@ -73,27 +73,27 @@ def frame_end(data: bytes, start: int, stop: int, *, last: bool = False) -> int:
     Returns
     -------
     int
-        The end, or `NOT_A_FRAME`, or `MORE` if the bytes from `stop` on are needed to decide.
+        The end, or `NOT_A_FRAME`, or `NEEDS_MORE` if the bytes from `stop` on are needed to decide.
     """
     available = stop - start
     header = 10 if data[start] == V2 else 6
     flags = data[start + 2] if header == 10 and available > 2 else 0
     # an incompatibility flag that we do not know: by the standard, not to be read
     if flags > SIGNED or available < header:
-        return NOT_A_FRAME if flags > SIGNED else MORE
+        return NOT_A_FRAME if flags > SIGNED else NEEDS_MORE
     number = data[start + 5] if header == 6 else _number(data, start)
     extra = EXTRA.get(number)
-    if extra is None and (header == 6 or data[start + 3] or number > LAST):
+    if extra is None and (header == 6 or data[start + 3] or number > MAX_MESSAGE_ID):
         return NOT_A_FRAME
     body_end = start + header + data[start + 1]
     end = body_end + 2 + (SIGNATURE if flags else 0)
     if end > stop:
-        return MORE
+        return NEEDS_MORE
     if extra is not None:
         right = checksum(data[start + 1 : body_end], extra)
         return end if right == data[body_end] | data[body_end + 1] << 8 else NOT_A_FRAME
     if end >= stop:
-        return end if last else MORE
+        return end if last else NEEDS_MORE
     return end if data[end] in (V1, V2) else NOT_A_FRAME
 
 

@@ -15,8 +15,18 @@ from magbridge.mavlink import dialect
 from magbridge.mavlink.enums import INVALID
 
 __all__ = [
-    "BAD_DATA", "IDS", "MESSAGES", "REFUSED", "Field", "Message", "Spec", "by_id", "east_e7", "nearest_name",
-    "spec", "split_index",
+    "BAD_DATA",
+    "MESSAGES",
+    "MESSAGE_IDS",
+    "REFUSED",
+    "Field",
+    "Message",
+    "Spec",
+    "by_id",
+    "east_e7",
+    "nearest_name",
+    "spec",
+    "split_index",
 ]  # fmt: skip
 
 BAD_DATA: Final = -1
@@ -31,7 +41,7 @@ TURN_E7 = 3_600_000_000
 MESSAGES: Final[dict[int, Any]] = {**upstream.mavlink_map, **dialect.mavlink_map}
 """Message id -> pymavlink's class of the message; ours and the few that the wheel lacks take precedence."""
 dialect.mavlink_map.update(MESSAGES)  # the generated parser decodes all of them
-IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
+MESSAGE_IDS = {layout.msgname: number for number, layout in MESSAGES.items()}
 """Message name -> id."""
 DECODER: Final = dialect.MAVLink(None)
 """Decodes frames that were accepted; it holds no key and no buffer."""
@@ -141,7 +151,7 @@ class Spec:
 @cache
 def spec(message: int | str) -> Spec:
     """Return the layout of a message, by id or name; KeyError: no such message."""
-    return Spec(message) if isinstance(message, int) else spec(IDS[message])
+    return Spec(message) if isinstance(message, int) else spec(MESSAGE_IDS[message])
 
 
 def nearest_name(name: str, valid: Iterable[str]) -> str:

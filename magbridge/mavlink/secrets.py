@@ -16,7 +16,7 @@ SECRET = frozenset(
     spec(name).id for name in ("SETUP_SIGNING", "AUTH_KEY", "CHANGE_OPERATOR_CONTROL", "WIFI_CONFIG_AP")
 )
 """Ids of the messages with a key, a passkey or a password in them."""
-HEADER = re.compile(
+SECRET_HEADER = re.compile(
     rb"\xfd.{6}(?:" + b"|".join(re.escape(number.to_bytes(3, "little")) for number in SECRET) + rb")",
     re.DOTALL,
 )
@@ -34,7 +34,7 @@ def without_secret(frame: bytes) -> bytes:
 
 def without_secrets(data: bytes) -> bytes:
     """Return bytes that are not a whole frame, with zeros wherever the payload of such a message may be."""
-    for match in HEADER.finditer(data):
+    for match in SECRET_HEADER.finditer(data):
         begin = match.end()
         end = min(begin + data[match.start() + 1], len(data))
         data = data[:begin] + bytes(end - begin) + data[end:]

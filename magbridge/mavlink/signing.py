@@ -30,14 +30,14 @@ __all__ = ["NOT_SIGNED", "Signing", "Stream", "load_key", "readable_by_all", "ti
 
 EPOCH_US = 1_420_070_400_000_000
 """2015-01-01 in µs of UNIX time."""
-SECOND = 100_000
+STAMPS_PER_SECOND = 100_000
 """in units of 10 µs"""
-MINUTE = 60 * SECOND
+MINUTE = 60 * STAMPS_PER_SECOND
 FOLLOW = 7 * 24 * 60 * MINUTE
 """How far ahead of our clock the autopilot's stamps may take ours."""
 SET = (1_672_531_200_000_000 - EPOCH_US) // 10
 """2023-01-01: a clock that shows less was never set."""
-LIMIT = (1 << 48) - 1
+MAX_STAMP = (1 << 48) - 1
 STREAMS = 1024
 """Most floors that are kept; of more, those of the streams heard first are forgotten."""
 NOT_SIGNED = "not signed"
@@ -53,7 +53,7 @@ Stream = tuple[int, int, int, bool, int]
 
 def timestamp(t_us: int) -> int:
     """Return the signing time stamp of a UNIX time in µs."""
-    return min(max(t_us - EPOCH_US, 0) // 10, LIMIT)
+    return min(max(t_us - EPOCH_US, 0) // 10, MAX_STAMP)
 
 
 def load_key(path: str | Path) -> bytes:
@@ -124,11 +124,11 @@ class Signing(MAVLinkSigning):
 
     def set_clock(self, t_us: int) -> None:
         """Choose the stamp of the next frame that pymavlink signs, at the UNIX time `t_us` (µs)."""
-        self.last = self.timestamp = min(max(self.last + 1, timestamp(t_us)), LIMIT)
+        self.last = self.timestamp = min(max(self.last + 1, timestamp(t_us)), MAX_STAMP)
 
     def skip(self, count: int, t_us: int) -> None:
         """Use up the stamps that signing `count` frames would: a replay does not have these frames."""
-        self.last = min(max(self.last + 1, timestamp(t_us)) + count - 1, LIMIT)
+        self.last = min(max(self.last + 1, timestamp(t_us)) + count - 1, MAX_STAMP)
 
     def reserved(self, t_us: int, ahead: int) -> int:
         """Return a stamp below which all stay that are used within the next `ahead` (units of 10 µs).
@@ -137,7 +137,7 @@ class Signing(MAVLinkSigning):
         here if this one does not end in good order; it would drift ahead of the clock, restart by restart,
         if `ahead` were simply added to the last stamp.
         """
-        return min(max(self.last + SECOND, timestamp(t_us) + ahead), LIMIT)
+        return min(max(self.last + STAMPS_PER_SECOND, timestamp(t_us) + ahead), MAX_STAMP)
 
     def accept(self, frame: bytes, stream: tuple[int, int], number: int, t_us: int) -> bool:
         """Return True if a frame of the `stream` (system, component) is genuine and new."""
@@ -163,7 +163,7 @@ class Signing(MAVLinkSigning):
         self._floors[key] = stamp
         if len(self._floors) > STREAMS:
             del self._floors[next(iter(self._floors))]
-        if stream == self._follow and stamp < (now + self._follow_limit if now > SET else LIMIT // 2):
+        if stream == self._follow and stamp < (now + self._follow_limit if now > SET else MAX_STAMP // 2):
             self.last = max(self.last, stamp)
             self.followed_days = max(0.0, (stamp - now) / (24 * 60 * MINUTE))
         return ""

@@ -18,22 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import IndexArray
-from magbridge.mavlink.framing import EXTRA, LAST, SIGNATURE, SIGNED, V1, V2, checksum, message
+from magbridge.mavlink.framing import EXTRA, MAX_MESSAGE_ID, SIGNATURE, SIGNED, V1, V2, checksum, message
 from magbridge.mavlink.messages import Message, spec
 
 __all__ = ["Block", "LogReader", "Record", "blocks", "pack_record", "pack_records"]
 
-STAMP: Final = Struct(">Q")
+TLOG_STAMP: Final = Struct(">Q")
 LATEST: Final = 1 << 52
 """µs; a stamp beyond the year 2112 is damage."""
 BLOCK_BYTES: Final = 1 << 22
 """Bytes read at a time."""
-LONGEST = 8 + 10 + 255 + 2 + SIGNATURE + 9
+MAX_RECORD_BYTES = 8 + 10 + 255 + 2 + SIGNATURE + 9
 """Bytes of the longest record, and of what shows that another follows."""
-LAYOUT = np.dtype([("stamp", ">u8"), ("head", "u1", 10)])
-KNOWN = np.full(1 << 16, -1, dtype=np.int64)
-KNOWN[[number for number in EXTRA if number < len(KNOWN)]] = [
-    EXTRA[number][0] for number in EXTRA if number < len(KNOWN)
+RECORD_LAYOUT = np.dtype([("stamp", ">u8"), ("head", "u1", 10)])
+KNOWN_LENGTHS = np.full(1 << 16, -1, dtype=np.int64)
+KNOWN_LENGTHS[[number for number in EXTRA if number < len(KNOWN_LENGTHS)]] = [
+    EXTRA[number][0] for number in EXTRA if number < len(KNOWN_LENGTHS)
 ]
 """CRC_EXTRA of each message in the dialect, -1 of the others."""
 
@@ -56,7 +56,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 
 def pack_record(time_us: int, channel: int, frame: bytes) -> bytes:
     """Return the bytes of a record; `time_us` loses its low two bits to the channel."""
-    return STAMP.pack(time_us & ~3 | channel) + frame
+    return TLOG_STAMP.pack(time_us & ~3 | channel) + frame
 
 
 def pack_records(records: Iterable[tuple[int, int, bytes]]) -> bytes:
@@ -153,7 +153,7 @@ class LogReader:
 
 def _block(data: bytes, broken: bool, *, last: bool) -> tuple[Block, int, bool]:
     """Return the records in `data`, where the undecided ones begin, and whether that is damage."""
-    stop = len(data) if last else max(len(data) - LONGEST, 0)
+    stop = len(data) if last else max(len(data) - MAX_RECORD_BYTES, 0)
     start, found = _candidates(data, stop)
     ends = found.pop("stop")
     taken, at, skipped, damages = [], 0, 0, 0
@@ -184,8 +184,8 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     n = max(min(stop, len(raw) - 16), 0)
     magic = raw[8 : 8 + n]
     start = np.flatnonzero(((magic == V2) | (magic == V1)) & (raw[:n] == 0) & (raw[1 : n + 1] < 0x10))
-    window = raw[np.minimum(start[:, None] + np.arange(LAYOUT.itemsize), len(raw) - 1)]
-    records = window.view(LAYOUT)[:, 0] if len(start) else np.empty(0, LAYOUT)
+    window = raw[np.minimum(start[:, None] + np.arange(RECORD_LAYOUT.itemsize), len(raw) - 1)]
+    records = window.view(RECORD_LAYOUT)[:, 0] if len(start) else np.empty(0, RECORD_LAYOUT)
     stamp, header = records["stamp"].astype(np.int64), records["head"].astype(np.int64)
     two = header[:, 0] == V2
     flags = np.where(two, header[:, 2], 0)
@@ -195,7 +195,9 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     payload = frame + np.where(two, 10, 6)
     body_end = payload + header[:, 1]
     end = body_end + 2 + np.where(flags > 0, SIGNATURE, 0)
-    extra = np.where(number < len(KNOWN), KNOWN[np.minimum(number, len(KNOWN) - 1)], -1)
+    extra = np.where(
+        number < len(KNOWN_LENGTHS), KNOWN_LENGTHS[np.minimum(number, len(KNOWN_LENGTHS) - 1)], -1
+    )
     fits = (flags <= 1) & (end <= len(raw)) & (stamp < LATEST)
     known = np.flatnonzero(fits & (extra >= 0))
     spans = zip((frame[known] + 1).tolist(), body_end[known].tolist(), number[known].tolist(), strict=True)
@@ -204,7 +206,7 @@ def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArra
     at = body_end[known]
     good[known] = crc == (raw[at].astype(np.int64) | raw[at + 1].astype(np.int64) << 8)
     # outside the dialect: believed where another follows
-    unknown = np.flatnonzero(fits & (extra < 0) & two & (header[:, 3] == 0) & (number <= LAST))
+    unknown = np.flatnonzero(fits & (extra < 0) & two & (header[:, 3] == 0) & (number <= MAX_MESSAGE_ID))
     after = end[unknown] + 8
     follows = np.isin(raw[np.minimum(after, len(raw) - 1)], (V1, V2)) & (after < len(raw))
     good[unknown] = follows | (after >= len(raw))

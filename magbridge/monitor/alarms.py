@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-__all__ = ["MOST", "Alarm", "Alarms"]
+__all__ = ["MAX_ALARMS", "Alarm", "Alarms"]
 
-MOST = 100
+MAX_ALARMS = 100
 """Alarms that are kept at most; the oldest go first."""
 
 
@@ -59,7 +59,7 @@ class Alarms:
         """Begin an alarm, or restart it; one that is not `active` is an event, over at once."""
         count = self._alarms.pop(key).count + 1 if key in self._alarms else 1
         self._alarms[key] = Alarm(key, text, now, now, active, count)
-        while len(self._alarms) > MOST:
+        while len(self._alarms) > MAX_ALARMS:
             del self._alarms[next(iter(self._alarms))]
 
     def acknowledge(self, key: str | None = None) -> None:

@@ -18,11 +18,11 @@ BREAK = 10.0
 ROOM, TAIL = 3.0, 0.02
 """The axis holds all but the share `TAIL` of the points at either end, and `ROOM` times their range beyond. A
 step of the field is more than that share within seconds; a spike never is."""
-LEAST = 1e-5
+MIN_AXIS_RANGE = 1e-5
 """Smallest range of the value: an axis is not shorter."""
 ROUND = {"showMinLabel": False, "showMaxLabel": False, "color": GREY}
 """No labels at the ends of an axis: they would be written over the round numbers next to them."""
-APART = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
+NUMBER_FORMAT = "value => value.toLocaleString('en').replaceAll(',', '\N{NARROW NO-BREAK SPACE}')"
 """Separates thousands, as everywhere on the page."""
 TOOLTIP = """seen => {
     const number = value => magbridge.number(value, DIGITS)
@@ -81,7 +81,7 @@ def options(name: str, unit: str, *, small: bool = False) -> dict[str, Any]:
             "type": "value",
             "scale": True,
             "splitNumber": 3 if small else 5,
-            "axisLabel": {":formatter": APART, **ROUND},
+            "axisLabel": {":formatter": NUMBER_FORMAT, **ROUND},
             "splitLine": {"lineStyle": {"color": GREYER}},
         },
         "series": [
@@ -124,7 +124,7 @@ def axis_range(points: Sequence[Point]) -> dict[str, float]:
     within = inner[0] - room, inner[-1] + room
     low = max(within[0], min(point.low for point in points))
     high = min(within[1], max(point.high for point in points))
-    if high - low < LEAST * abs(low):  # a constant is not magnified
+    if high - low < MIN_AXIS_RANGE * abs(low):  # a constant is not magnified
         low, high = within
     step = 10.0 ** floor(log10(max(high - low, 1e-6)) - 0.5)
     return {"min": floor(low / step) * step, "max": ceil(high / step) * step}

@@ -8,7 +8,7 @@ from nicegui import ui
 
 from magbridge.monitor.chart import drawn, options
 from magbridge.monitor.history import TIERS, Series
-from magbridge.monitor.state import TEMPERATURE, State
+from magbridge.monitor.state import TEMPERATURE_SERIES, State
 from magbridge.monitor.track import Background, series
 from magbridge.monitor.track import options as map_options
 from magbridge.monitor.widgets import GRID, Changes, card, nothing
@@ -16,7 +16,7 @@ from magbridge.monitor.widgets import GRID, Changes, card, nothing
 __all__ = ["Telemetry", "TotalField", "TrackMap"]
 
 KEYS = "; keys: plus and minus zoom, arrows pan, 0 shows all, S saves it as PNG"
-SLOWEST = 3.0
+MAX_CHART_INTERVAL_S = 3.0
 """s between two drawings of a chart of telemetry: there may be many, and a phone draws them."""
 
 
@@ -69,15 +69,15 @@ class Telemetry:
     """A chart each for the positions of the masses, whatever else the vehicle names, and the temperature."""
 
     def __init__(self) -> None:
-        self._changes, self._curves, self._drawn = Changes(), dict[str, Curve](), -SLOWEST
+        self._changes, self._curves, self._drawn = Changes(), dict[str, Curve](), -MAX_CHART_INTERVAL_S
         with card("Masses, other telemetry, and temperature"):
             self._box = ui.element().classes(f"{GRID} md:grid-cols-2 xl:grid-cols-3")
 
     def show(self, state: State, tier: str, now: float) -> None:
         """Draw them, now and then."""
-        names = sorted(state.telemetry, key=lambda name: (name == TEMPERATURE, name))
+        names = sorted(state.telemetry, key=lambda name: (name == TEMPERATURE_SERIES, name))
         if self._changes.new("names", names, self._box):
-            self._drawn = now - SLOWEST
+            self._drawn = now - MAX_CHART_INTERVAL_S
             with self._box:
                 if not names:
                     nothing(
@@ -88,7 +88,7 @@ class Telemetry:
                     with ui.column().classes("gap-0 w-full"):
                         ui.label(name).classes("text-sm font-medium")
                         self._curves[name] = Curve(name, name, "", small=True)
-        if now - self._drawn < SLOWEST and not self._changes.new("tier", tier):
+        if now - self._drawn < MAX_CHART_INTERVAL_S and not self._changes.new("tier", tier):
             return
         self._drawn = now
         for name, curve in self._curves.items():

@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf, isfinite
 
-__all__ = ["LARGEST", "TIERS", "Point", "Series", "TrackPoint", "Trail"]
+__all__ = ["MAX_PLOTTED_VALUE", "TIERS", "Point", "Series", "TrackPoint", "Trail"]
 
 TIERS = {"10 min": (600.0, 1.0), "2 h": (7_200.0, 10.0), "24 h": (86_400.0, 120.0)}
 """Window and width of a point, in s, by the name that the page gives the window."""
-LARGEST = 1e12
+MAX_PLOTTED_VALUE = 1e12
 """Larger values are kept as this: no field, and no sum of them overflows."""
 LAST_YEAR = 4.1e9
 """s since 1970: a later time (in 2100) is invalid."""
@@ -71,7 +71,10 @@ class Series:
         """
         if not (isfinite(value + two_sigma) and 0.0 <= time < LAST_YEAR):
             return
-        value, two_sigma = max(-LARGEST, min(value, LARGEST)), min(abs(two_sigma), LARGEST)
+        value, two_sigma = (
+            max(-MAX_PLOTTED_VALUE, min(value, MAX_PLOTTED_VALUE)),
+            min(abs(two_sigma), MAX_PLOTTED_VALUE),
+        )
         self.latest, self.added = value, self.added + 1
         for name, tier in self._tiers.items():
             width = TIERS[name][1]

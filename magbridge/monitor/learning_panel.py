@@ -15,7 +15,7 @@ __all__ = ["LearningPanel"]
 
 TITLE = "Learning in flight"
 DO = "MB_LEARN_CMD"
-ORDERS = {
+LEARNING_COMMANDS = {
     "Accept": (1.0, "Use the learned calibration from now on, and acknowledge the alarm"),
     "Forget": (2.0, "Return to the first calibration, and restart learning"),
 }
@@ -33,7 +33,7 @@ class LearningPanel:
             with ui.row().classes("gap-x-4"):
                 self._buttons = [
                     button(name, partial(self._order, value)).tooltip(meaning)
-                    for name, (value, meaning) in ORDERS.items()
+                    for name, (value, meaning) in LEARNING_COMMANDS.items()
                 ]
             self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
 

@@ -18,7 +18,7 @@ from magbridge.monitor.panels import Figures, Flags, Health, Navigation, Paramet
 from magbridge.monitor.rose import CompassRose
 from magbridge.monitor.state import State
 from magbridge.monitor.track import Background
-from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, RED, STYLE, Changes, slanted
+from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, MONITOR_STYLE, RED, Changes, slanted
 from magbridge.monitor.words import measured, silence
 from magbridge.wording import counted
 
@@ -41,7 +41,7 @@ class Page:
         self._state = State()
         self._tier, self._sound = next(iter(TIERS)), False
         self._changes = Changes()
-        ui.add_css(STYLE)
+        ui.add_css(MONITOR_STYLE)
         picture = f"magbridge.map = {json.dumps(background.picture)};" if background else ""
         ui.add_head_html(f"<script>{SCRIPT}{picture}</script>")
         ui.query("body").classes("bg-slate-100 dark:bg-slate-900").style(f"color: {INK}")

@@ -8,7 +8,7 @@ from math import nan
 from nicegui import ui
 
 from magbridge.config import Align, Telemetry
-from magbridge.link.message_rates import DEFAULTS, LIMITS
+from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS
 from magbridge.link.parameters import alignment, file_rate, learning, rates, telemetry_ages
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.monitor.link import StationLink
@@ -27,13 +27,13 @@ from magbridge.monitor.widgets import (
     nothing,
     slanted,
 )
-from magbridge.monitor.words import FLAGS, ago, health, measured, silence, whereabouts
+from magbridge.monitor.words import FLAG_TEXTS, ago, health, measured, silence, whereabouts
 
 __all__ = ["Figures", "Flags", "Health", "Navigation", "Parameters", "Texts"]
 
 TUNABLES = {
     one.name: one
-    for one in (*alignment(Align()), *file_rate(), *learning(enabled=True), *rates(DEFAULTS, LIMITS))
+    for one in (*alignment(Align()), *file_rate(), *learning(enabled=True), *rates(DEFAULT_RATES_HZ, LIMITS))
 }
 """The parameters of a bridge, with the unit and range that a PARAM_VALUE does not carry."""
 (AGE,) = telemetry_ages({"telemetry": Telemetry(message="", field="")})
@@ -82,7 +82,7 @@ class Flags:
             for name, since in flags.items():
                 color = AMBER if name == "no_boresight" else RED
                 with ui.column().classes("gap-0 border-l-4 pl-3").style(f"border-color: {color}"):
-                    ui.label(FLAGS[name]).classes("leading-tight")
+                    ui.label(FLAG_TEXTS[name]).classes("leading-tight")
                     ui.label(f"{name}, {since}").classes(f"text-xs {MUTED}")
 
 

@@ -45,7 +45,7 @@ HEADERS = {
 }
 """With every answer: nothing from elsewhere is loaded, and no site frames the page."""
 LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
-LONGEST = 4096
+MAX_COOKIE_CHARACTERS = 4096
 """Characters of a cookie header that are looked at."""
 
 
@@ -141,7 +141,7 @@ class Guard:
 
     def _known(self, headers: Mapping[str, str]) -> bool:
         try:
-            morsel = SimpleCookie(headers.get("cookie", "")[:LONGEST]).get(self._cookie)
+            morsel = SimpleCookie(headers.get("cookie", "")[:MAX_COOKIE_CHARACTERS]).get(self._cookie)
         except CookieError:
             return False
         return morsel is not None and _same(morsel.value, self._token)

@@ -13,22 +13,22 @@ from magbridge.monitor.alarms import Alarms
 from magbridge.monitor.history import Series, TrackPoint, Trail
 from magbridge.records import Quality
 
-__all__ = ["TEMPERATURE", "Parameter", "State", "Text"]
+__all__ = ["TEMPERATURE_SERIES", "Parameter", "State", "Text"]
 
 HOLD = 3.0
 """s for which a flag is still shown after it was last set."""
-RETRY = 1.5
+REQUEST_RETRY_S = 1.5
 """s after which a request without an answer is repeated."""
 WAITING = "no answer yet"
 SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
 """Samples, parameters, and series of telemetry that are kept at most."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
 """States of the position filter in which it says where the vehicle is."""
-ORDERS = {"MB_LEARN_CMD"}
+COMMAND_PARAMETERS = {"MB_LEARN_CMD"}
 """Parameters that go back to 0 once the request is done."""
 FIX_2D = 2
 """GPS_FIX_TYPE from which a receiver knows its place."""
-TEMPERATURE = "Temperature, °C"
+TEMPERATURE_SERIES = "Temperature, °C"
 """The series of the fluxgate's temperature, in addition to the telemetry."""
 
 
@@ -144,12 +144,12 @@ class State:
         target = dict(zip(("target_system", "target_component"), self.bridge, strict=True))
         known = {one.index for one in self.parameters.values()}
         missing = [index for index in range(min(self._count, PARAMETERS)) if index not in known]
-        if now - self._asked > RETRY and (missing or not known):
+        if now - self._asked > REQUEST_RETRY_S and (missing or not known):
             self._asked = now
             requests += [("PARAM_REQUEST_READ", {**target, "param_index": index}) for index in missing[:10]]
             requests += [("PARAM_REQUEST_LIST", target)] if not known else []
         for name, one in self.parameters.items():
-            if one.asked is not None and now - one.when > RETRY:
+            if one.asked is not None and now - one.when > REQUEST_RETRY_S:
                 one.error, one.when = WAITING if isfinite(one.when) else "", now
                 value = {"param_id": name, "param_value": one.asked, "param_type": MAV_PARAM_TYPE.REAL32}
                 requests.append(("PARAM_SET", {**target, **value}))
@@ -179,7 +179,7 @@ class State:
         )
 
     def _raw(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
-        self._measured(TEMPERATURE, message["time_usec"] * 1e-6, message["temperature"])
+        self._measured(TEMPERATURE_SERIES, message["time_usec"] * 1e-6, message["temperature"])
 
     def _named_value(self, message: Message, now: float) -> None:
         self._measured(message["name"], self.time(now), message["value"])
@@ -237,7 +237,7 @@ class State:
         one.value = value
         if one.asked is None:
             return
-        if isclose(one.asked, value, rel_tol=1e-6) or (name in ORDERS and value == 0.0):
+        if isclose(one.asked, value, rel_tol=1e-6) or (name in COMMAND_PARAMETERS and value == 0.0):
             one.error = ""
         elif one.error == WAITING:
             return  # of a list that somebody asked for meanwhile; our request is repeated

@@ -20,7 +20,7 @@ __all__ = ["Background", "ellipse", "extent", "options", "read_background", "ser
 ORANGE, BLUE = "#f97316", "#3b82f6"
 ASPECT = 4.0 / 3.0
 """Width to height of the plot: both of the chart and of its margins, so that a circle is one at any width."""
-LEAST = 200.0
+MIN_MAP_WIDTH_M = 200.0
 """m across that the map shows at least."""
 PIXELS = 600
 """Pixels of the picture of a grid along its longer side, at most."""
@@ -106,7 +106,9 @@ def extent(places: Iterable[tuple[float, float]]) -> tuple[float, float, float, 
     south, north = min(y for _, y in points), max(y for _, y in points)
     middle_x, middle_y = 0.5 * (west + east), 0.5 * (south + north)
     per_latitude, per_longitude = metres_per_degree(max(-89.0, min(middle_y, 89.0)))
-    height = 1.1 * max((north - south) * per_latitude, (east - west) * per_longitude / ASPECT, LEAST / ASPECT)
+    height = 1.1 * max(
+        (north - south) * per_latitude, (east - west) * per_longitude / ASPECT, MIN_MAP_WIDTH_M / ASPECT
+    )
     half_x, half_y = 0.5 * ASPECT * height / per_longitude, 0.5 * height / per_latitude
     return middle_x - half_x, middle_y - half_y, middle_x + half_x, middle_y + half_y
 

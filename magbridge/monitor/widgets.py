@@ -12,11 +12,24 @@ from nicegui import ui
 from magbridge.monitor.link import now
 
 __all__ = [
-    "AMBER", "FADED", "GREEN", "GRID", "INK", "MUTED", "RED", "STYLE", "Changes", "button", "card", "clock",
-    "fact", "nothing", "slanted",
+    "AMBER",
+    "FADED_COLOUR",
+    "GREEN",
+    "GRID",
+    "INK",
+    "MONITOR_STYLE",
+    "MUTED",
+    "RED",
+    "Changes",
+    "button",
+    "card",
+    "clock",
+    "fact",
+    "nothing",
+    "slanted",
 ]  # fmt: skip
 
-STYLE = """
+MONITOR_STYLE = """
 :root, .q-header {--ink: #1e293b; --good: #15803d; --suspect: #b45309; --bad: #b91c1c; --faded: #64748b}
 body.body--dark {--ink: #e2e8f0; --good: #4ade80; --suspect: #fbbf24; --bad: #f87171; --faded: #94a3b8}
 body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
@@ -25,7 +38,7 @@ body.body--dark {color-scheme: dark; --q-negative: var(--bad) !important}
 """
 """Colours by day and, where the browser asks for it, by night; the header is the same at both."""
 INK, GREEN, AMBER, RED = "var(--ink)", "var(--good)", "var(--suspect)", "var(--bad)"
-FADED = "var(--faded)"
+FADED_COLOUR = "var(--faded)"
 """Of figures that are not the present ones, which are also slanted; they stay legible."""
 MUTED = "text-slate-600 dark:text-slate-400"
 GRID = "w-full grid gap-4 grid-cols-1"
@@ -67,7 +80,7 @@ def fact(name: str) -> ui.label:
 
 def slanted(old: bool) -> str:
     """Return the style of figures that may be `old`: not the present ones."""
-    return f"font-style: {'italic' if old else 'normal'}; color: {FADED if old else INK}"
+    return f"font-style: {'italic' if old else 'normal'}; color: {FADED_COLOUR if old else INK}"
 
 
 def nothing(text: str = "None yet") -> ui.label:

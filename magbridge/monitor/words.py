@@ -16,12 +16,12 @@ from magbridge.mavlink.enums import (
 )
 from magbridge.monitor.state import State
 
-__all__ = ["FLAGS", "ago", "conditions", "health", "learnt", "measured", "silence", "whereabouts"]
+__all__ = ["FLAG_TEXTS", "ago", "conditions", "health", "learnt", "measured", "silence", "whereabouts"]
 
 SILENT, SLOW = 3.0, 30.0
 """s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field and of the
 status three of their intervals, at least `SILENT` and at most `SLOW`."""
-FLAGS = {
+FLAG_TEXTS = {
     "stale_telemetry": "A parameter of the calibration is old, missing or NaN",
     "extrapolated": "A parameter is outside the calibrated range",
     "moving": "A mass is moving",
@@ -38,11 +38,11 @@ ROUTINE = {"moving", "no_boresight", "late_join"}
 """Flags that come and go, or stay, in a mission without faults: they are shown, and raise no alarm."""
 STARTING = 15.0
 """s after its first message in which a bridge may still be waiting for its sensor and its autopilot."""
-LAST = 4_102_444_800
+MAX_ALARM_TIME_S = 4_102_444_800
 """s since 1970: no alarm began after 2099."""
-HUGE = 1e9
+MAX_PLAIN_NUMBER = 1e9
 """No figure of the page is as large: larger ones are written with a power of ten."""
-LOSSES = {
+LOSS_TEXTS = {
     "Samples lost at the sensor": "samples_lost",
     "Bad frames from the sensor": "sensor_frames_bad",
     "Bytes skipped from the sensor": "sensor_bytes_skipped",
@@ -96,7 +96,7 @@ def health(state: State, now: float) -> dict[str, tuple[str, bool]]:
     field = ({} if _late(state.sampled, state.interval, now) else state.field).get
     get = state.status.get
     sensor, autopilot, log = (get(f"{line}_state", 0) for line in ("sensor", "autopilot", "log"))
-    losses = {name: get(counter, 0) for name, counter in LOSSES.items()}
+    losses = {name: get(counter, 0) for name, counter in LOSS_TEXTS.items()}
     return {
         "Sensor": (_word(MAG_PORT_STATE, sensor), sensor == MAG_PORT_STATE.OK),
         "Autopilot": (_word(MAG_PORT_STATE, autopilot), autopilot == MAG_PORT_STATE.OK),
@@ -146,7 +146,7 @@ def learnt(state: State) -> dict[str, tuple[str, bool]]:
     """Return what the bridge says of its learning: each item's name to its text, and whether all is well."""
     get = state.learning.get
     causes = [cause for cause in MAG_CAUSE if get("causes", 0) & cause]
-    since = time.gmtime(min(get("alarm_since", 0) * 1e-6, LAST))
+    since = time.gmtime(min(get("alarm_since", 0) * 1e-6, MAX_ALARM_TIME_S))
     size = _figure(get("alarm_amplitude", nan), ".0f", "nT")
     doubted = f"{size} since {time.strftime('%d %b %H:%M', since)} UTC"
     names = ", ".join(str(cause.name).lower().replace("_", " ") for cause in causes)
@@ -169,7 +169,7 @@ def _calibration(published: int, first: int) -> str:
 
 def conditions(state: State, now: float) -> dict[str, str]:
     """Return what a person should look at, as :meth:`Alarms.update` takes it: key and words of each."""
-    wrong = {name: FLAGS[name] for name in state.flags if name not in ROUTINE}
+    wrong = {name: FLAG_TEXTS[name] for name in state.flags if name not in ROUTINE}
     starting = now - state.began < STARTING
     if (quiet := silence(state, now)) and not starting:
         wrong["silence"] = quiet.split(" for ")[0].capitalize()
@@ -199,8 +199,8 @@ def _number(value: float, form: str, two_sigma: float = nan, unit: str = "") -> 
     text, doubt = (
         plain.replace(",", "\N{NARROW NO-BREAK SPACE}").rstrip()
         for plain in (
-            f"{value:{apart if abs(value) < HUGE else '.3g'}} {unit}",
-            f"± {two_sigma:{apart.lstrip('+') if abs(two_sigma) < HUGE else '.3g'}}",
+            f"{value:{apart if abs(value) < MAX_PLAIN_NUMBER else '.3g'}} {unit}",
+            f"± {two_sigma:{apart.lstrip('+') if abs(two_sigma) < MAX_PLAIN_NUMBER else '.3g'}}",
         )
     )
     return text if isfinite(value) else "–", doubt if isfinite(two_sigma) else ""

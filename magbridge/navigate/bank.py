@@ -21,17 +21,17 @@ from magbridge.navigate.model import N_STATES, Block
 
 __all__ = ["Bank", "widest"]
 
-MOST = 6_000
+MAX_HYPOTHESES = 6_000
 """Hypotheses, at most."""
 AT_FIRST = 20_000
 """Hypotheses, at most, until the first measurement has thinned them out."""
-CELL = 0.8
+MERGE_FRACTION = 0.8
 """Share of the resolution, within which two hypotheses are one."""
 SPACING = 1.2
 """Distance of two neighbours, in their own sigma: their sum is flat to 1 %."""
 EDGE = 3.5
 """Sigmas: how far the hypotheses cover the Gaussian to begin with."""
-FADED = 1e-7
+MIN_WEIGHT_FRACTION = 1e-7
 """Share of the largest weight: a hypothesis with less is dropped."""
 COARSER = 1.25
 """Factor by which the resolution changes at a time."""
@@ -184,19 +184,19 @@ class Bank:
 
     def _tidy(self) -> None:
         """Drop hypotheses of negligible weight, split wide ones, now and then merge those at one place."""
-        keep = self.w > FADED * self.w.max()
+        keep = self.w > MIN_WEIGHT_FRACTION * self.w.max()
         if not keep.all():
             self._select(keep)
-        while len(self) > MOST:  # coarsen the resolution; dropping any could lose the true place
+        while len(self) > MAX_HYPOTHESES:  # coarsen the resolution; dropping any could lose the true place
             self.resolution *= COARSER
             self._merge()
-        if self.resolution > self.finest and len(self) < MOST / 4:
+        if self.resolution > self.finest and len(self) < MAX_HYPOTHESES / 4:
             self.resolution = max(self.finest, self.resolution / COARSER)
         if self._updates % MERGE_EVERY == 0 and len(self) > 1:
             self._merge()
         width = worse_axis(self.P[0, 0], self.P[0, 1], self.P[1, 1])
         wide = (width > 1.5 * self.resolution) & (self.w > 1e-4)
-        if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MOST:
+        if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MAX_HYPOTHESES:
             self._split(wide)
 
     def _select(self, keep: BoolArray) -> None:
@@ -216,7 +216,7 @@ class Bank:
 
     def _merge(self) -> None:
         """Merge hypotheses whose positions lie in the same cell, keeping mean and covariance."""
-        cell = np.floor(self.x[:2] / (CELL * self.resolution)).astype(np.int64)
+        cell = np.floor(self.x[:2] / (MERGE_FRACTION * self.resolution)).astype(np.int64)
         order = np.lexsort(cell)
         cell = cell[:, order]
         first = np.flatnonzero(np.append(True, (np.diff(cell) != 0).any(axis=0)))

@@ -17,13 +17,13 @@ from magbridge.logs.checks import increasing
 from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.navigate.findings import findings_of
-from magbridge.navigate.navigator import UNUSABLE, Navigator
+from magbridge.navigate.navigator import NO_POSITION_FLAGS, Navigator
 from magbridge.navigate.options import Options
 from magbridge.navigate.record import Record
 from magbridge.navigate.reference_track import REFERENCES, reference_track, with_errors
 from magbridge.progress import track
 
-__all__ = ["MOTIONS", "UNITS", "columns_of", "first_position", "motion_of", "navigate", "samples_of"]
+__all__ = ["COLUMN_UNITS", "MOTIONS", "columns_of", "first_position", "motion_of", "navigate", "samples_of"]
 
 MOTIONS: dict[str, dict[str, str]] = {
     "velocity": {"velocity_north": "velocity_north", "velocity_east": "velocity_east"},
@@ -35,7 +35,7 @@ MOTIONS: dict[str, dict[str, str]] = {
 }
 """Kinds of motion that a log may hold, best first: its columns, and their names in the dead reckoning."""
 
-UNITS = {
+COLUMN_UNITS = {
     "latitude": "deg", "longitude": "deg", "smoothed_latitude": "deg", "smoothed_longitude": "deg",
     "depth": "m", "covariance_nn": "m2", "covariance_ne": "m2", "covariance_ee": "m2",
     "innovation": "nT", "innovation_variance": "nT2", "anomaly": "nT", "map_anomaly": "nT",
@@ -123,7 +123,7 @@ def samples_of(deployment: xr.Dataset, source: str) -> tuple[RealArray, RealArra
     time = deployment["time"].to_numpy().astype(float)
     increasing(source, time)
     quality = np.nan_to_num(np.asarray(deployment.get("quality", 0.0), float)).astype(int)
-    field = np.where(quality & UNUSABLE, np.nan, deployment["total_field"].to_numpy())
+    field = np.where(quality & NO_POSITION_FLAGS, np.nan, deployment["total_field"].to_numpy())
     sigma = np.broadcast_to(np.asarray(deployment.get("total_field_sigma", 1.0), float), time.shape)
     return time, field, sigma
 
@@ -196,4 +196,4 @@ def _dataset(records: list[Record], smoothed: tuple[FloatArray, FloatArray]) -> 
     columns["smoothed_latitude"], columns["smoothed_longitude"] = np.array(places).T
     columns["smoothed_sigma_north"], columns["smoothed_sigma_east"] = np.sqrt([P[:, 0, 0], P[:, 1, 1]])
     time = np.array([record.time_us for record in records]) * 1e-6
-    return made("track", time, columns, UNITS)
+    return made("track", time, columns, COLUMN_UNITS)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Bound", "as_dataset", "position_bound"]
 
-STEP = 0.005
+SLOPE_STEP_DEG = 0.005
 """deg, over which the main field's slope is taken."""
 
 
@@ -103,8 +103,8 @@ def position_bound(
     local = grid.evaluate(lon, lat)
     main = total_field(lon, lat, depth, at)
     per_latitude, per_longitude = metres_per_degree(lat)
-    slope_north = (total_field(lon, lat + STEP, depth, at) - main) / (STEP * per_latitude)
-    slope_east = (total_field(lon + STEP, lat, depth, at) - main) / (STEP * per_longitude)
+    slope_north = (total_field(lon, lat + SLOPE_STEP_DEG, depth, at) - main) / (SLOPE_STEP_DEG * per_latitude)
+    slope_east = (total_field(lon + SLOPE_STEP_DEG, lat, depth, at) - main) / (SLOPE_STEP_DEG * per_longitude)
 
     variance = sigma**2 * every / interval
     _, P = prior(o)

@@ -19,7 +19,7 @@ from magbridge.navigate.options import Options
 
 __all__ = ["Collector"]
 
-LEAST = 1e-3
+MIN_SIGMA_NT = 1e-3
 """nT: a smaller sigma is not believed."""
 
 
@@ -77,7 +77,7 @@ class Collector:
         # the first sample of all is a block by itself: how long a step is, is not known yet
         wait, step = (there[0] - self._last[0], there[1] - self._last[1]) if self._last else (inf, inf)
         self._last = there
-        anomaly, variance = total_field - main, max(sigma, LEAST) ** 2
+        anomaly, variance = total_field - main, max(sigma, MIN_SIGMA_NT) ** 2
         place = where.latitude, where.longitude
         self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, where.depth))
         full = (

@@ -13,9 +13,9 @@ GLIDE = 8.0
 """deg, of pitch; a glider flatter than that is turning between dive and climb."""
 DEPTH_BASE = 10.0
 """s, over which the depth's rate is taken."""
-FASTEST = 3.0
+MAX_WATER_SPEED_M_S = 3.0
 """m/s, through the water; a higher speed comes from a jump in the depth."""
-LONGEST = 3600.0
+MAX_TELEMETRY_GAP_S = 3600.0
 """s without telemetry, after which the motion is unknown."""
 MAX_REPORT_INTERVAL_S = 60.0
 """s between two reports of the velocity, over which a change between them is averaged."""
@@ -101,14 +101,14 @@ class DeadReckoning:
         elapsed = time - self._time
         if elapsed <= 0.0:
             return
-        if isfinite(elapsed) and elapsed < LONGEST:
+        if isfinite(elapsed) and elapsed < MAX_TELEMETRY_GAP_S:
             self._move(self._velocity[0] * elapsed, self._velocity[1] * elapsed)
         self._time = time
 
     def ahead(self, time: float) -> tuple[float, float]:
         """Return latitude and longitude at `time`, along the last known velocity, without moving there."""
         elapsed = time - self._time
-        if not 0.0 < elapsed < LONGEST:
+        if not 0.0 < elapsed < MAX_TELEMETRY_GAP_S:
             return self.latitude, self.longitude
         return offset(self.latitude, self.longitude, self._velocity[0] * elapsed, self._velocity[1] * elapsed)
 
@@ -193,7 +193,7 @@ class DeadReckoning:
         if not isfinite(self._pitch) or abs(self._pitch) < GLIDE:
             return nan
         speed = abs(self._rate / tan(radians(self._pitch)))
-        return min(speed, FASTEST)
+        return min(speed, MAX_WATER_SPEED_M_S)
 
     def _move(self, north: float, east: float) -> None:
         self.travelled += hypot(north, east)

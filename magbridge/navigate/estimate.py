@@ -23,13 +23,13 @@ CONTRADICTION = 25.0
 """Squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6."""
 UNINFORMED = 0.8
 """Share of the sigma of dead reckoning alone, above which the field has added no information."""
-REACH = 300.0
+MIN_SEARCH_RADIUS_M = 300.0
 """m, smallest radius in which the integrity monitor searches."""
 JOIN, SPLIT = 1.2, 1.5
 """Position spread over the resolution: below the first, one hypothesis; above the second, several."""
 FINER = 0.8
 """Share of the resolution: it changes only if a measurement asks for one finer than this."""
-DOUBTFUL = 1.0
+DOUBTFUL_LOG_ODDS = 1.0
 """Log odds: another place explains the field better, but not yet at the odds of ``options.doubt``."""
 SPREADS = (2.0, 4.0, 2.0, 8.0)
 """1-sigma of successive searches, over the reach."""
@@ -185,7 +185,9 @@ class Estimate:
             self._judge(block, seen)
         self._choose(on_the_map)
         proven = self._confirmed and self._described
-        doubted = self.odds > DOUBTFUL or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
+        doubted = (
+            self.odds > DOUBTFUL_LOG_ODDS or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
+        )
         self.valid = self.state is State.TRACKING and proven and not doubted
         return seen
 
@@ -324,7 +326,7 @@ class Estimate:
     def _reach(self) -> float:
         """Return the 1-sigma (m) of the places around the filter that competing filters start from."""
         length = self.grid.correlation_length * (0.5 if self._confirmed else 1.0)
-        return max(REACH, widest(self.alone), min(length, 5.0 * REACH))
+        return max(MIN_SEARCH_RADIUS_M, widest(self.alone), min(length, 5.0 * MIN_SEARCH_RADIUS_M))
 
     @property
     def informed(self) -> bool:

@@ -18,23 +18,23 @@ from magbridge.navigate.record import Jump, State
 
 __all__ = ["findings_of"]
 
-SPARSE = 40
+MIN_MAP_POSITIONS = 40
 """Positions, below which a map's place cannot be judged."""
 SEARCH = 1_500.0
 """m, the largest displacement of a map that is tried, on each axis."""
 LATTICE = 31
 """Shifts that are tried on each axis."""
-FLAT = 3.0
+MIN_RELIEF_SIGMA = 3.0
 """Relief over the sigma of bias and map error, below which a map carries no information."""
 DOUBLE = 2.0
 """Scatter over the sigma of bias and map error, above which it is that of another field."""
-BETTER = 0.6
+MAX_SHIFTED_SCATTER_FRACTION = 0.6
 """Share of the scatter at the map's own place: a shift must do at least as well to be believed."""
-LEVEL = 4.0
+MAX_BIAS_SIGMA = 4.0
 """Sigmas of the calibration's bias: a larger difference in level has another reason."""
 LISTED = 3
 """Jumps of the filter that are reported one by one: the map of another place causes dozens."""
-DOUBTFUL = 3.0
+MAX_MEDIAN_SIGMA_RATIO = 3.0
 """Sigma of a sample over the median one, above which it says nothing about the map."""
 EXPLAINED = 0.5
 """Share of the field's variance along the track, below which the map does not describe it."""
@@ -77,7 +77,7 @@ def findings_of(
             + (
                 f"the map is flat there ({grid.rms:.1f} nT RMS, where calibration and map are known only to "
                 f"{known:.1f} nT)"
-                if grid.rms < FLAT * known
+                if grid.rms < MIN_RELIEF_SIGMA * known
                 else f"dead reckoning is as good as this map can be ({_sigma(result, silent):.0f} m)"
             )
         )
@@ -124,7 +124,7 @@ def _level(result: xr.Dataset, options: Options) -> list[str]:
         return []
     last = tracked.isel(time=slice(-max(1, tracked.sizes["time"] // 4), None))
     bias, sigma = float(last["bias"].mean()), float(last["bias_sigma"].mean())
-    if abs(bias) < LEVEL * max(options.bias_sigma, sigma):
+    if abs(bias) < MAX_BIAS_SIGMA * max(options.bias_sigma, sigma):
         return []
     sentences = (
         f"the measured level differs from the map's by {bias:+.0f} nT, where the calibration allows"
@@ -183,8 +183,8 @@ def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options)
     known = np.isfinite(measured + grid.evaluate(longitude, latitude, depth).anomaly)
     if "total_field_sigma" in reference_track:  # while a mass moves the field is off by any amount
         sigma = reference_track["total_field_sigma"].to_numpy()
-        known &= sigma <= DOUBTFUL * np.nanmedian(sigma)
-    if known.sum() < SPARSE:
+        known &= sigma <= MAX_MEDIAN_SIGMA_RATIO * np.nanmedian(sigma)
+    if known.sum() < MIN_MAP_POSITIONS:
         return []
     thin = np.flatnonzero(known)[:: max(1, int(known.sum()) // 400)]
     measured, latitude, longitude, depth = measured[thin], latitude[thin], longitude[thin], depth[thin]
@@ -192,13 +192,13 @@ def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options)
     level = float(np.mean(measured - grid.evaluate(longitude, latitude, depth).anomaly))
     step = 2.0 * SEARCH / (LATTICE - 1)
     findings = []
-    if abs(level) > LEVEL * options.bias_sigma + here:
+    if abs(level) > MAX_BIAS_SIGMA * options.bias_sigma + here:
         findings.append(
             f"at the known positions the field is {abs(level):.0f} nT {'above' if level > 0 else 'below'} "
             "the map's level: its main field may be of another epoch, or at another altitude"
         )
     expected = DOUBLE * hypot(options.bias_sigma, options.map_sigma)
-    if there < min(BETTER * here, expected) and hypot(north, east) > step:
+    if there < min(MAX_SHIFTED_SCATTER_FRACTION * here, expected) and hypot(north, east) > step:
         findings.append(
             f"at the known positions the map fits best when moved {hypot(north, east):.0f} m"
             f" ({_compass(north, east)}): {there:.1f} nT instead of {here:.1f} nT; another datum?"

@@ -62,7 +62,7 @@ MIN_FROZEN_M = 10.0
 FIELD_STEP = 0.1
 """Correlation lengths of the map between two measurements of the field that are compared: between closer ones
 an unrelated smooth field predicts as well as the map."""
-FRESH_US = 10_000_000
+MAX_GNSS_AGE_US = 10_000_000
 """µs for which a position, or a report of the receiver's, holds."""
 CORRELATION_TIME_S = 30.0
 """s over which the errors of successive positions are correlated."""
@@ -173,7 +173,7 @@ class GnssMonitor:
         self._trusted: _Position | None = None  # the first of the window when positions ceased to be used
         self._mean = np.zeros(2)
         self._reported = GnssReason.NONE
-        self._reported_us = -FRESH_US
+        self._reported_us = -MAX_GNSS_AGE_US
         self._field = _FieldTest(grid, options)
 
     @property
@@ -334,7 +334,7 @@ class GnssMonitor:
         return squared_mahalanobis(self._mean, P) > MAX_DEVIATION_SIGMA**2
 
     def _receiver_reports(self, time_us: int) -> GnssReason:
-        return self._reported if time_us - self._reported_us < FRESH_US else GnssReason.NONE
+        return self._reported if time_us - self._reported_us < MAX_GNSS_AGE_US else GnssReason.NONE
 
     # ---- changes of state ----------------------------------------------------------------------------
 
@@ -390,7 +390,7 @@ class _FieldTest:
         self._grid, self._options = grid, any_level(options, grid)
         self._unmapped = Unmapped(grid, self._options)
         self._tracker: Tracker | None = None
-        self._offset, self._sigma, self._time_us = (0.0, 0.0), inf, -FRESH_US
+        self._offset, self._sigma, self._time_us = (0.0, 0.0), inf, -MAX_GNSS_AGE_US
         self._step = Step()  # since the last measurement that was used
 
     @property
@@ -410,7 +410,7 @@ class _FieldTest:
 
     def move(self, time_us: int, offset_m: tuple[float, float], sigma: float, *, restart: bool) -> None:
         """Continue at a position (m, north and east of dead reckoning) with its 1-sigma (m)."""
-        if restart or time_us - self._time_us > FRESH_US:
+        if restart or time_us - self._time_us > MAX_GNSS_AGE_US:
             self._tracker, self.log_odds_of_map, self.log_odds_of_position = None, 0.0, 0.0
             self._against = 0.0
             self._unmapped = Unmapped(self._grid, self._options)
@@ -420,7 +420,7 @@ class _FieldTest:
         """Add a measurement, one `step` after the previous one."""
         self._step = self._step.joined(step)
         far = self._step.metres >= FIELD_STEP * self._grid.correlation_length
-        if abs(block.time_us - self._time_us) > FRESH_US or not far:
+        if abs(block.time_us - self._time_us) > MAX_GNSS_AGE_US or not far:
             return
         whole, self._step = self._step, Step()
         if self._tracker is None:

@@ -34,7 +34,7 @@ __all__ = [
 
 N_STATES = 6
 NO_MOTION_NOISE = MotionNoise()
-FINE = 0.35
+MAX_SPREAD_FRACTION = 0.35
 """Share of the spread that one measurement allows: errors of successive ones are correlated and add up."""
 
 
@@ -151,4 +151,4 @@ def resolution(grid: AnomalyGrid, options: Options, variance: float) -> float:
     _, Q = transition(options, options.interval, block_length(grid))
     noise = variance + (Q[4, 4] + Q[5, 5]) * 0.5**4
     curvature = 3.0**0.5 * grid.rms / length**2
-    return float(min(0.25 * length, FINE * (2.0 * noise) ** 0.25 / curvature**0.5))
+    return float(min(0.25 * length, MAX_SPREAD_FRACTION * (2.0 * noise) ** 0.25 / curvature**0.5))

@@ -28,9 +28,9 @@ from magbridge.navigate.options import Options
 from magbridge.navigate.record import Reckoned, Record, State
 from magbridge.records import Corrected, Quality
 
-__all__ = ["UNUSABLE", "Navigator"]
+__all__ = ["NO_POSITION_FLAGS", "Navigator"]
 
-UNUSABLE = int(Quality.SATURATED | Quality.UNCALIBRATED)
+NO_POSITION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED)
 FRESH = 3.0
 """Intervals: no position is dead-reckoned from an update older than that."""
 
@@ -149,7 +149,7 @@ class Navigator:
 
     def sample(self, time_us: int, corrected: Corrected) -> Record | None:
         """Add a corrected sample; return the update that it completes, or None."""
-        if corrected.quality & UNUSABLE:
+        if corrected.quality & NO_POSITION_FLAGS:
             return None
         return self.measure(time_us, corrected.total_field, corrected.total_field_sigma)
 

@@ -13,7 +13,7 @@ from magbridge.field.grid import AnomalyGrid
 
 __all__ = ["Options", "any_level", "informed", "with_level"]
 
-LASTING = 3.0
+MAX_NOISE_INTERVALS = 3.0
 """Intervals: noise with a longer correlation time becomes a bias."""
 LEG = 1_800.0
 """s, between turns or from dive to climb."""
@@ -80,7 +80,7 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     rho = noise.autocorrelation
     noise_time = -noise.interval / log(rho) if 0.0 < rho < 1.0 else 0.0
     lasts = LEG
-    if noise_time > LASTING * options.interval:
+    if noise_time > MAX_NOISE_INTERVALS * options.interval:
         white *= sqrt(noise.white + (1.0 - noise.white) * (1.0 - rho**2))
         lasts, noise_time = noise_time, 0.0
     level = calibration.reference.level_sigma

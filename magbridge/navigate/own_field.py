@@ -8,7 +8,7 @@ With drift d(t), a field f in place and the calibration's error b,
 .. math:: K_{ij} = s^2 k(|x_i + d_i - x_j - d_j| / \ell) + \beta_{ij} + R_{ij}
 
 f is integrated out: a Gaussian field (Rasmussen & Williams 2006, eq. 2.30; gradient eq. 5.9) of size s and
-length l. Its covariance k is one of :data:`KINDS`, from rough to smooth.
+length l. Its covariance k is one of :data:`COVARIANCE_KINDS`, from rough to smooth.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from magbridge.arrays import FloatArray
 from magbridge.navigate.model import Block, transition
 from magbridge.navigate.options import Options
 
-__all__ = ["KINDS", "OwnField", "drift_functions"]
+__all__ = ["COVARIANCE_KINDS", "OwnField", "drift_functions"]
 
-KINDS = ("exponential, once smooth", "exponential, twice smooth", "Gaussian")
+COVARIANCE_KINDS = ("exponential, once smooth", "exponential, twice smooth", "Gaussian")
 """Matern's covariances of smoothness 3/2 and 5/2, and the limit of both (Rasmussen & Williams, eq. 4.17)."""
 SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
 """nT of the crustal field, and the 1-sigma of its logarithm: sea floor and land by airborne surveys."""
@@ -30,13 +30,13 @@ LENGTH_SPREAD, NOISE_SPREAD = np.log(6.0), np.log(1.3)
 """1-sigma of the logarithm of the length, and of the noise over what the calibration claims."""
 STEPS, SHARE = 4.0, 2.5
 """The shortest length expected, over the distance of neighbours; the longest, over the track's extent."""
-LEVEL = 10.0
+LEVEL_SCATTERS = 10.0
 """The level's 1-sigma, over the scatter of the measured field: it is not known."""
 KNOTS, WAVES, LEFT_OUT = 240, 48, 1e-4
 """Times at which a drift's covariance is taken, its functions at most, and the share they may leave out."""
 FARTHEST = 8.0
 """Sigmas of its prior beyond which no size, length or noise is tried."""
-LOST = -1e300
+IMPOSSIBLE_LOG_LIKELIHOOD = -1e300
 """Log likelihood of an impossible track."""
 
 
@@ -100,7 +100,9 @@ class OwnField:
         self.shortest = STEPS * max(step, 1.0)
         self._middle = float(np.sqrt(self.shortest * max(extent / SHARE, 1.5 * self.shortest)))
         apart = np.abs(self.time[:, None] - self.time) / options.bias_time
-        self._other = options.bias_sigma**2 * np.exp(-apart) + (LEVEL * float(self.anomaly.std())) ** 2
+        self._other = (
+            options.bias_sigma**2 * np.exp(-apart) + (LEVEL_SCATTERS * float(self.anomaly.std())) ** 2
+        )
 
     def moved(self, u: FloatArray) -> FloatArray:
         """Return the error of dead reckoning (n, 2), m, of u (q,); (k, n, 2) of several, (k, q)."""
@@ -116,7 +118,7 @@ class OwnField:
         """Return log p of the first `count` blocks, up to a constant, and its gradient by u (q,)."""
         gradient = np.zeros(self.q)
         if np.abs(u[-3:]).max() > FARTHEST:
-            return LOST, gradient
+            return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
         n = slice(0, count)
         size, length, noise = self.scales(u)
         d, W = self.moved(u)[n], self.drift[n]
@@ -124,7 +126,7 @@ class OwnField:
         squared, k, h, K, R = self._covariance(x, kind, size, length, noise)
         L, info = dpotrf(K.T, lower=1)
         if info:
-            return LOST, gradient
+            return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
         alpha = dpotrs(L, y, lower=1)[0]
         value = -0.5 * float(y @ alpha) - float(np.log(L.diagonal()).sum())
         inverse = np.tril(dpotri(L, lower=1)[0])

@@ -26,13 +26,13 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import offset, separation
 from magbridge.logs.deployment import deployment as made
-from magbridge.navigate.batch import MOTIONS, UNITS, columns_of, first_position, motion_of, samples_of
+from magbridge.navigate.batch import COLUMN_UNITS, MOTIONS, columns_of, first_position, motion_of, samples_of
 from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import Options
 from magbridge.navigate.own_bound import with_bound
-from magbridge.navigate.own_field import KINDS, OwnField
+from magbridge.navigate.own_field import COVARIANCE_KINDS, OwnField
 from magbridge.navigate.particles import Particles, sample
 from magbridge.navigate.reference_track import reference_track, with_errors
 
@@ -41,11 +41,11 @@ __all__ = ["localise"]
 STEP, LASTS, BLOCKS = 60.0, 100.0, 400
 """m that a block of samples covers at most, the share of the log that it lasts at most is one in so many, and
 the number of blocks at most: of more, every second or third is used."""
-FEWEST = 12
+MIN_BLOCKS = 12
 """Blocks."""
 STAGES, PARTICLES = 10, 80
 """Parts in which the track is processed, and number of tracks (particles)."""
-SOON = 0.49
+MIN_LOST_FRACTION = 0.49
 """Share of the blocks from which on a track can be lost."""
 CONTRADICTED = 1.5
 """Noise over the calibration's from which on field and track contradict each other."""
@@ -72,7 +72,7 @@ class _Found:
     @classmethod
     def of(cls, field: OwnField, particles: Particles) -> _Found:
         moved = field.moved(particles.u)
-        kind = int(np.bincount(particles.kind, minlength=len(KINDS)).argmax())
+        kind = int(np.bincount(particles.kind, minlength=len(COVARIANCE_KINDS)).argmax())
         off = ((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2))
         nearest = int(np.where(particles.kind == kind, off, np.inf).argmin())
         scales = np.median(field.scales(particles.u), axis=0)
@@ -85,7 +85,7 @@ def _lost(field: OwnField, u: FloatArray, count: int | None = None) -> bool:
 
     Then more blocks do not bring them together: the first half decides.
     """
-    if count is not None and count < SOON * len(field.time):
+    if count is not None and count < MIN_LOST_FRACTION * len(field.time):
         return False
     apart = np.sqrt(field.moved(u)[:, :count].var(axis=0).sum(axis=1))
     return bool(np.median(apart) > np.median(field.scales(u), axis=0)[1])
@@ -128,7 +128,7 @@ def localise(
     counts = [len(blocks) * stage // STAGES for stage in range(1, STAGES + 1)]
     with threadpool_limits(1, "blas"):
         particles = sample(
-            field.log_likelihood, field.q, len(KINDS), counts, PARTICLES, partial(_lost, field)
+            field.log_likelihood, field.q, len(COVARIANCE_KINDS), counts, PARTICLES, partial(_lost, field)
         )
         found = _Found.of(field, particles)
         known = reference_track(deployment, frozenset(MOTIONS[motion]))
@@ -161,7 +161,7 @@ def _blocks(
         if np.isfinite(field[i]) and np.isfinite(sigma[i]):
             found.append(collector.add(round(t * 1e6), reckoning, float(field[i]), float(sigma[i])))
     whole = [one for one in (*found, collector.flush()) if one is not None]
-    if len(whole) < FEWEST:
+    if len(whole) < MIN_BLOCKS:
         raise FormatError(source, "expected samples of the total field at known times: too few are usable")
     step = ceil(len(whole) / BLOCKS)
     return whole[::step], step
@@ -191,7 +191,7 @@ def _dataset(
         "unaided_sigma": alone, "anomaly": field.anomaly,
         "map_anomaly": field.mean + y - R * np.linalg.solve(K, y), "valid": good.astype(float),
     }  # fmt: skip
-    return made("track", field.time, columns, UNITS | {"unaided_sigma": "m"})
+    return made("track", field.time, columns, COLUMN_UNITS | {"unaided_sigma": "m"})
 
 
 def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> Iterator[str]:

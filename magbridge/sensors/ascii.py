@@ -45,14 +45,14 @@ import msgspec
 from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
-from magbridge.records import BEYOND, MAX_DEVICE_TIME_S, Reading
+from magbridge.records import MAX_DEVICE_TIME_S, MAX_MEASURED_NT, Reading
 from magbridge.sensors.framing import Framer, nmea_checksum, saturated
 
 __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions", "strip_checksum"]
 
-LIMIT = 512
+MAX_LINE_BYTES = 512
 """Longest line, in bytes."""
-COUNTS = 2**31
+MAX_ASCII_COUNT = 2**31
 """A count that no converter reaches and no message can hold."""
 MAX_COUNT = 2**63
 """Larger than any count that an instrument can hold."""
@@ -84,7 +84,7 @@ def _finite(text: bytes) -> float:
 
 def _measured(text: bytes) -> float:
     number = float(text)  # NaN passes: some instruments send it for an unknown value
-    if abs(number) > BEYOND:
+    if abs(number) > MAX_MEASURED_NT:
         raise ValueError
     return number
 
@@ -96,7 +96,7 @@ def _count(text: bytes) -> int:
     return number
 
 
-KINDS: dict[str, Callable[[bytes], float]] = {
+COLUMN_READERS: dict[str, Callable[[bytes], float]] = {
     "time": _finite,
     "temperature": _measured,
     "supply": _measured,
@@ -143,8 +143,8 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     def __post_init__(self) -> None:
         named = self.columns[:-1] if self.columns[-1:] == ["*"] else self.columns
         for name in named:
-            if name not in ("x", "y", "z", "-", *KINDS):
-                raise ValueError(f"columns: {name!r} is none of x y z {' '.join(KINDS)} -")
+            if name not in ("x", "y", "z", "-", *COLUMN_READERS):
+                raise ValueError(f"columns: {name!r} is none of x y z {' '.join(COLUMN_READERS)} -")
             if name != "-" and named.count(name) > 1:
                 raise ValueError(f"columns: {name!r} stands there twice")
         if not {"x", "y", "z"} <= set(named):
@@ -165,7 +165,9 @@ class Ascii:
         self._width = len(columns) - self._more
         self._keys = [key.encode(ENCODING) for key in options.keys]
         self._xyz = itemgetter(*(columns.index(axis) for axis in "xyz"))
-        self._others = [(name, at, KINDS[name]) for at, name in enumerate(columns) if name in KINDS]
+        self._others = [
+            (name, at, COLUMN_READERS[name]) for at, name in enumerate(columns) if name in COLUMN_READERS
+        ]
         self._prefix = options.prefix.encode(ENCODING)
         self._separator = options.separator.encode(ENCODING) or None
         self._counts = options.unit == "counts"
@@ -176,7 +178,7 @@ class Ascii:
         self.sequence_modulo = options.sequence_modulo
         self.time_modulo = options.time_modulo
         self.period = 1.0 / options.rate if options.rate else 0.0
-        self._framer = Framer(options.terminator.encode(), LIMIT)
+        self._framer = Framer(options.terminator.encode(), MAX_LINE_BYTES)
         self.frames_bad = 0
 
     @property
@@ -224,7 +226,7 @@ class Ascii:
         scale = self._scale
         field = (x * scale, y * scale, z * scale)
         largest = abs(field[0]) + abs(field[1]) + abs(field[2])
-        if not largest < BEYOND or (self._counts and not abs(x) + abs(y) + abs(z) < COUNTS):
+        if not largest < MAX_MEASURED_NT or (self._counts and not abs(x) + abs(y) + abs(z) < MAX_ASCII_COUNT):
             raise ValueError
         others: dict[str, Any] = {name: kind(cells[at]) for name, at, kind in self._others}
         if abs(others.get("time", 0.0) * self._seconds) > MAX_DEVICE_TIME_S:

@@ -34,7 +34,7 @@ HALF: Final = 0.6
 """Fraction of a period: a reading later than this shows that one before it is missing."""
 BASELINE: Final = 1 << 16
 """Readings after which the interval between readings is measured again, to count missing readings."""
-ENOUGH: Final = 16
+MIN_INTERVAL_READINGS: Final = 16
 """Readings from which on an interval is better than the one before."""
 KEEP_PHASE: Final = 3
 """Missing readings in a row above which the line is restarted: the instrument may have stopped."""
@@ -172,7 +172,7 @@ class DeviceClock:
         if hole == 0 and self._readings < BASELINE:
             self._readings += 1
             return 0
-        if self._readings >= ENOUGH or (self._readings and not self._interval_us):
+        if self._readings >= MIN_INTERVAL_READINGS or (self._readings and not self._interval_us):
             self._interval_us = (self._arrival_us - self._since_us) / self._readings
         if hole and modulo:
             hole %= modulo

@@ -10,16 +10,16 @@ from typing import Final
 
 __all__ = ["TOLERANCE", "Floor"]
 
-BLOCK: Final = 8
+FIRST_BLOCK_READINGS: Final = 8
 """Readings in the first blocks."""
-POINTS: Final = 16
+LINE_POINTS: Final = 16
 """Lowest points that the line is fitted to."""
 SPAN: Final = 4.0
 """s: blocks grow to this duration, and every point must be late for this long before the line is given up,
 since a busy computer may delay all points for a second."""
 TOLERANCE: Final = 20_000.0
 """µs by which an arrival may contradict the line."""
-DELAY: Final = 5_000.0
+INITIAL_DELAY_US: Final = 5_000.0
 """µs, the mean delay before anything is known."""
 STALL: Final = 100_000.0
 """µs; longer delays enter the mean delay as this, because they say nothing about the usual ones."""
@@ -46,7 +46,7 @@ class Floor:
     def __init__(self, slope_sigma: float) -> None:
         self._prior_sigma = slope_sigma
         self.slope = 0.0
-        self.delay = DELAY
+        self.delay = INITIAL_DELAY_US
         self.restart(0.0, 0.0)
 
     def restart(self, x: float, y: float) -> None:
@@ -56,7 +56,7 @@ class Floor:
         self._points: list[tuple[float, float]] = []
         self._x, self._y = x, y
         self._drop = 0.0
-        self._size = BLOCK
+        self._size = FIRST_BLOCK_READINGS
         self._count = 0
         self._began, self._least, self.lowest = x, inf, (x, y)
         self._late_from = inf
@@ -96,7 +96,7 @@ class Floor:
             return self._least if x - self._late_from >= SPAN else 0.0
         self._late_from = inf
         self._points.append(self.lowest)
-        if len(self._points) == POINTS:
+        if len(self._points) == LINE_POINTS:
             self._thin(x - self._began)
         self._fit()
         return 0.0

@@ -26,17 +26,17 @@ from magbridge.sensors.framing import Framer, saturated
 __all__ = ["Hmr2300", "Hmr2300Options"]
 
 NT_PER_COUNT = NT_PER_UNIT["G"] / 15_000
-LIMIT = 30_000
-SIZE = 7
+MAX_COUNTS = 30_000
+READING_BYTES = 7
 RETURN = 0x0D
-COUNTS = Struct(">hhh")
+COUNTS_LAYOUT = Struct(">hhh")
 CONFIRM = 4
 """Frames in a row that must end in a carriage return before an alignment is believed."""
-TEXT = bytes(range(0x20, 0x7F)) + b"\r\n"
-WINDOW = SIZE * CONFIRM + SIZE - 1
+PRINTABLE = bytes(range(0x20, 0x7F)) + b"\r\n"
+ALIGNMENT_BYTES = READING_BYTES * CONFIRM + READING_BYTES - 1
 """Bytes in which each of the seven alignments has `CONFIRM` frames."""
-NUMBER = rb"([ +-][\d ]{2}[, ][\d ]{2}\d)"
-LINE = re.compile(rb"\s?" + NUMBER + rb"  " + NUMBER + rb"  " + NUMBER + rb" *")
+ASCII_NUMBER = rb"([ +-][\d ]{2}[, ][\d ]{2}\d)"
+ANSWER_LINE = re.compile(rb"\s?" + ASCII_NUMBER + rb"  " + ASCII_NUMBER + rb"  " + ASCII_NUMBER + rb" *")
 LINE_LIMIT = 64
 
 
@@ -64,7 +64,7 @@ class Hmr2300:
     """
 
     Options: ClassVar = Hmr2300Options
-    range_nt = LIMIT * NT_PER_COUNT
+    range_nt = MAX_COUNTS * NT_PER_COUNT
     nt_per_count = NT_PER_COUNT
     sequence_modulo = 0
     time_modulo = 0.0
@@ -103,16 +103,16 @@ class Hmr2300:
         at, end = 0, len(buffer)
         while True:
             if not self._aligned:
-                if end - at < WINDOW:
+                if end - at < ALIGNMENT_BYTES:
                     break
                 offset, self._aligned = _alignment(buffer, at)
                 self._lines.skipped += offset
                 at += offset
-            elif end - at < SIZE:
+            elif end - at < READING_BYTES:
                 break
-            elif buffer[at + SIZE - 1] == RETURN:
-                readings.append(_reading(*COUNTS.unpack_from(buffer, at)))
-                at += SIZE
+            elif buffer[at + READING_BYTES - 1] == RETURN:
+                readings.append(_reading(*COUNTS_LAYOUT.unpack_from(buffer, at)))
+                at += READING_BYTES
             else:
                 self.frames_bad += 1
                 self._aligned = False
@@ -122,7 +122,7 @@ class Hmr2300:
     def _feed_ascii(self, data: bytes) -> list[Reading]:
         readings = []
         for line in self._lines.split(data):
-            if match := LINE.fullmatch(line):
+            if match := ANSWER_LINE.fullmatch(line):
                 x, y, z = (int(number.translate(None, b" ,")) for number in match.groups())
                 readings.append(_reading(x, y, z))
             else:
@@ -133,7 +133,7 @@ class Hmr2300:
 
 def _reading(x: int, y: int, z: int) -> Reading:
     field = (x * NT_PER_COUNT, y * NT_PER_COUNT, z * NT_PER_COUNT)
-    return Reading(field, (x, y, z), saturated=saturated(x, y, z, LIMIT))
+    return Reading(field, (x, y, z), saturated=saturated(x, y, z, MAX_COUNTS))
 
 
 def _alignment(buffer: bytes, at: int) -> tuple[int, bool]:
@@ -142,15 +142,15 @@ def _alignment(buffer: bytes, at: int) -> tuple[int, bool]:
     The end of a reply to a command may look like a frame just before the first real one, so a first frame
     that is all text is skipped.
     """
-    best, least, found = SIZE, 0, False
-    for offset in range(SIZE):
-        starts = range(at + offset, at + offset + SIZE * CONFIRM, SIZE)
-        if all(buffer[start + SIZE - 1] == RETURN for start in starts):
-            frames = [COUNTS.unpack_from(buffer, start) for start in starts]
+    best, least, found = READING_BYTES, 0, False
+    for offset in range(READING_BYTES):
+        starts = range(at + offset, at + offset + READING_BYTES * CONFIRM, READING_BYTES)
+        if all(buffer[start + READING_BYTES - 1] == RETURN for start in starts):
+            frames = [COUNTS_LAYOUT.unpack_from(buffer, start) for start in starts]
             # without the first frame: it may be text, and its step to the second large
             variation = sum(sum(map(abs, map(sub, after, before))) for before, after in pairwise(frames[1:]))
             if not found or variation < least:
                 best, least, found = offset, variation, True
-    if found and not buffer[at + best : at + best + SIZE].translate(None, TEXT):
-        best += SIZE
+    if found and not buffer[at + best : at + best + READING_BYTES].translate(None, PRINTABLE):
+        best += READING_BYTES
     return best, found

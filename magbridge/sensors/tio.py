@@ -34,22 +34,22 @@ __all__ = [
 ]  # fmt: skip
 
 END = b"\xc0"
-LIMIT = 2 * (512 + 4)
+MAX_FRAME_BYTES = 2 * (512 + 4)
 """Longest SLIP frame, every byte escaped."""
 MAX_ROUTING = 8
 
 RPC_REQUEST, RPC_REPLY, RPC_ERROR, HEARTBEAT, TIMEBASE, SOURCE, STREAM, METADATA = 2, 3, 4, 5, 6, 7, 8, 11
-SAMPLES = 128
+STREAM_TYPE = 128
 """Samples of stream n have the type 128 + n."""
 DEVICE_RECORD, STREAM_RECORD, SEGMENT_RECORD, COLUMN_RECORD = 1, 2, 3, 4
 
-FORMATS = {
+TYPE_FORMATS = {
     0x10: "B", 0x11: "b", 0x20: "H", 0x21: "h", 0x40: "I", 0x41: "i", 0x42: "f",
     0x80: "Q", 0x81: "q", 0x82: "d",
 }  # fmt: skip
 """Data type: format character. The high nibble of a type is its size in bytes (24 bits have no character)."""
 
-HEADER = Struct("<BBH")
+TIO_HEADER = Struct("<BBH")
 RPC_HEADER = Struct("<HH")
 FLOAT = Struct("<f")
 TIMEBASE_HEADER = Struct("<HBBQIIIf")
@@ -72,7 +72,7 @@ COLUMN_HEADER = Struct("<BBBBBBB")
 
 
 class StreamColumn(NamedTuple):
-    """One number of a sample; `type` from :data:`FORMATS`."""
+    """One number of a sample; `type` from :data:`TYPE_FORMATS`."""
 
     name: str
     unit: str
@@ -114,7 +114,7 @@ def slip(packet: bytes) -> bytes:
 
 def pack(kind: int, payload: bytes, routing: bytes = b"") -> bytes:
     """Return a packet of the type `kind`; `routing` names the device, last hop first."""
-    return HEADER.pack(kind, len(routing), len(payload)) + payload + routing
+    return TIO_HEADER.pack(kind, len(routing), len(payload)) + payload + routing
 
 
 def request(number: int, method: str, routing: bytes = b"") -> bytes:

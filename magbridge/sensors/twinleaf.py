@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
-from magbridge.records import BEYOND, Reading
+from magbridge.records import MAX_MEASURED_NT, Reading
 from magbridge.sensors import tio
 from magbridge.sensors.framing import CRC32_RESIDUE, Framer, saturated
 
@@ -23,7 +23,7 @@ SEND_ALL, METADATA = 1, 2
 """Numbers of our two requests."""
 WRAP_1, WRAP_2 = 1 << 32, 1 << 24
 """Where the sample numbers of the two generations wrap."""
-REMEMBERED = 256
+MAX_DESCRIPTORS = 256
 """Descriptors of each kind that are kept at most."""
 
 
@@ -83,7 +83,7 @@ class Twinleaf:
         self._options = options
         self._routing = bytes(reversed(options.hops()))
         self.range_nt = options.range
-        self._framer = Framer(tio.END, tio.LIMIT)
+        self._framer = Framer(tio.END, tio.MAX_FRAME_BYTES)
         self.frames_bad = 0
         self._session: int | None = None
         self._timebases: dict[int, float] = {}
@@ -114,8 +114,8 @@ class Twinleaf:
         for frame in self._framer.split(data):
             try:
                 kind, payload = self._open(frame)
-                if kind >= tio.SAMPLES:
-                    readings += self._samples(kind - tio.SAMPLES, payload)
+                if kind >= tio.STREAM_TYPE:
+                    readings += self._samples(kind - tio.STREAM_TYPE, payload)
                 else:
                     self._describe(kind, payload)
             except (ValueError, IndexError, struct.error):
@@ -131,7 +131,7 @@ class Twinleaf:
         packet = tio.unslip(frame)
         if crc32(packet) != CRC32_RESIDUE:
             raise ValueError
-        kind, routing, length = tio.HEADER.unpack_from(packet)
+        kind, routing, length = tio.TIO_HEADER.unpack_from(packet)
         end = 4 + length
         if len(packet) != end + (routing & 0x0F) + 4:
             raise ValueError
@@ -168,7 +168,7 @@ class Twinleaf:
 
     def _remember(self, table: dict[Any, Any], key: Any, value: Any) -> None:
         if table.get(key) != value:
-            if len(table) >= REMEMBERED:
+            if len(table) >= MAX_DESCRIPTORS:
                 table.clear()
             table[key] = value
             self._rows.clear()
@@ -199,7 +199,9 @@ class Twinleaf:
             values = row.pick(row.fields.unpack_from(payload, 4 + (n - first) * row.size))
             x, y, z = values[0] * row.scale, values[1] * row.scale, values[2] * row.scale
             temperature = values[3] if len(values) == 4 else nan
-            if not abs(x) + abs(y) + abs(z) < BEYOND or abs(temperature) > BEYOND:  # also NaN
+            if (
+                not abs(x) + abs(y) + abs(z) < MAX_MEASURED_NT or abs(temperature) > MAX_MEASURED_NT
+            ):  # also NaN
                 self.frames_bad += 1
                 self._framer.skipped += row.fields.size
                 continue
@@ -261,12 +263,12 @@ class Twinleaf:
         if self._options.temperature in names:
             wanted.append(names.index(self._options.temperature))
         scale = NT_PER_UNIT.get(self._options.unit or columns[wanted[0]].unit)
-        if scale is None or any(columns[index].type not in tio.FORMATS for index in wanted):
+        if scale is None or any(columns[index].type not in tio.TYPE_FORMATS for index in wanted):
             raise ValueError
         offsets = [0, *accumulate(column.type >> 4 for column in columns)]
         text, at = "<", 0
         for index in sorted(wanted):
-            text += f"{offsets[index] - at}x{tio.FORMATS[columns[index].type]}"
+            text += f"{offsets[index] - at}x{tio.TYPE_FORMATS[columns[index].type]}"
             at = offsets[index + 1]
         ends = accumulate(len(part) for part in parts)
         return _Row(

@@ -12,7 +12,7 @@ __all__ = ["Crossovers", "crossovers"]
 
 SEGMENTS = 60_000
 """Largest number of segments of all lines: a longer track is processed in longer steps."""
-APART = 20
+MIN_SEGMENTS_BETWEEN = 20
 """Segments of one line between two that can be a crossover."""
 
 
@@ -83,11 +83,11 @@ def _near(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray,
     edges = np.flatnonzero(np.diff(key, prepend=key[:1] - 1, append=key[-1:] + 1))
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
         here = np.unique(segment[first:last])
-        if len(here) < 2 or (here[-1] - here[0] < APART and line[here[0]] == line[here[-1]]):
+        if len(here) < 2 or (here[-1] - here[0] < MIN_SEGMENTS_BETWEEN and line[here[0]] == line[here[-1]]):
             continue
         one, other = np.triu_indices(len(here), 1)
         one, other = here[one], here[other]
-        apart = (line[one] != line[other]) | (other - one >= APART)
+        apart = (line[one] != line[other]) | (other - one >= MIN_SEGMENTS_BETWEEN)
         pairs.append(np.stack([one[apart], other[apart]], axis=1).astype(np.intp))
     if not pairs:
         return np.empty(0, np.intp), np.empty(0, np.intp)

@@ -17,7 +17,7 @@ from magbridge.survey.samples import Samples
 
 __all__ = ["draw_survey"]
 
-DOTS = 20_000
+MAX_DOTS = 20_000
 """Samples drawn, at most."""
 
 
@@ -49,7 +49,7 @@ def draw_survey(
     figure = Figure(figsize=(12.0, 9.0), layout="constrained")
     axes = figure.subplots(2, 2)
     latitude, longitude = offset(*samples.origin, samples.place[:, 0], samples.place[:, 1])
-    step = slice(None, None, max(len(latitude) // DOTS, 1))
+    step = slice(None, None, max(len(latitude) // MAX_DOTS, 1))
     extent = float(np.nanquantile(np.abs(grid.anomaly - np.nanmedian(grid.anomaly)), 0.99))
     middle = float(np.nanmedian(grid.anomaly))
     _map(figure, axes[0, 0], grid, grid.anomaly, "Anomaly (nT)", "RdBu_r", (middle - extent, middle + extent))

@@ -45,18 +45,18 @@ LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
 """nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """As in a survey that calibrates itself."""
-UNSEEN = 0.25
+UNOBSERVED_CHANGE_NT = 0.25
 """nT of slow changes where the samples show none. On a track that never crosses itself a slow change is as
 likely as a crustal anomaly: with a free width, slow changes absorbed up to 6 nT of it."""
 SEARCHED, SEARCHED_NODES = 4_000, 12_000
 """Samples about the middle with which the field is searched, and nodes at most."""
-WIDE = 5_000.0
+VARIATION_BOX_M = 5_000.0
 """m, north and east of it: where there are more samples within, every second or tenth of these."""
-OUTLIER = 6.0
+GRID_OUTLIER_SIGMA = 6.0
 """Sigmas beyond which a sample is left out."""
 LARGE, LIKELIER = 100.0, 5.0
 """Areas of a length's square, and log-likelihood gain, from which on the field's size may vary with place."""
-MOST = 40_000
+MAX_GRID_NODES = 40_000
 """Nodes at most; their variances take 0.5 GB."""
 
 
@@ -72,7 +72,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
     """
     sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1)
     choice, roughness = _searched(samples, sigma, local=local)
-    nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MOST)
+    nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MAX_GRID_NODES)
     choice = replace(choice, field=replace(choice.field, nodes=nodes))
     every = np.arange(len(samples.value))
     problem = Rows(samples, _groups(samples), roughness)
@@ -87,7 +87,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         w = reduced.field(z)
         e = samples.value - problem.mean - problem.D @ z - problem.rock(choice.field, w)
         e = e / problem.scale  # unresolved anomalies grow with the roughness of the crustal field
-        if turn or not (far := np.abs(e) > OUTLIER * max(robust_scale(e), widths.sigma)).any():
+        if turn or not (far := np.abs(e) > GRID_OUTLIER_SIGMA * max(robust_scale(e), widths.sigma)).any():
             break
         problem.kept = ~far
         sums = problem.sums(choice.field, every)
@@ -169,12 +169,14 @@ def _needed(
     kept = select_blocks(
         reduced.quadratic, NO_COEFFICIENTS, groups, with_blocks(NO_COEFFICIENTS, groups).centre, sigma
     )
-    return tuple(one if one in kept else replace(one, width=UNSEEN, spread=0.0) for one in groups)
+    return tuple(
+        one if one in kept else replace(one, width=UNOBSERVED_CHANGE_NT, spread=0.0) for one in groups
+    )
 
 
 def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, Roughness]:
     """Return the field that a part of the samples, with noise of about `sigma` nT, is select_blocks with."""
-    part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, WIDE))
+    part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, VARIATION_BOX_M))
     step = max(len(part) // SEARCHED, 1)
     few = samples.part(part[::step])
     groups, rows = _groups(few), np.arange(len(few.value))

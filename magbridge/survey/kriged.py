@@ -32,17 +32,17 @@ AMONG = 400
 """Nearest samples among which are the GIVEN."""
 CHOOSING = 600
 """Samples that do."""
-STEPS = 50
+MAX_SEARCH_STEPS = 50
 """Steps of the maximisation over depth, size and noise."""
 SHARE, SPREAD = 0.1, np.log(5.0)
 """g as expected, and the 1-sigma of its logarithm."""
 SHARES = np.geomspace(0.02, 5.0, 60)
 """Those that are tried."""
-APART = 2.0
+SAMPLE_SPACING_DEPTHS = 2.0
 """Depths of the sources between a line's samples that tell its own."""
-CLEAR = 5.0
+VARYING_LOG_RATIO = 5.0
 """Nats from which on the field's size may vary from place to place."""
-CHUNK = 256
+KRIGED_PLACES = 256
 """Places at a time."""
 
 
@@ -67,9 +67,9 @@ class Kriged:
     def at(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance (n,) each, nT and nT², at places (n, 2), m."""
         out = np.empty((len(place), 2))
-        for start in range(0, len(place), CHUNK):
-            some = place[start : start + CHUNK]
-            out[start : start + CHUNK] = self.given(some, self.tree.query(some, NEAREST)[1])
+        for start in range(0, len(place), KRIGED_PLACES):
+            some = place[start : start + KRIGED_PLACES]
+            out[start : start + KRIGED_PLACES] = self.given(some, self.tree.query(some, NEAREST)[1])
         return out[:, 0], out[:, 1]
 
     def of_a_line(self, place: FloatArray) -> FloatArray:
@@ -125,7 +125,7 @@ def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
     ))  # fmt: skip
     rough = Roughness.of(samples, 2.0 * even.below)
     uneven, other = _likeliest(replace(even, roughness=rough))
-    best = uneven if other > score + CLEAR else even
+    best = uneven if other > score + VARYING_LOG_RATIO else even
     share = np.array([_share(best, line) for line in range(len(share))])
     return replace(best, share=share)
 
@@ -150,7 +150,10 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
 
     simplex = first + 0.5 * np.vstack([np.zeros(3), np.eye(3)])
     found = minimize(
-        downhill, first, method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": STEPS}
+        downhill,
+        first,
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": MAX_SEARCH_STEPS},
     )
     return at(found.x), -float(found.fun)
 
@@ -159,7 +162,7 @@ def _share(of: Kriged, line: int) -> float:
     """Return the likeliest g of a line, by what the others around predict; as expected where none are."""
     rows = np.flatnonzero(of.line == line)
     step = float(np.median(np.linalg.norm(np.diff(of.place[rows], axis=0), axis=1))) if len(rows) > 1 else 1.0
-    rows = rows[:: max(round(APART * of.below / max(step, 1e-3)), 1)]
+    rows = rows[:: max(round(SAMPLE_SPACING_DEPTHS * of.below / max(step, 1e-3)), 1)]
     near = of.tree.query(of.place[rows], AMONG)[1]
     near, whole = _first(near, of.line[near] != line)
     if not whole.any():

@@ -15,11 +15,11 @@ __all__ = ["anomaly_map"]
 
 A_LENGTH = 8.0
 """Nodes of a map to one length of its field."""
-NODES = 250_000
+MAX_MAP_NODES = 250_000
 """Nodes of a map at most, unless a spacing is asked for."""
-DRAWN = 100
+DRAWN_FIELDS = 100
 """Fields by which the sigma of a continued map is found: to 7 %."""
-KNOWN = 0.95
+MAX_SIGMA_FRACTION = 0.95
 """Fraction of the field's size at which the sigma counts as unknown, and the map has a hole."""
 
 
@@ -50,13 +50,13 @@ def anomaly_map(
     inner = places[gridded.field.nodes.inside(places)]
     low, high = inner.min(axis=0), inner.max(axis=0)
     step = spacing or max(
-        gridded.field.length / A_LENGTH, float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) / NODES))
+        gridded.field.length / A_LENGTH, float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) / MAX_MAP_NODES))
     )
     north, east = (np.arange(low[k], max(high[k], low[k] + 3.5 * step) + step, step) for k in range(2))
     at = np.stack(np.meshgrid(north, east, indexing="ij"), axis=-1).reshape(-1, 2)
     anomaly, sigma = gridded.at(at)
     size = gridded.size * gridded.roughness.at(at)
-    hole = ~gridded.field.nodes.inside(at) | (sigma > KNOWN * size)
+    hole = ~gridded.field.nodes.inside(at) | (sigma > MAX_SIGMA_FRACTION * size)
     anomaly[hole] = sigma[hole] = np.nan
     shape = len(north), len(east)
     origin = samples.origin
@@ -82,5 +82,7 @@ def _continued(grid: AnomalyGrid, gridded: Gridded, at: FloatArray, altitude: fl
     """
     there, missing, _ = continued(grid, -altitude)
     rise = raised(grid, altitude)
-    drawn = [(rise(one.reshape(grid.anomaly.shape)) - there.anomaly) ** 2 for one in gridded.draw(at, DRAWN)]
+    drawn = [
+        (rise(one.reshape(grid.anomaly.shape)) - there.anomaly) ** 2 for one in gridded.draw(at, DRAWN_FIELDS)
+    ]
     return there.replaced(sigma=np.hypot(np.sqrt(np.mean(drawn, axis=0)), missing))

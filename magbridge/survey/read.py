@@ -35,7 +35,7 @@ __all__ = [
     "corrected_by_others", "from_vector", "is_table", "joined", "read_points", "read_table", "without_creep",
 ]  # fmt: skip
 
-ANOMALY = (
+ANOMALY_COLUMNS = (
     "anomaly",
     "total_field_anomaly_nt",
     "total_field_anomaly",
@@ -45,7 +45,7 @@ ANOMALY = (
 )
 """Names of the anomaly in third-party tables."""
 HEIGHT = ("height", "altitude", "height_m", "height_ell_m", "altitude_m", "elevation")
-TABLES = (".csv", ".csv.gz", ".csv.xz", ".csv.bz2")
+TABLE_SUFFIXES = (".csv", ".csv.gz", ".csv.xz", ".csv.bz2")
 MODES, FAINT = 24, 0.05
 """Uncertain combinations of a calibration at most, and nT below which one does not matter."""
 THINNED = 2_000
@@ -54,10 +54,12 @@ THINNED = 2_000
 
 def is_table(path: Path) -> bool:
     """Return whether a file is a table of lines: positions and an anomaly, without a vector or a time."""
-    if not path.name.lower().endswith(TABLES):
+    if not path.name.lower().endswith(TABLE_SUFFIXES):
         return False
     names = set(_table(path, rows=0).columns)
-    return not names & set(CHANNELS) and "time" not in names and bool(names & {*ANOMALY, "total_field"})
+    return (
+        not names & set(CHANNELS) and "time" not in names and bool(names & {*ANOMALY_COLUMNS, "total_field"})
+    )
 
 
 def read_table(path: Path) -> Samples:
@@ -66,7 +68,7 @@ def read_table(path: Path) -> Samples:
     FormatError: a column is missing or holds something else than numbers.
     """
     table = _table(path)
-    value = _numbers(path, table, _first(path, table, ANOMALY))
+    value = _numbers(path, table, _first(path, table, ANOMALY_COLUMNS))
     longitude, latitude = (_numbers(path, table, name) for name in ("longitude", "latitude"))
     heights = [name for name in HEIGHT if name in table]
     if "depth" in table:

@@ -21,7 +21,7 @@ LAG, REACH = 0.5, 2.0
 """Lengths between the samples of a second difference, and of the smoothing's sigma."""
 LEAST, LARGEST = 0.2, 6.0
 """Limits of a roughness, relative to the typical one."""
-CELLS = 400
+MAX_CELLS_PER_SIDE = 400
 """Most cells a side."""
 PRIOR = 0.1
 """Weight of the typical roughness, over that of the average cell's samples."""
@@ -48,7 +48,7 @@ class Roughness:
         """Return that of a survey whose field has a `length`, m."""
         place = samples.place
         low, extent = place.min(axis=0), np.ptp(place, axis=0)
-        cell = max(float(extent.max()) / CELLS, REACH * length / 4.0)
+        cell = max(float(extent.max()) / MAX_CELLS_PER_SIDE, REACH * length / 4.0)
         bent = _bends(samples, LAG * length)
         known = np.isfinite(bent)
         if known.sum() < 50:

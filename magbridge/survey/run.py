@@ -11,7 +11,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.fitting.crossings import SHARE, courses, crossed, far_off, jumps, too_rough
+from magbridge.calibration.fitting.crossings import (
+    PLACE_LENGTH_FRACTION,
+    courses,
+    crossed,
+    far_off,
+    jumps,
+    too_rough,
+)
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
@@ -27,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Result", "facts", "samples_of", "summary", "survey"]
 
-DRAWN = 16
+DRAWN_TRACKS = 16
 """Fields and places that are drawn where a track jumps."""
 
 
@@ -105,7 +112,9 @@ def survey(samples: Samples) -> Result:
         warnings.append(
             "no line crosses another: only the smoothness of the crustal field separates it from line levels"
         )
-    elif not samples.line.any() and not sum(crossed(*courses(samples.place), SHARE * found.field.length)):
+    elif not samples.line.any() and not sum(
+        crossed(*courses(samples.place), PLACE_LENGTH_FRACTION * found.field.length)
+    ):
         warnings.append(
             "the track never crosses itself: slow changes with time cannot be distinguished from the crustal "
             "field, and are in the map"
@@ -143,13 +152,13 @@ def _misplaced(samples: Samples, at: IndexArray, found: Gridded) -> FloatArray:
     rng, field = np.random.default_rng(0), found.posteriors[0].field
     stretch, steps = samples.line, samples.place[at + 1] - samples.place[at]
     here, drawn = field.basis(samples.place), []
-    for w in found.posteriors[0].draw(rng, DRAWN).T:
+    for w in found.posteriors[0].draw(rng, DRAWN_TRACKS).T:
         off = np.zeros((stretch[-1] + 1, 2))
         for side in (at, at + 1):
             np.add.at(off, stretch[side], rng.normal(size=(len(at), 1)) * steps / 2.0**0.5)
         drawn.append(field.basis(samples.place + off[stretch]) @ w - here @ w)
     rough = found.roughness.at(samples.place)[:, None]
-    return np.asarray(rough * np.stack(drawn, axis=1) / DRAWN**0.5)
+    return np.asarray(rough * np.stack(drawn, axis=1) / DRAWN_TRACKS**0.5)
 
 
 def _has_vector(log: xr.Dataset) -> bool:

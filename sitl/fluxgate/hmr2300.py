@@ -26,13 +26,13 @@ class Hmr2300Encoder(Encoder):
 
     def encode(self, reading: Reading) -> bytes:
         """Return one frame or line, where it streams."""
-        x, y, z = (round(clip(value / wire.NT_PER_COUNT, wire.LIMIT)) for value in reading.field)
+        x, y, z = (round(clip(value / wire.NT_PER_COUNT, wire.MAX_COUNTS)) for value in reading.field)
         self._latest = x, y, z
         return self._sample() if self.streaming else b""
 
     def _sample(self) -> bytes:
         if self.binary:
-            return wire.COUNTS.pack(*self._latest) + b"\r"
+            return wire.COUNTS_LAYOUT.pack(*self._latest) + b"\r"
         return ("  ".join(map(_comma, self._latest)) + "  \r").encode()
 
     def feed(self, data: bytes) -> bytes:

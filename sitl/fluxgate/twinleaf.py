@@ -33,7 +33,7 @@ class TwinleafEncoder(Encoder):
         self._routing = bytes(reversed(options.hops()))
         self._columns = [*options.columns, *([options.temperature] if options.temperature else [])]
         self._unit = options.unit or "nT"
-        self._frames = Framer(tio.END, tio.LIMIT)
+        self._frames = Framer(tio.END, tio.MAX_FRAME_BYTES)
         self._described = False
 
     def encode(self, reading: Reading) -> bytes:
@@ -48,7 +48,7 @@ class TwinleafEncoder(Encoder):
         else:
             header = (number % wire.WRAP_2).to_bytes(3, "little") + bytes([self.power_cycle % 256])
         samples = header + b"".join(tio.FLOAT.pack(value) for value in values)
-        packet = self._slip(tio.SAMPLES + STREAM[self.generation], samples)
+        packet = self._slip(tio.STREAM_TYPE + STREAM[self.generation], samples)
         if self._described:
             return packet
         self._described = True
@@ -62,7 +62,7 @@ class TwinleafEncoder(Encoder):
             packet = tio.unslip(frame)
             if crc32(packet) != CRC32_RESIDUE:
                 continue
-            kind, _, length = tio.HEADER.unpack_from(packet)
+            kind, _, length = tio.TIO_HEADER.unpack_from(packet)
             if kind != tio.RPC_REQUEST or packet[4 + length : -4] != self._routing:
                 continue
             number, size = tio.RPC_HEADER.unpack_from(packet, 4)

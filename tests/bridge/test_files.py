@@ -10,7 +10,7 @@ import pytest
 from checks import replays
 from rig import Rig
 
-from magbridge.link.ftp import HEADER, Opcode
+from magbridge.link.ftp import FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, Message, Signing
 
 KEY = bytes(range(7, 39))
@@ -37,7 +37,7 @@ class Station:
     def ask(self, opcode: int, data: bytes = b"", *, session: int = 0, size: int = 0, offset: int = 0) -> int:
         """Send an FTP request; return where what follows begins in what is heard."""
         mark, self._sequence = len(self.received), self._sequence + 1
-        header = HEADER.pack(self._sequence, session, opcode, size or len(data), 0, 0, offset)
+        header = FTP_HEADER.pack(self._sequence, session, opcode, size or len(data), 0, 0, offset)
         payload = (header + data).ljust(251, b"\0")
         self.send_message("FILE_TRANSFER_PROTOCOL", target_system=1, target_component=191, payload=payload)
         return mark
@@ -46,7 +46,7 @@ class Station:
         """Yield opcode, whether the burst is complete, data of the FTP replies heard since."""
         for message in self.received[mark:]:
             if message.name == "FILE_TRANSFER_PROTOCOL":
-                _, _, opcode, size, _, complete, _ = HEADER.unpack_from(message["payload"])
+                _, _, opcode, size, _, complete, _ = FTP_HEADER.unpack_from(message["payload"])
                 yield opcode, complete, message["payload"][12 : 12 + size]
 
     def until(self, condition: Callable[[], object]) -> None:

@@ -20,7 +20,7 @@ from magbridge.calibration.file import calibration_id, load
 from magbridge.cli import main
 from magbridge.config import load as load_config
 from magbridge.errors import ConfigError
-from magbridge.learning.causes import CAUSES
+from magbridge.learning.causes import CAUSE_UNITS
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.mavlink.enums import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE
@@ -146,7 +146,7 @@ def test_a_wrong_key_is_one_line(tmp_path: Path, text: str, why: str) -> None:
 
 def test_the_causes_bits_are_those_of_the_dialect() -> None:
     """In the same order."""
-    assert [str(cause.name).lower() for cause in MAG_CAUSE] == list(CAUSES)
+    assert [str(cause.name).lower() for cause in MAG_CAUSE] == list(CAUSE_UNITS)
 
 
 def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:

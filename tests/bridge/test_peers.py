@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from magbridge.bridge.links import open_link
-from magbridge.bridge.peers import ANSWERED, KNOWN, SHARE, Peers
+from magbridge.bridge.peers import ANSWERED, MAX_PARSED_PEERS, PEER_READ_BYTES, Peers
 from magbridge.bridge.port import Port
 from magbridge.bridge.sockets import CONNECTIONS
 from magbridge.mavlink import Codec
@@ -154,7 +154,7 @@ def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
     both = Peers(PILOT)
     both.receive("autopilot", beat())
     both.drain()
-    for k in range(10 * KNOWN):
+    for k in range(10 * MAX_PARSED_PEERS):
         both.receive(k, beat(99)[:-1] + b"?" + bytes(1000))
     for _ in range(100):
         both.receive("station", beat(190, 255) * 20)
@@ -162,8 +162,8 @@ def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
         both.receive("autopilot", beat())
     frames = [one for one in Codec(1, 191).parse(both.drain(), whole=True) if one.known]
     assert sum(one.component == 1 for one in frames) == 1000
-    assert sum(one.component == 190 for one in frames) <= SHARE / len(beat())
-    assert both.ignored > 10 * KNOWN * 900
+    assert sum(one.component == 190 for one in frames) <= PEER_READ_BYTES / len(beat())
+    assert both.ignored > 10 * MAX_PARSED_PEERS * 900
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])

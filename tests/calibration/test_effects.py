@@ -13,7 +13,7 @@ from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect,
 from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import HIGHEST, TERMS, Effect, Polynomial, Series, term_class
+from magbridge.calibration.terms import MAX_ORDER, TERMS, Effect, Polynomial, Series, term_class
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import symmetric
 
@@ -123,7 +123,7 @@ def test_legendre_polynomials_of_positions() -> None:
     p = np.array([-0.5, 0.0, 2.0])
     got = stepped(LegendreEffect(cause="", exponents=(3,)), np.arange(3.0), p)
     np.testing.assert_allclose(got[:, 0], (5.0 * p**3 - 3.0 * p) / 2.0)
-    for exponents in ((-1,), (HIGHEST + 1,), (1, 1), ()):
+    for exponents in ((-1,), (MAX_ORDER + 1,), (1, 1), ()):
         with pytest.raises(CalibrationError, match="legendre: expected"):
             with_effect(LegendreEffect(cause="", exponents=exponents))
 

@@ -18,7 +18,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.dipole import Dipole
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import (
-    FORMAT,
+    CALIBRATION_FORMAT,
     calibration_id,
     decode_calibration,
     encode_calibration,
@@ -139,7 +139,7 @@ def _drop_row(c: dict[str, Any]) -> None:
 
 
 EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] = {
-    "newer": (lambda c: c.update(format=FORMAT + 1), FormatError, "newer magbridge"),
+    "newer": (lambda c: c.update(format=CALIBRATION_FORMAT + 1), FormatError, "newer magbridge"),
     "unknown key": (lambda c: c.update(colour="red"), FormatError, "colour"),
     "wrong type": (lambda c: c["noise"].update(sensor="low"), FormatError, "noise.sensor: Expected `float`"),
     "missing": (lambda c: c.pop("reference"), FormatError, "reference"),

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.fitting.fit import LEVEL, METHODS, fit
+from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, METHODS, fit
 from magbridge.calibration.fitting.nominal import nominal, nominal_samples
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
 from magbridge.calibration.fitting.validate import in_sensor_units
@@ -303,7 +303,7 @@ def test_nominal_constraints(glider: Gliders) -> None:
 
 
 @pytest.mark.parametrize(
-    ("unmapped", "map_sigma", "bias"), [(0.0, None, 0.0), (1.0, None, LEVEL), (1.0, 30.0, 30.0)]
+    ("unmapped", "map_sigma", "bias"), [(0.0, None, 0.0), (1.0, None, MAIN_FIELD_SIGMA_NT), (1.0, 30.0, 30.0)]
 )
 def test_by_default_the_level_is_known_as_well_as_the_reference(
     glider: Gliders, unmapped: float, map_sigma: float | None, bias: float

@@ -15,7 +15,7 @@ from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting import in_place, rounds
 from magbridge.calibration.fitting.crossings import too_rough
-from magbridge.calibration.fitting.fit import LEVEL, Fit, fit
+from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT, Fit, fit
 from magbridge.calibration.fitting.level import apart_from_level, level_of, with_level
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.pose import pose
@@ -56,7 +56,7 @@ def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
     """An IGRF alone does not know the level: the sigma counts that, and says how much of it there is."""
     data, true, found = survey
     level = found.calibration.reference.level_sigma
-    assert 0.8 * LEVEL < level < 1.5 * LEVEL
+    assert 0.8 * MAIN_FIELD_SIGMA_NT < level < 1.5 * MAIN_FIELD_SIGMA_NT
     got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
     assert got.sigma.min() > 0.9 * level
     assert abs(np.mean(got.total - true)) < 2.5 * level
@@ -74,7 +74,9 @@ def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) 
     """Its sigma spans what was found; what is apart from it stays."""
     data, _, found = survey
     samples = pose(data, 3, None, None).samples
-    doubted, believed = (with_level(found.calibration, samples, bias, LEVEL) for bias in (400.0, 200.0))
+    doubted, believed = (
+        with_level(found.calibration, samples, bias, MAIN_FIELD_SIGMA_NT) for bias in (400.0, 200.0)
+    )
     assert doubted.reference.level_sigma == 400.0
     assert believed.reference.level_sigma == pytest.approx(found.calibration.reference.level_sigma, rel=0.01)
     apart = apart_from_level(believed).covariance
@@ -96,9 +98,9 @@ def test_a_slope_of_the_crust_is_not_taken_for_a_level() -> None:
     seen = replace(data, field=ned + OFFSET, reference=data.reference + main, place=place)
     found = fit(seen).calibration
     error = correct(found, seen.field, np.empty((len(seen), 0)), seen.time).total - (true + main + crust)
-    assert abs(error.mean()) < 0.5 * LEVEL
+    assert abs(error.mean()) < 0.5 * MAIN_FIELD_SIGMA_NT
     assert error.std() < 0.25
-    assert 0.9 * LEVEL < found.reference.level_sigma < 1.5 * LEVEL
+    assert 0.9 * MAIN_FIELD_SIGMA_NT < found.reference.level_sigma < 1.5 * MAIN_FIELD_SIGMA_NT
 
 
 def test_level_stands_in_the_file(survey: Survey) -> None:
@@ -106,13 +108,13 @@ def test_level_stands_in_the_file(survey: Survey) -> None:
     again = decode_calibration(encode_calibration(calibration))
     assert again.reference == calibration.reference
     assert again.level == calibration.level
-    assert again.reference.bias_sigma == LEVEL
+    assert again.reference.bias_sigma == MAIN_FIELD_SIGMA_NT
 
 
 def test_level_is_less_than_the_sigma_by_the_noise_at_least() -> None:
     """Whatever it does to the offset: 150 nT across the field lengthen it by 0.2 nT, which is no level."""
     w = np.zeros(9)
-    w[:3], w[6] = LEVEL / np.sqrt(3.0), 150.0
+    w[:3], w[6] = MAIN_FIELD_SIGMA_NT / np.sqrt(3.0), 150.0
     still = identity()
     known = replace(still, covariance=np.outer(w, w), level=tuple(w), noise=Noise(NOISE), method="survey")
     field = np.array([[0.0, 0.0, 50_000.0], [0.0, 30_000.0, 40_000.0]])

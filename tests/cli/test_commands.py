@@ -305,7 +305,7 @@ def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr("sys.stderr", terminal)
         monkeypatch.setenv("TERM", "xterm")
         for patience, wanted in ((1000.0, ()), (0.0, (b"judging", b"0:00:"))):
-            monkeypatch.setattr("magbridge.progress.PATIENCE", patience)
+            monkeypatch.setattr("magbridge.progress.BAR_DELAY_S", patience)
             shown, deadline = b"", time.monotonic() + (20.0 if wanted else 0.3)
             with waiting("fitting") as step:
                 step("judging")

@@ -7,5 +7,5 @@ from magbridge.learning import causes
 
 
 def test_a_cause_learned_in_flight_has_a_name_of_the_diagnosis() -> None:
-    assert set(causes.CAUSES) <= set(CAUSES)
-    assert set(causes.FROM_ZERO) <= set(causes.CAUSES)
+    assert set(causes.CAUSE_UNITS) <= set(CAUSES)
+    assert set(causes.FROM_ZERO) <= set(causes.CAUSE_UNITS)

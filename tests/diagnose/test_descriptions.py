@@ -16,7 +16,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.statistic import SIZES, Statistic
+from magbridge.diagnose.inference.statistic import PRIOR_SIZES, Statistic
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 from magbridge.diagnose.unexplained.shapes import bends, crossing, delayed, near_surface, response, swings
@@ -34,7 +34,7 @@ def test_ridge_is_the_marginal_likelihood_of_a_common_size() -> None:
         return float(multivariate_normal.logpdf(y, cov=np.eye(60) + g * (X * width**2) @ X.T))
 
     best = Statistic(X.T @ X, width[None] ** 2).best(X.T @ y)
-    assert 0.5 * best.ratio == pytest.approx(max(density(g) for g in SIZES) - density(0.0), abs=1e-8)
+    assert 0.5 * best.ratio == pytest.approx(max(density(g) for g in PRIOR_SIZES) - density(0.0), abs=1e-8)
     gained = 0.5 * (y @ y - np.sum((y - X @ best.estimate) ** 2))
     assert gained - best.price == pytest.approx(0.5 * best.ratio, abs=1e-8)
     assert best.estimate[-1] == 0.0

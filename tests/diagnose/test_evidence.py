@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.inference.evidence import (
-    LEVEL,
+    FALSE_ALARM_RATE,
     evidence_of,
     log_bayes,
     log_odds,
@@ -95,7 +95,7 @@ def test_hypotheses_count_as_often_as_one_of_them_passes() -> None:
     apart = np.abs(np.subtract.outer(np.arange(12.0), np.arange(12.0)))
     S = np.kron(0.9**apart, np.eye(2))
     draws = np.linalg.cholesky(S) @ np.random.default_rng(4).standard_normal((24, 1_000_000))
-    level = LEVEL / 12.0
+    level = FALSE_ALARM_RATE / 12.0
     passed = (draws.reshape(12, 2, -1) ** 2).sum(axis=1).max(axis=0) > chi2.isf(level, 2)
     assert counted(S, [2] * 12) == pytest.approx(passed.mean() / level, rel=0.1)
 

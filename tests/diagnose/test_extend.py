@@ -16,7 +16,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.diagnose.assessment.numbers import level
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
-from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.compare.past import MAX_LAG, Past
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with_map_error, with_misfit
@@ -80,7 +80,7 @@ def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
     whole = right(1600)
     survey = replace(
         whole.survey, field=field, time=whole.survey.time + 1e4 * leg, dive=leg,
-        fitted=learned, learned=learned, steps=np.where(row > 0, 1, FAR),
+        fitted=learned, learned=learned, steps=np.where(row > 0, 1, MAX_LAG),
     )  # fmt: skip
     lost = 5e4 * 0.5 * (tau * 2.0 * np.pi / 300.0) ** 2
     calibration = replace(

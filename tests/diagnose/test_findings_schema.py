@@ -18,7 +18,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.report.findings import FORMAT, findings_json
+from magbridge.diagnose.report.findings import FINDINGS_FORMAT, findings_json
 from magbridge.diagnose.report.page import report_html
 from magbridge.diagnose.unexplained.leftover import Leftover
 from magbridge.diagnose.words import number
@@ -41,7 +41,7 @@ def variants(clear: Diagnosis) -> dict[str, Diagnosis]:
 
 def test_the_schema_is_one() -> None:
     Draft202012Validator.check_schema(SCHEMA)
-    assert SCHEMA["properties"]["format"]["const"] == FORMAT
+    assert SCHEMA["properties"]["format"]["const"] == FINDINGS_FORMAT
 
 
 @pytest.mark.parametrize("name", ["named", "contested", "nothing", "rest", "wrong"])
@@ -53,7 +53,7 @@ def test_findings_are_as_the_schema_says(clear: Diagnosis, name: str) -> None:
 
 def test_what_is_not_in_the_schema_is_refused(clear: Diagnosis) -> None:
     facts: dict[str, Any] = json.loads(findings_json(clear, CAUSES))
-    for wrong in (facts | {"more": 1}, facts | {"verdict": "fine"}, facts | {"format": FORMAT + 1}):
+    for wrong in (facts | {"more": 1}, facts | {"verdict": "fine"}, facts | {"format": FINDINGS_FORMAT + 1}):
         assert not Draft202012Validator(SCHEMA).is_valid(wrong)
 
 

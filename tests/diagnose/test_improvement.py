@@ -9,7 +9,7 @@ import pytest
 from posed import calibrated, surveyed, walk
 from scipy.stats import multivariate_normal
 
-from magbridge.diagnose.compare.past import FAR
+from magbridge.diagnose.compare.past import MAX_LAG
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.inference.joint import Joint, fit_joint
 from magbridge.diagnose.inference.left_out import held_out
@@ -22,7 +22,7 @@ def problem() -> Problem:
     """Five dives of turning, as calibrated but for 1 nT of noise."""
     rng = np.random.default_rng(4)
     n = 40 * DIVES
-    steps, dive = np.where(np.arange(n) % 40 > 0, 1, FAR), np.arange(n) // 40
+    steps, dive = np.where(np.arange(n) % 40 > 0, 1, MAX_LAG), np.arange(n) // 40
     survey = surveyed(walk(n, rng), np.sin(np.arange(n) / 9.0), steps=steps, dive=dive)
     noisy = replace(survey, field=survey.field + rng.normal(size=(n, 3)))
     return pose(noisy, calibrated(np.zeros(18)))

@@ -12,7 +12,7 @@ from magbridge.diagnose.assessment.numbers import delays
 from magbridge.diagnose.causes.time_dependent import offset_drift
 from magbridge.diagnose.causes.timing import channel_skew
 from magbridge.diagnose.compare.interpolation import interpolation_error
-from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, pose
+from magbridge.diagnose.compare.problem import AXIS_DELAY_SIGMA_S, DELAYS, Problem, pose
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.diagnose.extend import relinearised
 from magbridge.diagnose.inference.information import information
@@ -60,7 +60,7 @@ def test_the_delays_are_found() -> None:
     time = whole.survey.time
     problem = pose(made(whole, interpolated(time), 1), whole.calibration)
     fit = fit_joint(problem, [], 1)
-    found = DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0])
+    found = AXIS_DELAY_SIGMA_S * (fit.z[DELAYS] - fit.z[DELAYS][0])
     np.testing.assert_allclose(found, TAKEN, atol=0.03)
     stated = [float(x) for x in re.findall(r"([\d.]+) ± [\d.]+ s", late(delays(problem, fit)))]
     np.testing.assert_allclose(stated, found[1:], atol=1e-3)
@@ -73,7 +73,7 @@ def test_the_delays_stay_where_the_comparison_is_linearised_anew() -> None:
     problem = pose(made(whole, interpolated(time), 1), whole.calibration)
     drift = offset_drift(problem)[0]
     _, _, fit = relinearised(problem, [drift], fit_joint(problem, [drift.columns], 1))
-    np.testing.assert_allclose(DELAY * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
+    np.testing.assert_allclose(AXIS_DELAY_SIGMA_S * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
 
 
 def test_channels_taken_at_once_have_none() -> None:
@@ -81,7 +81,7 @@ def test_channels_taken_at_once_have_none() -> None:
     problem = pose(made(whole, swaying(whole.survey.time), 2), whole.calibration)
     fit = fit_joint(problem, [], 1)
     spread = fit.z[DELAYS] - np.mean(fit.z[DELAYS])
-    assert np.all(np.abs(DELAY * spread) < 0.03)
+    assert np.all(np.abs(AXIS_DELAY_SIGMA_S * spread) < 0.03)
     assert np.std(problem.straight(fit.z) - problem.residual) < 0.2
     assert delays(problem, fit) is None
 

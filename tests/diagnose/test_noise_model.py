@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.compare.past import MAX_LAG, Past
 from magbridge.diagnose.inference.evidence import certainty
-from magbridge.diagnose.inference.fit_noise import LONGEST, autoregressive_order, fit_noise
+from magbridge.diagnose.inference.fit_noise import MAX_NOISE_ORDER, autoregressive_order, fit_noise
 from magbridge.diagnose.inference.noise import Noise
 
 
@@ -21,7 +21,7 @@ def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.
     for i in range(1, n):
         r[i] += rho * r[i - 1]
     steps = np.ones(n, int)
-    steps[[0, n // 6, n // 2]] = FAR
+    steps[[0, n // 6, n // 2]] = MAX_LAG
     return r, steps
 
 
@@ -39,7 +39,7 @@ def test_noise_is_no_slower_than_a_log_can_tell() -> None:
     """What wanders throughout a log is left for drifts to explain; slow noise is fitted as it is."""
     v = np.random.default_rng(3).normal(size=4000)
     steps = np.ones(len(v), int)
-    steps[0] = FAR
+    steps[0] = MAX_LAG
     noise = fit_noise(np.cumsum(v), Past(steps, 5))
     assert np.abs(np.roots(np.append(1.0, -noise.ar))).max() == pytest.approx(1.0 - 20.0 / len(v))
     slow, _ = made("white", len(v), 0.98)
@@ -54,7 +54,7 @@ def test_a_correlation_is_taken_for_no_shorter_where_few_samples_have_all_of_the
     slow, _ = made("white", n, 0.95, seed=6)
     here = np.flatnonzero(rng.random(n) >= lost)
     r = (1.4 * rng.normal(size=n) + np.sqrt(1.0 - 0.95**2) * slow)[here]
-    assert autoregressive_order(r, here) == LONGEST
+    assert autoregressive_order(r, here) == MAX_NOISE_ORDER
 
 
 def test_a_correlation_is_no_longer_than_what_samples_with_a_whole_past_can_tell() -> None:
@@ -62,7 +62,7 @@ def test_a_correlation_is_no_longer_than_what_samples_with_a_whole_past_can_tell
     slow, _ = made("white", 6000, 0.95, seed=6)
     r = 1.4 * np.random.default_rng(5).normal(size=6000) + np.sqrt(1.0 - 0.95**2) * slow
     here = np.flatnonzero((np.arange(6000) % 1000 < 60) | (np.arange(6000) % 4 == 0))
-    assert 1 < autoregressive_order(r[here], here) < LONGEST
+    assert 1 < autoregressive_order(r[here], here) < MAX_NOISE_ORDER
 
 
 def test_heavy_tails_are_found_and_the_score_is_of_unit_variance() -> None:
@@ -112,7 +112,7 @@ def test_least_squares_of_the_filtered_is_generalised_least_squares(
     a, p = np.array(ar), len(ar)
     place = np.setdiff1d(np.arange(200), lost)
     n, stretch = len(place), np.searchsorted(breaks, place, "right")
-    steps = np.where(np.diff(stretch, prepend=-1) > 0, FAR, np.diff(place, prepend=0))
+    steps = np.where(np.diff(stretch, prepend=-1) > 0, MAX_LAG, np.diff(place, prepend=0))
     rng = np.random.default_rng(3)
     X = rng.normal(size=(n, 2)).cumsum(axis=0)
     noise = Noise(a, np.ones(n), 1e6, Past(steps, p), 0.0, np.zeros(n))
@@ -138,7 +138,7 @@ def test_what_says_how_much_a_constant_pulls_is_right_beside_gaps(lost: str) -> 
             "76 of 100": place % 100 > 75,
         }
         place = np.flatnonzero(keep[lost])
-        past = Past(np.append(FAR, np.diff(place)), 8)
+        past = Past(np.append(MAX_LAG, np.diff(place)), 8)
         noise = fit_noise(whole[place], past, blocks=False)
         one = noise.filter(np.ones((len(place), 1)))[:, 0]
         pulls.append(float(one @ noise.response(whole[place]) / np.sqrt(one @ one)))

@@ -12,7 +12,7 @@ from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.compare.past import MAX_LAG, Past
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.outliers import Outliers, outliers
@@ -51,7 +51,7 @@ def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float 
 
 def judged(residual: np.ndarray, order: int) -> Outliers | None:
     steps = np.ones(N, int)
-    steps[[0, N // 3]] = FAR
+    steps[[0, N // 3]] = MAX_LAG
     noise = fit_noise(residual, Past(steps, order))
     none = np.zeros(0)
     return outliers(Joint(noise.log_likelihood, none, none, np.zeros((0, 0)), noise, residual, none), 18)

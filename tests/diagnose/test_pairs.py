@@ -12,7 +12,7 @@ from posed import candidate, right
 
 from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.inference.competing import _separate, exchanged, sets_of
-from magbridge.diagnose.inference.evidence import LEVEL, score
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE, score
 from magbridge.diagnose.inference.pairs import pairs_of
 from magbridge.diagnose.inference.search import _backward_elimination
 from magbridge.diagnose.inference.state import State
@@ -81,7 +81,7 @@ def test_a_cause_that_is_not_worth_a_further_one_is_dropped(state: State) -> Non
     weak.null = weak.fit([])
     base = weak.fit([a, b, other])
     ratio = weak.ratio(base) - weak.ratio(weak.fit([a, b]))
-    assert weak.p_value(other, ratio, other.size) < LEVEL
+    assert weak.p_value(other, ratio, other.size) < FALSE_ALARM_RATE
     chosen, _ = _backward_elimination(weak, [a, b, other], base)
     assert [h.candidate for h in chosen] == [a, b]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.compare.past import MAX_LAG, Past
 from magbridge.diagnose.compare.survey import Survey, assemble
 
 
@@ -23,7 +23,7 @@ def test_a_step_is_what_a_quarter_of_the_samples_take_and_gaps_are_counted_in_it
     jitter = np.random.default_rng(1).uniform(-0.5, 0.5, 101)
     s = survey(np.cumsum(np.concatenate([[0.0], near, below])) + jitter)
     assert s.interval == pytest.approx(5.0, rel=0.05)
-    expected = np.concatenate([[FAR], np.full(40, 1), np.full(60, 4)])
+    expected = np.concatenate([[MAX_LAG], np.full(40, 1), np.full(60, 4)])
     expected[71] = 8
     assert s.steps.tolist() == expected.tolist()
     assert s.slots.tolist() == [0, *np.cumsum(expected[1:])]
@@ -34,15 +34,22 @@ def test_a_step_is_what_a_quarter_of_the_samples_take_and_gaps_are_counted_in_it
 def test_nothing_is_known_before_a_log_and_where_another_begins() -> None:
     n = 80
     s = survey(4.0 * np.arange(n), (np.arange(n) >= 50).astype(float))
-    assert np.flatnonzero(s.steps == FAR).tolist() == [0, 50]
+    assert np.flatnonzero(s.steps == MAX_LAG).tolist() == [0, 50]
     assert np.flatnonzero(~s.past(3).whole).tolist() == [0, 1, 2, 50, 51, 52]
     assert s.past(3) is s.past(3)
 
 
 def test_samples_beside_a_gap_have_the_lags_of_those_that_are_there() -> None:
-    past = Past(np.array([FAR, 1, 1, 3, 1, 1, FAR, 1]), 2)
+    past = Past(np.array([MAX_LAG, 1, 1, 3, 1, 1, MAX_LAG, 1]), 2)
     lags = {
         int(row): past.lags[pattern].tolist() for row, pattern in zip(past.rows, past.pattern, strict=True)
     }
-    assert lags == {0: [FAR, FAR], 1: [1, FAR], 3: [3, 4], 4: [1, 4], 6: [FAR, FAR], 7: [1, FAR]}
+    assert lags == {
+        0: [MAX_LAG, MAX_LAG],
+        1: [1, MAX_LAG],
+        3: [3, 4],
+        4: [1, 4],
+        6: [MAX_LAG, MAX_LAG],
+        7: [1, MAX_LAG],
+    }
     assert np.flatnonzero(past.whole).tolist() == [2, 5]

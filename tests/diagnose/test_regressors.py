@@ -20,7 +20,7 @@ from magbridge.diagnose.causes.time_dependent import offset_step
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.compare.design_columns import effect_columns
 from magbridge.diagnose.compare.interpolation import rates
-from magbridge.diagnose.compare.past import FAR
+from magbridge.diagnose.compare.past import MAX_LAG
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel
 from magbridge.diagnose.inference.statistic import Statistic
@@ -43,7 +43,7 @@ def problem() -> Problem:
         "p": Channel(p, "in", ("position",)), "fin": Channel(p[::-1].copy(), "deg", ("position",)),
         "warm": Channel(warm, "degC", ("temperature",)), "amps": Channel(amps, "A", ("current",)),
     }  # fmt: skip
-    steps = np.append(FAR, np.rint(np.diff(t) / 4.0).astype(int))
+    steps = np.append(MAX_LAG, np.rint(np.diff(t) / 4.0).astype(int))
     survey = surveyed(directions, p, time=t, steps=steps, channels=channels)
     return pose(survey, calibrated(rng.normal(0, 50.0, 27), centre=0.1, scale=0.9))
 

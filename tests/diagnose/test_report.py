@@ -12,7 +12,7 @@ import pytest
 from posed import candidate, right
 
 from magbridge.cli.diagnose import causes_of, summary
-from magbridge.diagnose.assessment.notes import IMPLAUSIBLE, Note, not_separated
+from magbridge.diagnose.assessment.notes import IMPLAUSIBLE_MULTIPLE, Note, not_separated
 from magbridge.diagnose.assessment.numbers import level, times_usual
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.compare.prior import isotropic
@@ -160,7 +160,7 @@ def test_sizes_of_one_unit_name_it_once() -> None:
 def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
     """A constant of 1,200 nT where main-field models are 100 nT off."""
     bias = candidate("reference_bias", np.ones(1), width=np.array([100.0]))
-    assert times_usual(bias, np.array([-12.0])) == 12.0 > IMPLAUSIBLE
+    assert times_usual(bias, np.array([-12.0])) == 12.0 > IMPLAUSIBLE_MULTIPLE
     assert times_usual(replace(bias, spectra=np.ones((1, 1))), np.array([-12.0])) == 0.0
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from posed import candidate
 
-from magbridge.diagnose.assessment.weigh import OWN, Assessment
+from magbridge.diagnose.assessment.weigh import OWN_LOG_TEXT, Assessment
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.inference.competing import CompetingHypothesis
@@ -102,7 +102,7 @@ def test_each_other_objection_is_reported(clear: Diagnosis) -> None:
     doubtful = {
         "shows no improvement on held-out parts": with_(clear, improvement=IDLE),
         "10 times the usual size": with_(clear, coefficients=large),
-        OWN: replace(clear, problem=own),
+        OWN_LOG_TEXT: replace(clear, problem=own),
         "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),
     }
     for text, diagnosis in doubtful.items():

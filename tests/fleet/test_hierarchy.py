@@ -9,7 +9,7 @@ from magbridge.arrays import FloatArray
 from magbridge.estimation.information import GaussianInformation
 from magbridge.fleet import hierarchy
 from magbridge.fleet.hierarchy import Observed, Population, learn
-from magbridge.fleet.variances import NONE, Shapes, Variances
+from magbridge.fleet.variances import NO_SHAPES, Shapes, Variances
 
 
 def observed(
@@ -37,7 +37,7 @@ def test_what_is_expected_is_the_dense_gaussians_answer(*, shaped: bool) -> None
     seen, _ = observed(rng, (1.0, 0.3, 0.1), (2, 2, 2), K=3)
     V = np.array([[1.0, 0.5, 2.0], [0.1, 0.2, 0.3], [0.01, 0.02, 0.03]])
     D, u = {"0": rng.normal(size=(3, 2)), "1": rng.normal(size=(3, 2))}, np.array([0.5, 2.0])
-    shapes = Shapes(D, np.arange(2)) if shaped else NONE
+    shapes = Shapes(D, np.arange(2)) if shaped else NO_SHAPES
     variances = Variances(V, u if shaped else np.zeros(0))
     population, _ = hierarchy._round(variances, seen, np.arange(3), shapes)
     mean, P = population.expected("1", [one for one in seen if one.vehicle == "1"], "0")

@@ -16,7 +16,7 @@ from databases import program, server
 
 from magbridge.cli import main
 from magbridge.errors import FormatError, PortError
-from magbridge.fleet.catalogue import TABLES, Catalogue, open_catalogue
+from magbridge.fleet.catalogue import CATALOGUE_TABLES, Catalogue, open_catalogue
 from magbridge.fleet.job import jobs
 from magbridge.fleet.work import work
 
@@ -52,7 +52,7 @@ def test_it_says_what_a_folder_says(url: str, flown: Path, tmp_path: Path) -> No
         assert not any(added)
         catalogue.add("done", [{**job.mark, "diagnosed": False, "mapped": True}])
         both.append(catalogue)
-    for table in TABLES:
+    for table in CATALOGUE_TABLES:
         assert both[0].rows(table) == both[1].rows(table)
     few = [catalogue.rows("calibrations", ["rms", "warnings"]) for catalogue in both]
     assert few[0] == few[1]

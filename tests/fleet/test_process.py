@@ -16,7 +16,7 @@ from magbridge.errors import WriteError
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
 from magbridge.fleet.job import jobs, new_jobs
 from magbridge.fleet.memory import current, lessons
-from magbridge.fleet.page import COLOURS
+from magbridge.fleet.page import PAGE_COLOURS
 from magbridge.fleet.register import Deployment, Vehicle, add_logs, add_vehicle
 from magbridge.fleet.status import status
 from magbridge.fleet.work import work
@@ -174,7 +174,7 @@ def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.
     for text in (page.read_text(), (pages / "comet.html").read_text()):
         assert "<td class=changed>hard iron, y</td>" in text
         assert text.count("<svg") == 6
-        assert not any(colour in text for colour in COLOURS)
+        assert not any(colour in text for colour in PAGE_COLOURS)
         assert "src=" not in text
         assert 'href="http' not in text
     assert '<a href="comet.html">' in (pages / "index.html").read_text()

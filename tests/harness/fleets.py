@@ -8,7 +8,7 @@ import numpy as np
 from gliders import make
 
 from magbridge.cli import main
-from magbridge.fleet.catalogue import TABLES, Row
+from magbridge.fleet.catalogue import CATALOGUE_TABLES, Row
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
 from magbridge.logs import write
 from magbridge.logs.deployment import deployment
@@ -40,7 +40,7 @@ def catalogue_of(folder: Path, flown: Path) -> Catalogue:
 
 def content(catalogue: Catalogue) -> dict[str, list[Row]]:
     """Return all that a catalogue holds."""
-    return {table: catalogue.rows(table) for table in TABLES}
+    return {table: catalogue.rows(table) for table in CATALOGUE_TABLES}
 
 
 FLEET = """

@@ -12,7 +12,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Effect, Polynomial, Series
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.past import FAR
+from magbridge.diagnose.compare.past import MAX_LAG
 from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.compare.survey import Channel, Survey
 
@@ -43,7 +43,7 @@ def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
     plain = {
         "time": T0 + 4.0 * np.arange(float(n)), "reference": np.full(n, FIELD), "still": (),
         "field": FIELD * directions / np.linalg.norm(directions, axis=1)[:, None],
-        "steps": np.where(np.arange(n) > 0, 1, FAR), "dive": np.arange(n) // 50, "place": None,
+        "steps": np.where(np.arange(n) > 0, 1, MAX_LAG), "dive": np.arange(n) // 50, "place": None,
         "attitude": None, "fitted": np.zeros(n, bool), "learned": np.zeros(n, bool), "cycles": np.empty(0),
         "source": "made",
         "channels": {"p": Channel(p, "in", ("position",))},
@@ -86,7 +86,7 @@ def thinned(survey: Survey, here: NDArray[np.bool_]) -> Survey:
     each = ("time", "field", "reference", "dive", "fitted", "learned")
     rows = {name: getattr(survey, name)[here] for name in each}
     channels = {name: c._replace(values=c.values[here]) for name, c in survey.channels.items()}
-    steps = np.append(FAR, np.minimum(np.diff(np.flatnonzero(here)), FAR))
+    steps = np.append(MAX_LAG, np.minimum(np.diff(np.flatnonzero(here)), MAX_LAG))
     return replace(survey, **rows, channels=channels, steps=steps)
 
 

@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v10 import common as version_1
 from rig import Rig
 
-from magbridge.link.ftp import HEADER, Opcode
+from magbridge.link.ftp import FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, Message
 
 LOG = "20250101T000000Z_0001.tlog"
@@ -102,7 +102,7 @@ def ears() -> Iterator[list[Ear]]:
 
 
 def ftp(opcode: int, data: bytes, sequence: int) -> dict[str, object]:
-    header = HEADER.pack(sequence, 0, opcode, len(data), 0, 0, 0)
+    header = FTP_HEADER.pack(sequence, 0, opcode, len(data), 0, 0, 0)
     return {"target_system": 1, "target_component": 191, "payload": (header + data).ljust(251, b"\0")}
 
 

@@ -10,7 +10,7 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.model import Calibration
 from magbridge.learning.bank import Bank
-from magbridge.learning.estimator import LONG, Estimator
+from magbridge.learning.estimator import MEAN_SAMPLES, Estimator
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
 from magbridge.learning.observation import observe
@@ -125,5 +125,5 @@ def test_a_level_that_nobody_has_seen_is_kept() -> None:
     by = level(published) - level(learned)
     assert abs(by) > 0.5
     assert level(quiet.coefficients) == pytest.approx(level(published), abs=1e-6)
-    share = 1.0 - (1.0 - 1.0 / LONG) ** 400  # of the mean derivative that is followed by now
+    share = 1.0 - (1.0 - 1.0 / MEAN_SAMPLES) ** 400  # of the mean derivative that is followed by now
     assert quiet.rock - rock == pytest.approx(by / share, rel=0.1)

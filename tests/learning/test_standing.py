@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from magbridge.learning.causes import Alarm
-from magbridge.learning.standing import COMPETING, PATIENCE, QUIET, SURE, Standing
+from magbridge.learning.standing import LOG_RATIO_PER_CAUSE, MAX_WAIT_SAMPLES, QUIET, SURE, Standing
 from magbridge.records import Quality
 
 
@@ -32,18 +32,18 @@ def test_it_is_learned_sooner_the_fewer_causes_fit() -> None:
     two = "offset_drift", "temperature_offset"
     first = alarm(20.0, *two)
     assert not standing(first, alarm(20.1 + SURE, *two)).ripe
-    assert standing(first, alarm(20.1 + SURE + COMPETING, *two)).ripe
+    assert standing(first, alarm(20.1 + SURE + LOG_RATIO_PER_CAUSE, *two)).ripe
     assert standing(first, alarm(20.1 + SURE, "offset_drift")).ripe
     assert standing(first).raised(alarm(22.0, "offset_drift")) == ""  # what it was is told at its end
 
 
 def test_patience_is_for_each_cause_and_of_telling_samples() -> None:
     """What tells nothing does not count."""
-    assert not standing(alarm(20.0, "offset_drift"), telling=PATIENCE).ripe
-    assert standing(alarm(20.0, "offset_drift"), telling=PATIENCE + 1).ripe
+    assert not standing(alarm(20.0, "offset_drift"), telling=MAX_WAIT_SAMPLES).ripe
+    assert standing(alarm(20.0, "offset_drift"), telling=MAX_WAIT_SAMPLES + 1).ripe
     two = alarm(20.0, "offset_drift", "temperature_offset")
-    assert not standing(two, telling=2 * PATIENCE).ripe
-    assert standing(two, telling=2 * PATIENCE + 1).ripe
+    assert not standing(two, telling=2 * MAX_WAIT_SAMPLES).ripe
+    assert standing(two, telling=2 * MAX_WAIT_SAMPLES + 1).ripe
 
 
 def test_an_alarm_that_is_not_news_for_long_is_gone() -> None:

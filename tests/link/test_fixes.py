@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from scipy.linalg import solve_continuous_are
 
-from magbridge.link.fixes import FIXES, WALK, Fix, Pose, widened
+from magbridge.link.fixes import FIX_MESSAGES, WALK, Fix, Pose, widened
 from magbridge.link.output import Outbox
 from magbridge.mavlink import Codec, Message
 
@@ -21,7 +21,7 @@ FIX = Fix(NOW, 49.5123456, -57.9876543, 400.0, 120.0, 100.0, -3.5, POSE, 300)
 
 def decoded(kind: str, fix: Fix = FIX) -> Message:
     outbox = Outbox(Codec(1, 191))
-    FIXES[kind].send(outbox, fix, 3, 4)
+    FIX_MESSAGES[kind].send(outbox, fix, 3, 4)
     ((_, frame),) = outbox.drain()
     return Codec(255, 190).parse(frame)[0]
 
@@ -43,10 +43,10 @@ def test_odometry_is_what_ardupilot_takes() -> None:
 
 def test_what_receivers_ask_of_their_source() -> None:
     """ArduPilot takes a sigma above 10 m for 10 m, and a source below 4 Hz for dead."""
-    odometry = FIXES["ODOMETRY"]
+    odometry = FIX_MESSAGES["ODOMETRY"]
     assert (odometry.trusted_to, odometry.least, odometry.rate) == (10.0, 4.0, 5.0)
     assert odometry.rate > odometry.least
-    assert all(kind.trusted_to == float("inf") for name, kind in FIXES.items() if name != "ODOMETRY")
+    assert all(kind.trusted_to == float("inf") for name, kind in FIX_MESSAGES.items() if name != "ODOMETRY")
     first = Fix(NOW, 49.5, -57.9, 400.0, 120.0, 100.0, pose=POSE)
     assert decoded("ODOMETRY", first)["reset_counter"] == 0
 

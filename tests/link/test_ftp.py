@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from line import Line
 
 from magbridge.link import metadata
-from magbridge.link.ftp import BURST, DATA, EACH, HEADER, SESSIONS, Error, FtpServer, Opcode, Request
+from magbridge.link.ftp import BURST, DATA, EACH, FTP_HEADER, SESSIONS, Error, FtpServer, Opcode, Request
 from magbridge.link.log_transfer import LogTransfer
 from magbridge.link.metadata import crc32
 from magbridge.link.tree import Tree
@@ -40,13 +40,13 @@ class Station:
         """Return opcode, session, offset, whether the burst is complete, data of each reply."""
         text = data.encode() if isinstance(data, str) else data
         self._sequence += not again
-        header = HEADER.pack(
+        header = FTP_HEADER.pack(
             self._sequence & 0xFFFF, session, opcode, len(text) if size is None else size, 0, 0, offset
         )
         replies = []
         for k, payload in enumerate(self._server.handle(self._who, (header + text).ljust(251, b"\0")), 1):
             assert len(payload) == 251
-            sequence, got, kind, length, asked, complete, at = HEADER.unpack_from(payload)
+            sequence, got, kind, length, asked, complete, at = FTP_HEADER.unpack_from(payload)
             assert (sequence, asked) == ((self._sequence + k) & 0xFFFF, opcode & 0xFF)
             replies.append((kind, got, at, complete, payload[12 : 12 + length]))
         return replies
@@ -231,7 +231,7 @@ def test_a_crowd_cannot_take_all_sessions_for_ever(server: FtpServer, clock: lis
 def test_a_burst_ends_with_its_session(server: FtpServer) -> None:
     station = Station(server)
     session = station.open(f"logs/{NAMES[0]}")
-    header = HEADER.pack(50, session, Opcode.BURST, 80, 0, 0, 0)
+    header = FTP_HEADER.pack(50, session, Opcode.BURST, 80, 0, 0, 0)
     burst = server.handle(ME, header.ljust(251, b"\0"))
     next(burst)
     station.ask(Opcode.TERMINATE, session=session)

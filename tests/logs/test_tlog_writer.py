@@ -46,7 +46,7 @@ def test_first_record_after_a_pause_is_on_disk_at_once(tmp_path: Path) -> None:
             while log.records <= k:
                 assert time.monotonic() < deadline
                 time.sleep(0.001)
-            time.sleep(2 * tlog.WINDOW)
+            time.sleep(2 * tlog.WRITE_INTERVAL_S)
         (path,) = tmp_path.iterdir()
         assert len(records(path)) == 3
 
@@ -99,7 +99,7 @@ def test_directory_that_cannot_be_made_is_said_and_tried_again(tmp_path: Path) -
             time.sleep(0.001)
         assert (log.lost, log.failure) == (1, "Not a directory")
         directory.parent.unlink()
-        log.extend([(T0 + tlog.RETRY_US, 0, FRAME)])
+        log.extend([(T0 + tlog.LOG_RETRY_US, 0, FRAME)])
     assert (log.records, log.failure) == (1, "")
 
 
@@ -159,7 +159,7 @@ def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
         if removed == "folder":
             folder.rmdir()
         assert write(T0 + tlog.SYNC_US) == (1, 1, "No such file or directory")
-        assert write(T0 + tlog.SYNC_US + tlog.RETRY_US) == (2, 1, "")
+        assert write(T0 + tlog.SYNC_US + tlog.LOG_RETRY_US) == (2, 1, "")
     assert [path.name[-9:] for path in folder.iterdir()] == ["0002.tlog"]
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pace import cost
 
 from magbridge.mavlink import BAD_DATA, Codec, Message, spec
-from magbridge.mavlink.codec import WINDOW
+from magbridge.mavlink.codec import MAX_PENDING_BYTES
 
 
 def stream(count: int, system: int = 1) -> list[bytes]:
@@ -45,7 +45,7 @@ PIECES = st.one_of(
 
 @given(st.lists(PIECES, max_size=20).map(b"".join), st.lists(st.integers(0, 10_000), max_size=30))
 @example(b"\xfd" * 5000, [1, 2, 3])
-@example(bytes(3 * WINDOW) + stream(1)[0], [WINDOW, WINDOW + 1])
+@example(bytes(3 * MAX_PENDING_BYTES) + stream(1)[0], [MAX_PENDING_BYTES, MAX_PENDING_BYTES + 1])
 def test_any_bytes_however_cut(data: bytes, places: list[int]) -> None:
     whole, one = parse([data])
     pieces, other = parse(cut(data, places))
@@ -53,7 +53,7 @@ def test_any_bytes_however_cut(data: bytes, places: list[int]) -> None:
     assert other.bytes_skipped == one.bytes_skipped
     kept = b"".join(message.frame for message in whole)
     assert data.startswith(kept)  # every byte is in a message, in order, or still waited for
-    assert len(data) - len(kept) <= WINDOW
+    assert len(data) - len(kept) <= MAX_PENDING_BYTES
     assert one.bytes_skipped == sum(len(m.frame) for m in whole if m.id == BAD_DATA)
     for message in whole:
         assert isinstance(message.fields, dict)
@@ -62,7 +62,7 @@ def test_any_bytes_however_cut(data: bytes, places: list[int]) -> None:
 
 @given(st.lists(PIECES, max_size=6).map(b"".join))
 def test_a_genuine_frame_survives_what_is_around_it(noise: bytes) -> None:
-    noise = noise.replace(b"\xfd", b"\xfc").replace(b"\xfe", b"\xfc")[: WINDOW - 100]
+    noise = noise.replace(b"\xfd", b"\xfc").replace(b"\xfe", b"\xfc")[: MAX_PENDING_BYTES - 100]
     frames = stream(3)
     found, codec = parse([noise + frames[0] + noise + frames[1] + frames[2]])
     assert [message.frame for message in found if message.known] == frames
@@ -124,4 +124,4 @@ def test_garbage_is_cheap_even_byte_by_byte() -> None:
         codec = Codec(1, 191)
         bytewise = (garbage[i : i + 1] for i in range(len(garbage)))
         assert cost(lambda: [codec.parse(byte) for byte in bytewise]) < 100.0  # noqa: B023 - called at once
-        assert codec.bytes_skipped > len(garbage) - WINDOW - 300
+        assert codec.bytes_skipped > len(garbage) - MAX_PENDING_BYTES - 300

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from magbridge.mavlink import Codec
-from magbridge.monitor.alarms import MOST, Alarms
+from magbridge.monitor.alarms import MAX_ALARMS, Alarms
 from magbridge.monitor.fleet import Fleet
 from magbridge.records import Quality
 
@@ -29,7 +29,7 @@ def test_alarms_are_bounded_and_newest_first() -> None:
     for k in range(1000):
         alarms.announce(f"text: {k}", str(k), float(k))
     assert [alarm.text for alarm in alarms][:2] == ["999", "998"]
-    assert len(list(alarms)) == MOST
+    assert len(list(alarms)) == MAX_ALARMS
     alarms.acknowledge()
     assert alarms.unseen == 0
 

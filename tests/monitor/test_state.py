@@ -19,7 +19,7 @@ from magbridge.monitor.chart import drawn
 from magbridge.monitor.fleet import MOST, Fleet
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.rose import heading_text, rose_picture
-from magbridge.monitor.state import TEMPERATURE, State
+from magbridge.monitor.state import TEMPERATURE_SERIES, State
 from magbridge.monitor.track import series as track_series
 from magbridge.monitor.words import ago, health, learnt, measured, silence, whereabouts
 from magbridge.records import Quality
@@ -227,7 +227,7 @@ def test_masses_and_temperature_of_the_same_vehicle_are_kept(air: Air) -> None:
     for k in range(100):  # bounded, whatever is named
         air.give(Codec(1, 1).pack("NAMED_VALUE_FLOAT", name=f"n{k}", value=k), NOW + 1)
     telemetry = air.state.telemetry
-    assert telemetry[TEMPERATURE].latest == 7.5
+    assert telemetry[TEMPERATURE_SERIES].latest == 7.5
     assert telemetry["battpos"].latest == pytest.approx(0.4)
     assert telemetry["battpos"].points("10 min")[0].time == NOW + 1
     assert len(telemetry) == 12

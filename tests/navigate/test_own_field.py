@@ -10,7 +10,7 @@ from magbridge.arrays import FloatArray
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import Options
 from magbridge.navigate.own_bound import own_bound
-from magbridge.navigate.own_field import KINDS, OwnField, drift_functions
+from magbridge.navigate.own_field import COVARIANCE_KINDS, OwnField, drift_functions
 from magbridge.navigate.particles import sample
 
 OPTIONS = Options(start_sigma=30.0, current_sigma=0.05, bias_sigma=2.0, bias_time=3600.0)
@@ -33,7 +33,7 @@ def u(field: OwnField) -> FloatArray:
     return np.random.default_rng(2).normal(size=field.q)
 
 
-@pytest.mark.parametrize("kind", range(len(KINDS)), ids=KINDS)
+@pytest.mark.parametrize("kind", range(len(COVARIANCE_KINDS)), ids=COVARIANCE_KINDS)
 def test_likelihood_is_that_of_a_normal_and_its_slope_is_its_own(
     field: OwnField, u: FloatArray, kind: int
 ) -> None:

@@ -15,7 +15,7 @@ import xarray as xr
 
 from magbridge.bridge.events import Event, Start
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.fit import LEVEL
+from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from magbridge.calibration.model import Noise, identity
 from magbridge.config import load as load_config
 from magbridge.errors import DataError, FormatError, PortError, WrongUse
@@ -322,7 +322,7 @@ def test_measured_counts_and_moving_masses_go_through(real_data: Path) -> None:
     assert last["held_out"]
     assert result["samples"] == result["rows"] == 6740
     assert 50.0 < last["corrected_rms_nT"] < 110.0 < 1000.0 < last["raw_rms_nT"]
-    assert np.isclose(last["sigma_nT"], np.hypot(last["corrected_rms_nT"], LEVEL), rtol=0.25)
+    assert np.isclose(last["sigma_nT"], np.hypot(last["corrected_rms_nT"], MAIN_FIELD_SIGMA_NT), rtol=0.25)
 
 
 @pytest.mark.real

@@ -89,7 +89,7 @@ def test_a_map_is_kriged_where_its_nodes_are_too_coarse(
     searched = gridding._searched(samples, NOISE, local=False)
     monkeypatch.setattr(gridding, "_searched", lambda *_, **__: searched)
     fine = gridding.gridded(samples, local=False)
-    monkeypatch.setattr(gridding, "MOST", fine.field.nodes.size // 8)
+    monkeypatch.setattr(gridding, "MAX_GRID_NODES", fine.field.nodes.size // 8)
     coarse = gridding.gridded(samples, local=False)
     assert fine.kriged is None
     assert coarse.kriged is not None

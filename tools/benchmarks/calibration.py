@@ -13,7 +13,7 @@ from benchmarks.row import Row
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from magbridge.calibration.correct import CHUNK, correct
+from magbridge.calibration.correct import CORRECTED_AT_ONCE, correct
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observations import Observations, polynomial_samples
@@ -135,7 +135,7 @@ def _jobs(
 
     jobs: dict[str, tuple[Callable[[], object], int]] = {
         "bare": (lambda: floors.product(n), n),
-        "pieces": (lambda: floors.product(CHUNK), n),
+        "pieces": (lambda: floors.product(CORRECTED_AT_ONCE), n),
         "moving": (lambda: correct(calibration, field, moving, when), n),
         "still": (lambda: correct(calibration, field, still, when), n),
         "live": (lambda: live(values), few),

@@ -12,7 +12,7 @@ from benchmarks.latency import Sent, bridge_command, play, sequences_of_messages
 from benchmarks.row import Row
 from benchmarks.workload import Feed
 
-from magbridge.link.ftp import DATA, HEADER, Opcode
+from magbridge.link.ftp import DATA, FTP_HEADER, Opcode
 from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.enums import MAV_PARAM_TYPE
 
@@ -39,8 +39,8 @@ class Download:
     def ask(self, opcode: int, data: bytes = b"") -> bytes:
         """Return a request."""
         self._sequence = self._sequence + 1000 & 0xFFFF
-        header = HEADER.pack(self._sequence, 0, opcode, len(data) or DATA, 0, 0, self.received)
-        payload = (header + data).ljust(HEADER.size + DATA, b"\0")
+        header = FTP_HEADER.pack(self._sequence, 0, opcode, len(data) or DATA, 0, 0, self.received)
+        payload = (header + data).ljust(FTP_HEADER.size + DATA, b"\0")
         return self._codec.pack(FTP.name, target_system=1, target_component=191, payload=payload)
 
     def set(self, name: str, value: float) -> bytes:
@@ -55,7 +55,7 @@ class Download:
             return b""
         complete = False
         for message in self._ear.parse(data):
-            _, _, opcode, size, asked, last, _ = HEADER.unpack_from(message["payload"])
+            _, _, opcode, size, asked, last, _ = FTP_HEADER.unpack_from(message["payload"])
             if asked == Opcode.BURST and opcode == Opcode.ACK:
                 self.received += size
             complete |= bool(last) or asked == Opcode.OPEN_READ

@@ -15,7 +15,7 @@ from magbridge.config import Link
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.link.component import Component
-from magbridge.link.fixes import FIXES
+from magbridge.link.fixes import FIX_MESSAGES
 from magbridge.navigate import Options
 from magbridge.records import Corrected
 from referee.autopilot import GPS_SIGMA, Autopilot, Truth
@@ -106,7 +106,7 @@ def sail(
     """Sail a passage with the autopilot that ``make(origin, start_us)`` returns, by fixes of one `kind`."""
     start_us = round(passage.time[0] * 1e6) // 4 * 4
     component = Component(Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us)
-    navigation = Navigation(grid, options, FIXES[kind], component)
+    navigation = Navigation(grid, options, FIX_MESSAGES[kind], component)
     origin = float(passage.latitude[0]), float(passage.longitude[0]), 3.0
     autopilot = make(origin, start_us)
     rows: list[tuple[float, ...]] = []

@@ -29,7 +29,7 @@ from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.causes.candidates import slices
 from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.compare.problem import pose
-from magbridge.diagnose.inference.evidence import LEVEL, ODDS, log_bayes
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE, ODDS, log_bayes
 from magbridge.diagnose.unexplained.descriptions import Description
 from study.deployment import Background, Injected, compare, project
 from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, numbers, with_another
@@ -190,5 +190,5 @@ def p_values(draws: Draws, spans: Sequence[Span], setting: Setting) -> FloatArra
 
 def _found(p: FloatArray) -> dict[str, float]:
     """Signal-to-noise at which 50 % and 95 % are found."""
-    chance = np.maximum.accumulate(np.mean(p < LEVEL, axis=1))
+    chance = np.maximum.accumulate(np.mean(p < FALSE_ALARM_RATE, axis=1))
     return {"half": float(np.interp(0.5, chance, SIZES)), "sure": float(np.interp(0.95, chance, SIZES))}

@@ -39,9 +39,9 @@ __all__ = ["fit_auto", "flown"]
 
 # ---- The ends of a log that are not its flight ----
 
-SHORTEST = 20
+MIN_END_SAMPLES = 20
 """Samples: fewer outliers at an end are outliers as any others."""
-MOSTLY = 0.7
+MIN_OUTLIER_FRACTION = 0.7
 """Share of an end's samples that are outliers."""
 
 
@@ -63,8 +63,8 @@ def flown(residual: FloatArray) -> BoolArray:
 def _end(off: BoolArray) -> int:
     """Return how many samples of the start are mostly outliers; 0 if those are few."""
     share = np.cumsum(off) / np.arange(1, len(off) + 1)
-    until = np.flatnonzero((share > MOSTLY) & off)
-    return int(until[-1]) + 1 if until.size and until[-1] + 1 >= SHORTEST else 0
+    until = np.flatnonzero((share > MIN_OUTLIER_FRACTION) & off)
+    return int(until[-1]) + 1 if until.size and until[-1] + 1 >= MIN_END_SAMPLES else 0
 
 
 # ---- The fit ----

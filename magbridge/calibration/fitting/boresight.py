@@ -28,7 +28,7 @@ __all__ = ["choose_boresight", "field_body", "find_boresight", "magnetic_heading
 
 MAX_OPEN_ANGLE_DEG = 2.0
 """deg, 1-sigma of the angle that roll and pitch determine least, above which headings are used."""
-FEWEST = 30
+MIN_BORESIGHT_SAMPLES = 30
 """Samples with attitude and direction that a boresight takes."""
 MISMATCH = 10.0
 """deg, median angle that no rotation removes: masses leave less, a reversed channel or angle more."""
@@ -78,7 +78,7 @@ def magnetic_headings(calibration: Calibration, data: Observations) -> str:
     that a correct heading does not.
     """
     known, attitude, reference_ned = data.directed()
-    if known.sum() < FEWEST or calibration.effects:
+    if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
         return ""
     declination = np.arctan2(reference_ned[:, 1], reference_ned[:, 0])
     D = float(np.degrees(np.arctan2(np.sin(declination).mean(), np.cos(declination).mean())))
@@ -111,7 +111,7 @@ def choose_boresight(calibration: Calibration, data: Observations) -> Boresight 
     if data.attitude is None or data.reference_ned is None or calibration.effects:
         return with_headings
     known = np.asarray(np.isfinite(np.hstack([data.attitude[:, :2], data.reference_ned])).all(axis=1))
-    if known.sum() < FEWEST:
+    if known.sum() < MIN_BORESIGHT_SAMPLES:
         return with_headings
     part = data.part(known)
     assert part.attitude is not None
@@ -143,7 +143,7 @@ def find_boresight(calibration: Calibration, data: Observations) -> Boresight | 
         No rotation takes the corrected vectors to where attitude and main field say they point.
     """
     known, attitude, reference_ned = data.directed()
-    if known.sum() < FEWEST or calibration.effects:
+    if known.sum() < MIN_BORESIGHT_SAMPLES or calibration.effects:
         return None
     part = data.part(known)
     v, b = field_body(attitude, reference_ned), _vectors(calibration, part)

@@ -28,18 +28,18 @@ __all__ = ["Combinations", "combinations", "expected_ratio", "heading_gap", "jud
 
 # ---- What the data determine ----
 
-ROWS = 5_000
+JACOBIAN_ROWS = 5_000
 """Rows of the Jacobian: more do not change its rank."""
-APART = 0.02
+MIN_POSITION_STEP_FRACTION = 0.02
 """Share of the half range by which neighbouring positions of a mass differ that are not one; and share of the
 samples that a position must have to count."""
 SWEPT = 0.3
 """Share of the half range that one position spans where its mass moved all along."""
-TOGETHER = 0.9
+MAX_CORRELATION = 0.9
 """Correlation of two positions above which their effects cannot be distinguished."""
 BANKED = 10.0
 """deg, range of roll that shows the vertical offset."""
-STEEP = 5.0
+DIVE_PITCH_DEG = 5.0
 """deg, pitch from which on a run is a dive or a climb."""
 OPEN = 60.0
 """deg, gap in the headings that is remarked on."""
@@ -71,7 +71,7 @@ def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Co
     sigma : float
         nT, noise of a sample.
     """
-    step = max(len(samples.field) // ROWS, 1)
+    step = max(len(samples.field) // JACOBIAN_ROWS, 1)
     part = samples.part(slice(None, None, step))
     _, g = residuals(part, coefficients)
     J = jacobian(part.phi, g) * np.sqrt(step) / sigma
@@ -101,8 +101,8 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
             default=0,
         )
         column = np.sort(data.parameters[:, k])
-        jumps = np.flatnonzero(np.diff(column) > APART * parameter.scale)
-        groups = [g for g in np.split(column, jumps + 1) if len(g) > APART * len(column)]
+        jumps = np.flatnonzero(np.diff(column) > MIN_POSITION_STEP_FRACTION * parameter.scale)
+        groups = [g for g in np.split(column, jumps + 1) if len(g) > MIN_POSITION_STEP_FRACTION * len(column)]
         if any(np.ptp(g) > SWEPT * parameter.scale for g in groups):
             continue  # it moved all along: no positions to count
         if len(groups) <= min(order, 3):
@@ -122,7 +122,7 @@ def _together(calibration: Calibration, data: Observations) -> Iterator[str]:
     together = np.atleast_2d(np.corrcoef(data.parameters[:, : len(names)].T))
     for i, one in enumerate(names):
         for j, other in enumerate(names[:i]):
-            if abs(together[i, j]) > TOGETHER:
+            if abs(together[i, j]) > MAX_CORRELATION:
                 yield (
                     f"{other} and {one} always moved together (correlation {together[i, j]:.2f}): their "
                     "effects cannot be distinguished; fly a run that moves only one of them"
@@ -143,13 +143,13 @@ def _attitudes(calibration: Calibration, data: Observations) -> Iterator[str]:
             f"roll stayed within {low:z.0f} to {high:z.0f} degrees: the vertical offset is known only to "
             f"{np.sqrt(variance):.0f} nT; fly a run banked the other way"
         )
-    if pitch.min() > -STEEP and pitch.max() < STEEP:
+    if pitch.min() > -DIVE_PITCH_DEG and pitch.max() < DIVE_PITCH_DEG:
         yield (
             f"pitch stayed within {pitch.min():z.0f} to {pitch.max():z.0f} degrees: nothing steeper was "
             "measured; fly dives and climbs"
         )
-    elif pitch.min() > -STEEP or pitch.max() < STEEP:
-        seen, lacking = ("climbs", "dives") if pitch.min() > -STEEP else ("dives", "climbs")
+    elif pitch.min() > -DIVE_PITCH_DEG or pitch.max() < DIVE_PITCH_DEG:
+        seen, lacking = ("climbs", "dives") if pitch.min() > -DIVE_PITCH_DEG else ("dives", "climbs")
         angles = f"pitch {pitch.min():z.0f} to {pitch.max():z.0f}"
         yield f"only {seen} ({angles}): nothing was measured in {lacking}"
     left, gap = _widest_gap(heading)
@@ -195,7 +195,7 @@ UNSUPPORTED = 5.0
 """Expected error over noise, above which the data do not support the fit."""
 LIKELIER = 3.0
 """Nats by which one more order is likelier (20:1) where the one that was asked for is too low."""
-WORSE = 1.25
+MAX_ERROR_RATIO = 1.25
 """Errors of parts left out over what a fit claims for them, from which on a pilot should know."""
 MIN_SIGNAL_TO_NOISE = 3.0
 """Standard deviation of the field along the sensor axis with the least variation, over the noise. Below it,
@@ -205,9 +205,9 @@ sigmas."""
 GAIN = 0.08
 """Departure of the middle scale from 1 that few sensors have, four sigmas of the prior. A wrong reference
 shrinks all scales: in a real flight over an unmapped crustal anomaly to 0.88 to 0.94."""
-LASTING = 0.98
+MAX_NOISE_AUTOCORRELATION = 0.98
 """Autocorrelation of neighbours above which a residual is not sensor noise, if a crustal field is fitted."""
-UNSEEN = 270.0
+MAX_HEADING_GAP_DEG = 270.0
 """deg, a gap in the headings: less than a quarter of the compass does not determine the rest."""
 
 
@@ -261,7 +261,7 @@ def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterato
 
     `lasting` is the residual's autocorrelation after the crustal field has been subtracted.
     """
-    if lasting > LASTING:
+    if lasting > MAX_NOISE_AUTOCORRELATION:
         yield (
             f"residuals of {noise:.0f} nT last for many samples (autocorrelation {lasting:.3f}) without the "
             "crustal field: two vehicles in one log, an offset that jumped, or wrong positions"
@@ -271,7 +271,7 @@ def _warnings(ratio: float, noise: float, gap: float, lasting: float) -> Iterato
             "at these pitches and positions, on any heading and with 10 degrees more roll, expect "
             f"{ratio * noise:.0f} nT of error"
         )
-    if gap > UNSEEN:
+    if gap > MAX_HEADING_GAP_DEG:
         yield (
             f"all headings lie within {360.0 - gap:.0f} degrees, and on other headings the vehicle's field "
             "cannot be distinguished from the Earth's"
@@ -296,7 +296,7 @@ def _suspicions(found: Fit) -> Iterator[str]:
     yield from in_words(found.calibration, found.creep)
     if ends := found.details.get("ends", 0):
         yield (f"{counted(ends, 'sample')} at the ends of the log left out: unlike the others (a crash?)")
-    if (ratio := found.details.get("left_out_ratio", 1.0)) > WORSE:
+    if (ratio := found.details.get("left_out_ratio", 1.0)) > MAX_ERROR_RATIO:
         yield (
             f"held-out parts have errors of {ratio:.1f} times the fit's sigma, so its sigmas were raised by "
             "that: an effect is missing in the model (magbridge diagnose), or in the reference"

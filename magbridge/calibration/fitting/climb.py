@@ -18,7 +18,7 @@ __all__ = ["Climbed", "climb", "thinned", "thinned_rows"]
 
 ENOUGH, BLOCK = 6000, 50
 """Samples that choose the start, and the size of the blocks of neighbours in which they are taken."""
-ROUNDS = 16
+MAX_START_ITERATIONS = 16
 """Rounds of coefficients, widths, noise, at most; five or six are usually enough."""
 
 
@@ -69,7 +69,7 @@ def climb(
     shape = noise.shape if noise is not None and shaped else None
     if noise is None:
         z, noise = _approach(samples, family.at(eta), z)
-    for step in range(ROUNDS):
+    for step in range(MAX_START_ITERATIONS):
         if family.renew is not None and step:
             family = family.renew(z)
         # the first widths are a guess, and not worth settling at
@@ -84,9 +84,9 @@ def climb(
         if still and not white:
             break
         # residuals of a wrong model look correlated for long, so the autocorrelation waits for convergence
-        white = white and not still and step < ROUNDS // 2
+        white = white and not still and step < MAX_START_ITERATIONS // 2
         # at last the noise's autocorrelation and outliers are kept, so that the rest converges
-        if step < ROUNDS - 4:
+        if step < MAX_START_ITERATIONS - 4:
             prior = family.at(eta)
             e = residuals_of(samples, prior.coefficients(z))
             doubt = (0.0, 0.0) if white or shape else _doubt(samples, prior, solution, noise)
@@ -111,7 +111,7 @@ def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray
     """Come near the answer: after each Gauss-Newton step the noise is set to the bulk of the residuals."""
     apart = np.full(len(samples.field), np.inf)
     noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_START_ITERATIONS):
         z = gauss_newton(samples, prior, noise, z, steps=1, tolerance=0.1).z
         last, noise = noise, estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
         if noise.sigma > 0.8 * last.sigma:

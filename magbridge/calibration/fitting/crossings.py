@@ -14,22 +14,23 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.wording import counted
 
 __all__ = [
-    "SHARE", "courses", "crossed", "far_off", "jumped", "jumps", "left_open", "left_open_by",
+    "PLACE_LENGTH_FRACTION", "courses", "crossed", "far_off", "jumped", "jumps", "left_open", "left_open_by",
     "rough_rock", "tells_rock", "too_rough",
 ]  # fmt: skip
 
-TURNED = 30.0
+MIN_CROSSING_DEG = 30.0
 """deg between two courses that cross."""
-BACK = 150.0
+REVERSED_COURSE_DEG = 150.0
 """deg, from which on the second course is the first one's reverse."""
 FEW = 3
 """Crossed places below which a survey says nothing about itself."""
-SHARE = 0.25
+PLACE_LENGTH_FRACTION = 0.25
 """Distance within which places count as one, as a fraction of the crustal field's length."""
 FARTHEST, NEAR = 5.0, 1000.0
 """Multiple of the distance from the middle within which 99 % of the samples stay, and its least value, m."""
 PLACES = (125.0, 250.0, 500.0)
-"""Distance within which places count as one before the length is known, m (:data:`SHARE` of 0.5 to 2 km)."""
+"""Distance within which places count as one before the length is known, m
+(:data:`PLACE_LENGTH_FRACTION` of 0.5 to 2 km)."""
 OFTEN, TWICE = 0.08, 2
 """Least fraction and number of the places that a survey has to meet again on another course: six hours of a
 glider's criss-cross meet 11 to 17 % again at 500 m, dives along one line 5 %."""
@@ -42,9 +43,9 @@ AREA = 120.0
 """Extent, m, below which the crustal field is nearly constant: its level, and the rest is the vehicle's."""
 LEAP = 100.0
 """m beyond what the vehicle can have moved: a jump in position."""
-BETWEEN = 0.5
+MIN_LENGTH_SPACINGS = 0.5
 """Fraction of the distance between tracks: a crustal field of shorter length differs from track to track."""
-STILL = 5.0
+MIN_COURSE_M = 5.0
 """m between samples, below which a course is not one."""
 
 
@@ -78,9 +79,9 @@ def left_open(data: Observations, length: float) -> Iterator[str]:
 def left_open_by(track: FloatArray, length: float) -> Iterator[str]:
     """Yield what a track (n, 2), m, cannot separate over an unmapped crustal field of a `length`, m."""
     place, course = courses(track)
-    if not len(place) or np.ptp(place, axis=0).max() < SHARE * length:
+    if not len(place) or np.ptp(place, axis=0).max() < PLACE_LENGTH_FRACTION * length:
         return  # all at one place: the crustal field is a constant
-    cells, reversed_cells = crossed(place, course, SHARE * length)
+    cells, reversed_cells = crossed(place, course, PLACE_LENGTH_FRACTION * length)
     if cells + reversed_cells == 0:
         yield (
             "you never crossed your own track: only its smoothness separates the crustal field from heading; "
@@ -110,7 +111,7 @@ def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterat
         return
     way = float(np.linalg.norm(np.diff(place, axis=0), axis=1).sum())
     apart = float(ConvexHull(place, qhull_options="QJ").volume) / way  # in a plane its volume is an area
-    if length < BETWEEN * apart:
+    if length < MIN_LENGTH_SPACINGS * apart:
         than = f"less than half the distance between your tracks (about {apart:.0f} m)"
     elif length <= shortest:
         than = f"the shortest length that these samples can tell being {shortest:.0f} m"
@@ -171,9 +172,9 @@ def crossed(place: FloatArray, course: FloatArray, cell: float) -> tuple[int, in
         new = np.flatnonzero(np.diff(here, prepend=-9) > 1)  # another visit
         passes = np.angle(np.add.reduceat(np.exp(1j * course[here]), new))
         apart = np.degrees(np.abs(np.angle(np.exp(1j * (passes[:, None] - passes)))))
-        if ((apart > TURNED) & (apart < BACK)).any():
+        if ((apart > MIN_CROSSING_DEG) & (apart < REVERSED_COURSE_DEG)).any():
             across += 1
-        elif (apart >= BACK).any():
+        elif (apart >= REVERSED_COURSE_DEG).any():
             back += 1
     return across, back
 
@@ -186,6 +187,6 @@ def courses(place: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _thinned(place: FloatArray) -> BoolArray:
-    """Return which places (n, 2) are at least :data:`STILL` m of way after the last one: (n,)."""
+    """Return which places (n, 2) are at least :data:`MIN_COURSE_M` m of way after the last one: (n,)."""
     way = np.cumsum(np.hypot(*np.diff(place, axis=0, prepend=place[:1]).T))
-    return np.asarray(np.diff(np.floor(way / STILL), prepend=-1) > 0)
+    return np.asarray(np.diff(np.floor(way / MIN_COURSE_M), prepend=-1) > 0)

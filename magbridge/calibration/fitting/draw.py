@@ -16,9 +16,9 @@ from magbridge.pictures import save
 
 __all__ = ["draw_fit"]
 
-POINTS = 5_000
+PANEL_POINTS = 5_000
 """Points drawn in a panel; more only make a blot."""
-WIDE = 6.0
+PANEL_HALF_HEIGHT_SIGMA = 6.0
 """Half the height of the lower row, in robust standard deviations; samples beyond are drawn at its edge."""
 
 
@@ -32,14 +32,14 @@ def draw_fit(calibration: Calibration, data: Observations, path: str | Path) -> 
     """
     read = np.linalg.norm(data.field, axis=1) - data.reference
     left, _ = in_sensor_units(calibration, data)
-    part = slice(None, None, max(1, len(data) // POINTS))
+    part = slice(None, None, max(1, len(data) // PANEL_POINTS))
     _, run = np.unique(data.runs, return_inverse=True)
     abscissae = _abscissae(data)
     figure = Figure(figsize=(1.0 + 3.4 * len(abscissae), 6.4), layout="constrained")
     axes = figure.subplots(2, len(abscissae), sharex="col", sharey="row", squeeze=False)
     noise = calibration.noise.sensor
     # the median, because samples with masses in motion must not set the scale
-    edge = WIDE * max(noise, robust_scale(left))
+    edge = PANEL_HALF_HEIGHT_SIGMA * max(noise, robust_scale(left))
     beyond = np.abs(left) > edge
     for values, row in ((read, axes[0]), (np.where(beyond, np.nan, left), axes[1])):
         for axis, x in zip(row, abscissae.values(), strict=True):

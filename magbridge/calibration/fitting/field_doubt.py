@@ -20,17 +20,17 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.field_search import Choice
 
-__all__ = ["MANY", "plausible"]
+__all__ = ["MAX_UNCERTAIN_NODES", "plausible"]
 
-MANY = 2_500
+MAX_UNCERTAIN_NODES = 2_500
 """Nodes from which on size and length are known well enough."""
-STEP = 0.3
+LOG_STEP = 0.3
 """Step in the logarithms of amplitude and length with which the evidence's curvature is computed."""
 WIDEST = 0.7
 """Largest spread of these logarithms: beyond, the evidence is not a parabola."""
 RULE = ((0.0, 2.0 / 3.0), (3.0**0.5, 1.0 / 6.0), (-(3.0**0.5), 1.0 / 6.0))
 """Nodes and weights for a standard normal distribution."""
-LEAST = 0.01
+MIN_WEIGHT = 0.01
 """Weight below which a point is not worth its cost."""
 
 
@@ -44,7 +44,7 @@ def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[floa
     best : Choice
         About where that is largest.
     """
-    if best.field.nodes.size > MANY:
+    if best.field.nodes.size > MAX_UNCERTAIN_NODES:
         return [(1.0, best)]
 
     def at(x: FloatArray) -> Choice:
@@ -65,15 +65,15 @@ def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[floa
         gained = (value(x) if x.any() else top) - top + 0.5 * (g * g + h * h)
         points.append((p * q * float(np.exp(min(gained, 5.0))), at(x)))
     total = sum(weight for weight, _ in points)
-    kept = [(weight, one) for weight, one in points if weight > LEAST * total]
+    kept = [(weight, one) for weight, one in points if weight > MIN_WEIGHT * total]
     total = sum(weight for weight, _ in kept)
     return [(weight / total, one) for weight, one in kept]
 
 
 def _spread(value: Callable[[FloatArray], float], top: float) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations (2,) along the axes, columns (2, 2), of the evidence's curvature."""
-    a, b = STEP * np.eye(2)
-    second = np.array([value(x) + value(-x) - 2.0 * top for x in (a, b, a + b)]) / STEP**2
+    a, b = LOG_STEP * np.eye(2)
+    second = np.array([value(x) + value(-x) - 2.0 * top for x in (a, b, a + b)]) / LOG_STEP**2
     if not np.isfinite(second).all():
         return np.full(2, 0.1), np.eye(2)
     # second differences along both axes and their diagonal give the Hessian

@@ -7,30 +7,30 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.estimation.nodes import Nodes, nodes_near
 
-__all__ = ["NODES", "SMOOTH", "about_the_middle", "fine_enough", "ladder", "nodes_for"]
+__all__ = ["MAX_FIELD_NODES", "SMOOTH", "about_the_middle", "fine_enough", "ladder", "nodes_for"]
 
 RUNGS = 7
 """Lengths that are tried first."""
-FINE = {2: 8.0, 3: 8.0, 4: 5.0}
+NODES_PER_LENGTH = {2: 8.0, 3: 8.0, 4: 5.0}
 SMOOTH, ENOUGH = 6, 3.0
 """Nodes a length by the power alpha, and from SMOOTH on: of a field 40 times the noise they leave out less
 than that noise (rough ones on coarser nodes gave maps with errors of 5 to 8 sigmas)."""
-PAD = 1.0
+PAD_LENGTHS = 1.0
 """Lengths around the track that have nodes."""
-NODES = 4_000
+MAX_FIELD_NODES = 4_000
 """Nodes at most, unless more are asked for."""
 SIDE = 1_500
 """Nodes along a side of the area's box at most, where it is a square."""
-SHORTEST = 60.0
+MIN_LENGTH_M = 60.0
 """Shortest correlation length, m."""
 
 
 def fine_enough(nodes: Nodes, length: float, alpha: int) -> bool:
     """Return whether nodes still suit a field of a `length`, m, and power alpha."""
-    return 0.7 <= length / nodes.spacing / FINE.get(alpha, ENOUGH) <= 1.5
+    return 0.7 <= length / nodes.spacing / NODES_PER_LENGTH.get(alpha, ENOUGH) <= 1.5
 
 
-def nodes_for(place: FloatArray, length: float, alpha: int, most: int = NODES) -> Nodes:
+def nodes_for(place: FloatArray, length: float, alpha: int, most: int = MAX_FIELD_NODES) -> Nodes:
     """Return the nodes on which a field is kept about places (n, 2), m; coarser where they are too many.
 
     Parameters
@@ -44,9 +44,9 @@ def nodes_for(place: FloatArray, length: float, alpha: int, most: int = NODES) -
     most : int
         Nodes at most, about.
     """
-    box = np.ptp(place, axis=0) + 4.0 * PAD * length
-    spacing = max(length / FINE.get(alpha, ENOUGH), float(np.sqrt(box.prod())) / SIDE)
-    while (nodes := nodes_near(place, spacing, PAD * length)).size > 1.05 * most:
+    box = np.ptp(place, axis=0) + 4.0 * PAD_LENGTHS * length
+    spacing = max(length / NODES_PER_LENGTH.get(alpha, ENOUGH), float(np.sqrt(box.prod())) / SIDE)
+    while (nodes := nodes_near(place, spacing, PAD_LENGTHS * length)).size > 1.05 * most:
         spacing *= (nodes.size / most) ** 0.5
     return nodes
 
@@ -67,5 +67,5 @@ def ladder(place: FloatArray) -> FloatArray:
     known = place[np.isfinite(place).all(axis=1)]
     extent = float(np.hypot(*np.ptp(known, axis=0)))
     step = np.linalg.norm(np.diff(known, axis=0), axis=1)
-    shortest = max(4.0 * float(np.median(step)), extent / 60.0, SHORTEST)
+    shortest = max(4.0 * float(np.median(step)), extent / 60.0, MIN_LENGTH_M)
     return np.asarray(np.geomspace(shortest, max(extent / 2.5, 1.5 * shortest), RUNGS))

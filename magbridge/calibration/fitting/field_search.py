@@ -9,14 +9,14 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.field_nodes import NODES, SMOOTH, fine_enough, ladder, nodes_for
+from magbridge.calibration.fitting.field_nodes import MAX_FIELD_NODES, SMOOTH, fine_enough, ladder, nodes_for
 from magbridge.estimation.elimination import FieldEliminated, SampleSums, eliminate_field
 from magbridge.estimation.gaussian_field import BURIED_FACTORS, SMOOTHNESS_POWERS, GaussianField
 from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.priors import PriorFamily
 
 __all__ = [
-    "CLEAR",
+    "DECISIVE_LOG_RATIO",
     "Choice", "Weighed", "choose", "climb", "first_guess", "refined", "same_noise",
 ]  # fmt: skip
 
@@ -24,13 +24,13 @@ RESOLVED = 2.0
 """Nodes a length at least: a shorter one is not tried on so large an area."""
 FEWER = 1_500
 """Nodes at most of the smoothest fields, whose precisions are nearly full."""
-CLEAR = 30.0
+DECISIVE_LOG_RATIO = 30.0
 """Nats by which one kind of field is likelier than the other at any smoothness, or an offer needed."""
 BENDS = 0.25
 """Fields are similar if the length times this power of alpha - 1 is equal."""
-SMALL = 0.03
+WHITE_AUTOCORRELATION = 0.03
 """Autocorrelation below which noise counts as white."""
-HIGHEST = 0.995
+MAX_FIT_AUTOCORRELATION = 0.995
 """Largest autocorrelation of a sample with the next one."""
 SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
 """Crustal field, nT, and the 1-sigma of its logarithm: sea floor and land, as airborne surveys find them."""
@@ -81,7 +81,7 @@ def choose(
     harmonic: bool,
     rho: float | None = None,
     effort: float = 1.0,
-    most: int = NODES,
+    most: int = MAX_FIELD_NODES,
 ) -> Choice:
     """Choose the field from nothing: lengths from a ladder, then smoothness and all the rest about the best.
 
@@ -142,7 +142,7 @@ def choose(
     kinds = [tried(best, best.field.alpha, kind) for kind in ((True, False) if harmonic else (False,))]
     kinds.sort(key=lambda one: one.score)
     best = _smoothness(kinds[-1], tried)
-    if harmonic and kinds[1].score - kinds[0].score < CLEAR:
+    if harmonic and kinds[1].score - kinds[0].score < DECISIVE_LOG_RATIO:
         other = tried(best, best.field.alpha, not best.field.harmonic)
         best = _smoothness(other, tried) if other.score > best.score else best
     if best.field.alpha < SMOOTH:  # the spectrum of sources at a depth falls off slowly, too
@@ -187,14 +187,14 @@ def climb(
 
     Its length or its noise's memory change, too, if need be.
     """
-    share = np.clip(max(start.rho, 0.01) / HIGHEST, 1e-6, 1.0 - 1e-6)
+    share = np.clip(max(start.rho, 0.01) / MAX_FIT_AUTOCORRELATION, 1e-6, 1.0 - 1e-6)
     moves = [0] + [1] * move_rho + [2] * move_length
     first = np.array([0.0, np.log(share / (1.0 - share)), 0.0])
 
     def at(moved: FloatArray) -> Choice:
         x = first.copy()
         x[moves] = moved
-        rho = HIGHEST / (1.0 + np.exp(-np.clip(x[1], -30.0, 30.0))) if move_rho else start.rho
+        rho = MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-np.clip(x[1], -30.0, 30.0))) if move_rho else start.rho
         field = start.field
         if move_length:
             field = replace(field, length=field.length * float(np.exp(np.clip(x[2], -0.5, 0.9))))
@@ -214,7 +214,7 @@ def climb(
         options={"initial_simplex": simplex, "maxfev": steps, "xatol": 0.05, "fatol": near},
     )  # fmt: skip
     best = at(found.x)
-    rho = best.rho if best.rho > SMALL or not move_rho else 0.0
+    rho = best.rho if best.rho > WHITE_AUTOCORRELATION or not move_rho else 0.0
     return replace(best, rho=rho, score=-float(found.fun))
 
 
@@ -234,7 +234,7 @@ def same_noise(sums: SampleSums, choice: Choice, weighed: Weighed) -> Choice:
 
     def downhill(x: float) -> float:
         try:
-            rho = HIGHEST / (1.0 + np.exp(-x))
+            rho = MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-x))
             return -weighed.score(
                 eliminate_field(sums, choice.field, choice.ratio, float(rho)), choice.field, choice.ratio
             )
@@ -242,5 +242,5 @@ def same_noise(sums: SampleSums, choice: Choice, weighed: Weighed) -> Choice:
             return 1e300
 
     found = minimize_scalar(downhill, bounds=(-5.0, 5.0), method="bounded", options={"maxiter": 12})
-    rho = float(HIGHEST / (1.0 + np.exp(-found.x)))
-    return replace(choice, rho=rho if rho > SMALL else 0.0)
+    rho = float(MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-found.x)))
+    return replace(choice, rho=rho if rho > WHITE_AUTOCORRELATION else 0.0)

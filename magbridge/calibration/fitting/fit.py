@@ -20,7 +20,7 @@ from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.residual import robust_scale
 from magbridge.field.reference import other_units
 
-__all__ = ["LEVEL", "METHODS", "Fit", "fit"]
+__all__ = ["MAIN_FIELD_SIGMA_NT", "METHODS", "Fit", "fit"]
 
 METHODS: dict[str, str] = {
     "auto": "magbridge.calibration.fitting.auto:fit_auto",
@@ -41,10 +41,10 @@ ONE_ELLIPSOID = (
 WITHOUT_PARAMETERS = "method nominal has no solution: used was method auto, without parameters"
 UNKNOWN_LENGTH = 500.0
 """Length assumed for the crustal field without a field in place, m."""
-LEVEL = 145.0
+MAIN_FIELD_SIGMA_NT = 145.0
 """nT, 1-sigma by which the total field at a site differs from a main-field model's: what its degrees do not
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
-ROCK, JUDGED = 3.0 * LEVEL, 3000
+ROCK, JUDGED = 3.0 * MAIN_FIELD_SIGMA_NT, 3000
 """RMS that an unmapped crustal field never exceeds over a whole track, nT; samples that suffice to see it."""
 
 
@@ -71,7 +71,7 @@ def fit(
     site_bias : float
         nT, 1-sigma of a constant error of the reference over the site. No scalar fit at one site separates
         it from the gain, so it goes into the covariance. By default none of a true field, of a map that of
-        the map, and of a main-field model alone :data:`LEVEL`.
+        the map, and of a main-field model alone :data:`MAIN_FIELD_SIGMA_NT`.
     **options
         Further arguments of the method's own function, as ``vehicle`` of
         :func:`~magbridge.calibration.fitting.auto.fit_auto`.
@@ -170,7 +170,7 @@ def _default_bias(data: Observations) -> float:
     """Return the default uncertainty of the reference's level, nT."""
     if not data.lacks_rock:
         return 0.0
-    return LEVEL if data.map_sigma is None else data.map_sigma
+    return MAIN_FIELD_SIGMA_NT if data.map_sigma is None else data.map_sigma
 
 
 def _biased(found: Fit, sigma: float) -> Fit:

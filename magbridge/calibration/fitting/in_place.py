@@ -37,7 +37,7 @@ from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep, offered, with_creep, with_temperature
 from magbridge.calibration.fitting.pose import Vehicle, pose
 from magbridge.calibration.fitting.result import Fit, assemble
-from magbridge.calibration.fitting.rounds import SEARCHED, SETTLED, WIDE, Answer, Rounds
+from magbridge.calibration.fitting.rounds import FIRST_SAMPLES, SEARCHED, WIDE, Answer, Rounds
 from magbridge.calibration.fitting.survey_samples import Drift, SurveySamples
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.blocks import ParameterBlock, slow_functions
@@ -47,7 +47,7 @@ from magbridge.estimation.residual import rms
 
 __all__ = ["fit_in_place"]
 
-REACH = 25_000.0
+REFERENCE_ERROR_LENGTH_M = 25_000.0
 """m over which the reference's error, of waves far longer than a site, changes by its size: 6 nT/km."""
 SLOW, SLOW_SPREAD = 2.0, np.log(10.0)
 """nT over a stretch, and the 1-sigma of its logarithm: a quiet day's currents aloft, a sensor's drift."""
@@ -129,7 +129,7 @@ def fit_in_place(
 def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
     """Return the unknowns other than coefficients and field: the level, its slope, changes with time."""
     assert data.place is not None
-    away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REACH
+    away = np.nan_to_num(data.place - np.nanmean(data.place, axis=0)) / REFERENCE_ERROR_LENGTH_M
     level = max(level, 1e-3)
     groups = [ParameterBlock("level", np.ones((len(data), 1)), np.ones(1), level)]
     groups.append(ParameterBlock("gradient", away, np.ones(3), level))
@@ -151,7 +151,7 @@ def _settled(survey: SurveySamples, own: PriorFamily) -> tuple[Answer, SurveySam
     CalibrationError
         The fit does not converge.
     """
-    step = max(len(survey.kept) // SETTLED, 1)
+    step = max(len(survey.kept) // FIRST_SAMPLES, 1)
     best = Rounds(survey.thinned(step), own)
     answer = best.settle()
     for one in sorted(best.unsure):

@@ -40,11 +40,11 @@ PARTS, BLOCKS = 10, 4
 that is most of the log."""
 ATTITUDES = 6
 """Groups of samples with the field in like directions, each of which is left out, too."""
-LASTING = 0.98
+MAX_GROUP_AUTOCORRELATION = 0.98
 """Autocorrelation of neighbours from which on a group of like attitude cannot be left out."""
 FORWARD_PARTS = 4
 """Parts of a log in time, of which the earlier ones predict the next."""
-STEPS = 10
+REFIT_STEPS = 10
 """Gauss-Newton's, at most, of a fit without a part: it begins at the fit to all."""
 TESTED = 20_000
 """Samples that are predicted: enough for any ratio."""
@@ -93,7 +93,7 @@ def leave_out(
         lasts, as on an aircraft: neighbours that stay would then predict the group.)
     """
     found = _left_out(samples, prior, z, noise, _parts(runs))
-    if attitudes and noise.autocorrelation < LASTING:
+    if attitudes and noise.autocorrelation < MAX_GROUP_AUTOCORRELATION:
         apart = _left_out(samples, prior, z, noise, _alike(samples))
         found = replace(found, ratio=max(found.ratio, apart.ratio))
     return found
@@ -137,7 +137,7 @@ def refitted(
         others = np.delete(np.arange(len(weight)), rows)
         kept = samples.part(others)
         kept.steps[1:][np.diff(others) > 1] = np.inf
-        found = gauss_newton(kept, prior, replace(noise, weight=weight[others]), z, steps=STEPS)
+        found = gauss_newton(kept, prior, replace(noise, weight=weight[others]), z, steps=REFIT_STEPS)
         e[rows] = residuals_of(samples.part(rows), prior.coefficients(found.z))
     limit = OUTLIER_SIGMA * robust_scale(e)
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
@@ -159,7 +159,7 @@ def carried_forward(samples: Samples, prior: Prior, z: FloatArray, noise: NoiseM
         earlier = np.concatenate(parts[:k])
         kept = samples.part(earlier)
         kept.steps[1:][np.diff(earlier) > 1] = np.inf
-        found = gauss_newton(kept, prior, replace(noise, weight=weight[earlier]), z, steps=STEPS)
+        found = gauss_newton(kept, prior, replace(noise, weight=weight[earlier]), z, steps=REFIT_STEPS)
         errors.append(residuals_of(samples.part(parts[k]), prior.coefficients(found.z)))
     e = np.concatenate(errors)
     limit = OUTLIER_SIGMA * robust_scale(e)

@@ -14,14 +14,14 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
-from magbridge.calibration.model import RAISED, Calibration, Reference
+from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Reference
 from magbridge.estimation.residual import Samples, jacobian, residuals, symmetric
 
 __all__ = ["apart_from_level", "level_of", "sizes", "with_level"]
 
 CONTRADICTS = 2.0
 """Largest departure of an estimated level from the reference's, in its 1-sigma, that is accepted."""
-ROWS = 5_000
+LEVEL_ROWS = 5_000
 """Samples that the mean is taken over, at most."""
 
 
@@ -40,7 +40,7 @@ def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sig
     bias, bias_sigma : float
         nT, of the reference's level, as found and as expected.
     """
-    part = samples.part(slice(None, None, max(len(samples.field) // ROWS, 1)))
+    part = samples.part(slice(None, None, max(len(samples.field) // LEVEL_ROWS, 1)))
     own = calibration.coefficients[: 9 * part.phi.shape[1]]
     _, g = residuals(part, own)
     j = np.zeros(len(calibration.coefficients))
@@ -73,7 +73,7 @@ def level_of(
     if not calibration.level:
         return np.zeros(len(field))
     up, here = (correct(one, field, channels, time).total for one in (calibration.at_level(), calibration))
-    return np.abs(up - here) / RAISED
+    return np.abs(up - here) / LEVEL_STEP_SIGMA
 
 
 def sizes(samples: Samples, coefficients: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["unfiltered"]
 
-REACH = 4.0
+MIN_SLOPE_TIME_CONSTANTS = 4.0
 """Time constants that a slope spans at least: over shorter spans it would be noise."""
 
 
@@ -51,7 +51,7 @@ def unfiltered(data: Observations, corner: float) -> Observations:
             f"filter corner = {corner:g} Hz: its time constant of {tau:.3g} s is longer than the data "
             f"({duration:.3g} s)"
         )
-    reach = max(int(np.ceil(0.5 * REACH * tau / np.median(np.diff(data.time)))), 1)
+    reach = max(int(np.ceil(0.5 * MIN_SLOPE_TIME_CONSTANTS * tau / np.median(np.diff(data.time)))), 1)
     stretch = np.cumsum(data.steps != 1)
     rows = np.arange(len(data))
     ahead, behind = np.minimum(rows + reach, len(data) - 1), np.maximum(rows - reach, 0)

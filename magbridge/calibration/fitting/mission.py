@@ -17,7 +17,7 @@ from magbridge.errors import CalibrationError
 
 __all__ = ["Mission", "expected_error", "nearby_mission"]
 
-POINTS = 600
+MISSION_SAMPLES = 600
 """Samples that represent a mission."""
 ROLL = 10.0
 """deg either way, by which a survey rolls further than the runs did."""
@@ -43,7 +43,7 @@ class Mission:
             raise CalibrationError(
                 "the mission has no sample with all of roll, pitch, heading, latitude and longitude"
             )
-        part = slice(None, None, max(len(attitude) // POINTS, 1))
+        part = slice(None, None, max(len(attitude) // MISSION_SAMPLES, 1))
         return cls(field_body(attitude[part], reference_ned[part]), data.parameters[known][part])
 
 
@@ -53,7 +53,7 @@ def nearby_mission(calibration: Calibration, data: Observations) -> Mission:
     A survey after these runs meets at least those. Rolling needs only the corrected vectors. Turning to other
     headings needs the vertical, which attitude telemetry gives: without it, only the runs' headings are used.
     """
-    rows = np.arange(0, len(data), max(3 * len(data) // POINTS, 1))
+    rows = np.arange(0, len(data), max(3 * len(data) // MISSION_SAMPLES, 1))
     k = len(calibration.parameters)
     positions = data.parameters[rows, :k]
     b = correct(calibration, data.field[rows], positions, data.time[rows]).vector

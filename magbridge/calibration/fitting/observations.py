@@ -15,7 +15,7 @@ from magbridge.calibration.model import Calibration, Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import Samples
-from magbridge.records import BEYOND
+from magbridge.records import MAX_MEASURED_NT
 
 __all__ = ["TEMPERATURE", "Observations", "monomials", "polynomial_samples"]
 
@@ -93,7 +93,7 @@ class Observations:
         runs = np.asarray(self.runs) if len(self.runs) else np.zeros(n, int)
         field = np.asarray(self.field, float)
         absent = (field == 0.0).all(axis=1, keepdims=True)  # what an absent sensor reads
-        field = np.where((np.abs(field) < BEYOND) & ~absent, field, np.nan)
+        field = np.where((np.abs(field) < MAX_MEASURED_NT) & ~absent, field, np.nan)
         whole = np.isfinite(field).all(axis=1) & np.isfinite(reference)
         whole &= np.isfinite(parameters).all(axis=1) & np.isfinite(time)
         _enough(n, whole, field, parameters, self.names, reference)

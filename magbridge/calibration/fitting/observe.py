@@ -27,7 +27,7 @@ __all__ = ["at_one_time", "observations"]
 
 MAP_ERROR = 20.0
 """nT, 1-sigma of a map that does not state its own."""
-GAP = 10.0
+MIN_GAP_INTERVALS = 10.0
 """Intervals without a sample, after which a sample is independent of the previous one."""
 FOLLOWED = (TEMPERATURE, "depth")
 """Columns that move no mass but may be fitted as if they did."""
@@ -148,4 +148,8 @@ def _runs(ds: xr.Dataset, time: FloatArray) -> NDArray[np.generic]:
         if name in ds:
             return np.asarray(ds[name].values)
     step = np.diff(time, prepend=time[:1])
-    return np.cumsum(step > GAP * np.median(step[1:])) if len(time) > 1 else np.zeros(len(time), int)
+    return (
+        np.cumsum(step > MIN_GAP_INTERVALS * np.median(step[1:]))
+        if len(time) > 1
+        else np.zeros(len(time), int)
+    )

@@ -22,9 +22,9 @@ from magbridge.estimation.blocks import OffsetBlock, ParameterBlock, slow_functi
 
 __all__ = ["Creep", "in_words", "offered", "with_creep", "with_temperature"]
 
-LAGS = (0.0, 600.0, 2400.0)
+TEMPERATURE_LAGS_S = (0.0, 600.0, 2400.0)
 """s, by which the offset may follow the temperature: a sensor by itself, in its housing, in a hull."""
-FASTEST = 1200.0
+SHORTEST_DRIFT_HALF_PERIOD_S = 1200.0
 """s, half the period of the fastest creep: of a random walk of 20 nT in 6 h all but 1 nT, and a step."""
 VARIES = 0.5
 """degC, standard deviation of a temperature, from which on it can tell anything."""
@@ -52,7 +52,7 @@ def offered(data: Observations) -> tuple[OffsetBlock, ...]:
     """Return the terms that may be in a log: the temperature at every lag, where there is any, and creep."""
     groups = []
     if data.temperature is not None and TEMPERATURE not in data.names:
-        for lag in LAGS:
+        for lag in TEMPERATURE_LAGS_S:
             warm = _temperature(data, lag)
             if np.std(warm) > VARIES:
                 column = (warm - warm.mean())[:, None]
@@ -60,7 +60,7 @@ def offered(data: Observations) -> tuple[OffsetBlock, ...]:
                 groups.append(
                     OffsetBlock(name, column, np.ones(3), PER_DEGREE, SPREAD, offered=True, lag=lag)
                 )
-    waves, shape = slow_functions(data.time, FASTEST)
+    waves, shape = slow_functions(data.time, SHORTEST_DRIFT_HALF_PERIOD_S)
     if len(shape):
         groups.append(
             OffsetBlock("creep of the offset", waves, np.tile(shape, 3), CREEPS, SPREAD, offered=True)

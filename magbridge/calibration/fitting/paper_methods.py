@@ -90,7 +90,7 @@ def _start(data: Observations) -> FloatArray:
 
 # ---- An ellipsoid for each run, then polynomials through them ----
 
-FEWEST = 20
+MIN_RUN_SAMPLES = 20
 """Samples of a run that is fitted."""
 AT_REST = 0.05
 """Largest difference of a monomial from the run's median in a sample with the masses at rest."""
@@ -116,7 +116,7 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         rows = data.runs == label
         typical = np.median(samples.phi[rows], axis=0)
         rows &= np.abs(samples.phi - typical).max(axis=1) < AT_REST
-        if rows.sum() < FEWEST:
+        if rows.sum() < MIN_RUN_SAMPLES:
             continue
         runs += 1
         part, z, scatter = single.part(rows), np.zeros(9), NoiseModel(noise.sigma)
@@ -129,7 +129,8 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
         right += np.kron(typical, Lambda @ prior.coefficients(z))
     if runs <= order:
         raise CalibrationError(
-            f"method runs: {runs} runs with {FEWEST} samples or more at one position of the masses; order "
+            f"method runs: {runs} runs with {MIN_RUN_SAMPLES} samples or more at one position of the masses; "
+            "order "
             f"{order} needs {order + 1}: fly runs with the masses at rest"
         )
     covariance = covariance_of(precision)
@@ -143,7 +144,7 @@ def fit_per_run(data: Observations, order: int = 3) -> Fit:
 
 MIN_LEVELLED_SAMPLES = 30
 """Samples that an ellipsoid's twelve unknowns need."""
-STEP = 1e-6
+DIFFERENCE_STEP = 1e-6
 """Of B, and of T over the field: the symmetric difference over it is good to 1e-9."""
 FIRST_NOISE = 1e-3
 """Share of the field: the noise that attitude errors make, before it is estimated."""
@@ -183,8 +184,10 @@ def fit_horizontal(data: Observations, order: int = 0) -> Fit:  # noqa: ARG001  
         x = found.x
         sigma = float(np.sqrt(np.mean((misfit(x, sigma)[:-12] * sigma) ** 2)))
     covariance = np.linalg.inv(found.jac.T @ found.jac)
-    steps = STEP * np.eye(12)
-    J = np.array([_coefficients(x + h, F_0) - _coefficients(x - h, F_0) for h in steps]).T / (2.0 * STEP)
+    steps = DIFFERENCE_STEP * np.eye(12)
+    J = np.array([_coefficients(x + h, F_0) - _coefficients(x - h, F_0) for h in steps]).T / (
+        2.0 * DIFFERENCE_STEP
+    )
     coefficients = _coefficients(x, F_0)
     check_scales(samples, coefficients)
     noise = estimate_noise(residuals_of(samples, coefficients), samples.steps, 9.0)

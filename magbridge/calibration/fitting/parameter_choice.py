@@ -34,11 +34,11 @@ __all__ = ["AUTO", "Offer", "best_parameters", "lines", "undeclared", "worths"]
 PARTS, BLOCKS = 8, 32
 """Parts of a log, of which each is left out in turn; and the blocks of neighbours that they are dealt. A mass
 that nearly always moves with a declared one is known only by a few: no part may have them all."""
-BETTER = 0.8
+MAX_REMAINING_FRACTION = 0.8
 """Share of the residual that must be left on the parts left out, for a column to be named."""
-LEAST = 2.0
+MIN_IMPROVEMENT_NT = 2.0
 """Least improvement that is reported, nT."""
-NAMED = 3
+MAX_REPORTED_COLUMNS = 3
 """Largest number of reported columns, each given the previous ones: a correlate of a mass is not a second."""
 WORTHY = 0.5
 """Share of the first one's worth that another must have: a mass's higher powers leave what anything fits."""
@@ -65,7 +65,7 @@ def undeclared(calibration: Calibration, data: Observations, columns: Mapping[st
     lines: list[str] = []
     conditional_on: tuple[str, ...] = ()
     first = 0.0
-    while len(conditional_on) < NAMED and (
+    while len(conditional_on) < MAX_REPORTED_COLUMNS and (
         found := worths(calibration, data, columns, conditional_on=conditional_on)
     ):
         name = max(found, key=lambda one: found[one])
@@ -84,7 +84,7 @@ def worths(
     calibration: Calibration,
     data: Observations,
     columns: Mapping[str, FloatArray],
-    better: float = BETTER,
+    better: float = MAX_REMAINING_FRACTION,
     conditional_on: tuple[str, ...] = (),
 ) -> dict[str, float]:
     """Return by how many nT each column (n,) reduces a residual on held-out parts; see :func:`undeclared`.
@@ -111,7 +111,7 @@ def worths(
         powers = (np.column_stack([plain, _moved(c, direction[known], order)]) for order in (1, 2))
         left = min(_left_out(design, residual[known]) for design in powers)
         worth = float(np.sqrt(max(without**2 - left**2, 0.0)))
-        if left < better * without and worth > LEAST:
+        if left < better * without and worth > MIN_IMPROVEMENT_NT:
             found[name] = worth
     return found
 
@@ -137,7 +137,7 @@ def _left_out(design: FloatArray, residual: FloatArray) -> float:
 
 AUTO = "auto"
 """``--parameter auto``."""
-MOST = 3
+MAX_PARAMETERS = 3
 """Parameters at most: each of several currents is in part the sum of the others."""
 FAILURES = 2
 """Columns in a row that were not worth it, after which no more are tried."""
@@ -183,7 +183,7 @@ def best_parameters(
     found = fit(observations(deployment, taken, grid=grid), **options)
     offers: list[Offer] = []
     failures = 0
-    while len(taken) < MOST and failures < FAILURES:
+    while len(taken) < MAX_PARAMETERS and failures < FAILURES:
         name = _most_promising(deployment, found, taken, [*offered], {one.name for one in offers}, grid)
         if name is None:
             break

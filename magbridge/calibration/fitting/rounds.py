@@ -10,7 +10,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.fitting.field_doubt import plausible
 from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder, nodes_for
 from magbridge.calibration.fitting.field_search import (
-    CLEAR,
+    DECISIVE_LOG_RATIO,
     Choice,
     Weighed,
     choose,
@@ -32,7 +32,7 @@ from magbridge.estimation.priors import PriorFamily
 from magbridge.estimation.residual import Samples, residuals_of, robust_scale
 from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
 
-__all__ = ["SEARCHED", "SETTLED", "WIDE", "Answer", "Rounds", "start"]
+__all__ = ["FIRST_SAMPLES", "SEARCHED", "WIDE", "Answer", "Rounds", "start"]
 
 # ---- The state of the iterations, and where they begin ----
 
@@ -90,28 +90,28 @@ def start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float
 
 # ---- The iterations ----
 
-GUESSED = 2
+INITIAL_ITERATIONS = 2
 """Iterations before the field is searched: coefficients far off look like crustal field and noise."""
 SEARCHES = 2
 """Rounds after that in which the search goes on."""
-ROUNDS = 40
+MAX_SURVEY_ITERATIONS = 40
 """Rounds at most; six are usual, and some twenty from a start 10,000 nT off, whose steps are shortened."""
-PATIENCE = 8
+MAX_LATE_ITERATIONS = 8
 """Rounds after the search within which they are expected to be at rest; a bent track takes more."""
-STILL = 0.05
+MAX_LAST_CHANGE = 0.05
 """Fraction of the noise: an iteration that changes no residual by more (RMS) is the last."""
-OUTLIER = 5.0
+FIT_OUTLIER_SIGMA = 5.0
 """Sigmas beyond which a sample is left out."""
 OVERSHOT = 10.0
 """Growth of the objective by which a step goes too far; less may be the track that is bent only after it."""
-SHORTEST = 1e-3
+MIN_ITERATION_STEP = 1e-3
 """Part of a step, below which it is not shortened further."""
 SEARCHED, WIDE = 12_000, 5_000.0
 """Samples about the middle that the field's size and length are searched with; where there are more within so
 many m north and east, every second or third of these."""
-SETTLED = 50_000
+FIRST_SAMPLES = 50_000
 """Samples with which the iterations converge, before those with all of a longer log."""
-MOST = 40_000
+MAX_SAMPLE_NODES = 40_000
 """Nodes about all samples, at most."""
 
 
@@ -120,7 +120,7 @@ class Rounds:
 
     def __init__(self, survey: SurveySamples, own: PriorFamily) -> None:
         self.survey, self.own, self.q = survey, own, own.E.shape[1]
-        self.until = GUESSED + SEARCHES
+        self.until = INITIAL_ITERATIONS + SEARCHES
         self.offers = any(one.offered for one in survey.groups)
         self.family = with_blocks(own, survey.groups)
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
@@ -142,7 +142,7 @@ class Rounds:
 
     def worth(self, answer: Answer) -> float:
         """Return its log evidence: a sample left out counts as one at the limit, an offer has its price."""
-        survey, each = self.survey, 0.5 * OUTLIER**2 + float(np.log(answer.widths.sigma))
+        survey, each = self.survey, 0.5 * FIT_OUTLIER_SIGMA**2 + float(np.log(answer.widths.sigma))
         left_out = int((survey.at_rest & ~survey.kept).sum())
         return (
             answer.score
@@ -157,14 +157,14 @@ class Rounds:
         field = self.choice.field
         survey.bend(field, self.w, self.z[self.q :])
         self.last = self._residuals(self.z, self._slow(self.z) + survey.rock(field, self.w))
-        survey.kept = survey.at_rest & (np.abs(self.last) <= OUTLIER * robust_scale(self.last))
+        survey.kept = survey.at_rest & (np.abs(self.last) <= FIT_OUTLIER_SIGMA * robust_scale(self.last))
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
         self.choice = same_noise(self._sums(field), self.choice, weighed)
 
     def settle(self) -> Answer:
         """Return the answer; NoSolutionError: the iterations do not converge."""
         survey, moved = self.survey, np.inf
-        for turn in range(ROUNDS):
+        for turn in range(MAX_SURVEY_ITERATIONS):
             if self.own.renew is not None and turn:
                 self.own = self.own.renew(self.z[: self.q])
                 self.family = with_blocks(self.own, survey.groups)
@@ -173,12 +173,12 @@ class Rounds:
             if self.last is not None:
                 moved = float(np.sqrt(np.mean((e - self.last) ** 2)))
             self.last = e
-            if turn >= GUESSED:
-                survey.kept = survey.at_rest & (np.abs(e) <= OUTLIER * robust_scale(e))
-            still = turn > self.until and moved < STILL * self.sigma
+            if turn >= INITIAL_ITERATIONS:
+                survey.kept = survey.at_rest & (np.abs(e) <= FIT_OUTLIER_SIGMA * robust_scale(e))
+            still = turn > self.until and moved < MAX_LAST_CHANGE * self.sigma
             if still and not self.offers:
                 return answer
-            if self.offers and (still or turn == self.until + PATIENCE):
+            if self.offers and (still or turn == self.until + MAX_LATE_ITERATIONS):
                 self._weigh_offers(turn)
         if moved > self.sigma:
             raise NoSolutionError("the fit to the survey did not converge: the data contradict themselves")
@@ -228,7 +228,7 @@ class Rounds:
         if self.part.all():
             return choice
         field = choice.field
-        nodes = nodes_for(self.survey.place, field.length, field.alpha, MOST)
+        nodes = nodes_for(self.survey.place, field.length, field.alpha, MAX_SAMPLE_NODES)
         return replace(choice, field=replace(field, nodes=nodes))
 
     def _weigh_offers(self, turn: int) -> None:
@@ -240,7 +240,7 @@ class Rounds:
         self.offers = False
         reduced = eliminate_field(self._sums(choice.field), choice.field, choice.ratio, choice.rho)
         weighed = reduced.quadratic, self.own, survey.groups, self.eta, self.sigma
-        kept, sure = select_blocks(*weighed), select_blocks(*weighed, price=CLEAR)
+        kept, sure = select_blocks(*weighed), select_blocks(*weighed, price=DECISIVE_LOG_RATIO)
         self.unsure = {one.name for one in kept} - {one.name for one in sure}
         if len(kept) < len(survey.groups):
             self._regroup(kept)
@@ -278,7 +278,7 @@ class Rounds:
             return float(e @ e) / self.sigma**2 + float(z @ precision @ z)
 
         before, part = objective(0.0), 1.0
-        while part > SHORTEST and not objective(part) < OVERSHOT * before:
+        while part > MIN_ITERATION_STEP and not objective(part) < OVERSHOT * before:
             part *= 0.5
         return self.z + part * step, here + part * change
 

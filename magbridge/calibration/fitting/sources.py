@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["heterogeneous_logs", "source_of", "unused_logs"]
 
-APART = 3.0
+MAX_JOINT_RMS_RATIO = 3.0
 """RMS of a fit to all logs over that of fits to each: sampling and slow errors alone do not reach it."""
 JUDGED = 10
 """Logs, those with most samples, that are fitted each on its own."""
@@ -71,7 +71,7 @@ def heterogeneous_logs(
     refit : callable
         Fits a part of the data in the same way.
     """
-    if len(logs) < 2 or (found and found.rms < APART * _scatter(found.residual)):
+    if len(logs) < 2 or (found and found.rms < MAX_JOINT_RMS_RATIO * _scatter(found.residual)):
         return ""  # the residuals are noise from one sample to the next
     which = source_of(logs, data.time)
     count = np.bincount(which[which >= 0], minlength=len(logs))
@@ -83,7 +83,7 @@ def heterogeneous_logs(
             continue
     judged = [k for k, _ in alone]
     own = float(np.sqrt(np.average([one**2 for _, one in alone], weights=count[judged]))) if alone else 0.0
-    if len(alone) < 2 or (found and rms(found.residual[np.isin(which, judged)]) < APART * own):
+    if len(alone) < 2 or (found and rms(found.residual[np.isin(which, judged)]) < MAX_JOINT_RMS_RATIO * own):
         return ""
     fits = ", ".join(f"{logs[k].attrs['source']} {one:.3g}" for k, one in sorted(alone)[:3])
     more = f" and {len(alone) - 3} more" if len(alone) > 3 else ""

@@ -16,9 +16,9 @@ __all__ = ["Limits", "PlannedRun", "candidate_runs", "settled", "trim_of"]
 
 SLACK = 3.0
 """deg, by which another trim of the vehicle changes the pitch at the same positions."""
-STILL = 0.01
+MAX_REST_FRACTION = 0.01
 """Share of half a position's range, from one sample to the next: a mass at rest."""
-REACH = 0.35
+MAX_POSITION_DIFFERENCE = 0.35
 """Share of half a position's range, by which a run may differ from positions that were flown."""
 
 
@@ -45,7 +45,8 @@ class Limits:
     """Positions (k,) -> pitch that they trim the vehicle to (deg), see :func:`trim_of`; without it pitch is
     free."""
     flown: FloatArray | None = None
-    """(m, k): Positions that the vehicle is known to fly with: a run keeps within :data:`REACH` of some of
+    """(m, k): Positions that the vehicle is known to fly with: a run keeps within
+    :data:`MAX_POSITION_DIFFERENCE` of some of
     them. (No glider dives with its ballast out.)."""
 
 
@@ -67,7 +68,7 @@ def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
 def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray:
     """Return the (m, k) positions at which the masses of `data` are at rest; `parameters` give the scales."""
     scale = [parameter.scale for parameter in parameters]
-    moving = (np.abs(np.diff(data.parameters, axis=0) / scale) > STILL).any(axis=1)
+    moving = (np.abs(np.diff(data.parameters, axis=0) / scale) > MAX_REST_FRACTION).any(axis=1)
     at_rest = np.ones(len(data), bool)
     at_rest[1:] &= ~moving
     at_rest[:-1] &= ~moving
@@ -100,4 +101,4 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
 def _near(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
     """Return True if some flown positions differ by no more than REACH in any parameter."""
     off = np.abs(positions - flown) / [parameter.scale for parameter in parameters]
-    return bool((off.max(axis=1) <= REACH).any())
+    return bool((off.max(axis=1) <= MAX_POSITION_DIFFERENCE).any())

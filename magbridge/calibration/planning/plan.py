@@ -35,12 +35,12 @@ from magbridge.estimation.residual import Samples, jacobian, residuals
 
 __all__ = ["Design", "Plan", "evaluate_runs", "expected_calibration", "plan"]
 
-HEADINGS = 24
-SAMPLES = 225
+PLANNED_HEADINGS = 24
+PLANNED_RUN_SAMPLES = 225
 """Samples of a run: a quarter of an hour at the paper's 0.25 Hz."""
-LEVELS = 7
+POSITION_LEVELS = 7
 """Values of each position that are tried."""
-POWER = 4
+VARIANCE_POWER = 4
 """Power of the variance that is averaged over the mission, the eighth of sigma: the worst counts most."""
 
 
@@ -113,13 +113,13 @@ class Design:
 
     def factor(self, run: PlannedRun) -> FloatArray:
         """Return F (K, 9) of a run through all headings."""
-        turn = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False)
-        attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * HEADINGS), turn])
-        truth = field_body(attitude, np.tile(self.field_ned, (HEADINGS, 1)))
-        phi, g = self.derivative(truth, np.tile(run.parameters, (HEADINGS, 1)))
+        turn = np.linspace(0.0, 2.0 * np.pi, PLANNED_HEADINGS, endpoint=False)
+        attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * PLANNED_HEADINGS), turn])
+        truth = field_body(attitude, np.tile(self.field_ned, (PLANNED_HEADINGS, 1)))
+        phi, g = self.derivative(truth, np.tile(run.parameters, (PLANNED_HEADINGS, 1)))
         noise = self.calibration.noise
         share = effective_fraction(noise.autocorrelation, noise.white)
-        weight = SAMPLES / HEADINGS / noise.sensor**2 * share
+        weight = PLANNED_RUN_SAMPLES / PLANNED_HEADINGS / noise.sensor**2 * share
         values, vectors = np.linalg.eigh(g.T @ g * weight)
         return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)
 
@@ -139,7 +139,7 @@ class Design:
         for F in factors:
             U = PC @ F
             reduction = np.einsum("ij,ji->i", U, np.linalg.solve(np.eye(F.shape[1]) + F.T @ C @ F, U.T))
-            found.append(np.mean(np.maximum(before - reduction, 0.0) ** POWER))
+            found.append(np.mean(np.maximum(before - reduction, 0.0) ** VARIANCE_POWER))
         return np.array(found)
 
 
@@ -185,7 +185,7 @@ def plan(
     """
     with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
         design = Design(calibration, mission, field_ned)
-        candidates = candidate_runs(limits, calibration.parameters, LEVELS)
+        candidates = candidate_runs(limits, calibration.parameters, POSITION_LEVELS)
         if not candidates:
             raise CalibrationError("plan: no pitch, roll and position lie within the vehicle's limits")
         factors = [design.factor(run) for run in candidates]

@@ -33,9 +33,9 @@ __all__ = ["Proposal", "facts", "propose", "summary"]
 
 ROCK, LENGTH, SMOOTH = 40.0, 700.0, 3
 """Amplitude (nT), length (m) and power of the expected crustal field, as the place is unmapped."""
-LEVEL = 145.0
+LEVEL_SIGMA_NT = 145.0
 """nT, 1-sigma of the main field's level."""
-SAMPLES = 1_500
+PATTERN_SAMPLES = 1_500
 """Largest number of samples of a pattern: more are averaged."""
 SPIRAL = 1_800.0
 """s of a spiral at the end."""
@@ -85,7 +85,7 @@ def propose(
     mission = Mission.of(data)
     field = np.asarray(ned.mean(axis=0))
     count = int(hours * 3600.0 / float(np.median(np.diff(time))))
-    rows = np.arange(0, count, max(count // SAMPLES, 1))
+    rows = np.arange(0, count, max(count // PATTERN_SAMPLES, 1))
     interval, as_flown = hours * 3600.0 / len(rows), rows % len(attitude)
     noise = calibration.noise.sensor * max(len(rows) / count, 1e-9) ** 0.5
     found = []
@@ -146,7 +146,7 @@ def _expected(
     field = GaussianField(nodes_for(place, LENGTH, SMOOTH), LENGTH, SMOOTH)
     sums = sum_rows([LinearisedRows(D, -field.basis(place), np.zeros(len(phi), bool))])
     H = eliminate_field(sums, field, ROCK / noise, 0.0).quadratic.precision / noise**2
-    prior = np.append(family.widths(family.centre), LEVEL) ** -2.0
+    prior = np.append(family.widths(family.centre), LEVEL_SIGMA_NT) ** -2.0
     P = covariance_of(H + np.diag(prior))[:-1, :-1]
     points = (design.points - design.points.mean(axis=0)) @ family.E
     variance = np.einsum("ij,jk,ik->i", points, P, points)

@@ -16,9 +16,9 @@ from magbridge.diagnose.words import measured, names_of, number, series_of
 if TYPE_CHECKING:
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
-__all__ = ["DOUBTS", "IMPLAUSIBLE", "Note", "contested", "not_separated", "notes"]
+__all__ = ["DOUBTS", "IMPLAUSIBLE_MULTIPLE", "Note", "contested", "not_separated", "notes"]
 
-IMPLAUSIBLE = 5.0
+IMPLAUSIBLE_MULTIPLE = 5.0
 """Multiple of its plausible size above which a cause is implausible."""
 DOUBTS = ("contested", "random_walk", "implausible_amplitude", "no_improvement")
 """Codes of notes that are reasons against the use of an extended calibration."""
@@ -60,7 +60,7 @@ def _of_numbers(finding: Finding) -> Iterator[Note]:
             {"corner_Hz": corner},
         )
     times = times_usual(candidate, finding.coefficients)
-    if times >= IMPLAUSIBLE:
+    if times >= IMPLAUSIBLE_MULTIPLE:
         yield Note(
             "implausible_amplitude",
             f"This is {number(times, 2)} times the usual size of such a cause. Two causes that cancel each "

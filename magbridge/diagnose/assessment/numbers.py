@@ -14,9 +14,9 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import known
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
-from magbridge.diagnose.compare.problem import DELAY, DELAYS, Problem, samples_of
-from magbridge.diagnose.inference.evidence import LEVEL
+from magbridge.diagnose.compare.derivatives import DERIVATIVE_ROWS, derivatives
+from magbridge.diagnose.compare.problem import AXIS_DELAY_SIGMA_S, DELAYS, Problem, samples_of
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.estimation.residual import residuals, residuals_of, rms
 
@@ -92,7 +92,7 @@ def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration
     after, g = residuals(samples, coefficients)
     fresh = np.flatnonzero(~survey.learned)
     shift = float((after - before)[fresh].mean())
-    some = fresh[:: 1 + fresh.size // CHUNK]  # enough for a mean
+    some = fresh[:: 1 + fresh.size // DERIVATIVE_ROWS]  # enough for a mean
     every = np.eye(extended.coefficients.size)
     slope = derivatives(extended, samples.part(some), g[some], every).mean(axis=0)
     sigma = float(np.sqrt(slope @ extended.covariance @ slope))
@@ -102,9 +102,9 @@ def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration
 def delays(problem: Problem, fit: Joint) -> Delays | None:
     """Return the axes' delays where they look interpolated: a noise that no calibration can undo."""
     places, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
-    later = DELAY * to_x @ fit.z[places]
-    covariance = DELAY**2 * to_x @ fit.covariance[np.ix_(places, places)] @ to_x.T
-    if chi2.sf(later @ np.linalg.solve(covariance, later), later.size) >= LEVEL:
+    later = AXIS_DELAY_SIGMA_S * to_x @ fit.z[places]
+    covariance = AXIS_DELAY_SIGMA_S**2 * to_x @ fit.covariance[np.ix_(places, places)] @ to_x.T
+    if chi2.sf(later @ np.linalg.solve(covariance, later), later.size) >= FALSE_ALARM_RATE:
         return None
     taken = float(np.std(problem.straight(fit.z) - problem.residual))
     return Delays(later, np.sqrt(np.diag(covariance)), taken)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from magbridge.diagnose.causes import Cause
     from magbridge.diagnose.diagnosis import Diagnosis, Finding
 
-__all__ = ["OWN", "Assessment", "Fitness", "Reason", "assess", "useful"]
+__all__ = ["OWN_LOG_TEXT", "Assessment", "Fitness", "Reason", "assess", "useful"]
 
 Fitness = Literal["yes", "conditional", "no"]
 Reason = Literal[
@@ -37,7 +37,7 @@ Reason = Literal[
     "no_improvement", "refit_as_good",
 ]  # fmt: skip
 """Code of the reason for the answer."""
-OWN = (
+OWN_LOG_TEXT = (
     "The calibration was fitted to this very log and has absorbed part of its errors: the improvement is "
     "not a test."
 )
@@ -246,7 +246,7 @@ def _against(
 ) -> list[Note]:
     """List the reasons against use, which a reviewer must resolve; `noted` has the notes of each finding."""
     survey, rest = diagnosis.problem.survey, diagnosis.unexplained
-    found = [Note("own_log", OWN)] if (survey.fitted & ~survey.learned).any() else []
+    found = [Note("own_log", OWN_LOG_TEXT)] if (survey.fitted & ~survey.learned).any() else []
     if warnings := "; ".join(diagnosis.problem.calibration.warnings):
         found.append(Note("unsupported", f"The calibration's own data do not support it: {warnings}."))
     if shift is not None:

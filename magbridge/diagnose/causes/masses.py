@@ -16,11 +16,11 @@ from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
 
-NEAR = (0.25, 0.5)
+SOURCE_DISTANCES = (0.25, 0.5)
 """Distances of sources from a mass' path that are tried, in half travels; nearer iron would be struck."""
-APART = 1.25
+SOURCE_SPACING = 1.25
 """Spacing of the sources, in units of their distance from the path: closer ones make the same field."""
-STRAIGHT = 4.0
+STRAIGHT_BRANCH_SCALE = 4.0
 """Scale, in half travels, of a branch of hysteresis that is practically straight."""
 
 
@@ -77,7 +77,7 @@ def actuator_order(problem: Problem) -> list[Candidate]:
     return [
         *(_term(problem, e) for e in missing),
         *(_series(problem, effect) for effect in changed),
-        *(_sources(problem, p.name, near) for p in moved for near in NEAR),
+        *(_sources(problem, p.name, near) for p in moved for near in SOURCE_DISTANCES),
     ]
 
 
@@ -85,12 +85,12 @@ def _sources(problem: Problem, name: str, near: float) -> Candidate:
     """Return sources all along one mass' path, and a little beyond its ends."""
     low, high = problem.survey.channels[name].extent
     scale = 0.5 * near * (high - low)
-    gaps = int(np.ceil(2.0 / (APART * near)))
-    centre = 0.5 * (low + high - gaps * APART * scale)
+    gaps = int(np.ceil(2.0 / (SOURCE_SPACING * near)))
+    centre = 0.5 * (low + high - gaps * SOURCE_SPACING * scale)
     effect = SourcesEffect(
-        cause="actuator_order", channel=name, centre=centre, scale=scale, apart=APART, count=gaps + 1
+        cause="actuator_order", channel=name, centre=centre, scale=scale, apart=SOURCE_SPACING, count=gaps + 1
     )
-    at = centre + APART * scale * np.arange(gaps + 1)
+    at = centre + SOURCE_SPACING * scale * np.arange(gaps + 1)
     names = tuple(f"{axis} {name} {x:.3g}" for x in at for axis in AXES)
     return of_effect(problem, effect, 50.0, "nT", names=names, spectra=np.ones((1, effect.size)))
 
@@ -108,7 +108,7 @@ def hysteresis(problem: Problem) -> list[Candidate]:
     S is straight for the backlash of a drive; for steel it is steep where the steel is: see
     :class:`~magbridge.calibration.memory_effects.PlayEffect`.
     """
-    drives = product((0.05, 0.15, 0.3), (0.0,), (STRAIGHT,))
+    drives = product((0.05, 0.15, 0.3), (0.0,), (STRAIGHT_BRANCH_SCALE,))
     steel = product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,))
     # only of modelled masses: the difference between any other channel and its wide play is that channel
     names = [parameter.name for parameter in problem.calibration.parameters]

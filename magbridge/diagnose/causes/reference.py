@@ -16,7 +16,7 @@ from magbridge.diagnose.compare.problem import Problem
 
 __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 
-CELLS = 300
+MAX_MAP_ERROR_CELLS = 300
 """Most cells at which a map's error is described."""
 FINEST = 125.0
 """Side of the smallest cell, m."""
@@ -96,9 +96,9 @@ def _expanded(
 
 
 def _cells(place: FloatArray) -> tuple[FloatArray, float]:
-    """(m, 3) mean places of the track in the cells that hold it, at most :data:`CELLS`, and their side, m."""
+    """Return mean places (m, 3) in at most :data:`MAX_MAP_ERROR_CELLS` cells of the track and their side."""
     side = FINEST
-    while (found := _each(np.floor(place / side)))[1].max() >= CELLS:
+    while (found := _each(np.floor(place / side)))[1].max() >= MAX_MAP_ERROR_CELLS:
         side *= 1.1
     of = found[1]
     return np.stack([np.bincount(of, x) for x in place.T], axis=1) / np.bincount(of)[:, None], side

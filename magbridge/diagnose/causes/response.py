@@ -29,7 +29,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     coefficients have one common size, because the three axes have the same design, up to :data:`BENT`: nine
     free numbers could otherwise take a wrong reference and a mass' error for one bend.
     """
-    # a common size is at most ten widths (:data:`~magbridge.diagnose.inference.statistic.SIZES`)
+    # a common size is at most ten widths (:data:`~magbridge.diagnose.inference.statistic.PRIOR_SIZES`)
     common = [_power(problem, power, 0.1 * BENT) for power in (1, 2, 3)]
     every = replace(reduce(Candidate.with_, common), parts=(), spectra=np.ones((1, 9)))
     return [*(_power(problem, power, BENT) for power in (2, 3)), every]

@@ -16,13 +16,13 @@ from magbridge.diagnose.compare.problem import Problem, once
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
 
-LAGS = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
+TELEMETRY_LAGS_S = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, spaced so closely that any lag between two of them is matched to within a fifth (RMS)."""
 STAGES = 2
 """Equal lags in series, because conducted heat passes the hull before it reaches the core. One lag misses 10
 to 30 % of the temperature in the centre of a slab, two in series miss 4 to 9 %."""
 
-TOGETHER = 12
+MAX_JOINT_CURRENTS = 12
 """Most currents that are also tried together."""
 
 
@@ -40,7 +40,7 @@ def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatA
     """Return the lagged temperatures, cached: origins and causes share them, each of 5 MB for a month."""
     survey = problem.survey  # a cache that referred to the problem would keep it alive
 
-    @lru_cache(len(LAGS) * len(problem.channels_of("temperature")))
+    @lru_cache(len(TELEMETRY_LAGS_S) * len(problem.channels_of("temperature")))
     def level(name: str, lag: float) -> Callable[[slice], FloatArray]:
         values = lagged(survey.time, survey.channels[name].values, lag, STAGES)
         return lambda rows: values[None, rows]
@@ -50,7 +50,7 @@ def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatA
 
 def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
     longest = 2.0 * float(np.ptp(problem.survey.time))
-    lags = [lag for lag in LAGS if lag <= longest]
+    lags = [lag for lag in TELEMETRY_LAGS_S if lag <= longest]
     return [c for name in problem.channels_of("temperature") for c in _warmed(problem, on, name, lags)]
 
 
@@ -96,7 +96,7 @@ def current_field(problem: Problem) -> list[Candidate]:
     battery) leave the field of currents at several places, which have one common size.
     """
     alone = _proportional(problem, "current_field", "current", 100.0)
-    if not 2 <= len(alone) <= TOGETHER:
+    if not 2 <= len(alone) <= MAX_JOINT_CURRENTS:
         return alone
     names = tuple(f"{axis} {one.channel}" for one in alone for axis in AXES)
     every = replace(reduce(Candidate.with_, alone), channel=None, names=names, parts=())

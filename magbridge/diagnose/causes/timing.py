@@ -10,7 +10,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect
-from magbridge.diagnose.compare.interpolation import LOST, rates
+from magbridge.diagnose.compare.interpolation import MAX_MISSING_SAMPLES, rates
 from magbridge.diagnose.compare.problem import Problem, once
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
@@ -19,7 +19,7 @@ SHIFTS_S = (0.5, 2.0, 6.0, 20.0, 60.0)
 """Shifts of the telemetry that are tried, s: those between half an interval and a fiftieth of the log."""
 MIN_SHIFT = 0.1
 """Shift, in sampling intervals, below which rates of change describe it."""
-MOMENT = 0.01
+CENTRAL_STEP_S = 0.01
 """s by which masses are moved forward and back, for a central difference of the nine coefficients."""
 
 
@@ -42,12 +42,12 @@ def mass_rates(problem: Problem) -> FloatArray:
     kernel = calibration.kernel
     p, t = survey.values([parameter.name for parameter in calibration.parameters]), survey.time
     after = np.diff(p, axis=0, append=p[-1:]) / np.diff(t, append=t[-1] + 1.0)[:, None]
-    after[:-1] *= survey.follows(LOST)[1:, None]
+    after[:-1] *= survey.follows(MAX_MISSING_SAMPLES)[1:, None]
     before = np.roll(after, 1, axis=0)
     larger = np.where(np.abs(before) > np.abs(after), before, after)
-    moved = MOMENT * np.where(before * after > 0.0, larger, 0.0)
+    moved = CENTRAL_STEP_S * np.where(before * after > 0.0, larger, 0.0)
     theta = kernel.rate_weights.T @ (kernel.monomials_of(p + moved) - kernel.monomials_of(p - moved))
-    return np.asarray(theta / (2.0 * MOMENT))
+    return np.asarray(theta / (2.0 * CENTRAL_STEP_S))
 
 
 def eddy_current(problem: Problem) -> list[Candidate]:
@@ -120,7 +120,7 @@ def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
     """
     survey, kernel = problem.survey, problem.calibration.kernel
     p, t = survey.values([parameter.name for parameter in problem.calibration.parameters]), survey.time
-    leg = np.cumsum(~survey.follows(LOST))
+    leg = np.cumsum(~survey.follows(MAX_MISSING_SAMPLES))
 
     def rows_of(rows: slice) -> FloatArray:
         later = t[rows] + shift

@@ -8,9 +8,9 @@ from scipy.interpolate import CubicSpline
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.survey import Survey
 
-__all__ = ["LOST", "interpolation_error", "rates"]
+__all__ = ["MAX_MISSING_SAMPLES", "interpolation_error", "rates"]
 
-LOST = 3
+MAX_MISSING_SAMPLES = 3
 """Largest number of samples missing in a row within a leg: the rate next to such a gap still has 98 % of the
 true one's power."""
 
@@ -18,7 +18,7 @@ true one's power."""
 def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
     r"""(k, n) first or second derivative of H (k, n): of the cubic spline through each leg; zero at its ends.
 
-    A leg is a run of samples in which no gap is longer than :data:`LOST` samples.
+    A leg is a run of samples in which no gap is longer than :data:`MAX_MISSING_SAMPLES` samples.
 
     Notes
     -----
@@ -31,7 +31,7 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
     which would pass for an effect; the spline treats both directions of time equally and has none.
     """
     t, out = survey.time, np.zeros_like(H)
-    starts = np.flatnonzero(~survey.follows(LOST))
+    starts = np.flatnonzero(~survey.follows(MAX_MISSING_SAMPLES))
     for start, end in zip(starts, np.append(starts[1:], len(t)), strict=True):
         if end - start > 2:
             spline = CubicSpline(t[start:end], H[:, start:end], axis=1).c

@@ -13,7 +13,7 @@ __all__ = ["ANY", "kinds_of"]
 ANY = ("temperature", "current", "pressure", "position")
 DRIVE = ("current", "position")
 """Quantities of a drive: its current flows when it turns, and the part that it turns may carry iron."""
-UNITS: dict[str, tuple[str, ...]] = {
+UNIT_KINDS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("degC", "K", "degF"), ("temperature",)),
     **dict.fromkeys(("A", "mA", "uA", "W", "mW"), ("current",)),
     **dict.fromkeys(("dbar", "bar", "mbar", "Pa", "hPa", "kPa"), ("pressure",)),
@@ -23,7 +23,7 @@ UNITS: dict[str, tuple[str, ...]] = {
 """Kinds of a series by its unit, where that decides."""
 VAGUE = {"", "1", "%", "m"}
 """Units that any kind of series may have, or that lengths and depths share: there the name decides."""
-WORDS: tuple[tuple[str, tuple[str, ...]], ...] = (
+NAME_KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("temp therm", ("temperature",)),
     ("current curr amps ampere", ("current",)),
     ("press depth baro alt altitude", ("pressure",)),
@@ -46,10 +46,10 @@ def kinds_of(name: str, unit: str) -> tuple[str, ...]:
     unit : str
         As declared; empty if it is not.
     """
-    if unit in UNITS:
-        return UNITS[unit]
+    if unit in UNIT_KINDS:
+        return UNIT_KINDS[unit]
     parts = [part.lower() for part in PART.findall(name)]
-    named = next((kinds for words, kinds in WORDS if any(_among(part, words) for part in parts)), ())
+    named = next((kinds for words, kinds in NAME_KINDS if any(_among(part, words) for part in parts)), ())
     if unit not in VAGUE:
         # of a temperature or a pressure we know the units; anything else may be what drives, or moves
         return DRIVE if named == DRIVE else ("position",)

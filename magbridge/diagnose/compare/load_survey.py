@@ -11,12 +11,12 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.fitting.survey_samples import beside_motion
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS, require, require_units
-from magbridge.diagnose.compare.survey import FEWEST, Survey, assemble
+from magbridge.diagnose.compare.survey import MIN_SURVEY_SAMPLES, Survey, assemble
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import positions, reference_field
 from magbridge.one_time import interpolate_to_rows
-from magbridge.records import BEYOND
+from magbridge.records import MAX_MEASURED_NT
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ __all__ = ["load_survey"]
 TRUSTED = 0.5
 """Largest cubic term in the interpolation of an axis to the time of its row, as a multiple of the noise;
 where it is exceeded the sample is not used."""
-FAR = 10.0
+MAX_HALF_RANGES = 10.0
 """Distance from the middle of the calibrated range, in half ranges, beyond which a parameter's value is
 not the position of a mass but a code for "not known"."""
 
@@ -75,7 +75,7 @@ def load_survey(
         )
     table = _comparable(table, calibration, source)
     for parameter in calibration.parameters:
-        far = np.abs(table[parameter.name] - parameter.centre) > FAR * parameter.scale
+        far = np.abs(table[parameter.name] - parameter.centre) > MAX_HALF_RANGES * parameter.scale
         if far.any():
             raise DataError(
                 f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of "
@@ -108,15 +108,16 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
     """Return the rows that have field, reference and parameters, each instant once."""
     needed = [*CHANNELS, "reference_field", *calibration.units]
     size = table["time"].size
-    if size < FEWEST:
-        raise DataError(f"{source}: {counted(size, 'sample')}, at least {FEWEST} needed")
+    if size < MIN_SURVEY_SAMPLES:
+        raise DataError(f"{source}: {counted(size, 'sample')}, at least {MIN_SURVEY_SAMPLES} needed")
     for name in CHANNELS:
-        table[name][~(np.abs(table[name]) < BEYOND)] = np.nan
+        table[name][~(np.abs(table[name]) < MAX_MEASURED_NT)] = np.nan
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
-    if whole.sum() < FEWEST:
+    if whole.sum() < MIN_SURVEY_SAMPLES:
         worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
         raise DataError(
-            f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least {FEWEST} "
+            f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least "
+            f"{MIN_SURVEY_SAMPLES} "
             f"needed (column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
         )
     table = {name: column[whole] for name, column in table.items()}

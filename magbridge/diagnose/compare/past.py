@@ -6,9 +6,9 @@ import numpy as np
 
 from magbridge.arrays import IntArray
 
-__all__ = ["FAR", "Past"]
+__all__ = ["MAX_LAG", "Past"]
 
-FAR = 1000
+MAX_LAG = 1000
 """Lag, in sampling intervals, from which on a sample says nothing about the noise; longer ones are cut
 to it."""
 
@@ -19,7 +19,7 @@ class Past:
     Parameters
     ----------
     steps : (n,) int array
-        Intervals since the sample before, at least 1; :data:`FAR` where there is none.
+        Intervals since the sample before, at least 1; :data:`MAX_LAG` where there is none.
     order : int
         p.
 
@@ -31,7 +31,7 @@ class Past:
     rows : (m,) int array
         Samples where there is one.
     lags : (l, p) int array
-        The different patterns of lags at `rows`, in intervals; :data:`FAR` where a sample is too long ago,
+        Patterns of lags at `rows`, in intervals; :data:`MAX_LAG` where a sample is too long ago,
         or there is none.
     pattern : (m,) int array
         Pattern of each of `rows`.
@@ -44,8 +44,8 @@ class Past:
         broken[:1] = 0
         self.whole = index - np.maximum.accumulate(broken) >= order
         self.rows = np.flatnonzero(~self.whole)
-        place = np.append(np.cumsum(np.minimum(steps, FAR)), -FAR)
+        place = np.append(np.cumsum(np.minimum(steps, MAX_LAG)), -MAX_LAG)
         before = np.maximum(self.rows[:, None] - np.arange(1, order + 1), -1)
-        lags = np.minimum(place[self.rows, None] - place[before], FAR)
+        lags = np.minimum(place[self.rows, None] - place[before], MAX_LAG)
         self.lags, inverse = np.unique(lags, axis=0, return_inverse=True)
         self.pattern: IntArray = inverse.ravel()

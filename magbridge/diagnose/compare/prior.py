@@ -23,7 +23,7 @@ BROADEST = 1e-3
 """Least precision, in units of the posterior's, of a direction that only the repeated logs determined."""
 FALL = 0.3
 """Share of a coefficient's plausible size that remains from one power of a mass' position to the next."""
-HELD = 0.1
+MIN_PRECISION = 0.1
 """Least precision, in units of the posterior's, of a direction that other logs determined, too."""
 STABLE = 2e-5
 """Stability between days, as a fraction of the field: no fluxgate's scales, axes and offsets do better
@@ -105,7 +105,9 @@ def _without_repeats(
     white = whiten(white, steps, noise.autocorrelation, noise.white) / noise_sigma(calibration, e)
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
-    held = values > HELD  # other directions were learned from the repeated samples alone, which count anyway
+    held = (
+        values > MIN_PRECISION
+    )  # other directions were learned from the repeated samples alone, which count anyway
     pull = vectors @ np.where(held, vectors.T @ (A.T @ y), 0.0)
     bound = L / _physical(calibration)[:, None]
     values, vectors = np.linalg.eigh((vectors * np.where(held, values, 0.0)) @ vectors.T + bound.T @ bound)

@@ -39,22 +39,31 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect, Series
-from magbridge.diagnose.compare.derivatives import CHUNK, derivatives
+from magbridge.diagnose.compare.derivatives import DERIVATIVE_ROWS, derivatives
 from magbridge.diagnose.compare.interpolation import interpolation_error
 from magbridge.diagnose.compare.prior import noise_sigma, prior
 from magbridge.diagnose.compare.slow_noise import slow_columns, waves
 from magbridge.diagnose.compare.survey import Survey
 from magbridge.estimation.residual import Samples, residuals
 
-__all__ = ["DELAY", "DELAYS", "Problem", "linearised", "once", "pose", "samples_of", "with_slow_noise"]
+__all__ = [
+    "AXIS_DELAY_SIGMA_S",
+    "DELAYS",
+    "Problem",
+    "linearised",
+    "once",
+    "pose",
+    "samples_of",
+    "with_slow_noise",
+]
 
 T = TypeVar("T")
 
-DELAY = 0.3
+AXIS_DELAY_SIGMA_S = 0.3
 """s, a plausible size of an axis' delay after its row."""
 DELAYS = slice(-3, None)
 """Places of the axes' delays in z."""
-SEEN = 0.01
+MIN_INFORMATION = 0.01
 """Share of a prior's information that data must add for its direction to be kept."""
 
 
@@ -75,7 +84,7 @@ class Problem:
     """(n,) 1/s of :mod:`magbridge.estimation.residual`: e per nT by which the true field exceeds the
     reference."""
     delay_jacobian: FloatArray
-    """(n, 3) ``-de/dz`` of the delays, in units of :data:`DELAY`."""
+    """(n, 3) ``-de/dz`` of the delays, in units of :data:`AXIS_DELAY_SIGMA_S`."""
     directions: FloatArray
     """(K, q) L; zero for slow noise and the delays."""
     centre: FloatArray
@@ -186,8 +195,8 @@ def linearised(
     """
     n = len(samples.field)
     e, g, reference_jacobian, reading = np.empty(n), np.empty((9, n)).T, np.empty(n), np.empty((n, 3))
-    for start in range(0, n, CHUNK):
-        rows = slice(start, start + CHUNK)
+    for start in range(0, n, DERIVATIVE_ROWS):
+        rows = slice(start, start + DERIVATIVE_ROWS)
         part = samples.part(rows)
         e[rows], slope = residuals(part, coefficients)
         # Errors in variables: move the reading along its own gradient until the residual vanishes
@@ -206,14 +215,14 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     e, g, reference_jacobian, reading = linearised(samples, coefficients)
     L, centre = prior(survey, calibration, samples, e, g)
     seen = np.zeros((L.shape[1],) * 2)
-    for start in range(0, n, CHUNK):
-        rows = slice(start, start + CHUNK)
+    for start in range(0, n, DERIVATIVE_ROWS):
+        rows = slice(start, start + DERIVATIVE_ROWS)
         J = derivatives(calibration, samples.part(rows), g[rows], L)
         seen += J.T @ J
     values, vectors = np.linalg.eigh(seen / noise_sigma(calibration, e) ** 2)
-    keep = values > SEEN
+    keep = values > MIN_INFORMATION
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
-    delay_jacobian = -DELAY * g[:, 6:] * interpolation_error(survey, reading.T).T
+    delay_jacobian = -AXIS_DELAY_SIGMA_S * g[:, 6:] * interpolation_error(survey, reading.T).T
     directions, centre = np.hstack([L @ V, np.zeros((len(L), 3))]), np.append(V.T @ centre, np.zeros(3))
     return Problem(
         survey, calibration, reading, e, g, reference_jacobian, delay_jacobian, directions, centre,

@@ -21,9 +21,9 @@ from magbridge.diagnose.compare.survey import Survey
 
 __all__ = ["Returns", "returns"]
 
-CELL = 250.0
+RETURN_CELL_M = 250.0
 """Side of the cells, m: crustal sources are seldom nearer, and a map's own grid is seldom finer."""
-AWAY = 900.0
+MIN_RETURN_TIME_S = 900.0
 """s after which passing a place again is a return."""
 SEPARABLE = 0.1
 """Least fraction from which on place and time are distinguished: at S/N 10 it gives log odds of 5 (150:1)."""
@@ -64,11 +64,11 @@ def returns(survey: Survey) -> Returns | None:
     """Return where and when the track of a survey returns; None for a log without positions."""
     if survey.place is None:
         return None
-    corner = np.floor(survey.place[:, :2] / CELL).astype(int)
+    corner = np.floor(survey.place[:, :2] / RETURN_CELL_M).astype(int)
     cell = np.unique(corner, axis=0, return_inverse=True)[1].ravel()
     order = np.lexsort((survey.time, cell))
     of, time = cell[order], survey.time[order]
-    again = (np.diff(of) == 0) & (np.diff(time) > AWAY)
+    again = (np.diff(of) == 0) & (np.diff(time) > MIN_RETURN_TIME_S)
     first, last = (
         np.searchsorted(of, np.arange(of[-1] + 1)),
         np.searchsorted(of, np.arange(of[-1] + 1), "right") - 1,

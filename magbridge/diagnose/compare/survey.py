@@ -13,18 +13,18 @@ from magbridge.arrays import BoolArray, FloatArray, IntArray
 from magbridge.columns import AGE
 from magbridge.diagnose.compare.dives import dives_of, eighths, held
 from magbridge.diagnose.compare.kinds import kinds_of
-from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.compare.past import MAX_LAG, Past
 from magbridge.errors import DataError
 from magbridge.field.geodesy import separation, wrap
 
-__all__ = ["FEWEST", "Channel", "Survey", "assemble"]
+__all__ = ["MIN_SURVEY_SAMPLES", "Channel", "Survey", "assemble"]
 
-FEWEST = 60
+MIN_SURVEY_SAMPLES = 60
 """Samples below which noise and effect cannot both be estimated."""
 SHORT = 0.25
 """Quantile of the time steps that is taken for the sampling interval: some gliders sample faster near
 the surface."""
-OURS = ("mag_", "truth_", AGE)
+INTERNAL_PREFIXES = ("mag_", "truth_", AGE)
 FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
 """Units of another magnetometer, which follows everything that this one does and so explains nothing."""
 NOT_TELEMETRY = {
@@ -62,7 +62,7 @@ class Survey:
     still: tuple[str, ...]
     """Telemetry that never changes."""
     steps: IntArray
-    """(n,) intervals since the previous sample; :data:`~.past.FAR` where that is too long ago to predict this
+    """(n,) intervals since the previous sample; :data:`~.past.MAX_LAG` if it is too long ago to predict this
     one's noise."""
     dive: IntArray
     """(n,) number of the dive, the unit of cross-validation."""
@@ -85,18 +85,18 @@ class Survey:
     @property
     def interval(self) -> float:
         """Sampling interval, s."""
-        known = self.steps[1:] < FAR
+        known = self.steps[1:] < MAX_LAG
         return float(np.median(np.diff(self.time)[known] / self.steps[1:][known])) if known.any() else 1.0
 
     @cached_property
     def slots(self) -> IntArray:
-        """(n,) intervals since the first sample; a gap counts at most :data:`~.past.FAR`."""
+        """(n,) intervals since the first sample; a gap counts at most :data:`~.past.MAX_LAG`."""
         return np.asarray(np.cumsum(self.steps) - self.steps[0])
 
     def follows(self, lost: int = 0) -> BoolArray:
         """(n,) the sample follows the previous one at the median interval, with at most `lost` missing."""
         apart = np.diff(self.time, prepend=np.inf)
-        return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < FAR))
+        return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < MAX_LAG))
 
     @property
     def parts(self) -> str:
@@ -146,8 +146,10 @@ def assemble(
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
     interval = float(np.nanquantile(step, SHORT))
-    steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), FAR), FAR).astype(np.int64)
-    steps[1:][table["learned"][1:] != table["learned"][:-1]] = FAR
+    steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), MAX_LAG), MAX_LAG).astype(
+        np.int64
+    )
+    steps[1:][table["learned"][1:] != table["learned"][:-1]] = MAX_LAG
     channels, still = _channels(table, units, needed)
     table = {name: column for name, column in table.items() if np.isfinite(column).any()}
     cycles = np.empty(0)
@@ -179,14 +181,14 @@ def _channels(
     """Return the telemetry that varies or is needed, and the names of the channels that never change."""
     channels, still = {}, []
     for name in sorted(table):
-        if name in NOT_TELEMETRY or name.startswith(OURS):
+        if name in NOT_TELEMETRY or name.startswith(INTERNAL_PREFIXES):
             continue
         values, unit = table[name], units.get(name, "")
         unit = "" if unit == "1" else unit
         if unit in FIELDS and name not in needed:
             continue
         known = values[np.isfinite(values)]
-        if known.size < FEWEST or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
+        if known.size < MIN_SURVEY_SAMPLES or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
             still.append(name)
             if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
                 channels[name] = Channel(held(values), unit, ())

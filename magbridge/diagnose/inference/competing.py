@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
-from magbridge.diagnose.inference.evidence import LEVEL, bayes_factor_threshold, score
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE, bayes_factor_threshold, score
 from magbridge.diagnose.inference.information import Information
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.pairs import AT_ONCE, pairs_of
@@ -19,7 +19,7 @@ from magbridge.diagnose.inference.state import State
 
 __all__ = ["CompetingHypothesis", "competing_hypotheses", "exchanged", "sets_of"]
 
-CHANGES = 6
+MAX_EXCHANGES = 6
 """Exchanges at most."""
 TRIED = 3
 """Alternatives tried for each place."""
@@ -51,7 +51,7 @@ def competing_hypotheses(
         behind = standing.evidence - s.evidence - cheaper
         if (
             behind < bayes_factor_threshold(standing.ratio)
-            and state.p_value(candidate, s.ratio, s.freedom) < LEVEL
+            and state.p_value(candidate, s.ratio, s.freedom) < FALSE_ALARM_RATE
         ):
             competing.append(CompetingHypothesis(candidate, behind))
     return tuple(sorted(competing, key=lambda hypothesis: hypothesis.behind))
@@ -86,7 +86,7 @@ def sets_of(
 def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
     """Replace one regressor or two by others, or drop one, while the evidence of the whole model grows."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
-    for _ in range(CHANGES):
+    for _ in range(MAX_EXCHANGES):
         best, better = state.value(pieces, base), (pieces, base)
         for new, at in _changes(state, pieces, base):
             changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in at)]

@@ -15,16 +15,16 @@ from magbridge.diagnose.compare.design_columns import Columns, places, side_by_s
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.noise import Noise
 
-__all__ = ["ALL", "Design", "in_threads", "normal", "pieces", "precomputed"]
+__all__ = ["ALL_PRODUCTS", "Design", "in_threads", "normal", "pieces", "precomputed"]
 
 S = TypeVar("S")
 T = TypeVar("T")
 
-CHUNK = 2048
+WHITENED_ROWS = 2048
 """Rows that are whitened at a time, few enough for the processor's cache."""
-KEPT = 12_500_000
+MAX_STORED_NUMBERS = 12_500_000
 """Most numbers of columns that are kept in memory: 100 MB."""
-ALL = ((slice(None), slice(None)),)
+ALL_PRODUCTS = ((slice(None), slice(None)),)
 """Products of every column with every other."""
 THREADS, LONG, POOL = 2, 32768, "diagnose"
 """Threads that share the work on a log, rows from which they are worth their while, and their name."""
@@ -32,7 +32,7 @@ THREADS, LONG, POOL = 2, 32768, "diagnose"
 
 def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
-    if n * sum(map(size_of, columns)) > KEPT:
+    if n * sum(map(size_of, columns)) > MAX_STORED_NUMBERS:
         return list(columns)
 
     def whole(column: Columns) -> FloatArray:
@@ -43,7 +43,7 @@ def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
 
 def pieces(n: int) -> list[slice]:
     """Return the pieces in which n rows are processed."""
-    return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+    return [slice(start, min(start + WHITENED_ROWS, n)) for start in range(0, n, WHITENED_ROWS)]
 
 
 class Design:
@@ -80,7 +80,7 @@ class Design:
 
 
 def normal(
-    X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL
+    X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL_PRODUCTS
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``X^T X`` (k, k) and ``X^T y`` (k,), X whitened if a noise is given.
 

@@ -34,17 +34,30 @@ from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, slices
 from magbridge.diagnose.compare.design_columns import Columns
 from magbridge.diagnose.inference.information import Information
-from magbridge.diagnose.inference.joint import FLAT
+from magbridge.diagnose.inference.joint import FLAT_PRECISION
 from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
 
 __all__ = [
-    "IDEAL", "LEVEL", "MOST_REMAINING", "ODDS", "REMNANT", "SMOOTH", "Score", "bayes_factor_threshold",
-    "certainty", "evidence_of", "log_bayes", "log_odds", "look_elsewhere_factors", "one_sided",
-    "regressor_error", "score",
+    "FALSE_ALARM_RATE",
+    "IDEAL",
+    "MOST_REMAINING",
+    "ODDS",
+    "REMNANT",
+    "SMOOTH",
+    "Score",
+    "bayes_factor_threshold",
+    "certainty",
+    "evidence_of",
+    "log_bayes",
+    "log_odds",
+    "look_elsewhere_factors",
+    "one_sided",
+    "regressor_error",
+    "score",
 ]  # fmt: skip
 
-LEVEL = 0.01
+FALSE_ALARM_RATE = 0.01
 """Family-wise false-alarm rate."""
 ODDS = float(np.log(20.0))
 """Log evidence by which a cause with an exact regressor must win to be named alone."""
@@ -88,7 +101,7 @@ def score(info: Information, at: slice, candidate: Candidate) -> Score:
         return Score(best.ratio, freedom, evidence, best.estimate, 1.0 / best.variance)
     ratio, values, V = float(statistic.ratio(b[:, None])[0]), statistic.values, statistic.vectors
     evidence = evidence_of(candidate, ratio, freedom)
-    return Score(ratio, freedom, evidence, V @ ((V.T @ b) / (values + 1.0)), np.full(len(b), FLAT))
+    return Score(ratio, freedom, evidence, V @ ((V.T @ b) / (values + 1.0)), np.full(len(b), FLAT_PRECISION))
 
 
 def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
@@ -133,7 +146,7 @@ def look_elsewhere_factors(
         members = [k for k, candidate in enumerate(candidates) if candidate.cause == cause]
         index, own = np.r_[*(at[k] for k in members)], slices([candidates[k] for k in members])
         free = [place for k, place in zip(members, own, strict=True) if candidates[k].spectra is None]
-        count = _independent(info.matrix[np.ix_(index, index)], free, LEVEL / len(causes))
+        count = _independent(info.matrix[np.ix_(index, index)], free, FALSE_ALARM_RATE / len(causes))
         # candidates of one common size count as independent: an upper bound
         count += len(members) - len(free)
         found[cause] = max(1.0, count) * max(candidates[k].look_elsewhere for k in members)

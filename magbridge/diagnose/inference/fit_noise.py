@@ -7,30 +7,30 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import gammaln
 
 from magbridge.arrays import FloatArray, IntArray
-from magbridge.diagnose.compare.derivatives import CHUNK
+from magbridge.diagnose.compare.derivatives import DERIVATIVE_ROWS
 from magbridge.diagnose.compare.past import Past
 from magbridge.diagnose.inference.noise import Noise, Predictors
 from magbridge.estimation.residual import robust_scale
 
-__all__ = ["BRIEFEST", "LONGEST", "TAILS", "autoregressive_order", "fit_noise"]
+__all__ = ["BRIEFEST", "MAX_NOISE_ORDER", "TAILS", "autoregressive_order", "fit_noise"]
 
 TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
-BLOCK = 150
+NOISE_BLOCK_SAMPLES = 150
 """Samples over which the noise's level is taken as constant."""
-ORDERS = (1, 2, 3, 5, 8, 13)
-LONGEST = ORDERS[-1]
+AR_ORDERS = (1, 2, 3, 5, 8, 13)
+MAX_NOISE_ORDER = AR_ORDERS[-1]
 GAUSSIAN = 1e5
 """Degrees of freedom from which on the tails are taken for Gaussian."""
-ROUNDS = 3
+NOISE_ITERATIONS = 3
 """Rounds of fitting autoregression, tails and level in turn, at most."""
 ALTERNATIONS = 6
 """Alternations between the weights of the samples and the level, at most."""
-SETTLED = 0.01
+MIN_GAIN = 0.01
 """Gain in log likelihood below which the fit has converged."""
 LOSS = 0.02
 """Largest order p as a share of the n samples that have a whole past: fitting p coefficients to them adds
 about p / n to the variance of the prediction."""
-NEAR = 0.9999
+MAX_PARTIAL_CORRELATION = 0.9999
 """Largest partial correlation."""
 TIMES = 20.0
 """Time constants of the noise that a log holds at least. Slower noise would swallow slow effects, and so few
@@ -54,13 +54,13 @@ def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
     n = len(residual)
     scale = robust_scale(residual) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
-    c = np.array([_product(r, slots, k) for k in range(LONGEST + 1)])
+    c = np.array([_product(r, slots, k) for k in range(MAX_NOISE_ORDER + 1)])
     a, v, costs = np.zeros(0), c[0] + 1e-300, {}
-    for p in range(1, LONGEST + 1):
-        kappa = np.clip((c[p] - a @ c[p - 1 : 0 : -1]) / v, -NEAR, NEAR)
+    for p in range(1, MAX_NOISE_ORDER + 1):
+        kappa = np.clip((c[p] - a @ c[p - 1 : 0 : -1]) / v, -MAX_PARTIAL_CORRELATION, MAX_PARTIAL_CORRELATION)
         a, v = np.append(a - kappa * a[::-1], kappa), v * (1.0 - kappa**2)
         costs[p] = n * np.log(v) + 2.0 * p
-    determined = [p for p in ORDERS if p <= LOSS * np.count_nonzero(slots[p:] - slots[:-p] == p)]
+    determined = [p for p in AR_ORDERS if p <= LOSS * np.count_nonzero(slots[p:] - slots[:-p] == p)]
     return min(determined, key=lambda p: costs[p], default=1)
 
 
@@ -105,7 +105,7 @@ def fit_noise(
         nu, scale = like.nu, like.scale
         weight = (nu + 1.0) / (nu + ((residual - lags @ like.ar) / scale) ** 2)
     v, log_likelihood = residual, -np.inf
-    for _ in range(ROUNDS):
+    for _ in range(NOISE_ITERATIONS):
         if whole.sum() > 2 * order:
             ar = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
         near_gaps = Predictors(past, ar)
@@ -116,7 +116,7 @@ def fit_noise(
         nu, scale, log_likelihood = _tails(v, count if blocks else np.array([n]), nu)
         log_likelihood += float(np.log(near_gaps.f)[past.pattern].sum())
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
-        if abs(log_likelihood - before) < SETTLED:
+        if abs(log_likelihood - before) < MIN_GAIN:
             break
     return Noise(ar, scale, nu, past, log_likelihood, v / scale)
 
@@ -125,8 +125,8 @@ def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArra
     """(p,) coefficients of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
     p = lags.shape[1]
     P, b = np.zeros((p, p)), np.zeros(p)
-    for start in range(0, len(r), CHUNK):
-        rows = slice(start, start + CHUNK)
+    for start in range(0, len(r), DERIVATIVE_ROWS):
+        rows = slice(start, start + DERIVATIVE_ROWS)
         X = np.ascontiguousarray(lags[rows])
         weighted = X * weight[rows, None]
         P += weighted.T @ X
@@ -136,7 +136,7 @@ def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArra
 
 def _counts(n: int) -> IntArray:
     """(blocks,) samples in each block."""
-    count = np.full(max(n // BLOCK, 1), BLOCK)
+    count = np.full(max(n // NOISE_BLOCK_SAMPLES, 1), NOISE_BLOCK_SAMPLES)
     count[-1] += n - count.sum()
     return count
 

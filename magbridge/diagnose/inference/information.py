@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.compare.design_columns import Columns, parts, places, side_by_side, together
 from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import ALL, normal
+from magbridge.diagnose.inference.design import ALL_PRODUCTS, normal
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.diagnose.inference.noise import Noise
 
@@ -89,7 +89,7 @@ def information(
         lambda rows: side_by_side([problem.calibration_jacobian[rows], *(X(rows) for X, _ in shared)]),
         noise.response(base.residual),
         noise,
-        asked if unshared else ALL,
+        asked if unshared else ALL_PRODUCTS,
     )
     pull = base.prior[:q] * (problem.centre - base.z)
     K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])

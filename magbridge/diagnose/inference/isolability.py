@@ -19,18 +19,19 @@ import numpy as np
 from scipy.special import chdtri, chndtrinc
 
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
-from magbridge.diagnose.inference.evidence import LEVEL, score
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE, score
 from magbridge.diagnose.inference.information import Information
 
 __all__ = [
-    "CONFOUNDED", "LARGEST", "Isolability", "Visible", "isolability", "likeness", "most_visible",
+    "CONFOUNDED", "MAX_PLAUSIBLE_MULTIPLE", "Isolability", "Visible", "isolability", "likeness",
+    "most_visible",
 ]  # fmt: skip
 
 CONFOUNDED = 0.85
 """Correlation beyond which two causes are listed as a pair: at this one they are distinguished in 95 of 100
 cases at signal-to-noise 6."""
 
-LARGEST = 50.0
+MAX_PLAUSIBLE_MULTIPLE = 50.0
 """Multiple of its plausible size from which on a cause is not plausible at all."""
 FREE = 1e-3
 """Prior precision, in units of a plausible size's, of coefficients that are each free; it is 1 for those of
@@ -92,7 +93,7 @@ def most_visible(candidates: Sequence[Candidate], info: Information, at: Sequenc
 def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: float) -> Visible:
     """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
     freedom = max(score(info, own, candidate).freedom, 1)
-    sure = float(np.sqrt(chndtrinc(chdtri(freedom, LEVEL / hypotheses), freedom, 0.05)))
+    sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))
     power = np.diag(info.matrix[own, own])
     if candidate.spectra is not None:  # what counts is what all of them do together
         x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
@@ -108,7 +109,7 @@ def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: fl
 
 def _plausible(size: float) -> float:
     """Return a size in units of a plausible one; infinite where nothing plausible would show."""
-    return size if size < LARGEST else float("inf")
+    return size if size < MAX_PLAUSIBLE_MULTIPLE else float("inf")
 
 
 def likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:

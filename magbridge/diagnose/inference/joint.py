@@ -22,13 +22,13 @@ from magbridge.diagnose.inference.noise import Noise
 from magbridge.diagnose.inference.statistic import Statistic
 from magbridge.estimation.residual import robust_scale
 
-__all__ = ["FLAT", "RIDGE", "Joint", "fit_joint", "volume_of"]
+__all__ = ["FLAT_PRECISION", "RIDGE", "Joint", "fit_joint", "volume_of"]
 
 RIDGE = 0.1
 """Prior precision of an effect, in units of a plausible size's: ten times that size is hardly believed, a
 hundred times not at all. Without it a nonlinearity and the calibration's scales can cancel each other and
 grow until they fit the noise."""
-FLAT = 1e-6
+FLAT_PRECISION = 1e-6
 """Prior precision of coefficients that are free, or of no known size."""
 
 
@@ -125,7 +125,7 @@ def fit_joint(
     if plain:
         first.append(_plain(X, problem.residual, prior, centre))
     for own, _ in common:
-        prior[own] = FLAT  # no size is known yet
+        prior[own] = FLAT_PRECISION  # no size is known yet
     tries = in_threads(len(problem), lambda c: (c, *at(c)), first)
     c, residual, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
     del tries  # of a month each is 15 MB

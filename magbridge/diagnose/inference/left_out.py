@@ -31,7 +31,7 @@ from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.design import Design, precomputed
 from magbridge.diagnose.inference.joint import Joint
 
-__all__ = ["LEVEL", "HeldOut", "Improvement", "held_out", "paired"]
+__all__ = ["CONFIDENCE_LEVEL", "HeldOut", "Improvement", "held_out", "paired"]
 
 FOLDS = 8
 """Folds at most: each costs one solution of the normal equations."""
@@ -39,7 +39,7 @@ DRAWS = 2000
 """Bootstrap samples: an end of the interval then scatters by 1.5 % of its width."""
 QUANTILES = (0.025, 0.975)
 """Quantiles of the bootstrap samples: the ends of the interval."""
-LEVEL = QUANTILES[1] - QUANTILES[0]
+CONFIDENCE_LEVEL = QUANTILES[1] - QUANTILES[0]
 """Confidence level of the interval."""
 
 
@@ -101,7 +101,7 @@ def held_out(
 
 @dataclass(frozen=True)
 class Improvement:
-    """RMS before and after (nT, held out), their ratio and its interval over dives (:data:`LEVEL`)."""
+    """Held-out RMS before and after, nT, their ratio, its interval over dives (:data:`CONFIDENCE_LEVEL`)."""
 
     before: float
     after: float

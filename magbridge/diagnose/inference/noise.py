@@ -32,7 +32,7 @@ from scipy.signal import lfilter, lfiltic
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.compare.design_columns import Columns
-from magbridge.diagnose.compare.past import FAR, Past
+from magbridge.diagnose.compare.past import MAX_LAG, Past
 
 __all__ = ["Noise", "Predictors", "autocovariance"]
 
@@ -179,7 +179,7 @@ class Predictors:
 
     def __init__(self, past: Past, ar: FloatArray) -> None:
         self.past, self.ar, lags = past, ar, past.lags
-        here = lags < FAR
+        here = lags < MAX_LAG
         C = autocovariance(ar, int(lags[here].max(initial=0)))
         self.a, self.f = np.zeros(lags.shape), np.ones(len(lags))
         own = np.arange(lags.shape[1])

@@ -39,7 +39,7 @@ __all__ = ["loosened"]
 Placed = tuple[Candidate, slice]
 """A candidate, and where its columns are."""
 
-SHARE = 0.05
+STEP_CELL_FRACTION = 0.05
 """Fraction of a grid cell by which a parameter is moved for its derivative."""
 
 
@@ -94,11 +94,11 @@ def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
         return
     values = [value for value, _ in piece.point.shape.values()]
     for k, cell in enumerate(piece.point.cells):
-        near = [value + SHARE * cell * (n == k) for n, value in enumerate(values)]
+        near = [value + STEP_CELL_FRACTION * cell * (n == k) for n, value in enumerate(values)]
         moved = piece.point.rebuild(*near)
 
         def columns(rows: slice, moved: Candidate = moved) -> FloatArray:
-            return np.asarray((moved.columns(rows) - piece.columns(rows)) @ b / SHARE)[:, None]
+            return np.asarray((moved.columns(rows) - piece.columns(rows)) @ b / STEP_CELL_FRACTION)[:, None]
 
         yield columns
 

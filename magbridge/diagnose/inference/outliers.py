@@ -13,7 +13,7 @@ from scipy.stats import chi2, rankdata
 
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.evidence import LEVEL, ODDS
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE, ODDS
 from magbridge.diagnose.inference.fit_noise import TAILS
 from magbridge.diagnose.inference.joint import Joint
 from magbridge.estimation.residual import robust_scale
@@ -42,7 +42,7 @@ class Outliers(NamedTuple):
     @property
     def isolated(self) -> bool:
         """Return True if the neighbouring samples are good, which excludes transients and ringing."""
-        return self.neighbours >= LEVEL and not self.lasting
+        return self.neighbours >= FALSE_ALARM_RATE and not self.lasting
 
 
 def outliers(fit: Joint, causes: int) -> Outliers | None:
@@ -60,7 +60,7 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
     ratio = 2.0 * (value - alone)
     p_value = min(1.0, causes * float(chi2.sf(ratio, 2)))
     rows = np.flatnonzero(member > 0.5)
-    if p_value >= LEVEL or not rows.size or rows.size > 0.05 * n:
+    if p_value >= FALSE_ALARM_RATE or not rows.size or rows.size > 0.05 * n:
         return None
     # through the noise's autoregression a wrong sample also spoils the innovations after it
     first = rows[np.insert(np.diff(rows) > 1, 0, True)]

@@ -23,7 +23,7 @@ from scipy.special import logsumexp
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes.candidates import Candidate, Group, slices
 from magbridge.diagnose.inference.evidence import (
-    LEVEL,
+    FALSE_ALARM_RATE,
     REMNANT,
     bayes_factor_threshold,
     log_bayes,
@@ -39,7 +39,7 @@ __all__ = ["AT_ONCE", "Pair", "pairs_of"]
 
 AT_ONCE = 4
 """Regressors of a model, beyond which no two are replaced at once: each two take a table of all pairs."""
-TOGETHER = 128
+PAIR_COLUMNS = 128
 """Columns of candidates that are scored at once: enough to outweigh a call, few enough for a core's cache."""
 
 
@@ -154,7 +154,7 @@ class _Table:
         """
         info = self.info
         for places in self._by_size(range(len(self.candidates))):
-            step = max(1, TOGETHER // self.candidates[places[0]].size)
+            step = max(1, PAIR_COLUMNS // self.candidates[places[0]].size)
             for some in (places[n : n + step] for n in range(0, len(places), step)):
                 own = np.array([np.r_[self.at[n]] for n in some])
                 rows, prior = info.matrix[own], np.array([np.diag(self.scores[n].prior) for n in some])
@@ -218,7 +218,7 @@ class _Table:
             ratio, freedom = self.ratio[other, n], self.freedom[other, n]
             if one.spectra is not None:
                 ratio, freedom = alone.ratio, alone.freedom
-            if self.state.p_value(one, float(ratio), int(freedom)) >= LEVEL:
+            if self.state.p_value(one, float(ratio), int(freedom)) >= FALSE_ALARM_RATE:
                 return False
             ratios.append(ratio)
         same = len({candidate.cause for candidate in self.standing}) == 1

@@ -31,7 +31,7 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.compare.problem import Problem, with_slow_noise
 from magbridge.diagnose.inference.competing import CompetingHypothesis, exchanged, sets_of
 from magbridge.diagnose.inference.evidence import (
-    LEVEL,
+    FALSE_ALARM_RATE,
     MOST_REMAINING,
     REMNANT,
     SMOOTH,
@@ -50,7 +50,7 @@ from magbridge.diagnose.inference.state import State
 
 __all__ = ["Outcome", "beside_slow_noise", "search"]
 
-MOST = 6
+MAX_REGRESSORS = 6
 """Regressors found one by one in a log, at most."""
 
 
@@ -138,7 +138,7 @@ def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Cand
     model: list[Candidate] = []
     base, found = state.null, first
     strengths: dict[str, float] = {}
-    for _ in range(MOST):
+    for _ in range(MAX_REGRESSORS):
         # a candidate of one common size is a whole: neither extended nor added to its cause's others
         whole = {c.cause for c in model if c.spectra is not None}
         grown = [
@@ -174,7 +174,9 @@ def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float)
     def remnant(cause: str) -> float:
         return max((size for other, size in strengths.items() if other != cause), default=0.0)
 
-    significant = [h for h in found if h.p_value < LEVEL and h.signal_to_noise >= remnant(h.candidate.cause)]
+    significant = [
+        h for h in found if h.p_value < FALSE_ALARM_RATE and h.signal_to_noise >= remnant(h.candidate.cause)
+    ]
     as_likely = [h for h in significant if h.evidence >= significant[0].evidence - regressor_error(ratio)]
     return min(as_likely, key=lambda h: h.candidate.size, default=None)
 
@@ -206,7 +208,9 @@ def _backward_elimination(
         without = state.fit(others) if others else state.null
         ratio = max(0.0, 2.0 * (base.log_likelihood - without.log_likelihood))
         p_value = state.p_value(own, ratio, own.freedom)
-        if p_value >= LEVEL or (others and state.value(others, without) > state.value(model, base)):
+        if p_value >= FALSE_ALARM_RATE or (
+            others and state.value(others, without) > state.value(model, base)
+        ):
             model, base, chosen, k = others, without, [], 0
             continue
         c, at = base.coefficients, sum(candidate.size for candidate in model[:k])

@@ -34,7 +34,7 @@ from magbridge.diagnose.inference.noise import Noise
 
 __all__ = ["State"]
 
-SHORT_LIST = 9
+JOINTLY_FITTED_CAUSES = 9
 """Causes that are fitted jointly in a round."""
 
 
@@ -134,7 +134,7 @@ class State:
                 under.setdefault(group, []).append(best)
         listed = sorted(under.values(), key=lambda won: -max(best.score.evidence for best in won))
         # the largest, which take longest, first: then the threads end together
-        tried = sorted(listed[:SHORT_LIST], key=lambda won: -self.candidates[won[0].place].size)
+        tried = sorted(listed[:JOINTLY_FITTED_CAUSES], key=lambda won: -self.candidates[won[0].place].size)
         found = in_threads(len(self.problem), partial(self._joint, model, base), tried)
         return sorted(found, key=lambda h: -h.evidence)
 

@@ -26,7 +26,7 @@ from magbridge.arrays import FloatArray
 
 __all__ = ["Ridge", "Statistic"]
 
-SIZES = np.logspace(-7, 2, 64)
+PRIOR_SIZES = np.logspace(-7, 2, 64)
 """Values of g that are tried, in units of the widths squared."""
 VISIBLE = 1e-3
 """Information, as a fraction of the prior's own, below which a direction is ignored."""
@@ -81,9 +81,9 @@ class Statistic:
 
     def _evidences(self, k: int, b: FloatArray) -> FloatArray:
         """(sizes, m) log evidence with the k-th spectrum."""
-        y2, grown = (self.vectors[k].T @ b) ** 2, SIZES[:, None] * self.values[k]
+        y2, grown = (self.vectors[k].T @ b) ** 2, PRIOR_SIZES[:, None] * self.values[k]
         return np.asarray(
-            0.5 * ((SIZES[:, None] / (1.0 + grown)) @ y2 - np.log1p(grown).sum(axis=1)[:, None])
+            0.5 * ((PRIOR_SIZES[:, None] / (1.0 + grown)) @ y2 - np.log1p(grown).sum(axis=1)[:, None])
         )
 
     def best(self, b: FloatArray) -> Ridge:
@@ -92,7 +92,7 @@ class Statistic:
         tables = [self._evidences(k, b[:, None])[:, 0] for k in range(len(self.spectra))]
         k = int(np.argmax([table.max() for table in tables]))
         at = int(np.argmax(tables[k]))
-        values, g = self.values[k], SIZES[at]
+        values, g = self.values[k], PRIOR_SIZES[at]
         c = g * (self.vectors[k].T @ b) / (1.0 + g * values)
         price = 0.5 * float(c @ c / g + np.log1p(g * values).sum())
         ratio, norm = 2.0 * float(tables[k][at]), float(np.sqrt(c**2 @ values))

@@ -15,19 +15,20 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.pictures import literal
 
 __all__ = [
-    "AFTER", "BEFORE", "DOTS", "FAINT", "INK", "SMALL", "canvas", "clock", "curves", "ends", "png", "rolling",
+    "AFTER", "BEFORE", "DOT_STYLE", "FAINT", "INK", "MIN_FONT_PT", "canvas", "clock", "curves", "ends", "png",
+    "rolling",
     "sides", "thin",
 ]  # fmt: skip
 
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 """Vermilion and blue, which any eye distinguishes; in grey print the second is darker."""
-SMALL = 9.0
+MIN_FONT_PT = 9.0
 """pt, the smallest letters."""
-POINTS = 4000
+CURVE_POINTS = 4000
 """Points drawn per curve; more only make the page heavy."""
-COLOURS = 256
+PALETTE_SIZE = 256
 """Colours of a plot: as many as fit a byte for each pixel, which needs two fifths of the memory."""
-DOTS: dict[str, Any] = {
+DOT_STYLE: dict[str, Any] = {
     "marker": "s",
     "markersize": 1.6,
     "markeredgewidth": 0,
@@ -35,7 +36,7 @@ DOTS: dict[str, Any] = {
     "alpha": 0.5,
 }
 """Samples as squares of whole pixels: round dots look the same, but their edges double the picture."""
-GAP = 20.0
+LINE_GAP_STEPS = 20.0
 """Median steps between two points beyond which no line joins them."""
 STRETCHES = 150
 """Stretches of a log whose means make a line through its dots."""
@@ -47,9 +48,9 @@ def canvas(width: float, height: float, rows: int = 1, columns: int = 1, **more:
     axes = figure.subplots(rows, columns, squeeze=False, **more)
     for axis in axes.flat:
         axis.spines[["top", "right"]].set_visible(False)
-        axis.tick_params(colors=INK, labelsize=SMALL)
-        axis.xaxis.label.set_size(SMALL + 0.5)
-        axis.yaxis.label.set_size(SMALL + 0.5)
+        axis.tick_params(colors=INK, labelsize=MIN_FONT_PT)
+        axis.xaxis.label.set_size(MIN_FONT_PT + 0.5)
+        axis.yaxis.label.set_size(MIN_FONT_PT + 0.5)
         axis.grid(color="#e6e9ec", linewidth=0.6)
         axis.set_axisbelow(True)
     return figure, axes
@@ -60,14 +61,14 @@ def png(figure: Figure) -> str:
     literal(figure)
     drawn, packed = BytesIO(), BytesIO()
     figure.savefig(drawn, format="png")
-    picture = Image.open(drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    picture = Image.open(drawn).convert("RGB").quantize(PALETTE_SIZE, dither=Image.Dither.NONE)
     picture.save(packed, "PNG", optimize=True)
     return b64encode(packed.getvalue()).decode()
 
 
 def thin(n: int) -> slice:
     """Return which of n points to draw."""
-    return slice(None, None, max(1, n // POINTS))
+    return slice(None, None, max(1, n // CURVE_POINTS))
 
 
 def clock(diagnosis: Diagnosis) -> tuple[float, str]:
@@ -80,7 +81,7 @@ def curves(diagnosis: Diagnosis, *values: FloatArray) -> tuple[FloatArray, ...]:
     t, part = diagnosis.problem.survey.time, thin(len(diagnosis.problem))
     since = (t[part] - t[0]) / clock(diagnosis)[0]
     steps = np.diff(since)
-    gap = np.append(steps > GAP * np.median(steps), False)
+    gap = np.append(steps > LINE_GAP_STEPS * np.median(steps), False)
     return since, *(np.where(gap, np.nan, value[part]) for value in values)
 
 

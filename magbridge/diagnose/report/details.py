@@ -19,7 +19,7 @@ from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.seen import Memory, Seen
 from magbridge.diagnose.unexplained.leftover import Leftover
 from magbridge.diagnose.words import (
-    MANY,
+    MAX_UNFOLDED_NUMBERS,
     bold,
     chance,
     figure,
@@ -37,7 +37,7 @@ from magbridge.wording import counted
 
 __all__ = ["described", "found", "nameless", "remaining", "visible"]
 
-KINDS = {
+KIND_SENTENCES = {
     "switching": "Something that switches or comes and goes",
     "drift": "A slow drift",
     "tone": "A tone",
@@ -45,9 +45,9 @@ KINDS = {
     "broadband": "Something broadband",
 }
 """Descriptions of the unexplained part, as the subject of a sentence."""
-WORSE = 1.3
+MIN_WORSE_RATIO = 1.3
 """Multiple of the fitted residual from which the one held out is remarked on."""
-ALIKE = 4
+MAX_SIMILAR_CAUSES = 4
 """Causes listed that look like one."""
 
 
@@ -81,10 +81,9 @@ def found(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
 
 def _when(time: FloatArray) -> str:
     """Return the first of times (k,), s since 1970, as a clock shows them."""
-    first = f"the first {MANY} " if time.size > MANY else ""
-    return (
-        f"{first}at {', '.join(f'{datetime.fromtimestamp(float(t), UTC):%H:%M:%S}' for t in time[:MANY])} UTC"
-    )
+    first = f"the first {MAX_UNFOLDED_NUMBERS} " if time.size > MAX_UNFOLDED_NUMBERS else ""
+    shown = time[:MAX_UNFOLDED_NUMBERS].tolist()
+    return f"{first}at {', '.join(f'{datetime.fromtimestamp(t, UTC):%H:%M:%S}' for t in shown)} UTC"
 
 
 def _outliers(time: FloatArray) -> str:
@@ -95,7 +94,7 @@ def _outliers(time: FloatArray) -> str:
 
 def _folded(terms: str, numbers: Mapping[str, Mapping[str, Any]]) -> str:
     """Fold a table that is too long to be read line by line: its terms count together, few by themselves."""
-    if len(numbers) <= MANY:
+    if len(numbers) <= MAX_UNFOLDED_NUMBERS:
         return terms
     clear = sum(abs(one["value"]) > 2.0 * one["sigma"] for one in numbers.values() if one["sigma"])
     return (
@@ -136,7 +135,7 @@ def remaining(diagnosis: Diagnosis, causes: Mapping[str, Cause]) -> list[str]:
         f"<p>The level shifts at {counted(len(shifts), 'place')}, {_when(shifts)}.</p>" * bool(len(shifts)),
         how,
         table(("difference between measured and reference", "RMS"), lines),
-        worse * ((budget.after or 0.0) > WORSE * budget.fitted),
+        worse * ((budget.after or 0.0) > MIN_WORSE_RATIO * budget.fitted),
     ]
 
 
@@ -167,7 +166,7 @@ def described(rest: Leftover, residual: Memory) -> str:
     own = f"{number(rest.size)} nT RMS of its own, " if rest.size is not None else ""
     lasts = f", which last {number(residual.correlation_time, 2)} s" * residual.lasts
     all_of_it = f"{own}in all {number(residual.rms)} nT RMS{lasts}"
-    return f"<b>{KINDS[rest.kind]}</b>{period} is left ({size}{goes}; {all_of_it})"
+    return f"<b>{KIND_SENTENCES[rest.kind]}</b>{period} is left ({size}{goes}; {all_of_it})"
 
 
 def _noise(diagnosis: Diagnosis) -> str:
@@ -219,5 +218,10 @@ def visible(diagnosis: Diagnosis) -> list[str]:
 def _alike(diagnosis: Diagnosis, one: Visible) -> str:
     """List the causes that look most like `one`, the likest first."""
     alike = [(b if a is one else a, rho) for a, b, rho in diagnosis.isolability.pairs if one is a or one is b]
-    few = [f"{escape(label(other.cause, other.channel))} {100 * rho:.0f} %" for other, rho in alike[:ALIKE]]
-    return ", ".join(few) + (f", and {len(alike) - ALIKE} more" if len(alike) > ALIKE else "")
+    few = [
+        f"{escape(label(other.cause, other.channel))} {100 * rho:.0f} %"
+        for other, rho in alike[:MAX_SIMILAR_CAUSES]
+    ]
+    return ", ".join(few) + (
+        f", and {len(alike) - MAX_SIMILAR_CAUSES} more" if len(alike) > MAX_SIMILAR_CAUSES else ""
+    )

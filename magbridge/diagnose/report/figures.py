@@ -13,10 +13,10 @@ from magbridge.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.canvas import (
     AFTER,
-    DOTS,
+    DOT_STYLE,
     FAINT,
     INK,
-    SMALL,
+    MIN_FONT_PT,
     canvas,
     clock,
     curves,
@@ -32,9 +32,16 @@ __all__ = ["channels", "measured", "spectrum", "terms", "track"]
 
 CHANNELS, BINS = 12, 20
 """Channels drawn, and bins of each."""
-MANY = 60
+MAX_SEPARATED_DIVES = 60
 """Dives from which on no lines separate them."""
-PERIODS = {10.0: "10 s", 60.0: "1 min", 600.0: "10 min", 3600.0: "1 h", 43200.0: "12 h", 864e3: "10 days"}
+PERIOD_LABELS = {
+    10.0: "10 s",
+    60.0: "1 min",
+    600.0: "10 min",
+    3600.0: "1 h",
+    43200.0: "12 h",
+    864e3: "10 days",
+}
 """s, periods that the spectrum names."""
 
 
@@ -51,18 +58,18 @@ def measured(diagnosis: Diagnosis) -> str:
         axis.fill_between(
             since, -stated, stated, color=FAINT, alpha=0.25, linewidth=0, label="±2 sigma as calibrated"
         )
-        axis.plot(since, residual[part], color=colour, label=name, **DOTS)
+        axis.plot(since, residual[part], color=colour, label=name, **DOT_STYLE)
         axis.plot(*rolling(diagnosis, residual), color=INK, linewidth=1.0, label="its running mean")
         axis.axhline(0.0, color=INK, linewidth=0.5)
-        for start in starts if starts.size < MANY else ():
+        for start in starts if starts.size < MAX_SEPARATED_DIVES else ():
             axis.axvline((start - survey.time[0]) / unit, color=FAINT, linewidth=0.4)
         axis.set_ylim(limits)
         axis.set_ylabel("nT")
         axis.legend(  # above the axes, where it covers nothing
-            fontsize=SMALL, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), markerscale=5,
+            fontsize=MIN_FONT_PT, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), markerscale=5,
             ncols=3, borderaxespad=0.0,
         )  # fmt: skip
-    lines = f"; grey lines separate the {survey.parts}" if starts.size < MANY else ""
+    lines = f"; grey lines separate the {survey.parts}" if starts.size < MAX_SEPARATED_DIVES else ""
     axes[-1, 0].set_xlabel(f"{hours} since the start{lines}")
     return png(figure)
 
@@ -77,17 +84,19 @@ def terms(diagnosis: Diagnosis) -> str | None:
         added = finding.field(diagnosis.problem)
         alone = added + diagnosis.residual / diagnosis.problem.reference_jacobian
         since, line = curves(diagnosis, added)
-        axis.plot(since, alone[part], color=FAINT, label="all else removed", **DOTS)
+        axis.plot(since, alone[part], color=FAINT, label="all else removed", **DOT_STYLE)
         axis.plot(*rolling(diagnosis, alone), color=INK, linewidth=0.9, label="its running mean")
         axis.plot(since, line, color=AFTER, linewidth=1.4, label="what the cause adds")
         axis.axhline(0.0, color=INK, linewidth=0.5)
         low, high = ends(alone, low=0.1, high=0.1)
         axis.set_ylim(min(low, 0.0), max(high, 0.0))
         axis.set_ylabel("nT")
-        axis.set_title(label(*finding.candidate.group), fontsize=SMALL + 1.0, loc="left")
+        axis.set_title(label(*finding.candidate.group), fontsize=MIN_FONT_PT + 1.0, loc="left")
     axes[-1, 0].set_xlabel(f"{clock(diagnosis)[1]} since the start")
     handles = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*handles, fontsize=SMALL, frameon=False, loc="outside upper left", ncols=3, markerscale=5)
+    figure.legend(
+        *handles, fontsize=MIN_FONT_PT, frameon=False, loc="outside upper left", ncols=3, markerscale=5
+    )
     return png(figure)
 
 
@@ -118,11 +127,11 @@ def spectrum(diagnosis: Diagnosis) -> str:
     axis.loglog(f, model, "--", color=INK, linewidth=1.2, label="noise model")
     axis.yaxis.set_major_formatter(LogFormatter())
     axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.6)))
-    axis.tick_params(which="minor", labelsize=SMALL, colors=INK)
+    axis.tick_params(which="minor", labelsize=MIN_FONT_PT, colors=INK)
     axis.set_xlabel("frequency (Hz)")
     axis.set_ylabel("amplitude density (nT/√Hz)")
     _periods(axis)
-    figure.legend(fontsize=SMALL, frameon=False, loc="outside upper left", ncols=3)
+    figure.legend(fontsize=MIN_FONT_PT, frameon=False, loc="outside upper left", ncols=3)
     return png(figure)
 
 
@@ -138,12 +147,12 @@ def _periods(axis: Any) -> None:
     """Name periods above an axis of frequencies, as people think of them."""
     low, high = axis.get_xlim()
     above = axis.secondary_xaxis("top")
-    seen = {1.0 / period: name for period, name in PERIODS.items() if low < 1.0 / period < high}
+    seen = {1.0 / period: name for period, name in PERIOD_LABELS.items() if low < 1.0 / period < high}
     above.xaxis.set_major_locator(FixedLocator(list(seen)))
     above.set_xticks(list(seen), list(seen.values()))
     above.xaxis.set_minor_locator(NullLocator())
     above.xaxis.set_minor_formatter(NullFormatter())
-    above.tick_params(labelsize=SMALL, colors=INK)
+    above.tick_params(labelsize=MIN_FONT_PT, colors=INK)
     above.spines["top"].set_visible(False)
 
 
@@ -180,7 +189,7 @@ def channels(diagnosis: Diagnosis) -> str:
         low, high = np.nanquantile(seen, [0.02, 0.98])
         axes[0, 0].set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
         handles = axes[0, 0].get_legend_handles_labels()
-        figure.legend(*handles, fontsize=SMALL, frameon=False, loc="outside upper left", ncols=2)
+        figure.legend(*handles, fontsize=MIN_FONT_PT, frameon=False, loc="outside upper left", ncols=2)
     return png(figure)
 
 
@@ -222,13 +231,13 @@ def track(diagnosis: Diagnosis) -> str | None:
         axis.set_facecolor("#f2f4f6")  # so that white, no difference, is seen
         axis.set_aspect("equal", adjustable="box")
         axis.xaxis.set_major_locator(MaxNLocator(4))
-        axis.set_title(title, fontsize=SMALL + 1.0, loc="left")
+        axis.set_title(title, fontsize=MIN_FONT_PT + 1.0, loc="left")
     for axis in axes[-1]:
         axis.set_xlabel(f"east ({unit})")
     for axis in axes[:, 0]:
         axis.set_ylabel(f"north ({unit})")
     assert dots is not None
     bar = figure.colorbar(dots, ax=axes, shrink=0.8, extend="both")
-    bar.set_label("measured − reference (nT)", size=SMALL)
-    bar.ax.tick_params(labelsize=SMALL)
+    bar.set_label("measured − reference (nT)", size=MIN_FONT_PT)
+    bar.ax.tick_params(labelsize=MIN_FONT_PT)
     return png(figure)

@@ -17,12 +17,12 @@ from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.design import normal
-from magbridge.diagnose.inference.left_out import LEVEL, Improvement
+from magbridge.diagnose.inference.left_out import CONFIDENCE_LEVEL, Improvement
 from magbridge.diagnose.seen import Seen
 
-__all__ = ["FORMAT", "findings", "findings_json", "parameters"]
+__all__ = ["FINDINGS_FORMAT", "findings", "findings_json", "parameters"]
 
-FORMAT = 3
+FINDINGS_FORMAT = 3
 """Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""
 
 
@@ -35,7 +35,7 @@ def findings(
         listed.append(_wrong(diagnosis))
     rest = diagnosis.unexplained
     return {
-        "format": FORMAT,
+        "format": FINDINGS_FORMAT,
         "verdict": diagnosis.verdict,
         "rms_before_nT": _round(diagnosis.improvement.before),
         "rms_after_nT": _round(diagnosis.improvement.after),
@@ -226,7 +226,7 @@ def _improvement(improvement: Improvement, diagnosis: Diagnosis) -> dict[str, An
     return {
         "rms_ratio": _round(improvement.ratio),
         "interval": [_round(improvement.interval[0]), _round(improvement.interval[1])],
-        "level": LEVEL,
+        "level": CONFIDENCE_LEVEL,
         "held_out": diagnosis.problem.survey.parts,
     }
 

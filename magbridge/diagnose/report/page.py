@@ -27,10 +27,10 @@ from magbridge.files import atomic_path, new_folder
 
 __all__ = ["improved", "late", "report_html", "write"]
 
-STYLE = Path(__file__).with_name("style.css")
+REPORT_STYLE = Path(__file__).with_name("style.css")
 MARKS: dict[Fitness, str] = {"yes": "good", "conditional": "doubt", "no": "none"}
 """How an answer is marked."""
-LONG = 7200.0
+MIN_HOURS_S = 7200.0
 """s, from which on a length is given in hours."""
 
 
@@ -79,7 +79,7 @@ def report_html(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequ
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{title}</title>'
-        f"<style>\n{STYLE.read_text('utf-8')}</style></head><body><main>{content}</main></body></html>\n"
+        f"<style>\n{REPORT_STYLE.read_text('utf-8')}</style></head><body><main>{content}</main></body></html>\n"
     )
 
 
@@ -89,7 +89,7 @@ def _log(diagnosis: Diagnosis) -> str:
     new = survey.time[~survey.learned]
     first, last = (datetime.fromtimestamp(float(t), UTC).strftime("%Y-%m-%d %H:%M") for t in new[[0, -1]])
     span = float(new[-1] - new[0])
-    length = f"{span / 3600.0:.1f} h" if span > LONG else f"{span / 60.0:.0f} min"
+    length = f"{span / 3600.0:.1f} h" if span > MIN_HOURS_S else f"{span / 60.0:.0f} min"
     dives = f" in {np.unique(survey.dive[~survey.learned]).size} dives" * (survey.parts == "dives")
     training = f", beside {int(survey.learned.sum())} that the calibration was fitted to"
     return (

@@ -23,7 +23,7 @@ from magbridge.diagnose.compare.design_columns import Columns, places, times
 from magbridge.diagnose.compare.problem import Problem
 from magbridge.diagnose.inference.competing import CompetingHypothesis
 from magbridge.diagnose.inference.design import Design, in_threads, precomputed
-from magbridge.diagnose.inference.evidence import LEVEL
+from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE
 from magbridge.diagnose.inference.fit_noise import fit_noise
 from magbridge.diagnose.inference.information import information
 from magbridge.diagnose.inference.joint import Joint
@@ -34,7 +34,7 @@ from magbridge.estimation.residual import rms, robust_scale
 
 __all__ = ["Leftover", "leftover"]
 
-SHORT_LIST = 3
+COMPARED_DESCRIPTIONS = 3
 """Number of the best descriptions under each noise that are then weighed by the full likelihood."""
 TURNS = 6
 """Alternations between fitting a curve and fitting its direction."""
@@ -146,7 +146,7 @@ def leftover(
     found: list[tuple[Fitted, Scored]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
-        tried = sorted(scored, key=lambda one: -one.evidence)[:SHORT_LIST]
+        tried = sorted(scored, key=lambda one: -one.evidence)[:COMPARED_DESCRIPTIONS]
         weighed = in_threads(len(problem), lambda one: _weighed(problem, columns, fit, one), tried)
         found += zip(weighed, tried, strict=True)
     likeliest, (_, kind, one, best, _) = max(found, key=lambda entry: entry[0].evidence)
@@ -156,7 +156,7 @@ def leftover(
     count = sum(len(one.widths) for one in listed)
     p_value = min(1.0, count * tail)
     # stricter where no cause was found: the distribution is only asymptotic
-    if p_value >= (LEVEL if model else 0.1 * LEVEL):
+    if p_value >= (FALSE_ALARM_RATE if model else 0.1 * FALSE_ALARM_RATE):
         return None
     every = slice(0, len(problem))
     shape = times(likeliest.columns, every, likeliest.fit.coefficients[-len(best.variance) :])

@@ -46,13 +46,13 @@ WINDOW, FINER = 6, 8
 """Lengths in a window, and how many times finer than 1 / L frequencies are."""
 LEAST_RATIO = 6.0
 """Likelihood ratio below which a place is ignored."""
-MOST = 12
+MAX_PACKETS = 12
 """Most packets in a log."""
-APART = 2.5
+PACKET_SEPARATION = 2.5
 """Lengths in time, and bandwidths in frequency, within which two places hold the same packet."""
-REACH = 5.0
+PACKET_CUTOFF_LENGTHS = 5.0
 """Lengths from its moment beyond which a packet is cut off."""
-SPARSE = 8
+MAX_SAMPLE_INTERVALS = 8
 """Intervals per sample; a log with fewer samples than one in so many is not searched for packets."""
 DURATIONS, BRIEFEST, SLOWEST = 12, 8.0, 0.125
 """Durations of a passage: how many are tried, the shortest in samples, the longest as a share of the log."""
@@ -77,18 +77,18 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
     survey = problem.survey
     n = int(survey.slots[-1]) + 1
     lengths = SHORTEST * 2 ** np.arange(max(int(np.log2(max(LONGEST * n / SHORTEST, 0.5))) + 1, 0))
-    if n > SPARSE * len(survey) or not lengths.size:
+    if n > MAX_SAMPLE_INTERVALS * len(survey) or not lengths.size:
         return None
     listed = in_threads(n, partial(_places, problem, fit), lengths.tolist())
     length, frequency, moment, ratio, log_prior = np.concatenate(listed, axis=1)
     log_prior = log_prior - np.log(len(lengths))
     found: list[int] = []
     price = 0.0
-    while len(found) < MOST and ratio.any():
+    while len(found) < MAX_PACKETS and ratio.any():
         k = int(np.argmax(ratio))
         band = np.hypot(1.0 / length, 1.0 / length[k]) / (2.0 * np.pi)
-        same = np.abs(frequency - frequency[k]) < APART * band
-        same &= np.abs(moment - moment[k]) < APART * np.hypot(length, length[k])
+        same = np.abs(frequency - frequency[k]) < PACKET_SEPARATION * band
+        same &= np.abs(moment - moment[k]) < PACKET_SEPARATION * np.hypot(length, length[k])
         near = float(np.log(np.sum(np.exp(log_prior[same] + 0.5 * (ratio[same] - ratio[k])))))
         if log_bayes(ratio[k], 2) + near <= 0.0:
             break
@@ -108,7 +108,7 @@ def _columns(
     since = (problem.survey.slots[rows, None] - moment) / length
     turns = 2.0 * np.pi * length * frequency * since
     # divided by the root of the length, so that in white noise all packets have about one norm
-    under = np.where(np.abs(since) < REACH, np.exp(-0.5 * since**2), 0.0) / np.sqrt(length)
+    under = np.where(np.abs(since) < PACKET_CUTOFF_LENGTHS, np.exp(-0.5 * since**2), 0.0) / np.sqrt(length)
     waves = np.stack([under * np.cos(turns), under * np.sin(turns)], axis=2)
     return np.asarray(problem.reference_jacobian[rows, None] * waves.reshape(len(waves), -1))
 

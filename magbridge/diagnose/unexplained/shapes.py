@@ -27,7 +27,7 @@ BEND = 32
 """Order of the polynomials of an axis' response: fine enough for a converter's coarsest steps."""
 PLAYS = (0.3, 0.8)
 """Widths of the play operators that describe a channel's past, in half ranges."""
-LAGS = (0.0, 300.0, 1000.0, 3000.0, 10000.0)
+HULL_LAGS_S = (0.0, 300.0, 1000.0, 3000.0, 10000.0)
 """s, lags with which the inside of a hull follows: heat, water that seeps, stress that relaxes."""
 SWAYS = (0.0, 10.0, 30.0)
 """s, lags with which something loose, or on a line, follows a turn."""
@@ -125,8 +125,8 @@ def hysteresis(values: FloatArray) -> Columns:
 
 
 def delayed(time: FloatArray, values: FloatArray) -> Columns:
-    """Return a channel (n,) with each of :data:`LAGS`: mixed, they make any smooth response to it."""
-    return _centred(_followed(time, _scaled(values)(slice(None))[None], LAGS), len(values))
+    """Return a channel (n,) with each of :data:`HULL_LAGS_S`: mixed, they make any smooth response to it."""
+    return _centred(_followed(time, _scaled(values)(slice(None))[None], HULL_LAGS_S), len(values))
 
 
 def swings(time: FloatArray, rate: FloatArray) -> Columns:
@@ -140,7 +140,7 @@ def swings(time: FloatArray, rate: FloatArray) -> Columns:
 def near_surface(time: FloatArray, depth: FloatArray) -> Columns:
     """Return effects of the surface that fade with depth (n,), m, and, with lags, afterwards."""
     near = np.exp(-(depth - depth.min()) / np.array(SKIN)[:, None])
-    return _centred(_followed(time, near, LAGS[:-1]), len(depth))
+    return _centred(_followed(time, near, HULL_LAGS_S[:-1]), len(depth))
 
 
 def repeated(problem: Problem) -> Columns:

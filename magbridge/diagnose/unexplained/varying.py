@@ -14,7 +14,7 @@ from magbridge.diagnose.unexplained.descriptions import Description
 
 __all__ = ["varying"]
 
-MOST = 6
+MAX_TESTED_COEFFICIENTS = 6
 """Coefficients of a cause of which this is asked: with more, it takes almost any shape."""
 
 
@@ -36,7 +36,7 @@ def varying(
     look_elsewhere : mapping
         Cause -> number of independent hypotheses behind it.
     """
-    if candidate.spectra is not None or candidate.size > MOST:
+    if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
         return None
     values = _followed(problem, candidate.channel)
     low = np.array([[value.min()] for value in values])
