@@ -20,7 +20,7 @@ from magbridge.sensors.rm3100 import Bus, Rm3100
 
 __all__ = ["BusPort", "open_bus", "sensor_port"]
 
-ADDRESS = re.compile(r"i2c:(\d+):(0x[0-9a-fA-F]{1,2}|\d{1,3})|spi:(\d+)\.(\d+)")
+BUS_ADDRESS = re.compile(r"i2c:(\d+):(0x[0-9a-fA-F]{1,2}|\d{1,3})|spi:(\d+)\.(\d+)")
 SPI_HZ = 1_000_000
 MAX_ERRORS = 5
 """Errors of the bus in a row after which the port is lost, and opened again."""
@@ -73,7 +73,7 @@ class SpiBus:
 
 def open_bus(name: str) -> Any:
     """Return the bus of ``i2c:BUS:ADDRESS`` or ``spi:BUS.DEVICE``; OSError: it cannot be opened."""
-    match = ADDRESS.fullmatch(name)
+    match = BUS_ADDRESS.fullmatch(name)
     assert match is not None
     if match[1]:
         return I2cBus(int(match[1]), int(match[2], 0))
@@ -192,7 +192,7 @@ def sensor_port(config: Config) -> SerialPort | BusPort:
     sensor, source = config.sensor, str(config.path)
     if not sensor.port.startswith(("i2c:", "spi:")):
         return serial_line(sensor.port, sensor.baudrate, source, "sensor.port")
-    if not ADDRESS.fullmatch(sensor.port):
+    if not BUS_ADDRESS.fullmatch(sensor.port):
         expected = "expected i2c:BUS:ADDRESS such as i2c:1:0x20, or spi:BUS.DEVICE such as spi:0.0"
         raise ConfigError(source, "sensor.port", f"{expected}, got {sensor.port!r}")
     driver = open_driver(sensor.driver, sensor.options, config.path)

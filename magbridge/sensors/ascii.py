@@ -54,7 +54,7 @@ MAX_LINE_BYTES = 512
 """Longest line, in bytes."""
 MAX_ASCII_COUNT = 2**31
 """A count that no converter reaches and no message can hold."""
-MAX_COUNT = 2**63
+MAX_DEVICE_COUNT = 2**63
 """Larger than any count that an instrument can hold."""
 ENCODING = "latin-1"
 NAMED_VALUE = re.compile(rb'(\w+)"?\s*:\s*"?([-+.\w]+)')
@@ -91,7 +91,7 @@ def _measured(text: bytes) -> float:
 
 def _count(text: bytes) -> int:
     number = int(text)
-    if abs(number) > MAX_COUNT:
+    if abs(number) > MAX_DEVICE_COUNT:
         raise ValueError
     return number
 
