@@ -75,12 +75,21 @@ class Kernel:
         return np.asarray(self.table @ (phi[self.first] * phi[self.second]))
 
     def sums_of_one(self, phi: list[float]) -> list[float]:
-        """Return the same 81 sums for one sample's regressors; NaN where a regressor is too large."""
+        """Return the same 81 sums for one sample's regressors; NaN where a regressor is too large.
+
+        Products are rounded and then added one after the other: a matrix product would round in an order
+        that depends on the processor, and a replay on another computer must give the same bytes.
+        """
         if max(phi) > MAX_REGRESSOR or min(phi) < -MAX_REGRESSOR:
             return [nan] * TABLE_SUMS
-        psi = [phi[i] * phi[j] for i, j in self.pairs]
-        sums: list[float] = self.table.dot(np.fromiter(psi, float, len(psi))).tolist()
+        psi = np.fromiter([phi[i] * phi[j] for i, j in self.pairs], float, len(self.pairs))
+        sums: list[float] = np.add.reduce(self.products * psi[:, None], axis=0).tolist()
         return sums
+
+    @cached_property
+    def products(self) -> FloatArray:
+        """(q, 81) `table` with a row for each product."""
+        return np.ascontiguousarray(self.table.T)
 
     @cached_property
     def pairs(self) -> list[tuple[int, int]]:

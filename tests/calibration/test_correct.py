@@ -15,6 +15,7 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.dipole import Dipole
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.forward import forward
+from magbridge.calibration.kernel import TABLE_SUMS
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, identity
 from magbridge.calibration.terms import Effect, Polynomial, PositionTerm, full_order
 from magbridge.errors import CalibrationError
@@ -140,6 +141,18 @@ def test_one_by_one_and_all_at_once_agree_to_1e_12(
         np.testing.assert_allclose(one.field, batch.vector[i], rtol=0.0, atol=1e-12 * F_0)
         np.testing.assert_allclose(one.total_field_sigma, batch.sigma[i], rtol=1e-12)
         np.testing.assert_allclose(one.field_sigma, batch.vector_sigma[i], rtol=1e-12)
+
+
+def test_one_sample_is_summed_in_one_order_on_any_processor() -> None:
+    """A replay on another computer gives the same bytes: no matrix product, no fused operation."""
+    kernel = random_calibration(5).kernel
+    rng = np.random.default_rng(5)
+    for position in rng.uniform(-1.2, 1.4, (20, 2)).tolist():
+        phi = kernel.monomials(position, 1.0)
+        expected = [0.0] * TABLE_SUMS
+        for row, (i, j) in zip(kernel.table.T.tolist(), kernel.pairs, strict=True):
+            expected = [total + share * (phi[i] * phi[j]) for total, share in zip(expected, row, strict=True)]
+        assert kernel.sums_of_one(phi) == expected
 
 
 def test_what_is_missing_is_flagged_and_never_a_number() -> None:
