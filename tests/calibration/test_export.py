@@ -150,5 +150,5 @@ def test_autopilots_correct_as_we_do(current: bool) -> None:
 def test_what_an_autopilot_cannot_hold_is_said(tmp_path: Path) -> None:
     save(made(*TWO), tmp_path / "cal.json")
     lost = " ".join(compass_of(load(tmp_path / "cal.json")).lost)
-    assert "what moves with battpos, ballast: up to " in lost
+    assert "the field of battpos, ballast: up to " in lost
     assert "the boresight, a turn of 6.1 deg" in lost
