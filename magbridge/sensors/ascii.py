@@ -57,7 +57,7 @@ MAX_ASCII_COUNT = 2**31
 MAX_DEVICE_COUNT = 2**63
 """Larger than any count that an instrument can hold."""
 ENCODING = "latin-1"
-NAMED_VALUE = re.compile(rb'(\w+)"?\s*:\s*"?([-+.\w]+)')
+NAMED_VALUE_PATTERN = re.compile(rb'(\w+)"?\s*:\s*"?([-+.\w]+)')
 """A key with its number, both with or without quotation marks."""
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
 Positive = Annotated[float, Meta(gt=0)]
@@ -209,7 +209,7 @@ class Ascii:
         """Return the cells of a line, in the order of the columns."""
         if not self._keys:
             return text.split(self._separator)
-        found = dict(NAMED_VALUE.findall(text))
+        found = dict(NAMED_VALUE_PATTERN.findall(text))
         return [found[key] for key in self._keys if key in found]
 
     def _reading(self, line: bytes) -> Reading:
