@@ -117,7 +117,7 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         press(panel.get_by_role("button", name="Forget"), page.get_by_text("learning: all forgotten"))
         panel.get_by_text(re.compile("the first$")).wait_for()
         browser.close()
-    texts = {text.partition(" what")[0] for text in rig.texts()}
+    texts = {text.partition(" learned calibration")[0] for text in rig.texts()}
     announced = (
         "MB_LEARN_CMD = 1, set by 255:190",
         "accepted:",
