@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+from msgspec import inspect
 
 from magbridge.errors import ConfigError
+from magbridge.wording import nearest_name
 
 __all__ = ["Table", "check_entries", "convert", "load_toml"]
 
@@ -70,6 +72,32 @@ def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
         sentence, _, where = str(error).partition(" - at ")
         keys = where.strip("`").removeprefix("$").lstrip(".")
         if match := re.match(r"Object (contains unknown|missing required) field `([^`]*)`", sentence):
+            sentence = "missing key"
+            if "unknown" in match[1]:
+                near = nearest_name(match[2], _valid_keys(kind, keys))
+                sentence = "unknown key" + (f"; did you mean {near}?" if near else "")
             keys = f"{keys}.{match[2]}".lstrip(".")
-            sentence = "unknown key" if "unknown" in match[1] else "missing key"
         raise ConfigError(path, f"{prefix}{keys}".rstrip("."), sentence[0].lower() + sentence[1:]) from error
+
+
+def _valid_keys(kind: Any, keys: str) -> list[str]:
+    """Return the keys of the table at the dotted path `keys` in `kind`; empty if it is no struct."""
+    tables = [inspect.type_info(kind)]
+    for key in [*filter(None, re.split(r"\.|(?=\[)", keys)), None]:
+        tables = [
+            part for one in tables for part in (one.types if isinstance(one, inspect.UnionType) else [one])
+        ]
+        if key is None:
+            break
+        tables = [inner for one in tables for inner in _entries(one, key)]
+    fields = [field for one in tables if isinstance(one, inspect.StructType) for field in one.fields]
+    return [field.encode_name for field in fields]
+
+
+def _entries(table: inspect.Type, key: str) -> list[inspect.Type]:
+    """Return the types that the entry `key` of a table may have."""
+    if isinstance(table, inspect.StructType):
+        return [field.type for field in table.fields if field.encode_name == key]
+    if isinstance(table, inspect.DictType):
+        return [table.value_type]
+    return [table.item_type] if isinstance(table, inspect.ListType) else []

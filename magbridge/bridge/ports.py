@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import re
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import serial
@@ -23,6 +27,8 @@ TEXT_LINE = re.compile(rb"[^\r\n]+[\r\n]")
 TEXT_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?")
 SHOWN = 60
 """Characters shown of a line that is not understood."""
+BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
+"""Error numbers of a port that another program has opened for itself."""
 MIN_RECOGNISED = 3
 """Readings or frames by which a sender is known."""
 
@@ -74,7 +80,7 @@ def listen(
         try:
             data = _read(device, baudrate, seconds)
         except (serial.SerialException, OSError, ValueError) as error:
-            return Recognised("", access(device) or f"cannot be opened: {error}"), None, b""
+            return Recognised("", _refusal(device, error)), None, b""
         recognised = recognise(data, seconds)
         if recognised.who not in {"", "bytes", "text"}:
             return recognised, baudrate, data
@@ -83,6 +89,26 @@ def listen(
         if "://" in device:  # a network's line has no baud rate of ours
             break
     return best, at, came
+
+
+def _refusal(device: str, error: Exception) -> str:
+    """Return why a port cannot be opened, and what to do."""
+    if getattr(error, "errno", None) in BUSY:
+        users = _users(device)
+        return f"busy: {users or 'another program'} has opened it; stop that program, then repeat"
+    there = "://" in device or Path(device).exists()
+    return (access(device) if there else "") or f"cannot be opened: {error}"
+
+
+def _users(device: str) -> str:
+    """Return the programs that hold a device open, as far as this user may see them; empty if unknown."""
+    found, real = set(), Path(device).resolve()
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        with suppress(OSError):  # another user's process, or one that has ended
+            process = link.parts[2]
+            if link.readlink() == real and int(process) != os.getpid():
+                found.add(f"{Path('/proc', process, 'comm').read_text().strip()} (process {process})")
+    return " and ".join(sorted(found))
 
 
 def _read(device: str, baudrate: int, seconds: float) -> bytes:

@@ -115,11 +115,12 @@ def _check(config: Path) -> None:
 
     found = findings(config)
     for one in found:
-        complain(one.text)
-    fatal = sum(one.fatal for one in found)
-    if fatal:
-        raise WrongUse(f"{config}: the bridge would not start: {counted(fatal, 'problem')} to fix")
-    print(f"{config}: the bridge would start" + (", with the warnings above" if found else ""))
+        complain(f"{'error' if one.fatal else 'warning'}: {one.text}")
+    errors = sum(one.fatal for one in found)
+    warnings = counted(len(found) - errors, "warning")
+    if errors:
+        raise WrongUse(f"{config}: the bridge would not start: {counted(errors, 'error')}, {warnings}")
+    print(f"{config}: the bridge would start, {warnings}")
 
 
 @command("replay FILE... [--config bridge.toml] [OPTIONS]")

@@ -11,7 +11,8 @@ from magbridge.config import Telemetry
 from magbridge.errors import ConfigError
 from magbridge.link.clock import VehicleClock
 from magbridge.mavlink import Message, Spec, spec
-from magbridge.mavlink.messages import MESSAGE_IDS, Field, nearest_name, split_index
+from magbridge.mavlink.messages import MESSAGE_IDS, Field, split_index
+from magbridge.wording import nearest_name
 
 __all__ = ["TelemetryMap", "own_time", "sent_us"]
 

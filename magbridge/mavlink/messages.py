@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from difflib import get_close_matches
 from functools import cache
 from struct import Struct
 from typing import Any, Final, TypeVar
@@ -24,7 +22,6 @@ __all__ = [
     "Spec",
     "by_id",
     "east_e7",
-    "nearest_name",
     "spec",
     "split_index",
 ]  # fmt: skip
@@ -152,13 +149,6 @@ class Spec:
 def spec(message: int | str) -> Spec:
     """Return the layout of a message, by id or name; KeyError: no such message."""
     return Spec(message) if isinstance(message, int) else spec(MESSAGE_IDS[message])
-
-
-def nearest_name(name: str, valid: Iterable[str]) -> str:
-    """Return the valid name that is nearest to one that does not exist; empty if none is near."""
-    by_lower = {candidate.lower(): candidate for candidate in valid}
-    found = get_close_matches(name.lower(), by_lower, n=1)
-    return by_lower[found[0]] if found else ""
 
 
 def by_id(**of: T) -> dict[int, T]:

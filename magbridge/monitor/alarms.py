@@ -62,6 +62,10 @@ class Alarms:
         while len(self._alarms) > MAX_ALARMS:
             del self._alarms[next(iter(self._alarms))]
 
+    def withdraw(self, key: str) -> None:
+        """Remove an alarm whose text was only the beginning of a longer one."""
+        self._alarms.pop(key, None)
+
     def acknowledge(self, key: str | None = None) -> None:
         """Note that somebody has seen an alarm; without a key, all of them."""
         for one in self._alarms.values():

@@ -219,7 +219,9 @@ class State:
         number, piece = message["id"], message["chunk_seq"]
         statustext = Text(now, message["severity"], message["text"])
         if piece and self._piece == (number, piece - 1):
-            statustext = statustext._replace(text=self.texts.popleft().text + statustext.text)
+            beginning = self.texts.popleft().text
+            self.alarms.withdraw(f"text: {beginning}")
+            statustext = statustext._replace(text=beginning + statustext.text)
         self._piece = number, piece
         self.texts.appendleft(statustext)
         if statustext.severity <= MAV_SEVERITY.ERROR:

@@ -113,7 +113,7 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Meaning of each column: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-``
     for a column to ignore; ``*`` at the end for any number of further ones."""
     keys: list[str] = msgspec.field(default_factory=list)
-    """For lines of JSON, or of text such as ``x:"14"``: the key of each column, in the order of `columns`."""
+    """For lines of JSON, or of text such as ``x:"14"``: the key of each column, in the order of columns."""
     separator: str = ""
     """Between columns; empty for any number of blanks or tabs."""
     prefix: str = ""
@@ -141,6 +141,9 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Commands to send once the port is open."""
 
     def __post_init__(self) -> None:
+        for key in ("scale", "range", "time_modulo", "rate"):
+            if not isfinite(getattr(self, key) or 0.0):
+                raise ValueError(f"{key}: expected a finite number, got {getattr(self, key)}")
         named = self.columns[:-1] if self.columns[-1:] == ["*"] else self.columns
         for name in named:
             if name not in ("x", "y", "z", "-", *COLUMN_READERS):

@@ -67,8 +67,8 @@ def test_everything_is_said_at_once(config: Path) -> None:
     )
     texts = "\n".join(lines(config, fatal=True))
     for words in (
-        "sensor.baudrat: unknown key",
-        "lgo: unknown key",
+        "sensor.baudrat: unknown key; did you mean baudrate?",
+        "lgo: unknown key; did you mean log?",
         "sensor.options.rate: invalid enum value 21",
         "sensor.options.speed: unknown key",
         "link.url: expected udpin, udpout",

@@ -95,6 +95,24 @@ def test_ports_as_a_command(command: Command) -> None:
     assert "cannot be opened" in second["said"] or "may not be opened" in second["said"]
 
 
+def test_a_busy_port_names_the_program_that_holds_it() -> None:
+    master, slave = pty.openpty()
+    code = (
+        "import serial, sys; line = serial.Serial(sys.argv[1], exclusive=True); print(1, flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, os.ttyname(slave)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        recognised, _, _ = listen(os.ttyname(slave), (9600,), 0.1)
+        other.communicate(b"\n")
+    os.close(master)
+    os.close(slave)
+    assert recognised.text.startswith("busy: ")
+    assert f"(process {other.pid})" in recognised.text
+
+
 @pytest.mark.parametrize("driver", driver_names())
 def test_every_option_of_a_driver_is_told(driver: str, command: Command) -> None:
     output = command("drivers", driver).out
@@ -138,13 +156,13 @@ def test_init_says_what_is_left_to_fill_in(command: Command) -> None:
     output = command("init", "--driver", "digitizer")
     assert "sensor.options.sensitivity: missing key" in output.err
     assert "FILL IN" in Path("bridge.toml").read_text()
-    assert "1 problem to fix" in command("run", "--check", "--config", "bridge.toml", code=2).err
+    assert "1 error, " in command("run", "--check", "--config", "bridge.toml", code=2).err
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("init --driver none", "expected one of ascii, digitizer, hmr2300, twinleaf"),
+        ("init --driver none", "expected one of ascii, digitizer, hmr2300, rm3100, twinleaf"),
         ("init --option x", "expected NAME=VALUE"),
         ("init --calibration none.json", "none.json: cannot be read"),
         ("drivers none", "expected one of ascii"),

@@ -306,6 +306,13 @@ def test_a_long_text_is_put_together(air: Air) -> None:
     assert air.state.texts[1].time == NOW + 2
 
 
+def test_a_long_text_is_one_alarm(air: Air) -> None:
+    air.field(NOW)
+    for piece, text in enumerate(("a" * 50, "b" * 50, "c")):
+        air.feed(NOW + piece, "STATUSTEXT", severity=3, text=text, id=9, chunk_seq=piece)
+    assert [alarm.text for alarm in air.state.alarms] == ["a" * 50 + "b" * 50 + "c"]
+
+
 class Exchange:
     """The station and a real bridge, whose first answers for the parameters of `lose` are lost."""
 

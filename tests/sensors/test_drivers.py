@@ -162,6 +162,8 @@ def test_the_table_keeps_its_word(name: str) -> None:
         ("ascii", {"columns": ["x", "y"]}, "sensor.options: columns: x, y and z must be among them"),
         ("ascii", {"columns": ["x", "y", "z", "q"]}, "sensor.options: columns: 'q' is none of x y z"),
         ("ascii", {"columns": ["x", "y", "z", "z"]}, "sensor.options: columns: 'z' stands there twice"),
+        ("ascii", {"scale": float("inf")}, "sensor.options: scale: expected a finite number, got inf"),
+        ("ascii", {"range": float("inf")}, "sensor.options: range: expected a finite number, got inf"),
         ("ascii", {"checksum": "crc8"}, "sensor.options.checksum: invalid enum value 'crc8'"),
     ],
 )
