@@ -1,0 +1,533 @@
+"""Fit the compensation of a scalar magnetometer.
+
+Notes
+-----
+The model of :mod:`magbridge.calibration.scalar` is linear, its coefficients Gaussian with widths w_b for each
+block of columns (permanent, induced, eddy, lag, each channel), and the noise is white plus a sum of
+Ornstein-Uhlenbeck processes, plus, where the reference lacks the crustal field, a Matern process of
+smoothness 5/2 in time. The marginal likelihood times the hyperparameters' prior is maximised (Rasmussen &
+Williams 2006, section 5.4):
+
+1. For given noise, the steady-state Kalman filter of the slow processes whitens reading and columns. For a
+   stationary process it is a linear filter with the zeros ``eig(A)`` and the poles ``eig(A - K C)``, applied
+   as second-order sections, so that the cost is linear in the samples.
+2. With the normal equations of the whitened columns, the evidence and its gradient by the log widths are
+   algebra of the columns' number alone.
+
+No channel is selected: the evidence of one log does not distinguish channels that help in another log from
+those that harm, but a physical width does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_discrete_are
+from scipy.optimize import minimize
+from scipy.signal import sosfilt, zpk2sos
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.scalar import (
+    LEVEL_SIGMA_NT,
+    PLATFORM_TERMS,
+    ScalarChannel,
+    ScalarNoise,
+    ScalarSensor,
+    ScalarSeries,
+    scalar_design,
+)
+from magbridge.errors import CalibrationError
+
+__all__ = ["ScalarFit", "adapt_to_log", "fit_scalar"]
+
+WIDTH_CENTRES_NT = {"permanent": 1000.0, "induced": 100.0, "eddy": 10.0}
+"""Centres of the priors of the widths, nT (eddy: nT s)."""
+LOG_WIDTH_SIGMA = 1.0
+CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA = 10.0, 1.5
+"""nT a swing and its log's 1-sigma: centre of a channel's width."""
+LAG_SIGMA_S = 0.5
+"""s, 1-sigma of the lag between scalar and vector."""
+TIME_CONSTANTS_S = (1.5, 5.0, 15.0, 50.0, 150.0, 500.0, 1500.0, 5000.0)
+"""s, of the Ornstein-Uhlenbeck processes."""
+FIT_INTERVAL_S = 0.5
+"""s, shortest interval of the samples that are fitted; faster logs are averaged to it."""
+GAP_INTERVALS = 3.0
+"""Intervals without a sample after which the whitening filter begins again."""
+MIN_SAMPLES = 100
+NOISE_ITERATIONS = 15
+LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2.0, 0.7
+"""Log of nT: centre and 1-sigma of white noise and fastest process, 1-sigma of the change to the next."""
+LOG_CRUST_CENTRES, LOG_CRUST_SPREAD = np.log(np.array([30.0, 30.0])), 1.5
+"""Log of the crustal field's amplitude (nT) and time scale (s) along the track, where no map is known."""
+OUTLIER_SIGMA, OUTLIER_PAD = 8.0, 4
+"""Whitened residual beyond which a sample is left out of the fit, and samples left out on either side."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScalarFit:
+    """A fitted compensation and what it did to the samples."""
+
+    sensor: ScalarSensor
+    rms_before: float
+    """nT, RMS of reading minus reference about its mean."""
+    rms_after: float
+    """nT, RMS of compensated minus reference about its mean, on the fitted samples."""
+    contribution: dict[str, float]
+    """nT, standard deviation of what each block adds to the fitted samples."""
+    left_out: int
+    """Samples that were left out as outliers."""
+    log_evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Columns that share a prior width."""
+
+    name: str
+    columns: slice
+    centre: float
+    spread: float
+    """1-sigma of the log of the width; 0: the width is fixed."""
+
+
+def fit_scalar(
+    series: ScalarSeries,
+    names: tuple[str, ...],
+    *,
+    column: str = "scalar",
+    directions_from: str = "vector",
+    units: tuple[str, ...] = (),
+    lag: float | None = None,
+    map_known: bool = False,
+    use: BoolArray | None = None,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> ScalarFit:
+    """Fit the compensation of a scalar magnetometer.
+
+    Parameters
+    ----------
+    series : ScalarSeries
+        All samples; those with a missing value are left out.
+    names : tuple of str
+        The channels' columns.
+    column, directions_from : str
+        Names that the result carries.
+    units : tuple of str
+        The channels' units.
+    lag : float, optional
+        s, of the scalar after the vector; estimated if not given.
+    map_known : bool
+        True if the reference includes the crustal field. Otherwise the crustal field along the track is a
+        Matern process.
+    use : (n,) array of bool, optional
+        Samples that may be fitted, for example those at which a witness agrees.
+    lever : tuple of 3 float
+        m, that the reference already includes; the result carries it.
+
+    Raises
+    ------
+    CalibrationError
+        Too few samples, or a constant direction.
+    """
+    valid = (
+        np.isfinite(series.scalar) & np.isfinite(series.vector).all(axis=1) & np.isfinite(series.reference)
+    )
+    valid &= np.isfinite(series.channels).all(axis=1)
+    if use is not None:
+        valid &= use
+    if valid.sum() < MIN_SAMPLES:
+        raise CalibrationError(
+            f"{column}: expected at least {MIN_SAMPLES} samples with vector, reference and "
+            f"{', '.join(names) or 'no telemetry'}, got {int(valid.sum())}"
+        )
+    channels = tuple(
+        _channel(name, series.channels[valid, k], units[k] if units else "") for k, name in enumerate(names)
+    )
+    reference_field = float(np.median(series.reference[valid]))
+    problem = _Problem.build(series, valid, channels, reference_field, lag)
+    kept = np.ones(len(problem.target), bool)
+    start: FloatArray | None = None
+    for _ in range(3):  # outliers of one pass are left out in the next
+        state = problem.part(kept).optimise(map_known=map_known, start=start)
+        outliers = problem.outliers(state, kept)
+        if not outliers.any():
+            break
+        kept &= ~outliers
+        start = state.log_noise
+    return _result(problem, kept, state, series, column, directions_from, channels, lever)
+
+
+def _channel(name: str, values: FloatArray, unit: str) -> ScalarChannel:
+    low, high = np.quantile(values, [0.02, 0.98]).tolist()
+    return ScalarChannel(
+        name, float(np.median(values)), (low, high), float(values.min()), float(values.max()), unit
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Hyperparameters and posterior."""
+
+    log_noise: FloatArray
+    widths: FloatArray
+    mean: FloatArray
+    covariance: FloatArray
+    value: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Target and columns at the fit's interval."""
+
+    time: FloatArray
+    target: FloatArray
+    """(n,), nT, reading minus reference."""
+    design: FloatArray
+    """(n, m), all columns, levels last."""
+    blocks: tuple[_Block, ...]
+    segments: tuple[slice, ...]
+    interval: float
+    cycles: tuple[int | None, ...]
+    averaged: int
+
+    @staticmethod
+    def build(
+        series: ScalarSeries,
+        valid: BoolArray,
+        channels: tuple[ScalarChannel, ...],
+        reference_field: float,
+        lag: float | None,
+    ) -> _Problem:
+        """Average to the fit's interval and form the columns."""
+        step = float(np.median(np.diff(series.time)))
+        many = max(1, int(FIT_INTERVAL_S / step + 1e-6))
+        design = scalar_design(series, channels, reference_field)
+        target = series.scalar - series.reference
+        lag_column = PLATFORM_TERMS - 1
+        if lag is not None:
+            target = target + lag * design[:, lag_column]
+            design[:, lag_column] = 0.0
+        numbers, cycles = _power_cycles(series.power_cycle[valid])
+        levels = np.zeros((len(target), len(cycles)))
+        levels[np.flatnonzero(valid), numbers] = 1.0
+        table = np.column_stack([series.time, target, design, levels])[valid]
+        # Average neighbours, never across a gap.
+        piece = np.cumsum(np.diff(table[:, 0], prepend=table[0, 0]) > GAP_INTERVALS * step)
+        first = np.flatnonzero(np.diff(piece, prepend=-1))
+        group = piece * len(table) + (np.arange(len(table)) - first[piece]) // many
+        _, starts, counts = np.unique(group, return_index=True, return_counts=True)
+        table = np.add.reduceat(table, starts, axis=0) / counts[:, None]
+        blocks = _blocks(channels, len(cycles), fixed_lag=lag is not None)
+        return _Problem(
+            table[:, 0], table[:, 1], table[:, 2:], blocks, _segments(table[:, 0], many * step), many * step,
+            cycles, many,
+        )  # fmt: skip
+
+    def part(self, kept: BoolArray) -> _Problem:
+        """Return the problem of some samples."""
+        time = self.time[kept]
+        return _Problem(
+            time, self.target[kept], self.design[kept], self.blocks, _segments(time, self.interval),
+            self.interval, self.cycles, self.averaged,
+        )  # fmt: skip
+
+    def whiten(self, log_noise: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Return the whitened target and design, and the log of the noise's determinant."""
+        sections, variance = _whitening_filter(log_noise, self.interval)
+        both = np.column_stack([self.target, self.design])
+        for segment in self.segments:
+            both[segment] = sosfilt(sections, both[segment], axis=0)
+        both /= np.sqrt(variance)
+        return both[:, 0], both[:, 1:], len(both) * float(np.log(variance))
+
+    def level_sigma(self, log_noise: FloatArray) -> float:
+        """Return the prior's 1-sigma of a level, nT: the slow processes begin at zero in the filter."""
+        return float(np.hypot(LEVEL_SIGMA_NT, np.sqrt(_slow_variances(log_noise).sum())))
+
+    def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> tuple[_State, FloatArray]:
+        """Return the posterior given the hyperparameters, and the optimal log widths."""
+        y, X, log_det = self.whiten(log_noise)
+        chosen = _choose_widths(X.T @ X, X.T @ y, self.blocks, self.level_sigma(log_noise), log_widths)
+        value = chosen.value + 0.5 * (float(y @ y) + log_det) - _log_noise_prior(log_noise)
+        return _State(log_noise, chosen.sigma, chosen.mean, chosen.covariance, value), chosen.log_widths
+
+    def optimise(self, *, map_known: bool, start: FloatArray | None) -> _State:
+        """Maximise the evidence over the noise, and for each noise over the widths."""
+        warm = np.log([block.centre for block in self.blocks if block.spread > 0.0])
+        best: _State | None = None
+
+        def cost(log_noise: FloatArray) -> float:
+            nonlocal warm, best
+            state, widths = self.posterior(log_noise, warm)
+            if best is None or state.value < best.value:
+                best, warm = state, widths
+            return state.value
+
+        if start is None:
+            rough = np.diff(self.target) / np.sqrt(2.0)
+            white = np.log(max(1.4826 * float(np.median(np.abs(rough))), 1e-3))
+            start = np.full(1 + len(TIME_CONSTANTS_S), LOG_PROCESS_CENTRE)
+            start[0] = white
+            if not map_known:
+                start = np.append(start, LOG_CRUST_CENTRES)
+        minimize(
+            cost, start, method="L-BFGS-B", bounds=[(-9.0, 9.0)] * len(start),
+            options={"maxiter": NOISE_ITERATIONS, "ftol": 1e-6, "eps": 1e-3},
+        )  # fmt: skip
+        assert best is not None
+        return best
+
+    def outliers(self, state: _State, kept: BoolArray) -> BoolArray:
+        """Return samples (n,) whose whitened residual is far too large, with their neighbours."""
+        part = self.part(kept)
+        y, X, _ = part.whiten(state.log_noise)
+        residual = y - X @ state.mean
+        scale = 1.4826 * float(np.median(np.abs(residual)))
+        large = np.abs(residual) > OUTLIER_SIGMA * max(scale, 1.0)
+        padded = np.convolve(large, np.ones(2 * OUTLIER_PAD + 1), mode="same") > 0.5
+        out = np.zeros(len(kept), bool)
+        out[np.flatnonzero(kept)[padded]] = True
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _Widths:
+    """Optimal prior widths and the posterior that they give."""
+
+    log_widths: FloatArray
+    sigma: FloatArray
+    """(m,), 1-sigma of each coefficient's prior."""
+    mean: FloatArray
+    covariance: FloatArray
+    value: float
+    """Negative log of evidence times prior, without the terms that do not depend on the widths."""
+
+
+def _choose_widths(
+    gram: FloatArray, moment: FloatArray, blocks: tuple[_Block, ...], level: float, log_widths: FloatArray
+) -> _Widths:
+    """Maximise the evidence over the widths, given the normal equations of whitened columns.
+
+    Notes
+    -----
+    With ``B = 1 + W X^T X W``, W the prior's 1-sigma on the diagonal, the posterior mean is ``W B^-1 W X^T
+    y`` and its covariance ``W B^-1 W``; the log evidence is ``-(log|B| + y^T y - y^T X mean) / 2``, and its
+    derivative by the log of a block's width the block's sum of ``(mean^2 + variance) / w^2 - 1``.
+    """
+    free = [block for block in blocks if block.spread > 0.0]
+    centres = np.log([block.centre for block in free])
+    spreads = np.array([block.spread for block in free])
+    size = len(moment)
+
+    def evaluate(logs: FloatArray) -> tuple[float, FloatArray, _Widths]:
+        sigma = _prior_sigma(blocks, np.exp(logs), level, size)
+        factor = cho_factor(np.eye(size) + sigma[:, None] * gram * sigma, lower=True)
+        mean = sigma * cho_solve(factor, sigma * moment)
+        covariance = sigma[:, None] * cho_solve(factor, np.eye(size)) * sigma
+        value = float(np.log(np.diag(factor[0])).sum()) - 0.5 * float(moment @ mean)
+        value += 0.5 * float((((logs - centres) / spreads) ** 2).sum())
+        slope = (logs - centres) / spreads**2
+        second = (mean**2 + np.diag(covariance)) / sigma**2 - 1.0
+        for index, block in enumerate(free):
+            slope[index] -= second[block.columns].sum()
+        return value, slope, _Widths(logs, sigma, mean, covariance, value)
+
+    found = minimize(
+        lambda logs: evaluate(logs)[:2], log_widths, jac=True, method="L-BFGS-B", options={"maxiter": 60}
+    )
+    return evaluate(found.x)[2]
+
+
+def adapt_to_log(sensor: ScalarSensor, channels: FloatArray) -> ScalarSensor:
+    """Return the sensor with the priors of its channels for one swing over the fitted and another log.
+
+    Parameters
+    ----------
+    sensor : ScalarSensor
+        Fitted compensation.
+    channels : (n, k) array
+        The channels in the log to be corrected; NaN where unknown.
+
+    Notes
+    -----
+    The data's information about the coefficients, ``P - 1 / prior^2`` and ``P mean``, is unchanged; a
+    channel's coefficients are per unit of its new swing, and the widths maximise the evidence again. A
+    channel that hardly moved in the fitted log and moves far in this one thus has a weak estimate and a
+    large sigma.
+    """
+    factor, wider = np.ones(len(sensor.coefficients)), list(sensor.channels)
+    for k, channel in enumerate(sensor.channels):
+        values = channels[np.isfinite(channels[:, k]), k]
+        if len(values):
+            low, high = np.quantile(values, [0.02, 0.98]).tolist()
+            quantiles = min(channel.quantiles[0], low), max(channel.quantiles[1], high)
+            wider[k] = msgspec.structs.replace(channel, quantiles=quantiles)
+            columns = slice(PLATFORM_TERMS + 3 * k, PLATFORM_TERMS + 3 * k + 3)
+            factor[columns] = channel.scale / wider[k].scale
+    if (factor == 1.0).all():
+        return sensor
+    prior = np.array(sensor.prior_sigma)
+    precision = np.linalg.inv(np.array(sensor.covariance))
+    moment = precision @ np.array(sensor.coefficients)
+    information = (precision - np.diag(1.0 / prior**2)) * factor[:, None] * factor
+    blocks = _blocks(tuple(wider), len(sensor.power_cycles), fixed_lag=prior[PLATFORM_TERMS - 1] < 1e-6)
+    start = np.log([prior[block.columns][0] for block in blocks if block.spread > 0.0])
+    chosen = _choose_widths(information, moment * factor, blocks, float(prior[-1]), start)
+    return msgspec.structs.replace(
+        sensor,
+        channels=tuple(wider),
+        coefficients=tuple(chosen.mean.tolist()),
+        covariance=tuple(tuple(row) for row in chosen.covariance.tolist()),
+        prior_sigma=tuple(chosen.sigma.tolist()),
+    )
+
+
+def _log_noise_prior(log_noise: FloatArray) -> float:
+    """Return the log of the hyperparameters' prior: process widths vary smoothly with their scale."""
+    white, processes = log_noise[0], log_noise[1 : 1 + len(TIME_CONSTANTS_S)]
+    value = ((white - LOG_PROCESS_CENTRE) / LOG_PROCESS_SPREAD) ** 2
+    value += ((processes[0] - LOG_PROCESS_CENTRE) / LOG_PROCESS_SPREAD) ** 2
+    value += float((np.diff(processes) ** 2).sum()) / LOG_PROCESS_STEP**2
+    crust = log_noise[1 + len(TIME_CONSTANTS_S) :]
+    if len(crust):
+        value += float((((crust - LOG_CRUST_CENTRES) / LOG_CRUST_SPREAD) ** 2).sum())
+    return -0.5 * float(value)
+
+
+def _power_cycles(
+    numbers: FloatArray,
+) -> tuple[np.ndarray[tuple[int], np.dtype[np.intp]], tuple[int | None, ...]]:
+    """Return the index of each sample's power cycle and the cycles' numbers."""
+    labels = np.where(np.isnan(numbers), -1.0, numbers)
+    found, index = np.unique(labels, return_inverse=True)
+    return index, tuple(None if label < 0.0 else int(label) for label in found.tolist())
+
+
+def _blocks(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool) -> tuple[_Block, ...]:
+    sizes = (("permanent", 0, 3), ("induced", 3, 9), ("eddy", 9, 18))
+    blocks = [
+        _Block(name, slice(begin, end), WIDTH_CENTRES_NT[name], LOG_WIDTH_SIGMA) for name, begin, end in sizes
+    ]
+    blocks.append(_Block("lag", slice(18, 19), 1e-9 if fixed_lag else LAG_SIGMA_S, 0.0))
+    column = PLATFORM_TERMS
+    for channel in channels:
+        blocks.append(
+            _Block(channel.name, slice(column, column + 3), CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA)
+        )
+        column += 3
+    blocks.append(_Block("level", slice(column, column + levels), LEVEL_SIGMA_NT, 0.0))
+    return tuple(blocks)
+
+
+def _prior_sigma(blocks: tuple[_Block, ...], widths: FloatArray, level: float, size: int) -> FloatArray:
+    """Return the prior's 1-sigma of every coefficient, (m,)."""
+    sigma, free = np.empty(size), iter(widths.tolist())
+    for block in blocks:
+        sigma[block.columns] = next(free) if block.spread > 0.0 else block.centre
+    sigma[blocks[-1].columns] = level
+    return sigma
+
+
+def _segments(time: FloatArray, interval: float) -> tuple[slice, ...]:
+    """Return the stretches of samples without a gap."""
+    breaks = np.flatnonzero(np.diff(time) > GAP_INTERVALS * interval) + 1
+    ends = [0, *breaks.tolist(), len(time)]
+    return tuple(slice(begin, end) for begin, end in pairwise(ends))
+
+
+def _slow_variances(log_noise: FloatArray) -> FloatArray:
+    """Return the variance of every slow process, nT^2; the crustal one last where there is one."""
+    many = len(TIME_CONSTANTS_S)
+    return np.asarray(np.exp(2.0 * log_noise[1 : 2 + many]))
+
+
+def _whitening_filter(log_noise: FloatArray, interval: float) -> tuple[FloatArray, float]:
+    """Return the second-order sections that whiten the noise, and the innovations' variance, nT^2.
+
+    Notes
+    -----
+    State space of the slow processes, ``x' = A x + w, y = C x + v``. The discrete algebraic Riccati equation
+    gives the steady prediction covariance P, ``S = C P C^T + sigma^2``, ``K = A P C^T / S``. The
+    innovations are the output of a filter with the zeros eig(A) and the poles eig(A - K C).
+    """
+    variances = _slow_variances(log_noise)
+    decay = np.exp(-interval / np.array(TIME_CONSTANTS_S))
+    A, Q = np.diag(decay), np.diag(variances[: len(decay)] * (1.0 - decay**2))
+    C = np.ones(len(decay))
+    if len(log_noise) > 1 + len(TIME_CONSTANTS_S):
+        A_m, Q_m = _matern_transition(float(np.exp(log_noise[-1])), float(variances[-1]), interval)
+        A = np.block([[A, np.zeros((len(A), 3))], [np.zeros((3, len(A))), A_m]])
+        Q = np.block([[Q, np.zeros((len(Q), 3))], [np.zeros((3, len(Q))), Q_m]])
+        C = np.append(C, [1.0, 0.0, 0.0])
+    white = float(np.exp(2.0 * log_noise[0]))
+    P = solve_discrete_are(A.T, C[:, None], Q + 1e-12 * np.eye(len(Q)), np.array([[white]]))
+    variance = float(C @ P @ C) + white
+    K = A @ P @ C / variance
+    sections = zpk2sos(np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(K, C)), 1.0)
+    return np.asarray(sections), variance
+
+
+def _matern_transition(length: float, variance: float, interval: float) -> tuple[FloatArray, FloatArray]:
+    """Return transition and process noise of a Matern process of smoothness 5/2.
+
+    Notes
+    -----
+    ``lambda = sqrt(5) / l``; ``A = exp(F dt)`` with F the companion matrix of ``(s + lambda)^3``; ``Q = P -
+    A P A^T`` with the stationary covariance P (Hartikainen & Sarkka 2010, doi:10.1109/MLSP.2010.5589113).
+    """
+    rate, t = np.sqrt(5.0) / length, interval
+    N = np.array([[rate, 1.0, 0.0], [0.0, rate, 1.0], [-(rate**3), -3.0 * rate**2, -2.0 * rate]])
+    A = np.exp(-rate * t) * (np.eye(3) + t * N + 0.5 * t * t * N @ N)  # N is nilpotent: N^3 = 0
+    k = variance * rate**2 / 3.0
+    P = np.array([[variance, 0.0, -k], [0.0, k, 0.0], [-k, 0.0, variance * rate**4]])
+    return A, P - A @ P @ A.T
+
+
+def _result(
+    problem: _Problem,
+    kept: BoolArray,
+    state: _State,
+    series: ScalarSeries,
+    column: str,
+    directions_from: str,
+    channels: tuple[ScalarChannel, ...],
+    lever: tuple[float, float, float],
+) -> ScalarFit:
+    """Return the fit with its sensor, RMS before and after, and contributions."""
+    part = problem.part(kept)
+    residual = part.target - part.design @ state.mean
+    contribution = {
+        block.name: float(np.std(part.design[:, block.columns] @ state.mean[block.columns]))
+        for block in problem.blocks
+    }
+    averaged_white = float(np.exp(state.log_noise[0]))
+    duration = float(part.time[-1] - part.time[0])
+    variances = _slow_variances(state.log_noise)[: len(TIME_CONSTANTS_S)]
+    # A process slower than the log is part of its level.
+    slow = float((variances * np.minimum(1.0, duration / np.array(TIME_CONSTANTS_S))).sum())
+    sensor = ScalarSensor(
+        kind="scalar",
+        column=column,
+        directions_from=directions_from,
+        reference_field=float(np.median(series.reference[np.isfinite(series.reference)])),
+        channels=channels,
+        coefficients=tuple(state.mean.tolist()),
+        covariance=tuple(tuple(row) for row in state.covariance.tolist()),
+        prior_sigma=tuple(state.widths.tolist()),
+        noise=ScalarNoise(
+            averaged_white * float(np.sqrt(problem.averaged)), problem.interval / problem.averaged,
+            TIME_CONSTANTS_S, tuple(np.sqrt(variances).tolist()),
+        ),
+        power_cycles=problem.cycles,
+        fitted_from=float(part.time[0]),
+        fitted_until=float(part.time[-1]),
+        lever=lever,
+        slow_variance=slow,
+    )  # fmt: skip
+    return ScalarFit(
+        sensor, float(np.std(part.target)), float(np.std(residual)), contribution,
+        int((~kept).sum()) * problem.averaged, -state.value,
+    )  # fmt: skip

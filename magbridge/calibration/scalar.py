@@ -1,0 +1,224 @@
+"""Compensate a scalar magnetometer by the direction of a vector sensor and by telemetry.
+
+Notes
+-----
+A scalar magnetometer on a vehicle reads the Earth's field F and what the vehicle adds along it (Tolles &
+Lawson 1950; Leliak 1961, doi:10.1109/TANE3.1961.4201799)::
+
+    s - F = u.p + (F / F_0) u^T I u + u^T E du/dt + sum_k z_k (u.c_k) + a dF/dt + level
+
+u is the unit vector of the field in the vector sensor's axes, p the permanent field (nT), I the induced (nT,
+symmetric), E the eddy currents' (nT s), z_k a telemetry channel about its centre in units of its swing, c_k
+its field (nT a swing), a the lag (s, negative if the scalar is late), and the level is one constant for
+each power cycle. All coefficients are Gaussian with the prior widths that the fit chose.
+
+The width of a channel's prior is for one swing *over everything known, the log to be corrected included*:
+:func:`magbridge.calibration.fitting.scalar_fit.adapt_to_log`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.errors import CalibrationError
+
+__all__ = [
+    "LEVEL_SIGMA_NT", "PLATFORM_TERMS", "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarSensor",
+    "ScalarSeries", "correct_scalar", "scalar_design",
+]  # fmt: skip
+
+PLATFORM_TERMS = 19
+"""Permanent (3), induced (6), eddy (9) and lag (1) columns, before the channels' three each."""
+LEVEL_SIGMA_NT = 30.0
+"""nT, 1-sigma of the level of a power cycle."""
+SAME_POWER_CYCLE_S = 12 * 3600.0
+"""s, within which a log without a power cycle's number is taken to be of the fitted cycle."""
+RANGE_MARGIN = 0.02
+"""Fraction of a channel's range by which telemetry may exceed it without a flag."""
+INDUCED_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Row and column of the six entries of the symmetric I."""
+
+
+class ScalarChannel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A telemetry channel of the compensation."""
+
+    name: str
+    """Column of the log."""
+    centre: float
+    """Median of the channel in the fitted logs, in its unit."""
+    quantiles: tuple[float, float]
+    """2 % and 98 % quantile of the channel in the fitted logs, in its unit."""
+    low: float
+    """Smallest value in the fitted logs, in its unit."""
+    high: float
+    """Largest value in the fitted logs, in its unit."""
+    unit: str = ""
+
+    @property
+    def scale(self) -> float:
+        """The channel's swing in the fitted logs, in its unit; 1 for a channel that did not change."""
+        swing = self.quantiles[1] - self.quantiles[0]
+        return swing if swing > 0.0 else 1.0
+
+
+class ScalarNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Noise of the compensated scalar: white, and a sum of Ornstein-Uhlenbeck processes (flicker)."""
+
+    white: float
+    """nT, 1-sigma of the white part of one sample."""
+    interval: float
+    """s, between the samples to which `white` refers."""
+    time_constants: tuple[float, ...] = ()
+    """s, of the Ornstein-Uhlenbeck processes."""
+    process_sigma: tuple[float, ...] = ()
+    """nT, 1-sigma of each process."""
+
+
+class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A calibrated scalar magnetometer: one entry of ``sensors`` in ``cal.json``."""
+
+    kind: str
+    """``scalar``."""
+    column: str
+    """Column of the log that holds the scalar's reading, nT."""
+    directions_from: str
+    """Vector sensor whose corrected field gives the directions u."""
+    reference_field: float
+    """nT, F_0."""
+    channels: tuple[ScalarChannel, ...]
+    coefficients: tuple[float, ...]
+    """Permanent (nT), induced xx yy zz xy xz yz (nT), eddy (nT s, row by row), lag (s), three for each
+    channel (nT a swing), then one level for each power cycle (nT)."""
+    covariance: tuple[tuple[float, ...], ...]
+    prior_sigma: tuple[float, ...]
+    """1-sigma of each coefficient's prior."""
+    noise: ScalarNoise
+    power_cycles: tuple[int | None, ...] = (None,)
+    """Number of the power cycle of each level."""
+    fitted_from: float = 0.0
+    """s since 1970 UTC, first sample of the fit."""
+    fitted_until: float = 0.0
+    """s since 1970 UTC, last sample of the fit."""
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """m, forward, starboard and down from the positions' origin to the scalar sensor."""
+    slow_variance: float = 0.0
+    """nT^2, variance of the slow noise over the fitted log: the sigma of the corrected field counts it."""
+
+
+class ScalarSeries(NamedTuple):
+    """Samples of a scalar magnetometer beside a vector sensor."""
+
+    time: FloatArray
+    """(n,), s since 1970 UTC, ascending."""
+    scalar: FloatArray
+    """(n,), nT, as read; NaN where missing."""
+    vector: FloatArray
+    """(n, 3), nT, field of the vector sensor, corrected where it is calibrated."""
+    reference: FloatArray
+    """(n,), nT, what the field is known to be (main field, map); NaN where unknown."""
+    channels: FloatArray
+    """(n, k), telemetry, in the channels' order."""
+    power_cycle: FloatArray
+    """(n,), number of the power cycle; NaN where unknown."""
+
+
+class CorrectedScalar(NamedTuple):
+    """A compensated scalar magnetometer, n samples."""
+
+    field: FloatArray
+    """(n,), nT."""
+    sigma: FloatArray
+    """(n,), nT, standard deviation of `field`."""
+    level_sigma: FloatArray
+    """(n,), nT, the part of `sigma` that all samples of a power cycle share."""
+    extrapolated: BoolArray
+    """(n,), a channel is outside the range of the fit."""
+    missing: BoolArray
+    """(n,), a channel or the direction is unknown."""
+
+
+def scalar_design(
+    series: ScalarSeries, channels: tuple[ScalarChannel, ...], reference_field: float
+) -> FloatArray:
+    """Return the columns (n, 19 + 3k) of the model, without levels; `reference_field` is F_0, nT."""
+    length = np.sqrt(np.einsum("ni,ni->n", series.vector, series.vector))
+    u = series.vector / length[:, None]
+    turn = np.gradient(u, series.time, axis=0)  # du/dt, 1/s
+    ratio = length / reference_field
+    columns = [*u.T]
+    columns += [(2.0 - (i == j)) * u[:, i] * u[:, j] * ratio for i, j in INDUCED_PAIRS]
+    columns += [u[:, i] * turn[:, j] for i in range(3) for j in range(3)]
+    smooth = np.where(np.isfinite(series.reference), series.reference, series.scalar)
+    columns.append(np.gradient(smooth, series.time))
+    for channel, values in zip(channels, series.channels.T, strict=True):
+        z = (values - channel.centre) / channel.scale
+        columns += [z * u[:, i] for i in range(3)]
+    return np.stack(columns, axis=1)
+
+
+def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScalar:
+    """Compensate a scalar magnetometer.
+
+    Parameters
+    ----------
+    sensor : ScalarSensor
+        Fitted compensation.
+    series : ScalarSeries
+        `reference` may be NaN throughout.
+
+    Returns
+    -------
+    CorrectedScalar
+        `field` is NaN where a channel, the direction or the reading is unknown; `sigma` there is infinite.
+
+    Raises
+    ------
+    CalibrationError
+        Another number of channels than the sensor's.
+    """
+    known = sensor.channels
+    if series.channels.shape[1] != len(known):
+        names = ", ".join(channel.name for channel in known)
+        raise CalibrationError(f"expected {len(known)} channels ({names}), got {series.channels.shape[1]}")
+    mean, covariance = np.array(sensor.coefficients), np.array(sensor.covariance)
+    design = scalar_design(series, known, sensor.reference_field)
+    size = design.shape[1]
+    level, level_sigma, cross = _level(sensor, series, mean, covariance)
+    with np.errstate(invalid="ignore"):
+        field = series.scalar - design @ mean[:size] - level
+        platform = np.einsum("ni,ij,nj->n", design, covariance[:size, :size], design)
+        joint = 2.0 * np.einsum("ni,ni->n", design, cross)
+        variance = np.maximum(platform + joint + level_sigma**2, 0.0)
+        variance += sensor.noise.white**2 + sensor.slow_variance
+        low = np.array([channel.low for channel in known])
+        high = np.array([channel.high for channel in known])
+        margin = RANGE_MARGIN * (high - low)
+        outside = ((series.channels < low - margin) | (series.channels > high + margin)).any(axis=1)
+    missing = ~np.isfinite(field)
+    return CorrectedScalar(
+        field,
+        np.where(missing, np.inf, np.sqrt(variance)),
+        level_sigma,
+        np.asarray(outside & ~missing),
+        missing,
+    )
+
+
+def _level(
+    sensor: ScalarSensor, series: ScalarSeries, mean: FloatArray, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the level of every sample (n,), its sigma (n,), and its covariance with the terms (n, m)."""
+    n, size = len(series.time), len(mean) - len(sensor.power_cycles)
+    level, sigma, cross = np.zeros(n), np.full(n, LEVEL_SIGMA_NT), np.zeros((n, size))
+    near = (series.time > sensor.fitted_from - SAME_POWER_CYCLE_S) & (
+        series.time < sensor.fitted_until + SAME_POWER_CYCLE_S
+    )
+    for index, cycle in enumerate(sensor.power_cycles, size):
+        rows = np.isnan(series.power_cycle) & near if cycle is None else series.power_cycle == cycle
+        level[rows], sigma[rows] = mean[index], np.sqrt(covariance[index, index])
+        cross[rows] = covariance[index, :size]
+    return level, sigma, cross
