@@ -27,13 +27,14 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.errors import CalibrationError
 
 __all__ = [
-    "LEVEL_SIGMA_NT", "PLATFORM_TERMS", "CorrectedScalar", "ScalarChannel", "ScalarNoise", "ScalarSensor",
+    "CYCLE_LEVEL_SIGMA_NT", "PLATFORM_TERMS", "CorrectedScalar", "ScalarChannel", "ScalarNoise",
+    "ScalarSensor",
     "ScalarSeries", "correct_scalar", "scalar_design",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19
 """Permanent (3), induced (6), eddy (9) and lag (1) columns, before the channels' three each."""
-LEVEL_SIGMA_NT = 30.0
+CYCLE_LEVEL_SIGMA_NT = 30.0
 """nT, 1-sigma of the level of a power cycle."""
 SAME_POWER_CYCLE_S = 12 * 3600.0
 """s, within which a log without a power cycle's number is taken to be of the fitted cycle."""
@@ -213,7 +214,7 @@ def _level(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the level of every sample (n,), its sigma (n,), and its covariance with the terms (n, m)."""
     n, size = len(series.time), len(mean) - len(sensor.power_cycles)
-    level, sigma, cross = np.zeros(n), np.full(n, LEVEL_SIGMA_NT), np.zeros((n, size))
+    level, sigma, cross = np.zeros(n), np.full(n, CYCLE_LEVEL_SIGMA_NT), np.zeros((n, size))
     near = (series.time > sensor.fitted_from - SAME_POWER_CYCLE_S) & (
         series.time < sensor.fitted_until + SAME_POWER_CYCLE_S
     )

@@ -31,7 +31,7 @@ from scipy.signal import sosfilt, zpk2sos
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.scalar import (
-    LEVEL_SIGMA_NT,
+    CYCLE_LEVEL_SIGMA_NT,
     PLATFORM_TERMS,
     ScalarChannel,
     ScalarNoise,
@@ -54,15 +54,15 @@ TIME_CONSTANTS_S = (1.5, 5.0, 15.0, 50.0, 150.0, 500.0, 1500.0, 5000.0)
 """s, of the Ornstein-Uhlenbeck processes."""
 FIT_INTERVAL_S = 0.5
 """s, shortest interval of the samples that are fitted; faster logs are averaged to it."""
-GAP_INTERVALS = 3.0
+FILTER_GAP_INTERVALS = 3.0
 """Intervals without a sample after which the whitening filter begins again."""
-MIN_SAMPLES = 100
-NOISE_ITERATIONS = 15
+MIN_SCALAR_SAMPLES = 100
+EVIDENCE_ITERATIONS = 15
 LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2.0, 0.7
 """Log of nT: centre and 1-sigma of white noise and fastest process, 1-sigma of the change to the next."""
 LOG_CRUST_CENTRES, LOG_CRUST_SPREAD = np.log(np.array([30.0, 30.0])), 1.5
 """Log of the crustal field's amplitude (nT) and time scale (s) along the track, where no map is known."""
-OUTLIER_SIGMA, OUTLIER_PAD = 8.0, 4
+OUTLIER_INNOVATION_SIGMA, OUTLIER_PAD = 8.0, 4
 """Whitened residual beyond which a sample is left out of the fit, and samples left out on either side."""
 
 
@@ -138,16 +138,16 @@ def fit_scalar(
     valid &= np.isfinite(series.channels).all(axis=1)
     if use is not None:
         valid &= use
-    if valid.sum() < MIN_SAMPLES:
+    if valid.sum() < MIN_SCALAR_SAMPLES:
         raise CalibrationError(
-            f"{column}: expected at least {MIN_SAMPLES} samples with vector, reference and "
+            f"{column}: expected at least {MIN_SCALAR_SAMPLES} samples with vector, reference and "
             f"{', '.join(names) or 'no telemetry'}, got {int(valid.sum())}"
         )
     channels = tuple(
         _channel(name, series.channels[valid, k], units[k] if units else "") for k, name in enumerate(names)
     )
     reference_field = float(np.median(series.reference[valid]))
-    problem = _Problem.build(series, valid, channels, reference_field, lag)
+    problem = _ScalarProblem.build(series, valid, channels, reference_field, lag)
     kept = np.ones(len(problem.target), bool)
     start: FloatArray | None = None
     for _ in range(3):  # outliers of one pass are left out in the next
@@ -179,7 +179,7 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _ScalarProblem:
     """Target and columns at the fit's interval."""
 
     time: FloatArray
@@ -200,7 +200,7 @@ class _Problem:
         channels: tuple[ScalarChannel, ...],
         reference_field: float,
         lag: float | None,
-    ) -> _Problem:
+    ) -> _ScalarProblem:
         """Average to the fit's interval and form the columns."""
         step = float(np.median(np.diff(series.time)))
         many = max(1, int(FIT_INTERVAL_S / step + 1e-6))
@@ -215,21 +215,21 @@ class _Problem:
         levels[np.flatnonzero(valid), numbers] = 1.0
         table = np.column_stack([series.time, target, design, levels])[valid]
         # Average neighbours, never across a gap.
-        piece = np.cumsum(np.diff(table[:, 0], prepend=table[0, 0]) > GAP_INTERVALS * step)
+        piece = np.cumsum(np.diff(table[:, 0], prepend=table[0, 0]) > FILTER_GAP_INTERVALS * step)
         first = np.flatnonzero(np.diff(piece, prepend=-1))
         group = piece * len(table) + (np.arange(len(table)) - first[piece]) // many
         _, starts, counts = np.unique(group, return_index=True, return_counts=True)
         table = np.add.reduceat(table, starts, axis=0) / counts[:, None]
         blocks = _blocks(channels, len(cycles), fixed_lag=lag is not None)
-        return _Problem(
+        return _ScalarProblem(
             table[:, 0], table[:, 1], table[:, 2:], blocks, _segments(table[:, 0], many * step), many * step,
             cycles, many,
         )  # fmt: skip
 
-    def part(self, kept: BoolArray) -> _Problem:
+    def part(self, kept: BoolArray) -> _ScalarProblem:
         """Return the problem of some samples."""
         time = self.time[kept]
-        return _Problem(
+        return _ScalarProblem(
             time, self.target[kept], self.design[kept], self.blocks, _segments(time, self.interval),
             self.interval, self.cycles, self.averaged,
         )  # fmt: skip
@@ -245,7 +245,7 @@ class _Problem:
 
     def level_sigma(self, log_noise: FloatArray) -> float:
         """Return the prior's 1-sigma of a level, nT: the slow processes begin at zero in the filter."""
-        return float(np.hypot(LEVEL_SIGMA_NT, np.sqrt(_slow_variances(log_noise).sum())))
+        return float(np.hypot(CYCLE_LEVEL_SIGMA_NT, np.sqrt(_slow_variances(log_noise).sum())))
 
     def posterior(self, log_noise: FloatArray, log_widths: FloatArray) -> tuple[_State, FloatArray]:
         """Return the posterior given the hyperparameters, and the optimal log widths."""
@@ -275,7 +275,7 @@ class _Problem:
                 start = np.append(start, LOG_CRUST_CENTRES)
         minimize(
             cost, start, method="L-BFGS-B", bounds=[(-9.0, 9.0)] * len(start),
-            options={"maxiter": NOISE_ITERATIONS, "ftol": 1e-6, "eps": 1e-3},
+            options={"maxiter": EVIDENCE_ITERATIONS, "ftol": 1e-6, "eps": 1e-3},
         )  # fmt: skip
         assert best is not None
         return best
@@ -286,7 +286,7 @@ class _Problem:
         y, X, _ = part.whiten(state.log_noise)
         residual = y - X @ state.mean
         scale = 1.4826 * float(np.median(np.abs(residual)))
-        large = np.abs(residual) > OUTLIER_SIGMA * max(scale, 1.0)
+        large = np.abs(residual) > OUTLIER_INNOVATION_SIGMA * max(scale, 1.0)
         padded = np.convolve(large, np.ones(2 * OUTLIER_PAD + 1), mode="same") > 0.5
         out = np.zeros(len(kept), bool)
         out[np.flatnonzero(kept)[padded]] = True
@@ -418,7 +418,7 @@ def _blocks(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool
             _Block(channel.name, slice(column, column + 3), CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA)
         )
         column += 3
-    blocks.append(_Block("level", slice(column, column + levels), LEVEL_SIGMA_NT, 0.0))
+    blocks.append(_Block("level", slice(column, column + levels), CYCLE_LEVEL_SIGMA_NT, 0.0))
     return tuple(blocks)
 
 
@@ -433,7 +433,7 @@ def _prior_sigma(blocks: tuple[_Block, ...], widths: FloatArray, level: float, s
 
 def _segments(time: FloatArray, interval: float) -> tuple[slice, ...]:
     """Return the stretches of samples without a gap."""
-    breaks = np.flatnonzero(np.diff(time) > GAP_INTERVALS * interval) + 1
+    breaks = np.flatnonzero(np.diff(time) > FILTER_GAP_INTERVALS * interval) + 1
     ends = [0, *breaks.tolist(), len(time)]
     return tuple(slice(begin, end) for begin, end in pairwise(ends))
 
@@ -487,7 +487,7 @@ def _matern_transition(length: float, variance: float, interval: float) -> tuple
 
 
 def _result(
-    problem: _Problem,
+    problem: _ScalarProblem,
     kept: BoolArray,
     state: _State,
     series: ScalarSeries,
