@@ -89,6 +89,10 @@ COLUMNS: dict[str, Column] = {
     "vehicle_heading": Column("deg", "the vehicle's own heading, clockwise from north"),
     "anomaly": Column("nT", "corrected total field minus the reference model"),
     "quality": Column("1", "flags of a doubtful sample"),
+    "scalar_field": Column("nT", "compensated total field of the scalar magnetometer"),
+    "scalar_field_sigma": Column("nT", "1-sigma of the compensated scalar field"),
+    "scalar_level_sigma": Column("nT", "the part of scalar_field_sigma that a power cycle's samples share"),
+    "scalar_quality": Column("1", "flags of a compensated scalar sample"),
 }
 CORRECTED = ("total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly", "quality")
 """What ``magbridge correct`` writes in addition to ``time``."""

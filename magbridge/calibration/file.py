@@ -15,23 +15,25 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.scalar import PLATFORM_TERMS, ScalarSensor
 from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
 from magbridge.errors import CalibrationError, FormatError
 from magbridge.files import atomic_path
 
 __all__ = ["CALIBRATION_FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
-CALIBRATION_FORMAT = 4
+CALIBRATION_FORMAT = 5
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
-``white`` share, ``level`` and the reference's ``level_sigma``: each is written only where there is any."""
+``white`` share, ``level`` and the reference's ``level_sigma``, 5 ``sensors``: each is written only where
+there is any."""
 
 MAX_STATED_SIGMA = 1e15
 """The largest noise (nT) or standard deviation of a coefficient that is accepted: its square is a float32."""
 
 AS_IN_MEMORY = (
     "software", "method", "sensor", "parameters", "noise", "reference", "boresight", "runs", "inputs",
-    "level",
+    "level", "sensors",
 )  # fmt: skip
 """What the file holds as :class:`~.model.Calibration` does."""
 
@@ -55,6 +57,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     inputs: dict[str, str]
     doubts: tuple[str, ...] = ()
     level: tuple[float, ...] = ()
+    sensors: tuple[ScalarSensor, ...] = ()
 
 
 class _Version(msgspec.Struct):
@@ -64,7 +67,7 @@ class _Version(msgspec.Struct):
 def encode_calibration(calibration: Calibration) -> bytes:
     """Return `calibration` as JSON, one key a line."""
     content = _File(
-        format=4 if calibration.noise.white or calibration.level else 3 if calibration.warnings else 2,
+        format=_format(calibration),
         terms=[_term_out(term) for term in calibration.terms],
         effects=[_term_out(effect) for effect in calibration.effects],
         coefficients=calibration.coefficients.tolist(),
@@ -73,15 +76,23 @@ def encode_calibration(calibration: Calibration) -> bytes:
         **{name: getattr(calibration, name) for name in AS_IN_MEMORY},
     )
     encode = msgspec.json.encode
-    names = [
-        name for name in _File.__struct_fields__ if name not in ("doubts", "level") or getattr(content, name)
-    ]
+    optional = "doubts", "level", "sensors"
+    names = [name for name in _File.__struct_fields__ if name not in optional or getattr(content, name)]
     values = {name: getattr(content, name) for name in names}
     for key, lately in (("noise", "white"), ("reference", "level_sigma")):
         known = msgspec.structs.asdict(values[key])
         values[key] = {name: value for name, value in known.items() if name != lately or value}
     lines = [encode(name) + b": " + encode(value) for name, value in values.items()]
     return b"{\n" + b",\n".join(lines) + b"\n}\n"
+
+
+def _format(calibration: Calibration) -> int:
+    """Return the oldest format that holds all that a calibration has."""
+    if calibration.sensors:
+        return 5
+    if calibration.noise.white or calibration.level:
+        return 4
+    return 3 if calibration.warnings else 2
 
 
 def decode_calibration(data: bytes, file: str | Path = "cal.json") -> Calibration:
@@ -201,12 +212,25 @@ def _check_settings(content: _File) -> None:
     for parameter in content.parameters:
         if not (parameter.scale > 0.0 and parameter.low <= parameter.high):
             raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
+    for sensor in content.sensors:
+        _check_scalar(sensor)
     if not content.reference.field > 0.0:
         raise CalibrationError("reference: field: expected nT, > 0")
     if not 0.0 <= content.noise.sensor <= MAX_STATED_SIGMA:
         raise CalibrationError(f"noise: sensor: expected nT, 0 to {MAX_STATED_SIGMA:g}")
     if not 0.0 <= content.noise.white <= 1.0:
         raise CalibrationError("noise: white: expected a share, 0 to 1")
+
+
+def _check_scalar(sensor: ScalarSensor) -> None:
+    """Refuse a scalar sensor whose numbers do not belong together."""
+    size = PLATFORM_TERMS + 3 * len(sensor.channels) + len(sensor.power_cycles)
+    where = f"sensor {sensor.column!r}: "
+    if not len(sensor.coefficients) == len(sensor.prior_sigma) == len(sensor.covariance) == size:
+        raise CalibrationError(f"{where}expected {size} coefficients, prior_sigma and rows of covariance")
+    if {len(row) for row in sensor.covariance} != {size} or not sensor.reference_field > 0.0:
+        raise CalibrationError(f"{where}expected a covariance of {size} x {size} and reference_field > 0")
+    _check_covariance(np.array(sensor.covariance), where)
 
 
 def _check_covariance(covariance: FloatArray, whose: str = "") -> None:

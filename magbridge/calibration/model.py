@@ -25,6 +25,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import compile_kernel
 from magbridge.calibration.kernel import Kernel
+from magbridge.calibration.scalar import ScalarSensor
 from magbridge.calibration.terms import Effect, Parameter, Polynomial, PositionTerm
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import symmetric
@@ -138,6 +139,8 @@ class Calibration:
     level: tuple[float, ...] = ()
     """How the first coefficients move together where the level of the reference is off by 1-sigma (nT); empty
     where that was known."""
+    sensors: tuple[ScalarSensor, ...] = ()
+    """Scalar magnetometers beside the vector sensor."""
 
     def __post_init__(self) -> None:
         names = tuple(parameter.name for parameter in self.parameters)

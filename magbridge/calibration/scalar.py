@@ -7,10 +7,10 @@ Lawson 1950; Leliak 1961, doi:10.1109/TANE3.1961.4201799)::
 
     s - F = u.p + (F / F_0) u^T I u + u^T E du/dt + sum_k z_k (u.c_k) + a dF/dt + level
 
-u is the unit vector of the field in the vector sensor's axes, p the permanent field (nT), I the induced (nT,
-symmetric), E the eddy currents' (nT s), z_k a telemetry channel about its centre in units of its swing, c_k
-its field (nT a swing), a the lag (s, negative if the scalar is late), and the level is one constant for
-each power cycle. All coefficients are Gaussian with the prior widths that the fit chose.
+u is the unit vector of the field in the vector sensor's axes, p the permanent field (nT), I the induced
+(nT, symmetric), E that of the eddy currents (nT s), z_k a telemetry channel about its centre in units of
+its swing, c_k its field (nT a swing), a the lag (s, negative if the scalar is late), and the level is one
+constant for each power cycle. All coefficients are Gaussian with the prior widths that the fit chose.
 
 The width of a channel's prior is for one swing *over everything known, the log to be corrected included*:
 :func:`magbridge.calibration.fitting.scalar_fit.adapt_to_log`.
@@ -18,6 +18,7 @@ The width of a channel's prior is for one swing *over everything known, the log 
 
 from __future__ import annotations
 
+from enum import IntFlag
 from typing import NamedTuple
 
 import msgspec
@@ -28,8 +29,8 @@ from magbridge.errors import CalibrationError
 
 __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "PLATFORM_TERMS", "CorrectedScalar", "ScalarChannel", "ScalarNoise",
-    "ScalarSensor",
-    "ScalarSeries", "correct_scalar", "scalar_design",
+    "ScalarQuality", "ScalarSensor", "ScalarSeries", "Witness", "compare_sensors", "correct_scalar",
+    "scalar_design",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19
@@ -42,6 +43,27 @@ RANGE_MARGIN = 0.02
 """Fraction of a channel's range by which telemetry may exceed it without a flag."""
 INDUCED_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Row and column of the six entries of the symmetric I."""
+JUMP_SIGMA = 8.0
+"""Change from one sample to the next, in robust standard deviations of the changes, that is a jump."""
+DISAGREEMENT_SIGMA = 4.0
+"""Difference of two sensors, in its standard deviations, from which on it is flagged."""
+REFERENCE_SIGMA_NT = 145.0
+"""nT, 1-sigma of the main-field model where no map is known (error model of the WMM 2020)."""
+BLAME_RATIO = 2.0
+"""Ratio of two sensors' standardised distances from the reference, beyond which the farther one is blamed."""
+
+
+class ScalarQuality(IntFlag):
+    """Flags of a compensated sample, column ``scalar_quality``."""
+
+    EXTRAPOLATED = 1
+    """A telemetry channel is outside the range of the fit."""
+    DISAGREES = 2
+    """Scalar and vector sensor differ by more than their standard deviations allow."""
+    JUMP = 4
+    """The reading jumped while the vector sensor's did not."""
+    MISSING = 8
+    """A channel, the direction or the reading is unknown."""
 
 
 class ScalarChannel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,6 +117,7 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """Permanent (nT), induced xx yy zz xy xz yz (nT), eddy (nT s, row by row), lag (s), three for each
     channel (nT a swing), then one level for each power cycle (nT)."""
     covariance: tuple[tuple[float, ...], ...]
+    """Of the coefficients."""
     prior_sigma: tuple[float, ...]
     """1-sigma of each coefficient's prior."""
     noise: ScalarNoise
@@ -167,7 +190,7 @@ def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScala
     Parameters
     ----------
     sensor : ScalarSensor
-        Fitted compensation.
+        The calibrated sensor.
     series : ScalarSeries
         `reference` may be NaN throughout.
 
@@ -219,7 +242,68 @@ def _level(
         series.time < sensor.fitted_until + SAME_POWER_CYCLE_S
     )
     for index, cycle in enumerate(sensor.power_cycles, size):
-        rows = np.isnan(series.power_cycle) & near if cycle is None else series.power_cycle == cycle
+        unnumbered = np.isnan(series.power_cycle) & near
+        rows = unnumbered if cycle is None else series.power_cycle == cycle
         level[rows], sigma[rows] = mean[index], np.sqrt(covariance[index, index])
         cross[rows] = covariance[index, :size]
     return level, sigma, cross
+
+
+class Witness(NamedTuple):
+    """What the comparison of a scalar and a vector sensor adds, n samples."""
+
+    scalar_variance: FloatArray
+    """(n,), nT^2, to add to the scalar's variance."""
+    vector_variance: FloatArray
+    """(n,), nT^2, to add to the variance of the vector sensor's total field."""
+    disagrees: BoolArray
+    """(n,), the difference is beyond its standard deviation."""
+    jump: BoolArray
+    """(n,), the scalar jumped and the vector sensor did not."""
+
+
+def compare_sensors(
+    scalar: FloatArray,
+    scalar_sigma: FloatArray,
+    total: FloatArray,
+    total_sigma: FloatArray,
+    reference: FloatArray,
+) -> Witness:
+    """Compare a compensated scalar sensor with the length of a corrected vector.
+
+    Parameters
+    ----------
+    scalar, scalar_sigma, total, total_sigma : (n,) array
+        nT, both sensors' total field with its standard deviation; NaN where unknown.
+    reference : (n,) array
+        nT, what the field is expected to be; NaN where unknown.
+
+    Notes
+    -----
+    With ``w`` the difference, ``max(0, w^2 - s1^2 - s2^2)`` is its variance that neither sigma explains. It
+    is added to the sensor that is the farther from the reference, in standard deviations that include the
+    reference's own; to both where that does not distinguish them.
+    """
+    with np.errstate(invalid="ignore"):
+        difference = scalar - total
+        expected = scalar_sigma**2 + total_sigma**2
+        excess = np.nan_to_num(np.maximum(difference**2 - expected, 0.0), posinf=0.0)
+        off_scalar = np.abs(scalar - reference) / np.hypot(scalar_sigma, REFERENCE_SIGMA_NT)
+        off_total = np.abs(total - reference) / np.hypot(total_sigma, REFERENCE_SIGMA_NT)
+        # Both comparisons are False where the reference is unknown.
+        spares_scalar = off_total > BLAME_RATIO * off_scalar
+        spares_vector = off_scalar > BLAME_RATIO * off_total
+        disagrees = difference**2 > DISAGREEMENT_SIGMA**2 * expected
+    return Witness(
+        np.where(spares_scalar, 0.0, excess),
+        np.where(spares_vector, 0.0, excess),
+        np.asarray(disagrees),
+        _jumps(scalar) & ~_jumps(total),
+    )
+
+
+def _jumps(values: FloatArray) -> BoolArray:
+    """Return where values (n,), nT, change by far more than they usually do from one sample to the next."""
+    change = np.abs(np.diff(values, prepend=values[:1]))
+    usual = 1.4826 * np.nanmedian(change) if np.isfinite(change).any() else 0.0
+    return np.asarray(np.nan_to_num(change) > JUMP_SIGMA * max(usual, 1e-3))

@@ -35,7 +35,10 @@ if TYPE_CHECKING:
 
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.calibration.fitting.observations import Observations
+    from magbridge.calibration.model import Calibration
 
+MAX_LISTED_CONTRIBUTIONS = 5
+"""Contributions to a scalar's reading that the summary lists."""
 ALL_COMPASSES = "all"
 """``--compass all``: a calibration for each compass."""
 
@@ -50,13 +53,16 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     vehicle: str = "",
     grid: Path | None = None,
     base: Base = None,
-    reference: Literal["mean"] | None = None,
+    reference: Literal["mean", "scalar"] | None = None,
     site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     filter_cutoff: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
     fleet: str = "",
     refit: str = "",
     heading_reference: Heading = None,
+    scalar: str = "",
+    lag: str = "auto",
+    lever: str = "",
     plot: Plot = None,
     force: bool = False,
     reading: Reading = AS_THEY_SAY,
@@ -97,7 +103,8 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     reference
         mean: use the mean length of the log's own readings as the reference, if neither the log nor --date
         gives the Earth's field. The total field then has the sensor's own scale, which site_bias counts: by
-        default 2 %.
+        default 2 %. scalar: use the reading of the column that --scalar names, for a scalar magnetometer away
+        from the vehicle's iron or compensated already; its column's sigma is site_bias, by default 1 nT.
     site_bias
         1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
         the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
@@ -115,6 +122,14 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
         runs are then often enough.
     refit
         Which refit it flies with, if its logs are not catalogued; by default a new one.
+    scalar
+        The column of a scalar magnetometer beside the vector sensor, nT: its compensation by the vector's
+        direction and by telemetry is fitted, too, and stands in the same file. The channels are those of
+        --parameter; without it, or with auto, all telemetry of the log.
+    lag
+        Time in s by which the scalar is behind the vector; auto estimates it.
+    lever
+        Position of the scalar sensor: m forward, starboard and down of the log's positions, as 1.5,0,-0.3.
     plot
         A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
         each parameter.
@@ -144,17 +159,22 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     from magbridge.logs.deployment import join
 
     _refuse_together(parameter, method, masses, fleet)
+    beside = _scalar_options(scalar, reference, lag, lever)
+    named_channels = tuple(name for name in parameter if name != AUTO)
     start = fleet_start(fleet, vehicle, refit, files) if fleet else None
     parameter = parameter or (start.names if start else ())
     anomalies = read_grid(grid) if grid else None
     with waiting("reading"):
         logs = by_base_station(read_each(files, options=reading.options), base)
         deployment = join(logs)
-    require(deployment, (*CHANNELS, *(name for name in parameter if name != AUTO)))
+    require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *named_channels))
     deployment = with_true_heading(deployment, heading_reference)
     note_losses(deployment.attrs)
     if reference == "mean":
         deployment, site_bias = _about_mean(deployment, site_bias)
+    if reference == "scalar":
+        deployment = deployment.assign(reference_field=("time", deployment[scalar].to_numpy().astype(float)))
+        site_bias = 1.0 if site_bias is None else site_bias
     note_unused_grid(grid, deployment)
     options: dict[str, Any] = {"vehicle": read_vehicle(masses)} if masses else {}
     with naming(deployment), waiting("fitting"):
@@ -180,14 +200,71 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
         complain(warning)
     if refused:
         raise DataError(f"{output}: not written, because {found.warnings[0]}; --force writes it all the same")
-    save(found.calibration, output)
+    calibration, text = found.calibration, ""
     left_out, facts = deployment.sizes["time"] - len(data), _facts(found, data)
+    if scalar and reference != "scalar":
+        with waiting("fitting the scalar"):
+            known = anomalies is not None or ("reference_field" in deployment and reference is None)
+            own = {"grid": anomalies, "map_known": known, **beside}
+            calibration, text = _with_scalar(deployment, calibration, scalar, named_channels, facts, own)
+    save(calibration, output)
     print_result(
         {"file": str(output), "method": method, **facts, "left_out": left_out, **worth},
         f"{output}: {method}, {_summary(facts)}"
-        + (f"; {counted(left_out, 'row')} without every value left out" if left_out else ""),
+        + (f"; {counted(left_out, 'row')} without every value left out" if left_out else "")
+        + text,
         json,
     )
+
+
+def _scalar_options(scalar: str, reference: str | None, lag: str, lever: str) -> dict[str, Any]:
+    """Return lag and lever arm as numbers; WrongUse: not numbers, or options without --scalar."""
+    if not scalar:
+        if reference == "scalar" or lag != "auto" or lever:
+            raise WrongUse("--reference scalar, --lag and --lever: give --scalar COLUMN, too")
+        return {}
+    try:
+        behind = None if lag == "auto" else float(lag)
+        arm = tuple(float(part) for part in lever.split(",")) if lever else (0.0, 0.0, 0.0)
+    except ValueError:
+        raise WrongUse(
+            f"--lag {lag}, --lever {lever or 0}: expected auto or s, and m as F,R,D such as 1.5,0,-0.3"
+        ) from None
+    if len(arm) != 3 or not all(map(isfinite, (*arm, behind or 0.0))):
+        raise WrongUse(f"--lever {lever}: expected three numbers, F,R,D in m, such as 1.5,0,-0.3")
+    return {"lag": behind, "lever": arm}
+
+
+def _with_scalar(
+    deployment: xr.Dataset,
+    calibration: Calibration,
+    scalar: str,
+    names: tuple[str, ...],
+    facts: dict[str, Any],
+    options: dict[str, Any],
+) -> tuple[Calibration, str]:
+    """Return the calibration with its scalar sensor, and a summary; add to the facts to print as JSON."""
+    from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns
+
+    names = names or telemetry_columns(deployment, scalar)
+    fit = calibrate_scalar(deployment, calibration, scalar, names, **options)
+    facts["scalar"] = {
+        "column": scalar,
+        "channels": list(names),
+        "rms_before_nT": fit.rms_before,
+        "rms_nT": fit.rms_after,
+        "contribution_nT": fit.contribution,
+        "left_out": fit.left_out,
+    }
+    largest = sorted(fit.contribution.items(), key=lambda one: -one[1])
+    parts = ", ".join(
+        f"{name} {value:.2g}" for name, value in largest[:MAX_LISTED_CONTRIBUTIONS] if value > 0.0
+    )
+    text = (
+        f"; scalar {scalar}: {fit.rms_before:.2f} -> {fit.rms_after:.2f} nT about the mean with "
+        f"{counted(len(names), 'channel')} ({parts} nT)"
+    )
+    return replace(calibration, sensors=(fit.sensor,)), text
 
 
 def _refuse_together(parameter: tuple[str, ...], method: str, vehicle: Path | None, fleet: str) -> None:

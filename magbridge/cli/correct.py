@@ -84,7 +84,8 @@ def correct(
         The calibration (cal.json); with --config by default that of the bridge.
     output
         The file to write: total field with its sigma, vector, anomaly and quality flags; also the log's
-        position, depth, attitude and the calibration's parameters.
+        position, depth, attitude and the calibration's parameters. With a scalar magnetometer in the
+        calibration and in the log: scalar_field, its sigma and flags.
     learn
         Learn the calibration during the run, as a bridge with [learning] does; the log needs positions.
     config
@@ -113,7 +114,7 @@ def correct(
     with Writer(output) as writer:
         parts = track(read_chunks(files, required=CHANNELS, options=reading.options), "correcting")
         given = files, known, source, settings if learn else None
-        for part, corrected, correction in _corrected(parts, *given):
+        for part, corrected, correction in _scalar_too(_corrected(parts, *given), known):
             writer.append(corrected)
             _notify(correction)
             pieces.append(part.attrs)
@@ -133,6 +134,24 @@ def correct(
     if correction is not None and correction.learner is not None:
         summary += _keep_learned(correction.learner, known, facts, save)
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
+
+
+def _scalar_too(
+    pieces: Iterator[tuple[xr.Dataset, xr.Dataset, Correction]], known: Calibration
+) -> Iterator[tuple[xr.Dataset, xr.Dataset, Correction]]:
+    """Yield the corrected pieces, with the compensated scalar where the calibration has one.
+
+    The swing of a channel is that of the whole log: with a scalar the pieces are one.
+    """
+    if not known.sensors:
+        yield from pieces
+        return
+    from magbridge.calibration.fitting.scalar_log import with_scalar
+    from magbridge.logs.deployment import join
+
+    logs, corrected, correction = zip(*pieces, strict=True)
+    log = join(logs)
+    yield log, with_scalar(join(corrected), log, known.sensors), correction[-1]
 
 
 def _source(calibration: Path | None, config: Path | None, *, learn: bool) -> Path:

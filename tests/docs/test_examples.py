@@ -121,7 +121,7 @@ def test_the_page_of_a_calibration_has_its_keys(survey_and_runs: Path) -> None:
     keys = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
     written = json.loads((survey_and_runs / "cal.json").read_text())
     assert [key for key in keys if key in written] == list(written)
-    assert set(keys) - set(written) <= {"doubts", "level"}
+    assert set(keys) - set(written) <= {"doubts", "level", "sensors"}
 
 
 @pytest.mark.parametrize("block", blocks("python"), ids=str)

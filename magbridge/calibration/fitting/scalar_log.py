@@ -1,0 +1,245 @@
+"""Read a scalar magnetometer beside a vector sensor from a log, fit it, and compensate a log with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.calibration.correct import correct
+from magbridge.calibration.fitting.observe import at_one_time
+from magbridge.calibration.fitting.scalar_fit import ScalarFit, adapt_to_log, fit_scalar
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.scalar import (
+    ScalarQuality,
+    ScalarSensor,
+    ScalarSeries,
+    compare_sensors,
+    correct_scalar,
+)
+from magbridge.columns import CHANNELS, COLUMNS, require
+from magbridge.errors import DataError, FormatError
+from magbridge.field.reference import reference_field
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magbridge.field.grid import AnomalyGrid
+
+__all__ = ["SCALAR_COLUMNS", "calibrate_scalar", "telemetry_columns", "with_scalar"]
+
+SCALAR_COLUMNS = "scalar_field", "scalar_field_sigma", "scalar_level_sigma", "scalar_quality"
+"""Columns that compensation adds."""
+MAX_CHANNEL_GAP_S = 30.0
+"""s between two values of a channel, across which it is not interpolated."""
+EARTH_RADIUS_M = 6371008.8
+TELEMETRY_OF_SENSOR = ("sensor_temperature", "depth")
+"""Columns with a meaning of their own that may also be telemetry channels."""
+SAMPLE_LABELS = {"run", "dive", "line", "line_type", "power_cycle"}
+NOT_TELEMETRY_PREFIXES = ("mag_", "age_", "gps_", "dr_", "truth_", "local_")
+"""Columns that number, time or place a sample."""
+
+
+def telemetry_columns(ds: xr.Dataset, column: str) -> tuple[str, ...]:
+    """Return the columns of a log that are telemetry: numbers without another meaning, which change.
+
+    Parameters
+    ----------
+    ds : Dataset
+        The log.
+    column : str
+        The scalar's column, which is none of them.
+    """
+    names = []
+    for name in map(str, ds.data_vars):
+        own = (name in COLUMNS and name not in TELEMETRY_OF_SENSOR) or name in SAMPLE_LABELS
+        if own or name == column or name.startswith(NOT_TELEMETRY_PREFIXES):
+            continue
+        if ds[name].dtype.kind not in "fiub" or ds[name].ndim != 1:
+            continue
+        values = ds[name].to_numpy().astype(float)
+        values = values[np.isfinite(values)]
+        if len(values) > 1 and values.min() < values.max() and not _is_field(ds[name]):
+            names.append(name)
+    return tuple(names)
+
+
+def calibrate_scalar(
+    ds: xr.Dataset,
+    calibration: Calibration,
+    column: str,
+    names: Sequence[str],
+    *,
+    grid: AnomalyGrid | None = None,
+    map_known: bool = False,
+    lag: float | None = None,
+    lever: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> ScalarFit:
+    """Fit the compensation of a log's scalar magnetometer.
+
+    Parameters
+    ----------
+    ds : Dataset
+        With the vector sensor's channels and `column`, nT, and a reference or positions.
+    calibration : Calibration
+        Of the vector sensor, which gives the directions.
+    column : str
+        The scalar magnetometer's reading.
+    names : sequence of str
+        Telemetry channels.
+    grid : AnomalyGrid, optional
+        Added to the main field.
+    map_known : bool
+        The reference includes the crustal field.
+    lag : float, optional
+        s, of the scalar behind the vector; estimated if not given.
+    lever : tuple of 3 float
+        m, forward, starboard and down from the positions to the scalar sensor.
+
+    Raises
+    ------
+    FormatError
+        A column is missing, or there is neither a reference nor a position.
+    DataError
+        The reading is not nT.
+    CalibrationError
+        Too few samples.
+    """
+    require(ds, (*CHANNELS, column, *names))
+    reading = ds[column].to_numpy().astype(float)
+    usual = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
+    if not 1e4 < usual < 1e5:
+        source = ds.attrs.get("source", "the log")
+        raise DataError(
+            f"{source}: column {column!r}: expected the total field in nT, got a median of {usual:g}"
+        )
+    reference = reference_field(_moved(ds, lever), grid)
+    if "daily_variation" in ds:
+        reference = reference + ds["daily_variation"].to_numpy()
+    rows = at_one_time(ds)
+    time = np.asarray(ds["time"].to_numpy(), float)
+    field = np.stack([rows[name].to_numpy().astype(float) for name in CHANNELS], axis=1)
+    channels = [_at_rows(time, ds, name) for name in calibration.channels]
+    corrected = correct(calibration, field, np.stack(channels, axis=1) if channels else field[:, :0], time)
+    series = _series(ds, column, names, corrected.vector, reference)
+    units = tuple(str(ds[name].attrs.get("units", "")) for name in names)
+    return fit_scalar(
+        series, tuple(names), column=column, units=units, lag=lag, map_known=map_known, lever=lever
+    )
+
+
+def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[ScalarSensor]) -> xr.Dataset:
+    """Return a corrected log with the compensated scalar magnetometer.
+
+    Parameters
+    ----------
+    corrected : Dataset (time)
+        What the correction of the vector sensor made of `log`.
+    log : Dataset
+        With the scalar's column and its telemetry channels; other times than those of `corrected` are
+        interpolated for telemetry, and have no reading.
+    sensors : sequence of ScalarSensor
+        Of the calibration; the first whose column the log has is used.
+
+    Returns
+    -------
+    Dataset
+        With :data:`SCALAR_COLUMNS`; ``total_field_sigma`` is larger where the two sensors differ and the
+        vector sensor may be the cause. Unchanged where the log has no such column.
+
+    Raises
+    ------
+    FormatError
+        A telemetry channel of the compensation is not in the log.
+    """
+    sensor = next((one for one in sensors if one.column in log), None)
+    if sensor is None:
+        return corrected
+    if missing := [channel.name for channel in sensor.channels if channel.name not in log]:
+        source = log.attrs.get("source", "the log")
+        raise FormatError(source, f"column {missing[0]!r} is missing: the scalar's compensation needs it")
+    log = log.sel(time=corrected["time"]) if log.sizes["time"] != corrected.sizes["time"] else log
+    vector = np.stack([corrected[f"field_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+    total, sigma = (corrected[name].to_numpy() for name in ("total_field", "total_field_sigma"))
+    reference = total - corrected["anomaly"].to_numpy()
+    series = _series(log, sensor.column, [channel.name for channel in sensor.channels], vector, reference)
+    found = correct_scalar(adapt_to_log(sensor, series.channels), series)
+    seen = compare_sensors(found.field, found.sigma, total, sigma, reference)
+    quality = np.zeros(len(total), int)
+    for flag, rows in (
+        (ScalarQuality.EXTRAPOLATED, found.extrapolated),
+        (ScalarQuality.DISAGREES, seen.disagrees),
+        (ScalarQuality.JUMP, seen.jump),
+        (ScalarQuality.MISSING, found.missing),
+    ):
+        quality[rows] |= int(flag)
+    columns = (
+        found.field,
+        np.sqrt(found.sigma**2 + seen.scalar_variance),
+        found.level_sigma,
+        quality.astype(float),
+    )
+    added = {
+        name: ("time", values, COLUMNS[name]._asdict())
+        for name, values in zip(SCALAR_COLUMNS, columns, strict=True)
+    }
+    wider = np.sqrt(sigma**2 + seen.vector_variance)
+    own = {"total_field_sigma": ("time", wider, corrected["total_field_sigma"].attrs)}
+    return corrected.assign(own | added)
+
+
+def _series(
+    ds: xr.Dataset, column: str, names: Sequence[str], vector: FloatArray, reference: FloatArray
+) -> ScalarSeries:
+    """Return the rows of a log as arrays, telemetry interpolated to them."""
+    time = np.asarray(ds["time"].to_numpy(), float)
+    channels = [_at_rows(time, ds, name) for name in names]
+    cycle = ds["power_cycle"].to_numpy().astype(float) if "power_cycle" in ds else np.full(len(time), np.nan)
+    return ScalarSeries(
+        time,
+        ds[column].to_numpy().astype(float),
+        vector,
+        reference,
+        np.stack(channels, axis=1) if channels else np.empty((len(time), 0)),
+        cycle,
+    )
+
+
+def _at_rows(time: FloatArray, ds: xr.Dataset, name: str) -> FloatArray:
+    """Return a channel at every row (n,): interpolated where it has values close enough on both sides."""
+    values = ds[name].to_numpy().astype(float)
+    known = np.isfinite(values)
+    if known.all() or known.sum() < 2:
+        return np.asarray(values)
+    filled = np.interp(time, time[known], values[known], left=np.nan, right=np.nan)
+    after = np.searchsorted(time[known], time).clip(1, known.sum() - 1)
+    far = time[known][after] - time[known][after - 1] > MAX_CHANNEL_GAP_S
+    return np.where(known, values, np.where(far, np.nan, filled))
+
+
+def _moved(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dataset:
+    """Return a log with the positions of the scalar sensor instead of its own.
+
+    FormatError: there is a lever, and the log has positions but no attitude.
+    """
+    if not any(lever) or not {"latitude", "longitude"} <= set(ds.variables):
+        return ds
+    require(ds, ("roll", "pitch", "heading"))
+    angles = [ds[name].to_numpy().astype(float) for name in ("heading", "pitch", "roll")]
+    known: BoolArray = np.isfinite(np.stack(angles)).all(axis=0)
+    turned = np.zeros((len(known), 3))
+    turned[known] = Rotation.from_euler("ZYX", np.stack(angles, axis=1)[known], degrees=True).apply(lever)
+    latitude = ds["latitude"].to_numpy() + np.degrees(turned[:, 0] / EARTH_RADIUS_M)
+    east = turned[:, 1] / (EARTH_RADIUS_M * np.cos(np.radians(latitude)))
+    return ds.assign(
+        latitude=("time", latitude, ds["latitude"].attrs),
+        longitude=("time", ds["longitude"].to_numpy() + np.degrees(east), ds["longitude"].attrs),
+    )
+
+
+def _is_field(column: xr.DataArray) -> bool:
+    """Return True for a column in units of magnetic flux density: another sensor, not telemetry."""
+    return str(column.attrs.get("units", "")) in ("nT", "uT", "µT", "mT", "T", "G", "mG")

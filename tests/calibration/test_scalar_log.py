@@ -1,0 +1,140 @@
+"""A scalar magnetometer beside the vector: files, commands, and one sensor checked by the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from magbridge import logs
+from magbridge.arrays import FloatArray
+from magbridge.calibration.file import decode_calibration, encode_calibration, load
+from magbridge.calibration.fitting.scalar_fit import fit_scalar
+from magbridge.calibration.model import identity
+from magbridge.calibration.scalar import (
+    ScalarQuality,
+    ScalarSeries,
+    compare_sensors,
+)
+from magbridge.cli import main
+from magbridge.errors import CalibrationError
+
+RATE, MINUTES = 4.0, 24
+CHANNELS = "motor_current", "relay", "rudder"
+SCALAR = "mag_cabin"
+
+
+def flown(seed: int, noise: float = 0.3) -> ScalarSeries:
+    """Return a flight over a known field, by dipoles and currents that the model does not share code with."""
+    random = np.random.default_rng(seed)
+    n = int(MINUTES * 60 * RATE)
+    t = np.arange(n) / RATE
+
+    def slow(seconds: float) -> FloatArray:
+        kernel = np.exp(-0.5 * (np.arange(-4 * seconds, 4 * seconds, 1 / RATE) / seconds) ** 2)
+        y = np.convolve(random.normal(size=n + len(kernel)), kernel, "valid")[:n]
+        return np.asarray((y - y.mean()) / y.std())
+
+    # Four headings in legs of two minutes, with rolls and pitches as in a box flight.
+    heading = np.repeat(90.0 * np.arange(MINUTES // 2), int(120 * RATE))
+    angles = np.column_stack([heading + 3 * slow(4), 6 * slow(3), 9 * slow(3)])
+    earth = np.array([17_000.0, -3_500.0, 51_000.0])
+    total = np.linalg.norm(earth) + 30.0 * slow(20.0)
+    u = Rotation.from_euler("ZYX", angles, degrees=True).inv().apply(earth / np.linalg.norm(earth))
+    channels = np.column_stack([5 + 3 * slow(60), (np.sin(t / 50) > 0.3) * 2.0, 8 * slow(2)])
+    body = u * total[:, None] + [400.0, -250.0, 600.0]
+    body += u * total[:, None] @ np.diag([2e-3, -1e-3, 1.5e-3])
+    body += np.gradient(u, t, axis=0) @ random.normal(0, 8, (3, 3)).T
+    body += channels @ np.array([[3.0, -2.0, 4.0], [6.0, 5.0, -3.0], [0.3, 0.2, -0.4]])
+    flicker = np.cumsum(random.normal(0, 0.01, n))
+    scalar = np.linalg.norm(body, axis=1) + noise * random.normal(size=n) + flicker - flicker.mean() + 5.0
+    vector = u * total[:, None] + random.normal(0, 1.0, (n, 3))
+    return ScalarSeries(t + 1.6e9, scalar, vector, total, channels, np.full(n, np.nan))
+
+
+def half(series: ScalarSeries, second: bool) -> ScalarSeries:
+    middle = len(series.time) // 2
+    rows = slice(middle, None) if second else slice(middle)
+    return ScalarSeries(*(column[rows] for column in series))
+
+
+def test_a_disturbance_that_no_channel_shows_is_seen_by_the_vector() -> None:
+    n = 400
+    truth = np.full(n, 53_000.0)
+    random = np.random.default_rng(3)
+    scalar, total = truth + random.normal(0, 0.5, n), truth + random.normal(0, 5.0, n)
+    scalar[100:160] -= 3_000.0
+    seen = compare_sensors(scalar, np.full(n, 0.5), total, np.full(n, 5.0), truth)
+    assert seen.disagrees[100:160].all()
+    assert seen.disagrees[:100].mean() < 0.01
+    assert (np.sqrt(seen.scalar_variance[100:160]) > 2_900.0).all()
+    assert (seen.vector_variance[100:160] == 0.0).all()  # the reference tells which one is off
+    assert seen.jump[100]
+    assert seen.jump[160]
+    unknown = compare_sensors(scalar, np.full(n, 0.5), total, np.full(n, 5.0), np.full(n, np.nan))
+    assert (unknown.vector_variance[100:160] > 0.0).all()
+
+
+def test_the_file_holds_the_sensor_and_refuses_numbers_that_do_not_belong_together() -> None:
+    found = fit_scalar(half(flown(4), False), CHANNELS, column=SCALAR, map_known=True)
+    both = replace(identity(), sensors=(found.sensor,))
+    written = encode_calibration(both)
+    assert decode_calibration(written).sensors == both.sensors
+    assert b'"format": 5' in written
+    sensor = msgspec.structs.replace(found.sensor, coefficients=found.sensor.coefficients[:-1])
+    short = replace(both, sensors=(sensor,))
+    with pytest.raises(CalibrationError, match=r"sensor 'mag_cabin': expected \d+ coefficients"):
+        decode_calibration(encode_calibration(short))
+
+
+def write(series: ScalarSeries, path: Path) -> None:
+    columns = {f"mag_{axis}": series.vector[:, k] for k, axis in enumerate("xyz")}
+    columns |= {SCALAR: series.scalar, "reference_field": series.reference}
+    columns |= dict(zip(CHANNELS, series.channels.T, strict=True))
+    units = {"motor_current": "A", "relay": "A", "rudder": "deg"}
+    ds = xr.Dataset(
+        {name: ("time", values, {"units": units.get(name, "nT")}) for name, values in columns.items()},
+        coords={"time": series.time},
+    )
+    logs.write(ds, path)
+
+
+def test_commands_calibrate_and_correct_a_scalar(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    series = flown(5)
+    write(half(series, False), tmp_path / "a.nc")
+    write(half(series, True), tmp_path / "b.nc")
+    cal, out = tmp_path / "cal.json", tmp_path / "out.nc"
+    assert main(["calibrate", str(tmp_path / "a.nc"), "--scalar", SCALAR, "-o", str(cal)]) == 0
+    assert "with 3 channels" in capsys.readouterr().out
+    assert [channel.name for channel in load(cal).sensors[0].channels] == list(CHANNELS)
+    assert main(["correct", str(tmp_path / "b.nc"), "--calibration", str(cal), "-o", str(out)]) == 0
+    back = logs.read(out)
+    error = back["scalar_field"].to_numpy() - half(series, True).reference
+    assert np.sqrt(np.mean(error**2)) < 2.0
+    assert np.mean(back["scalar_quality"].to_numpy().astype(int) & ScalarQuality.DISAGREES != 0) < 0.01
+    assert main(["calibrate", str(tmp_path / "a.nc"), "--lag", "1", "-o", str(cal)]) == 2
+    assert "--scalar COLUMN" in capsys.readouterr().err
+    wrong = ["calibrate", str(tmp_path / "a.nc"), "--scalar", SCALAR, "--lever", "1,2", "-o", str(cal)]
+    assert main(wrong) == 2
+    assert "F,R,D" in capsys.readouterr().err
+
+
+def test_the_vector_is_calibrated_by_the_scalar(tmp_path: Path) -> None:
+    """A scalar away from the iron is the reference: no map and no position are needed."""
+    series = flown(6)
+    iron = np.array([300.0, -200.0, 100.0])
+    seen = series._replace(scalar=series.reference, vector=np.add(series.vector, iron))
+    path, cal, out = tmp_path / "a.nc", tmp_path / "cal.json", tmp_path / "out.nc"
+    write(seen, path)
+    only = tmp_path / "only.nc"
+    logs.write(logs.read(path).drop_vars("reference_field"), only)
+    assert main(["calibrate", str(only), "--scalar", SCALAR, "--reference", "scalar", "-o", str(cal)]) == 0
+    assert load(cal).sensors == ()
+    assert main(["correct", str(path), "--calibration", str(cal), "-o", str(out)]) == 0
+    error = logs.read(out)["total_field"].to_numpy() - series.reference
+    assert np.sqrt(np.mean(error**2)) < 1.5
