@@ -177,7 +177,7 @@ ATTACKS = (
            lambda a, k: a.emit(frame(255, 190, "COMMAND_LONG", **to_us(command=k % 1000)), 5),
            "commands a second"),
     Attack("our own heartbeat, sent back", "udpin", 1,
-           lambda a, _: a.emit(frame(1, 191, "HEARTBEAT", type=18, autopilot=8)), "another program speaks"),
+           lambda a, _: a.emit(frame(1, 191, "HEARTBEAT", type=18, autopilot=8)), "another program sends"),
     Attack("nothing, by TCP", "tcpin", 0, lambda _a, _k: None),
     Attack("1,000 connections a second", "tcpin", 0, connect),
     Attack("1,000 connections a second, each with half a frame", "tcpin", 0,

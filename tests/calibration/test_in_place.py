@@ -177,7 +177,7 @@ def test_a_long_log_comes_to_rest_with_few_samples_and_ends_with_all(
         used.append(found.samples)
         return found
 
-    monkeypatch.setattr(in_place, "SETTLED", len(data) // 6)
+    monkeypatch.setattr(in_place, "FIRST_SAMPLES", len(data) // 6)
     monkeypatch.setattr(rounds.Rounds, "_sums", counted)
     found = fit(data)
     all_of_them = [number for number in used if number > len(data) // 2]

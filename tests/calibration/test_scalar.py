@@ -110,3 +110,21 @@ def test_wrong_number_of_channels_and_too_few_samples(halves: Halves, fitted: Sc
         correct_scalar(fitted.sensor, second._replace(channels=second.channels[:, :1]))
     with pytest.raises(CalibrationError, match="expected at least 100 samples"):
         fit_scalar(_part(first, slice(0, 50)), NAMES)
+
+
+def test_a_source_that_no_channel_shows_is_left_out_of_the_fit(halves: Halves, fitted: ScalarFit) -> None:
+    first, second, truth = halves
+    scalar = first.scalar.copy()
+    scalar[1500:1600] -= 3_000.0
+    found = fit_scalar(first._replace(scalar=scalar), NAMES, map_known=True)
+    error = correct_scalar(adapt_to_log(found.sensor, second.channels), second).field - truth
+    assert np.sqrt(np.mean(error**2)) < 3.0
+    assert found.rms_after < 1.5 * fitted.rms_after
+
+
+def test_without_a_map_the_crustal_field_is_estimated(halves: Halves) -> None:
+    first, second, truth = halves
+    main = np.full(len(first.time), np.median(truth))
+    found = fit_scalar(first._replace(reference=main), NAMES)
+    error = correct_scalar(adapt_to_log(found.sensor, second.channels), second).field - truth
+    assert np.sqrt(np.mean(error**2)) < 0.5 * np.std(truth)

@@ -28,6 +28,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_discrete_are
 from scipy.optimize import minimize
 from scipy.signal import sosfilt, zpk2sos
+from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.scalar import (
@@ -62,6 +63,14 @@ LOG_PROCESS_CENTRE, LOG_PROCESS_SPREAD, LOG_PROCESS_STEP = float(np.log(0.1)), 2
 """Log of nT: centre and 1-sigma of white noise and fastest process, 1-sigma of the change to the next."""
 LOG_CRUST_CENTRES, LOG_CRUST_SPREAD = np.log(np.array([30.0, 30.0])), 1.5
 """Log of the crustal field's amplitude (nT) and time scale (s) along the track, where no map is known."""
+LOG_LONGEST_CRUST, REFUSED_COST = float(np.log(1000.0)), 1e9
+"""Log of s, longest time scale of the crustal field; cost of noise whose whitening filter is unstable."""
+WITNESS_SIGMA, WITNESS_PASSES = 8.0, 12
+"""Distance from the vector sensor, in robust standard deviations, beyond which a sample is not fitted."""
+LOG_WIDTH_LIMITS = -15.0, 15.0
+"""Limits of the log of a width, nT: a trial step of the optimiser stays finite."""
+ROUNDING = 1e-10
+"""Fraction of the crustal variance that is added to each step, whose own variance is lost in rounding."""
 OUTLIER_INNOVATION_SIGMA, OUTLIER_PAD = 8.0, 4
 """Whitened residual beyond which a sample is left out of the fit, and samples left out on either side."""
 
@@ -147,17 +156,44 @@ def fit_scalar(
         _channel(name, series.channels[valid, k], units[k] if units else "") for k, name in enumerate(names)
     )
     reference_field = float(np.median(series.reference[valid]))
+    valid &= _agreeing(series, valid, channels, reference_field)
     problem = _ScalarProblem.build(series, valid, channels, reference_field, lag)
     kept = np.ones(len(problem.target), bool)
     start: FloatArray | None = None
-    for _ in range(3):  # outliers of one pass are left out in the next
-        state = problem.part(kept).optimise(map_known=map_known, start=start)
-        outliers = problem.outliers(state, kept)
-        if not outliers.any():
-            break
-        kept &= ~outliers
-        start = state.log_noise
+    with threadpool_limits(1, "blas"):  # for matrices this small threads cost more than they gain
+        for _ in range(3):  # outliers of one pass are left out in the next
+            state = problem.part(kept).optimise(map_known=map_known, start=start)
+            outliers = problem.outliers(state, kept)
+            if not outliers.any():
+                break
+            kept &= ~outliers
+            start = state.log_noise
     return _result(problem, kept, state, series, column, directions_from, channels, lever)
+
+
+def _agreeing(
+    series: ScalarSeries, valid: BoolArray, channels: tuple[ScalarChannel, ...], reference_field: float
+) -> BoolArray:
+    """Return the samples (n,) at which the scalar is what the vector sensor makes one expect.
+
+    Notes
+    -----
+    The crustal field is in both sensors, so that the difference of scalar and vector length is the platform's
+    field and noise. A fit of the model's columns by least absolute values leaves a source that no channel
+    shows.
+    """
+    design = scalar_design(series, channels, reference_field)
+    design = np.column_stack([design, np.ones(len(design))])
+    difference = series.scalar - np.linalg.norm(series.vector, axis=1)
+    weight = valid.astype(float)
+    for _ in range(WITNESS_PASSES):
+        # Weights of 1 / |r| minimise the sum of |r|: some far samples do not move the fit.
+        root = np.sqrt(weight)
+        found = np.linalg.lstsq(design[valid] * root[valid, None], (difference * root)[valid], rcond=1e-10)[0]
+        residual = np.abs(difference - design @ found)
+        usual = max(1.4826 * float(np.median(residual[valid])), 1e-3)
+        weight = 1.0 / np.maximum(residual, usual)
+    return np.asarray(valid & (residual <= WITNESS_SIGMA * usual))
 
 
 def _channel(name: str, values: FloatArray, unit: str) -> ScalarChannel:
@@ -259,8 +295,14 @@ class _ScalarProblem:
         warm = np.log([block.centre for block in self.blocks if block.spread > 0.0])
         best: _State | None = None
 
+        # A time scale beyond these limits is white noise or part of the level; its filter would be unstable.
+        limits = [(-9.0, 9.0)] * (1 + len(TIME_CONSTANTS_S))
+        limits += [(-3.0, 7.0), (float(np.log(2.0 * self.interval)), LOG_LONGEST_CRUST)]
+
         def cost(log_noise: FloatArray) -> float:
             nonlocal warm, best
+            if not np.isfinite(self.whiten(log_noise)[1]).all():
+                return REFUSED_COST
             state, widths = self.posterior(log_noise, warm)
             if best is None or state.value < best.value:
                 best, warm = state, widths
@@ -274,7 +316,7 @@ class _ScalarProblem:
             if not map_known:
                 start = np.append(start, LOG_CRUST_CENTRES)
         minimize(
-            cost, start, method="L-BFGS-B", bounds=[(-9.0, 9.0)] * len(start),
+            cost, start, method="L-BFGS-B", bounds=limits[: len(start)],
             options={"maxiter": EVIDENCE_ITERATIONS, "ftol": 1e-6, "eps": 1e-3},
         )  # fmt: skip
         assert best is not None
@@ -336,8 +378,9 @@ def _choose_widths(
         return value, slope, _Widths(logs, sigma, mean, covariance, value)
 
     found = minimize(
-        lambda logs: evaluate(logs)[:2], log_widths, jac=True, method="L-BFGS-B", options={"maxiter": 60}
-    )
+        lambda logs: evaluate(logs)[:2], log_widths, jac=True, method="L-BFGS-B",
+        bounds=[LOG_WIDTH_LIMITS] * len(log_widths), options={"maxiter": 60},
+    )  # fmt: skip
     return evaluate(found.x)[2]
 
 
@@ -478,12 +521,13 @@ def _matern_transition(length: float, variance: float, interval: float) -> tuple
     ``lambda = sqrt(5) / l``; ``A = exp(F dt)`` with F the companion matrix of ``(s + lambda)^3``; ``Q = P -
     A P A^T`` with the stationary covariance P (Hartikainen & Sarkka 2010, doi:10.1109/MLSP.2010.5589113).
     """
-    rate, t = np.sqrt(5.0) / length, interval
-    N = np.array([[rate, 1.0, 0.0], [0.0, rate, 1.0], [-(rate**3), -3.0 * rate**2, -2.0 * rate]])
-    A = np.exp(-rate * t) * (np.eye(3) + t * N + 0.5 * t * t * N @ N)  # N is nilpotent: N^3 = 0
-    k = variance * rate**2 / 3.0
-    P = np.array([[variance, 0.0, -k], [0.0, k, 0.0], [-k, 0.0, variance * rate**4]])
-    return A, P - A @ P @ A.T
+    # Derivatives in units of lambda and lambda^2: all entries are of the order of 1, whatever the scales are.
+    x = np.sqrt(5.0) / length * interval
+    N = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0], [-1.0, -3.0, -2.0]])  # F / lambda + 1; N^3 = 0
+    A = np.exp(-x) * (np.eye(3) + x * N + 0.5 * x * x * N @ N)
+    P = variance * np.array([[1.0, 0.0, -1.0 / 3.0], [0.0, 1.0 / 3.0, 0.0], [-1.0 / 3.0, 0.0, 1.0]])
+    Q = P - A @ P @ A.T + ROUNDING * variance * np.eye(3)
+    return A, 0.5 * (Q + Q.T)
 
 
 def _result(
