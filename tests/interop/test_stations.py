@@ -45,7 +45,7 @@ def test_mavproxy(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     )  # fmt: skip
     peer.until("Detected vehicle 1:191")
     peer.ask("param fetch")
-    peer.until("Received 18 parameters")
+    peer.until("Received 19 parameters")
     peer.ask("param show MB_*")
     peer.until("MB_GAP_FACTOR")
     peer.ask("param set MB_GAP_FACTOR 4.5")
