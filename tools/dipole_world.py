@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magbridge.arrays import BoolArray, FloatArray
+from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.correction import Correction
 from magbridge.field.igrf import igrf
-from magbridge.records import Quality, Reading
+from magbridge.records import Reading
 
 __all__ = [
     "START_S",
@@ -29,7 +29,6 @@ __all__ = [
     "calibrate",
     "correct_live",
     "glider_track",
-    "plane_track",
 ]
 
 START_S = 1_780_000_000.0
@@ -74,29 +73,12 @@ class Crust:
         return np.asarray(self._amplitude * np.cos(metres @ self._k.T + self._phase).sum(axis=1))
 
 
-def flicker(rng: np.random.Generator, seconds: FloatArray, sigma_nt: float) -> FloatArray:
-    """Return 1/f noise (n, 3): Ornstein-Uhlenbeck processes of 1 to 10,000 s, one a half decade."""
-    step = float(seconds[1] - seconds[0])
-    times = 10.0 ** np.arange(0.0, 4.01, 0.5)
-    out = np.zeros((len(seconds), 3))
-    for tau in times:
-        keep = np.exp(-step / tau)
-        state = rng.normal(size=3)
-        shocks = rng.normal(size=(len(seconds), 3)) * np.sqrt(1.0 - keep**2)
-        for k, shock in enumerate(shocks):
-            state = keep * state + shock
-            out[k] += state
-    return np.asarray(sigma_nt * out / np.sqrt(len(times)))
-
-
 class Vehicle:
-    """Hard iron, soft iron, dipole masses and the currents of one vehicle, drawn from `seed`."""
+    """Hard iron, soft iron and dipole masses of one vehicle, drawn from `seed`."""
 
-    def __init__(
-        self, seed: int, masses: tuple[str, ...] = ("battpos", "ballast"), current: str = ""
-    ) -> None:
+    def __init__(self, seed: int, masses: tuple[str, ...] = ("battpos", "ballast")) -> None:
         rng = np.random.default_rng([seed, 3])
-        self.masses, self.current = masses, current
+        self.masses = masses
         self._hard = rng.normal(0.0, 800.0, 3)
         soft = rng.normal(0.0, 0.012, (3, 3))
         self._soft = np.eye(3) + soft
@@ -106,7 +88,6 @@ class Vehicle:
         for name in masses:
             away = rng.normal(size=3)
             self._home[name] = away / np.linalg.norm(away) * rng.uniform(0.55, 0.75)
-        self._per_ampere = rng.normal(0.0, 4.0, 3)
 
     def field(
         self, track: Track, anomaly: FloatArray, masses: dict[str, FloatArray]
@@ -124,8 +105,6 @@ class Vehicle:
             moment = self._moment[name] + self._induced[name] * body
             along = np.sum(n * moment, axis=1)[:, None]
             out = out + MU0_OVER_4PI_NT * (3.0 * n * along - moment) / distance**3
-        if self.current:
-            out = out + masses[self.current][:, None] * self._per_ampere
         return np.asarray(out), np.asarray(total + anomaly)
 
 
@@ -209,39 +188,6 @@ def glider_track(
     )
 
 
-def plane_track(
-    seed: int, hours: float, rate_hz: float, *, start_s: float = START_S, box: bool = False
-) -> Track:
-    """Return a plane at 22 m/s with turns of 90 degrees every few minutes, and its battery current, A."""
-    rng = np.random.default_rng([seed, 6, int(box)])
-    step = 1.0 / rate_hz
-    n = int(3600.0 * hours * rate_hz)
-    seconds = step * np.arange(n)
-    leg = 60.0 if box else 200.0
-    turns = rng.choice([-0.5, 0.5], int(seconds[-1] / leg) + 2) * np.pi
-    heading = smooth(np.cumsum(turns)[(seconds / leg).astype(int)], 9.0 / step)
-    rate = np.gradient(heading, step)
-    roll = np.arctan(22.0 * rate / 9.81)
-    pitch = np.radians(2.0) + np.zeros(n)
-    if box:
-        roll = roll + np.radians(10.0) * np.sin(2.0 * np.pi * seconds / 5.0) * (seconds % leg > 35.0)
-        pitch = pitch + np.radians(8.0) * np.sin(2.0 * np.pi * seconds / 6.3) * (seconds % leg > 25.0)
-    for angle, sigma in ((pitch, 0.7), (roll, 1.0), (heading, 0.7)):
-        angle[:] = angle + np.radians(wander(rng, n, step, 2.0, sigma))
-    current = 11.0 + wander(rng, n, step, 8.0, 1.0) + smooth(8.0 * np.abs(rate) / 0.17, 2.0 / step)
-    speed = 22.0
-    north, east = (np.cumsum(speed * f(heading)) * step for f in (np.cos, np.sin))
-    return Track(
-        np.asarray(start_s + seconds, float),
-        np.stack([roll, pitch, heading], axis=1),
-        -35.39 + north / METRES_PER_DEGREE,
-        149.17 + east / (METRES_PER_DEGREE * np.cos(np.radians(35.39))),
-        np.full(n, -684.0),
-        {"batt_current": current},
-        np.full(n, 22.0),
-    )
-
-
 def calibrate(vehicle: Vehicle, track: Track, noise: FloatArray, *, unit: str = "") -> Calibration:
     """Fit a calibration to runs whose true total field is known."""
     field, total = vehicle.field(track, np.zeros(len(track.time)), track.masses)
@@ -252,23 +198,17 @@ def calibrate(vehicle: Vehicle, track: Track, noise: FloatArray, *, unit: str = 
     data["reference_field"] = "time", total, {"units": "nT"}
     data["segment"] = "time", np.floor(10.0 * np.arange(len(total)) / len(total)).astype(int).astype(str)
     log = xr.Dataset(data, coords={"time": track.time})
-    return fit(
-        observations(log, vehicle.masses + (vehicle.current,) * bool(vehicle.current)), "auto"
-    ).calibration
+    return fit(observations(log, vehicle.masses)).calibration
 
 
-@dataclass
+@dataclass(frozen=True)
 class Published:
-    """Total field and sigma (nT) and flags of each sample, and the messages with their row."""
+    """Total field and sigma (n,), nT, and flags of each sample; the messages with their row."""
 
     total: FloatArray
     sigma: FloatArray
     quality: FloatArray
     notices: list[tuple[int, str]]
-
-    def plain(self) -> BoolArray:
-        """Return whether each sample has no flag except a missing boresight."""
-        return np.asarray((self.quality.astype(int) & ~int(Quality.NO_BORESIGHT)) == 0)
 
 
 def correct_live(
@@ -277,35 +217,28 @@ def correct_live(
     field: FloatArray,
     reported: dict[str, FloatArray],
     *,
-    every: int = 1,
     interval_s: float = 1.0,
-    lost: FloatArray | None = None,
-    main_field: FloatArray | None = None,
 ) -> Published:
-    """Feed a correction with readings (every `every`-th row) and telemetry, in the order of time.
+    """Feed a correction with the readings of a track and its telemetry, in the order of time.
 
-    A row's telemetry comes just before its reading, if the row has any: what moves after a report is not
-    known until the next.
+    A row's telemetry comes just before its reading, if the row has any: a motion after a report is not known
+    until the next report.
     """
-    rows = np.arange(0, len(track.time), every)
-    total, sigma = np.full((2, len(rows)), np.nan)
-    quality, notices = np.zeros(len(rows)), []
-    if main_field is None:
-        ned = igrf(track.longitude, track.latitude, track.depth, track.time)
-        main_field = np.linalg.norm(ned, axis=1)
-    step = float(track.time[1] - track.time[0])
-    reports = max(round(interval_s / step), 1)
+    n = len(track.time)
+    total, sigma = np.full((2, n), np.nan)
+    quality, notices = np.zeros(n), []
+    main_field = np.linalg.norm(igrf(track.longitude, track.latitude, track.depth, track.time), axis=1)
+    reports = max(round(interval_s / float(track.time[1] - track.time[0])), 1)
     stamps = (np.rint(track.time * 1e6).astype(np.int64) & ~3).tolist()
     fields, warmth, main = field.tolist(), track.temperature.tolist(), main_field.tolist()
     where = list(zip(track.latitude.tolist(), track.longitude.tolist(), strict=True))
     values = {name: column.tolist() for name, column in reported.items()}
-    for k, row in enumerate(rows.tolist()):
-        for report in range(row - every + 1, row + 1):
-            if report >= 0 and report % reports == 0 and (lost is None or not lost[report]):
-                for name, column in values.items():
-                    correction.telemetry(name, column[report], stamps[report])
-        reading = Reading(tuple(fields[row]), temperature=warmth[row])
-        _, one = correction.reading(reading, stamps[row], main_field=main[row], where=where[row])
+    for k in range(n):
+        if k % reports == 0:
+            for name, column in values.items():
+                correction.telemetry(name, column[k], stamps[k])
+        reading = Reading(tuple(fields[k]), temperature=warmth[k])
+        _, one = correction.reading(reading, stamps[k], main_field=main[k], where=where[k])
         total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
         notices += [(k, text) for text in correction.notices]
         correction.notices.clear()

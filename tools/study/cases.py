@@ -45,19 +45,7 @@ PREDICTED = ("named", "ladder", "pair", *NAMELESS)
 STRANGE = ("jettison", "duet", "winch", "mooring")
 """Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
 SEEN = (
-    "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase", "swell",
-    "cargo", "contact", "strobe", "storm", "rotor", "viscous", "brownout", "mains", "slip", "motional",
-    "leak", "ranges", "sag", "crossover", "popcorn", "discharge", "towed", "sunlit", "eccentric", "astray",
-    "trailing", "compliant", "restart", "whistle",
-    "yielding", "afterglow", "mast", "annealed", "dynamo", "hvdc", "dew",
-    "sampler", "substorm", "litter", "stuck", "sounder",
-    "gradient", "squeezed", "flare", "swarf",
-    "ageing", "crossfield", "railway", "rudder",
-    "latch", "recovery", "clamp", "seiche",
-    "accumulator", "modem", "rezero", "pipeline",
-    "backdriven", "microphonic", "soliton", "escort",
-    "airlock", "wiper", "seep", "ferry",
-    "solar", "gimbal", "lookup", "consort",
+    "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase",
 )  # fmt: skip
 """Foreign effects that were once made for this purpose, but before the detector was last improved."""
 GOLDEN = 0.6180339887498949
