@@ -59,7 +59,7 @@ def bridge_toml(answers: Answers, calibration: Calibration | None = None) -> str
     return "\n".join(
         [
             "# What each key means, and all others: magbridge's documentation, 'On a vehicle'.",
-            "# magbridge run --check --config THIS says what would go wrong; it opens nothing.",
+            "# magbridge run --check --config THIS says what would go wrong; with --live, what arrives.",
             "",
             *_sensor(answers),
             "",

@@ -134,7 +134,7 @@ class Pipeline:
             kept=start.parameters,
             status=self._status,
             speaking=lambda: self.sensor.state == MAG_PORT_STATE.OK,
-            streams=self._streams() if config.link.request_streams else None,
+            streams=self._streams(),
         )
         own = config.link
         self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
@@ -167,6 +167,11 @@ class Pipeline:
             navigation=config.navigation is not None,
             telemetry=tuple(wanted.message for wanted in config.telemetry.values()),
         )
+
+    @property
+    def samples(self) -> int:
+        """Number of readings so far."""
+        return self._samples
 
     @property
     def declarations(self) -> list[bytes]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from threading import Thread
 
 from magbridge.bridge import states
-from magbridge.bridge.bus_port import sensor_port
+from magbridge.bridge.bus_port import BusPort, sensor_port
 from magbridge.bridge.drive import drive, set_up
 from magbridge.bridge.events import HostClock
 from magbridge.bridge.file_server import FileServer
@@ -22,12 +22,14 @@ from magbridge.bridge.links import open_link
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.nmea import NmeaOutput, nmea_port
 from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.port import Port
+from magbridge.bridge.serial_port import SerialPort
 from magbridge.config import Config, load
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["run"]
+__all__ = ["ports", "run"]
 
 SWITCH = 0.0005
 """s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
@@ -56,18 +58,8 @@ def run(path: Path) -> None:
     keeper = Keeper(config)
     clock = HostClock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
-    sensor = sensor_port(config)
+    link, sensor = ports(config)
     nmea = nmea_port(config)
-    own = config.link
-    who, signed = (own.system, own.autopilot), own.signing_key is not None
-    link = open_link(
-        own.url,
-        own.baudrate,
-        str(config.path),
-        autopilot=who,
-        budget=1e3 * own.max_other_peers_rate,
-        signed=signed,
-    )
     # the link first, so that a sensor's port that does not open can be reported over it
     edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
     keeper.attach(edge)
@@ -90,7 +82,7 @@ def run(path: Path) -> None:
         pipeline.component.metadata, logs, lambda: 1e3 * parameters["MB_FILE_RATE"], edge.notify
     )
 
-    def after(time_us: int) -> None:
+    def finish_event(time_us: int) -> None:
         while requests:
             files.ask(requests.popleft())
         if not link.waiting:
@@ -106,7 +98,7 @@ def run(path: Path) -> None:
             sensor.move_on()
 
     try:
-        drive(pipeline, edge, log, after)
+        drive(pipeline, edge, log, finish_event)
     finally:
         keeper.save(pipeline, last=True)
         files.close()
@@ -115,6 +107,23 @@ def run(path: Path) -> None:
             sentences.close()
         if log is not None:
             log.close()
+
+
+def ports(config: Config) -> tuple[Port, SerialPort | BusPort]:
+    """Return the (unopened) ports of the link and of the sensor.
+
+    ConfigError: a name that no port can have.
+    """
+    own = config.link
+    link = open_link(
+        own.url,
+        own.baudrate,
+        str(config.path),
+        autopilot=(own.system, own.autopilot),
+        budget=1e3 * own.max_other_peers_rate,
+        signed=own.signing_key is not None,
+    )
+    return link, sensor_port(config)
 
 
 def _stop_on_signals(edge: LiveEdge) -> None:

@@ -6,7 +6,7 @@ import sys
 from contextlib import nullcontext
 from math import inf, nan
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter, validators
 
@@ -25,6 +25,9 @@ from magbridge.cli.common import (
 from magbridge.errors import DataError, WrongUse
 from magbridge.files import new_folder
 from magbridge.wording import counted
+
+if TYPE_CHECKING:
+    from magbridge.bridge.check import ConfigFault
 
 MIN_REPLAY_SPEED = 1e-3
 """Lowest replay speed, relative to real time: a log of an hour then takes six weeks."""
@@ -84,8 +87,8 @@ def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
             serve(link, 0, "127.0.0.1", port, grid=out / MAP, show=show)
 
 
-@command("run --config bridge.toml [--check]")
-def run(*, config: Path, check: bool = False) -> None:
+@command("run --config bridge.toml [--check [--live]]")
+def run(*, config: Path, check: bool = False, live: bool = False) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
 
     magbridge init writes a configuration, magbridge ports shows which device sends on which serial port, and
@@ -96,11 +99,15 @@ def run(*, config: Path, check: bool = False) -> None:
     config
         The configuration (bridge.toml).
     check
-        Report everything that would go wrong, and exit; no port is opened.
+        Report everything that would go wrong, and exit; without --live, no port is opened.
+    live
+        With --check, open the ports for 20 s and list which messages arrive at which rate.
     """
     if check:
-        _check(config)
+        _check(config, live=live)
         return
+    if live:
+        raise WrongUse("run: --live needs --check")
 
     from magbridge.bridge.run import run as attach
 
@@ -109,18 +116,37 @@ def run(*, config: Path, check: bool = False) -> None:
     attach(config)
 
 
-def _check(config: Path) -> None:
-    """Print all that would go wrong; WrongUse: the bridge would not start."""
+def _check(config: Path, *, live: bool) -> None:
+    """Print all that would go wrong, and with `live` what arrives; WrongUse: the bridge would not start."""
     from magbridge.bridge.check import findings
 
     found = findings(config)
+    errors = sum(one.fatal for one in found)
+    if live and not errors:
+        found += _listen(config)
     for one in found:
         complain(f"{'error' if one.fatal else 'warning'}: {one.text}")
-    errors = sum(one.fatal for one in found)
     warnings = counted(len(found) - errors, "warning")
     if errors:
         raise WrongUse(f"{config}: the bridge would not start: {counted(errors, 'error')}, {warnings}")
     print(f"{config}: the bridge would start, {warnings}")
+
+
+def _listen(config: Path) -> list[ConfigFault]:
+    """Print what arrives on the ports; return what is missing."""
+    from magbridge.bridge.live_check import LISTEN_TIME_S, LiveCheck
+    from magbridge.config import load
+
+    loaded = load(config)
+    print(f"{config}: {LISTEN_TIME_S:.0f} s on {loaded.link.url} and {loaded.sensor.port}", flush=True)
+    check = LiveCheck(loaded, LISTEN_TIME_S)
+    check.listen()
+    print(f"sensor {loaded.sensor.driver}: {check.readings_hz:.4g} readings/s")
+    print(f"{'message':30} {'from':>8} {'Hz':>8} {'needed':>8}")
+    for one in check.arrived:
+        needed = f"{one.needed_hz:g}" if one.needed_hz else "-"
+        print(f"{one.name:30} {one.sender:>8} {one.rate_hz:8.3g} {needed:>8}")
+    return check.faults
 
 
 @command("replay FILE... [--config bridge.toml] [OPTIONS]")

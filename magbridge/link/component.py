@@ -101,8 +101,9 @@ class Component:
         self.announcer = Announcer(self.outbox, self.timers)
         self.vehicle = VehicleState(link.system, link.component, link.autopilot, self.announcer, self.timers)
         self.streams = StreamRequests(
-            (link.system, link.autopilot), streams or {}, self.outbox, self.timers, self.announcer
-        )
+            (link.system, link.autopilot), streams or {}, self.outbox, self.timers, self.announcer,
+            active=link.request_streams,
+        )  # fmt: skip
         self.vehicle.on_reboot = self.streams.rebooted
         self.parameters = Parameters([*rates({**DEFAULT_RATES_HZ, **publish}, LIMITS), *tunables])
         for name in self.parameters.restore(kept or {}):

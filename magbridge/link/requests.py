@@ -63,6 +63,8 @@ class StreamRequests:
         As :func:`needed_rates` returns them.
     outbox, timers, announcer
         Those of the link.
+    active : bool
+        False: rates are only measured.
     """
 
     def __init__(
@@ -72,16 +74,24 @@ class StreamRequests:
         outbox: Outbox,
         timers: Timers,
         announcer: Announcer,
+        *,
+        active: bool = True,
     ) -> None:
+        self._active = active
         self._peer, self._outbox, self._timers, self._announcer = peer, outbox, timers, announcer
-        self._needed = {spec(name).id: pair for name, pair in rates.items()}
+        self.needed = {spec(name).id: pair for name, pair in rates.items()}
+        """Message id -> rate in Hz at which it is needed on an aircraft, and on any other vehicle."""
         self._received: Counter[int] = Counter()
         self._attempts: Counter[int] = Counter()
         self._queue: deque[int] = deque()
         self._asked: int | None = None
         self._present = self._is_aircraft = False
+        self.interval_us = RATE_INTERVAL_US
+        """µs over which rates are measured."""
         self.measured: dict[str, float] = {}
-        """Rate in Hz at which each needed message arrived in the last :data:`RATE_INTERVAL_US`."""
+        """Rate in Hz at which each needed message arrived in the last interval."""
+        self.denied: dict[str, str] = {}
+        """Message that the autopilot does not send as requested -> the text that was announced."""
 
     def receive(self, message: Message, time_us: int) -> None:
         """Count a message of the autopilot; handle the answer to a request."""
@@ -91,28 +101,29 @@ class StreamRequests:
             self._is_aircraft = message["type"] in AIRCRAFT
             if not self._present:
                 self._present = True
-                self._timers.every("streams", RATE_INTERVAL_US, self._look, time_us + RATE_INTERVAL_US)
+                self._timers.every("streams", self.interval_us, self._look, time_us + self.interval_us)
         elif message.id == ACK:
             if message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL and self._asked is not None:
                 self._answered(message["result"])
-        elif message.id in self._needed:
+        elif message.id in self.needed:
             self._received[message.id] += 1
 
     def rebooted(self) -> None:
         """Restart: the autopilot has forgotten the requests."""
         self._attempts.clear()
         self._received.clear()
+        self.denied.clear()
 
     def rate_of(self, number: int) -> float:
         """Return the rate in Hz at which a message is needed."""
-        return self._needed[number][0 if self._is_aircraft else 1]
+        return self.needed[number][0 if self._is_aircraft else 1]
 
     def _look(self, _: int) -> None:
         """Queue requests for the messages that arrived too rarely since the last call."""
-        for number in self._needed:
-            rate = self._received[number] * 1e6 / RATE_INTERVAL_US
+        for number in self.needed:
+            rate = self._received[number] * 1e6 / self.interval_us
             self.measured[spec(number).name] = rate
-            rare = rate < MIN_RATE_FRACTION * self.rate_of(number)
+            rare = self._active and rate < MIN_RATE_FRACTION * self.rate_of(number)
             if rare and self._attempts[number] < MAX_ATTEMPTS and number not in self._queue:
                 self._queue.append(number)
         self._received.clear()
@@ -145,11 +156,9 @@ class StreamRequests:
         if result not in (MAV_RESULT.ACCEPTED, MAV_RESULT.IN_PROGRESS):
             self._attempts[self._asked] = MAX_ATTEMPTS
             why = MAV_RESULT(result).name if result in MAV_RESULT.__members__.values() else str(result)
-            self._announcer.state(
-                f"stream {name}",
-                f"the autopilot does not send {name} at {self.rate_of(self._asked):g} Hz: {why}",
-                MAV_SEVERITY.WARNING,
-            )
+            text = f"the autopilot does not send {name} at {self.rate_of(self._asked):g} Hz: {why}"
+            self.denied[name] = text
+            self._announcer.state(f"stream {name}", text, MAV_SEVERITY.WARNING)
         self._timers.cancel("stream request")
         self._ask_next()
 

@@ -1,16 +1,26 @@
-"""``run --check``: all that would go wrong with a configuration, and nothing opened."""
+"""``run --check``: all that would go wrong with a configuration; ``--live``: what arrives on the ports."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 
 import pytest
+from rig import Rig
 
+from magbridge.bridge import live_check
 from magbridge.bridge.check import findings
+from magbridge.bridge.live_check import Arrived, LiveCheck
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Calibration, Parameter, Sensor, identity
 from magbridge.calibration.terms import Polynomial
+from magbridge.cli import main
+from magbridge.config import load
+from magbridge.mavlink import spec
+from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT
 
 GOOD = """
 [sensor]
@@ -132,3 +142,111 @@ def test_a_device_that_may_not_be_opened_says_which_group(
     (line,) = [line for line in lines(config) if line.startswith("sensor.port")]
     assert line.startswith("sensor.port: /dev/null may not be opened by this user: it belongs to the group ")
     assert "sudo usermod -aG" in line
+
+
+LISTEN_S = 4.0
+
+
+class Sender:
+    """Answers the requests of a rig's bridge, and sends ATTITUDE as requested."""
+
+    def __init__(self, rig: Rig, result: int) -> None:
+        self._rig, self._result, self._mark = rig, result, 0
+        self._period, self._due = 1.0, 0.0
+        self.asked: list[str] = []
+
+    def turn(self, now: float) -> None:
+        for message in self._rig.of("COMMAND_LONG", self._mark):
+            assert message["command"] == MAV_CMD.SET_MESSAGE_INTERVAL
+            self.asked.append(spec(int(message["param1"])).name)
+            if self._result == MAV_RESULT.ACCEPTED and self.asked[-1] == "ATTITUDE":
+                self._period = message["param2"] * 1e-6
+            answer = {"command": MAV_CMD.SET_MESSAGE_INTERVAL, "result": self._result}
+            self._rig.autopilot.send_message("COMMAND_ACK", **answer)
+        self._mark = self._rig.mark
+        if now >= self._due:
+            self._due = now + self._period
+            self._rig.autopilot.send_message("ATTITUDE", time_boot_ms=self._rig.autopilot.boot_us // 1000)
+
+
+def listened(rig: Rig, result: int = MAV_RESULT.ACCEPTED) -> tuple[LiveCheck, Sender]:
+    """Check the ports of a rig while its sensor and its autopilot send."""
+    sender, check = Sender(rig, result), LiveCheck(load(rig.config), LISTEN_S)
+    thread = Thread(target=check.listen)
+    rig.fluxgate.plug()
+    rig.autopilot.up()
+    thread.start()
+
+    def ended() -> bool:
+        sender.turn(time.monotonic())
+        return not thread.is_alive()
+
+    rig.until(ended)
+    return check, sender
+
+
+def by_name(check: LiveCheck) -> dict[str, Arrived]:
+    return {one.name: one for one in check.arrived}
+
+
+def test_live_lists_the_rates_that_arrive_and_requests_those_that_are_needed(
+    make_rig: Callable[..., Rig],
+) -> None:
+    rig = make_rig()
+    check, sender = listened(rig)
+    arrived = by_name(check)
+    assert "ATTITUDE" in sender.asked
+    assert arrived["ATTITUDE"].needed_hz == 4.0
+    assert arrived["ATTITUDE"].rate_hz == pytest.approx(4.0, rel=0.5)
+    assert arrived["NAMED_VALUE_FLOAT"].rate_hz > 5.0
+    assert arrived["NAMED_VALUE_FLOAT"].sender == "1:1"
+    assert check.readings_hz > 10.0
+    assert {message.name for _, message in rig.received} <= {"HEARTBEAT", "TIMESYNC", "COMMAND_LONG"}
+    texts = [one.text.removeprefix(f"{rig.config}: ") for one in check.faults]
+    (text,) = [text for text in texts if text.startswith(("link:", "telemetry", "sensor"))]
+    assert text.startswith(
+        "link: GLOBAL_POSITION_INT does not arrive and is needed at 1 Hz: set SRn_POSITION "
+    )
+    assert text.endswith(" to 1, or request it of PX4 by `mavlink stream -s GLOBAL_POSITION_INT -r 1`")
+    assert not any(one.fatal for one in check.faults)
+    assert not (rig.folder / "logs").exists()
+
+
+def test_live_reports_a_denial_with_its_remedy(make_rig: Callable[..., Rig]) -> None:
+    rig = make_rig()
+    check, _ = listened(rig, MAV_RESULT.DENIED)
+    (text,) = [one.text for one in check.faults if "ATTITUDE" in one.text]
+    assert "needed at 4 Hz (the autopilot does not send ATTITUDE at 4 Hz: DENIED): set SRn_EXTRA1" in text
+
+
+def test_live_reports_silent_ports(
+    make_rig: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = make_rig()
+    monkeypatch.setattr(live_check, "LISTEN_TIME_S", 1.0)
+    assert main(["run", "--check", "--live", "--config", str(rig.config)]) == 0
+    out, err = capsys.readouterr()
+    assert "sensor digitizer: 0 readings/s" in out
+    assert "link: no HEARTBEAT of 1:1 and no other message: check link.url" in err
+    assert "sensor: digitizer: no reading in 1 s: the port is not open" in err
+    assert "the bridge would start, " in out
+    assert main(["run", "--live", "--config", str(rig.config)]) == 2
+
+
+def test_live_names_the_systems_that_send_and_telemetry_that_does_not_match(
+    make_rig: Callable[..., Rig],
+) -> None:
+    rig = make_rig()
+    text = rig.config.read_text()
+    rig.config.write_text(text.replace('{name = "battpos"}', '{name = "ballast"}'))
+    check, _ = listened(rig)
+    assert any(
+        "telemetry.battpos: NAMED_VALUE_FLOAT of component 1 does not match" in one.text
+        for one in check.faults
+    )
+    rig.config.write_text(text.replace("[link]", "[link]\nsystem = 7"))
+    check = LiveCheck(load(rig.config), 2.0)
+    thread = Thread(target=check.listen)
+    thread.start()
+    rig.until(lambda: not thread.is_alive())
+    assert any("no HEARTBEAT of 7:1, but messages of 1:1" in one.text for one in check.faults)
