@@ -13,7 +13,7 @@ from typing import Any
 
 from magbridge.align import Aligner, Sample
 from magbridge.calibration.corrector import Corrector
-from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, identity
+from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Condition, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
@@ -27,6 +27,7 @@ from magbridge.track import Input
 
 __all__ = ["TEMPERATURE", "Correction"]
 
+EXTRAPOLATED = int(Quality.EXTRAPOLATED)
 MOVING = int(Quality.MOVING)
 NOT_MASS_UNITS = frozenset({"A", "mA", "V", "W", "degC", "K", "bar", "dbar", "Pa", "kPa"})
 """Units of parameters that are not the position of a mass: a sample while they change is not `moving`."""
@@ -81,6 +82,7 @@ class Correction:
         self.health = self._health(calibration) if calibration.method != "none" else None
         self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
         self._was_moving = False
+        self._conditions = _unmodelled_conditions(calibration)
 
     @property
     def calibration(self) -> Calibration:
@@ -103,6 +105,8 @@ class Correction:
     def telemetry(self, name: str, value: float, time_us: int, *, guessed: bool = False) -> None:
         """Take a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
         self.aligner.telemetry(name, time_us, value, guessed=guessed)
+        if name in self._conditions:
+            self._hold(name, value)
 
     def reading(
         self,
@@ -113,6 +117,7 @@ class Correction:
         missing: int = 0,
         main_field: float = nan,
         where: tuple[float, float] | None = None,
+        depth: float = nan,
     ) -> tuple[Sample, Corrected]:
         """Align and correct one reading, and check the result.
 
@@ -124,6 +129,8 @@ class Correction:
             nT, the main field's total where the sample was taken; NaN where that is not known.
         where : tuple of 2 float or None
             deg, latitude and longitude; None where not known.
+        depth : float
+            m; NaN where not known.
         """
         if self.learner is not None and self.learner.calibration is not self._corrector.calibration:
             self._use(self.learner.calibration)
@@ -148,6 +155,12 @@ class Correction:
             flags, variance = parts.call(
                 "learning", (0, 0.0), self._learn, sample, quality, main_field, where, restarted
             )
+            quality |= flags
+            judged += variance
+        if self._conditions:
+            self._hold("depth", max(depth, 0.0))
+            self._hold(TEMPERATURE, reading.temperature)
+            variance, flags = self._extrapolation(sigma)
             quality |= flags
             judged += variance
         if sample.sigma or sample.spans or judged or turned:
@@ -198,6 +211,25 @@ class Correction:
             spans.append((index, value - half, value + half))
         return list(self._corrector.changes(sample.field, sample.values, spans))
 
+    def _hold(self, name: str, value: float) -> None:
+        """Hold the last known value of a condition."""
+        if name in self._conditions and isfinite(value):
+            self._conditions[name] = self._conditions[name][0], value
+
+    def _extrapolation(self, sigma: float) -> tuple[float, int]:
+        """Return the variance (nT^2) and the flag where depth or temperature is beyond the fit's.
+
+        An effect that the fit could not see over half the range is as large as the sample's own `sigma`, nT,
+        without the level of the reference. It grows in proportion to the distance.
+        """
+        calibration = self._corrector.calibration
+        own = max(sigma * sigma - calibration.reference.level_sigma**2, calibration.noise.sensor**2)
+        variance = 0.0
+        for condition, value in self._conditions.values():
+            if excess := condition.excess(value):  # an infinite sigma stays one
+                variance += own * excess * excess
+        return (variance, EXTRAPOLATED) if variance > sigma * sigma else (variance, 0)
+
     def _check_direction(self, sample: Sample, vector: Vector) -> tuple[float, int]:
         """Return the variance (nT^2) of each component and the flags that the direction's check adds."""
         assert self.direction is not None
@@ -234,6 +266,7 @@ class Correction:
     def _use(self, calibration: Calibration) -> None:
         """Correct from now on with another calibration, of the same terms or with effects more or fewer."""
         self.aligner.follow(calibration.channels)
+        self._conditions = {}  # a learned calibration holds under the conditions that it was learned in
         values = [track.last for track in self.aligner.tracks]
         by = self._corrector.replace(calibration, values)
         if not calibration.level:
@@ -268,3 +301,9 @@ class Correction:
         ):  # also NaN, as where a parameter has neither value nor range
             more = inf
         return more
+
+
+def _unmodelled_conditions(calibration: Calibration) -> dict[str, tuple[Condition, float]]:
+    """Return the conditions that no parameter and no effect follows, each with its value: not known yet."""
+    modelled = calibration.channels
+    return {one.name: (one, nan) for one in calibration.conditions if one.name not in modelled}

@@ -31,7 +31,7 @@ class Quality(IntFlag):
     STALE_TELEMETRY = 1
     """A parameter the calibration needs is older than its ``max_age``, missing or NaN."""
     EXTRAPOLATED = 2
-    """A parameter lies outside the calibrated range."""
+    """A parameter, the depth or the temperature lies outside the calibrated range."""
     MOVING = 4
     """A mass was moving at the time of the sample, or had just moved."""
     SATURATED = 8

@@ -75,11 +75,16 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     known, tilt = main_fields.tolist(), _tilt(deployment)
     fields, values = np.full((len(results), 3), nan), np.full((len(results), len(correction.names)), nan)
     added = np.zeros(len(results))
+    depth = (
+        deployment["depth"].to_numpy().astype(float) if "depth" in deployment else np.full(len(results), nan)
+    )
     for row, reading, stamp in _readings(correction, deployment):
         if correction.direction is not None and attitudes is not None:
             correction.direction.expect(*vectors[row].tolist())
             correction.direction.attitude(stamp, *attitudes[row])
-        sample, one = correction.reading(reading, stamp, main_field=known[row], where=places[row])
+        sample, one = correction.reading(
+            reading, stamp, main_field=known[row], where=places[row], depth=float(depth[row])
+        )
         level[row], age[row] = correction.level(sample, one), sample.age
         fields[row], values[row] = sample.field, sample.values[: values.shape[1]]
         added[row] = one.field_sigma[0] ** 2 + one.field_sigma[1] ** 2 + one.field_sigma[2] ** 2

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import hypot, nan
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.file import decode_calibration, encode_calibration
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration, Condition, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import Align
 from magbridge.correction import Correction
@@ -94,3 +98,53 @@ def test_the_temperature_may_be_in_rows_of_another_log() -> None:
     quality = corrected["quality"].to_numpy().astype(int)[measured]
     assert not (quality & Quality.STALE_TELEMETRY).any()
     np.testing.assert_allclose(corrected["total_field"][measured], total(0.3))
+
+
+@pytest.mark.parametrize(("depth", "factor"), [(0.0, 1.0), (181.0, 1.0), (362.0, hypot(1.0, 2.0)), (nan, 1.0)])
+def test_sigma_grows_with_the_depth_beyond_the_calibrated_range(
+    calibration: Calibration, depth: float, factor: float
+) -> None:
+    seen = replace(calibration, conditions=(Condition("depth", 0.0, 181.0),))
+    correction = Correction(decode_calibration(encode_calibration(seen)))
+    correction.telemetry("battpos", 0.2, START)
+    _, corrected = correction.reading(Reading(FIELD), START, depth=depth)
+    assert corrected.total_field_sigma == pytest.approx(factor, rel=1e-3)
+    assert bool(corrected.quality & Quality.EXTRAPOLATED) == (factor > 1.5)
+
+
+@pytest.mark.parametrize("temperature", [3.0, 27.0])
+def test_sigma_grows_with_the_temperature_outside_the_calibrated_range(
+    calibration: Calibration, temperature: float
+) -> None:
+    """One temperature of calibration holds for 2 degC either way, and an effect takes the range's place."""
+    seen = replace(calibration, conditions=(Condition("sensor_temperature", 15.0, 15.0),))
+    followed = replace(follows("sensor_temperature", "degC"), conditions=seen.conditions)
+    sigma = []
+    for one in (seen, followed):
+        correction = Correction(one)
+        correction.telemetry("battpos", 0.2, START)
+        sigma.append(correction.reading(Reading(FIELD, temperature=temperature), START)[1].total_field_sigma)
+    assert sigma[0] == pytest.approx(hypot(1.0, 5.0), rel=1e-3)
+    assert sigma[1] < 1.1
+
+
+def test_a_depth_effect_beyond_the_calibrated_range_stays_within_sigma() -> None:
+    """The offset follows the depth by 0.3 nT/m; the fit sees 100 m of it and the log goes to 200 m."""
+    rng = np.random.default_rng(3)
+    n = 3000
+    direction = rng.normal(size=(n, 3))
+    field = 50_000.0 * direction / np.linalg.norm(direction, axis=1)[:, None] + rng.normal(0.0, 1.0, (n, 3))
+    depth = np.where(np.arange(n) < 2000, rng.uniform(0.0, 100.0, n), rng.uniform(100.0, 200.0, n))
+    field[:, 0] += 0.3 * depth
+    columns = {f"mag_{axis}": ("time", field[:, k], {"units": "nT"}) for k, axis in enumerate("xyz")}
+    columns["depth"] = ("time", depth, {"units": "m"})
+    columns["reference_field"] = ("time", np.full(n, 50_000.0), {"units": "nT"})
+    log = xr.Dataset(columns, coords={"time": ("time", np.arange(n) + 1.5e9)}, attrs={"source": "log"})
+    found = fit(observations(log.isel(time=slice(2000)), ())).calibration
+    assert [condition.name for condition in found.conditions] == ["depth"]
+    corrected = correct_rows(Correction(found), log)
+    z = (corrected["total_field"].to_numpy() - 50_000.0) / corrected["total_field_sigma"].to_numpy()
+    assert np.sqrt((z[2000:] ** 2).mean()) < 1.25
+    assert np.sqrt((z[:2000] ** 2).mean()) < 1.25
+    deep = corrected["quality"].to_numpy().astype(int)[depth > 160.0]
+    assert (deep & Quality.EXTRAPOLATED != 0).mean() > 0.9

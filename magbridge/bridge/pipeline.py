@@ -247,6 +247,7 @@ class Pipeline:
             missing=missing,
             main_field=main_field,
             where=position.where,
+            depth=position.depth,
         )
         if self._notices:
             self._report_implausible()

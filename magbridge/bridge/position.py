@@ -64,6 +64,11 @@ class Position:
         """Latitude and longitude of the last position, deg; None before the first and after a jump."""
         return None if self._jumped_us else self._where
 
+    @property
+    def depth(self) -> float:
+        """Depth of the last position, m; NaN where :attr:`where` is None."""
+        return nan if self.where is None else self._depth
+
     def update(self, message: Message, time_us: int) -> None:
         """Use a GLOBAL_POSITION_INT; ignore one that states an unknown or impossible position.
 

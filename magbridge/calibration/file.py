@@ -14,7 +14,17 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.model import (
+    MIN_HALF_RANGE,
+    Boresight,
+    Calibration,
+    Condition,
+    Noise,
+    Parameter,
+    Reference,
+    Run,
+    Sensor,
+)
 from magbridge.calibration.scalar import PLATFORM_TERMS, ScalarSensor
 from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
 from magbridge.errors import CalibrationError, FormatError
@@ -22,18 +32,18 @@ from magbridge.files import atomic_path
 
 __all__ = ["CALIBRATION_FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
-CALIBRATION_FORMAT = 5
+CALIBRATION_FORMAT = 6
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
-``white`` share, ``level`` and the reference's ``level_sigma``, 5 ``sensors``: each is written only where
-there is any."""
+``white`` share, ``level`` and the reference's ``level_sigma``, 5 ``sensors``, 6 ``conditions``: each is
+written only where there is any."""
 
 MAX_STATED_SIGMA = 1e15
 """The largest noise (nT) or standard deviation of a coefficient that is accepted: its square is a float32."""
 
 AS_IN_MEMORY = (
     "software", "method", "sensor", "parameters", "noise", "reference", "boresight", "runs", "inputs",
-    "level", "sensors",
+    "level", "sensors", "conditions",
 )  # fmt: skip
 """What the file holds as :class:`~.model.Calibration` does."""
 
@@ -58,6 +68,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     doubts: tuple[str, ...] = ()
     level: tuple[float, ...] = ()
     sensors: tuple[ScalarSensor, ...] = ()
+    conditions: tuple[Condition, ...] = ()
 
 
 class _Version(msgspec.Struct):
@@ -76,7 +87,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
         **{name: getattr(calibration, name) for name in AS_IN_MEMORY},
     )
     encode = msgspec.json.encode
-    optional = "doubts", "level", "sensors"
+    optional = "doubts", "level", "sensors", "conditions"
     names = [name for name in _File.__struct_fields__ if name not in optional or getattr(content, name)]
     values = {name: getattr(content, name) for name in names}
     for key, lately in (("noise", "white"), ("reference", "level_sigma")):
@@ -88,6 +99,8 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 def _format(calibration: Calibration) -> int:
     """Return the oldest format that holds all that a calibration has."""
+    if calibration.conditions:
+        return 6
     if calibration.sensors:
         return 5
     if calibration.noise.white or calibration.level:
@@ -212,6 +225,11 @@ def _check_settings(content: _File) -> None:
     for parameter in content.parameters:
         if not (parameter.scale > 0.0 and parameter.low <= parameter.high):
             raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
+    for condition in content.conditions:
+        if condition.name not in MIN_HALF_RANGE or not condition.low <= condition.high:
+            raise CalibrationError(
+                f"condition {condition.name!r}: expected low <= high, of {' or '.join(MIN_HALF_RANGE)}"
+            )
     for sensor in content.sensors:
         _check_scalar(sensor)
     if not content.reference.field > 0.0:

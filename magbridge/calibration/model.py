@@ -32,8 +32,8 @@ from magbridge.estimation.residual import symmetric
 from magbridge.wording import counted
 
 __all__ = [
-    "LEVEL_STEP_SIGMA", "Boresight", "Calibration", "Noise", "Parameter", "Reference", "Run", "Sensor",
-    "identity",
+    "LEVEL_STEP_SIGMA", "Boresight", "Calibration", "Condition", "Noise", "Parameter", "Reference", "Run",
+    "Sensor", "identity",
 ]  # fmt: skip
 
 
@@ -103,6 +103,27 @@ class Boresight(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
+MIN_HALF_RANGE = {"depth": 10.0, "sensor_temperature": 2.0}
+"""Conditions that a fit records, and the least half range of each, m and degC: a calibration at one depth, or
+at one temperature, holds for this much more."""
+
+
+class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The range of a condition in the data of a fit that does not model its effect: depth, temperature."""
+
+    name: str
+    """A key of :data:`MIN_HALF_RANGE`."""
+    low: float
+    high: float
+    """`low`, `high`: The range seen, m (above the surface: 0) or degC."""
+
+    def excess(self, value: float) -> float:
+        """Return how far a value lies outside the range, in half ranges; 0 inside, or where it is NaN."""
+        half = max(0.5 * (self.high - self.low), MIN_HALF_RANGE[self.name])
+        distance = abs(value - 0.5 * (self.low + self.high)) / half
+        return distance - 1.0 if distance > 1.0 else 0.0
+
+
 class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One calibration run: number of samples, RMS residual (nT in the sensor's own units), mean positions."""
 
@@ -141,6 +162,8 @@ class Calibration:
     where that was known."""
     sensors: tuple[ScalarSensor, ...] = ()
     """Scalar magnetometers beside the vector sensor."""
+    conditions: tuple[Condition, ...] = ()
+    """Ranges of depth and temperature in the data that it was fitted to."""
 
     def __post_init__(self) -> None:
         names = tuple(parameter.name for parameter in self.parameters)

@@ -113,7 +113,9 @@ def fit(
         if (kept := found.details.pop("flown", None)) is not None:
             data = data.part(kept)
             found.details["ends"] = int((~kept).sum())
-        return judged(found if method == "survey" else _biased(found, bias), data)
+        found = found if method == "survey" else _biased(found, bias)
+        calibration = replace(found.calibration, conditions=data.conditions())
+        return judged(replace(found, calibration=calibration), data)
 
 
 def _first_solution(

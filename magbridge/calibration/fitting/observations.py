@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.model import Calibration, Parameter
+from magbridge.calibration.model import Calibration, Condition, Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import Samples
@@ -22,12 +22,14 @@ __all__ = ["TEMPERATURE", "Observations", "monomials", "polynomial_samples"]
 TEMPERATURE = "sensor_temperature"
 """The column of the fluxgate's temperature."""
 
+RARE = 0.001
+"""Share of the samples at either end that does not count for the range of a condition: it may be wrong."""
 COMMON, FAR = 0.005, 10.0
 """A position is implausible if it is farther from the median than FAR times the span between the quantiles
 COMMON and 1 - COMMON."""
 _PER_SAMPLE = (
     "field", "reference", "parameters", "runs", "time", "attitude", "reference_ned", "place", "unmapped",
-    "temperature",
+    "temperature", "depth",
 )  # fmt: skip
 
 
@@ -64,6 +66,8 @@ class Observations:
     true field."""
     temperature: FloatArray | None = None
     """(n,), degC, of the fluxgate; NaN where it is not known."""
+    depth: FloatArray | None = None
+    """(n,), m; NaN where it is not known."""
     map_sigma: float | None = None
     """nT, 1-sigma of the map in the reference; None without a map."""
     origin: tuple[float, float] = (0.0, 0.0)
@@ -103,7 +107,7 @@ class Observations:
         put(self, "parameters", parameters[whole])
         put(self, "runs", runs[whole])
         put(self, "time", time[whole])
-        for name in ("attitude", "reference_ned", "place", "unmapped", "temperature"):
+        for name in ("attitude", "reference_ned", "place", "unmapped", "temperature", "depth"):
             if getattr(self, name) is not None:
                 put(self, name, np.asarray(getattr(self, name), float)[whole])
 
@@ -154,6 +158,18 @@ class Observations:
             near = (self.runs[1:] == self.runs[:-1]) & (apart > 0)
             steps[1:][near] = np.maximum(np.rint(apart[near] / np.median(apart)), 1.0)
         return steps
+
+    def conditions(self) -> tuple[Condition, ...]:
+        """Return the ranges of depth and temperature, as far as they are known."""
+        found = []
+        for name, values in (("depth", self.depth), (TEMPERATURE, self.temperature)):
+            known = np.empty(0) if values is None else values[np.isfinite(values)]
+            if name == "depth":
+                known = np.maximum(known, 0.0)  # above the surface the pressure does not change enough
+            if known.size:
+                low, high = np.quantile(known, [RARE, 1.0 - RARE]).tolist()
+                found.append(Condition(name, low, high))
+        return tuple(found)
 
     def ranges(self) -> tuple[Parameter, ...]:
         """Return the parameters with the range seen, scaled to [-1, 1].

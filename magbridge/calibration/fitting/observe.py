@@ -86,6 +86,7 @@ def observations(
         place=place,
         unmapped=unmapped,
         temperature=_column(ds, TEMPERATURE) if TEMPERATURE in ds else None,
+        depth=_column(ds, "depth") if "depth" in ds else None,
         map_sigma=None if grid is None else grid_sigma(grid),
         origin=origin,
         sensor=str(ds.attrs.get("sensor", "")),
