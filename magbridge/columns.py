@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 from magbridge.errors import FormatError
+from magbridge.wording import suggestion
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -246,9 +247,10 @@ def may_be(unit: str, other: str) -> bool:
 
 def absent(name: str, there: Iterable[str]) -> str:
     """Return the message that a column is missing, which there are, and how to declare it."""
-    names = [repr(name) if " " in name else name for name in there]
+    names = [repr(one) if " " in one else one for one in there]
     headings = " ".join(names[:MAX_NAMES]) + f" and {len(names) - MAX_NAMES} more" * (len(names) > MAX_NAMES)
-    return f'expected this column; there are: {headings}; if one is it: --column {name}="THEIRS [unit]"'
+    near = suggestion(name, names)
+    return f'expected this column{near}; there are: {headings}; if one is it: --column {name}="THEIRS [unit]"'
 
 
 def require(deployment: xr.Dataset, names: Iterable[str]) -> None:

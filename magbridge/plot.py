@@ -20,6 +20,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.errors import MissingExtra, WrongUse
 from magbridge.estimation.residual import rms
 from magbridge.field.grid import AnomalyGrid
+from magbridge.wording import one_of
 
 try:
     import matplotlib.pyplot as plt
@@ -90,7 +91,7 @@ def residuals(
         number = data.names.index(against)
         x, label = data.parameters[:, number], f"{against}, {data.units[number] or '?'}"
     else:
-        raise WrongUse(f"against {against!r}: expected one of {', '.join(('time', 'heading', *data.names))}")
+        raise WrongUse(f"against: {one_of(against, ('time', 'heading', *data.names))}")
     axes = _axes(ax)
     noise = calibration.noise.sensor
     axes.axhspan(-2.0 * noise, 2.0 * noise, color="0.6", alpha=0.25, lw=0, label="2 sigma of the noise")

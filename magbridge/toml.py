@@ -12,7 +12,7 @@ import msgspec
 from msgspec import inspect
 
 from magbridge.errors import ConfigError
-from magbridge.wording import nearest_name
+from magbridge.wording import suggestion
 
 __all__ = ["Table", "check_entries", "convert", "load_toml"]
 
@@ -74,8 +74,7 @@ def convert(table: Any, kind: type[T], path: str | Path, prefix: str = "") -> T:
         if match := re.match(r"Object (contains unknown|missing required) field `([^`]*)`", sentence):
             sentence = "missing key"
             if "unknown" in match[1]:
-                near = nearest_name(match[2], _valid_keys(kind, keys))
-                sentence = "unknown key" + (f"; did you mean {near}?" if near else "")
+                sentence = "unknown key" + suggestion(match[2], _valid_keys(kind, keys))
             keys = f"{keys}.{match[2]}".lstrip(".")
         raise ConfigError(path, f"{prefix}{keys}".rstrip("."), sentence[0].lower() + sentence[1:]) from error
 

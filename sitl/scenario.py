@@ -12,6 +12,7 @@ from msgspec import Meta
 from magbridge.config import NotNegative
 from magbridge.errors import ConfigError
 from magbridge.toml import Table, check_entries, convert, load_toml
+from magbridge.wording import one_of
 from sitl.instrument import Instrument
 from sitl.mission import LIMITS, Limit, Part
 from sitl.platform import MOUNTINGS, Mass, Vehicle
@@ -115,7 +116,7 @@ def load(path: str | Path) -> Scenario:
     if path.suffix == "":
         known = {one.stem: one for one in sorted(SCENARIOS.glob("*.toml"))}
         if str(path) not in known:
-            raise ConfigError(path, "", f"expected a scenario file (.toml), or one of {', '.join(known)}")
+            raise ConfigError(path, "", f"scenario: {one_of(str(path), known)}; or a file (.toml)")
         path = known[str(path)]
     table = load_toml(path)
     vehicle = table.get("vehicle")
@@ -124,7 +125,7 @@ def load(path: str | Path) -> Scenario:
     scenario = convert(table, Scenario, path)
     for name in scenario.masses:
         if name not in MOUNTINGS:
-            raise ConfigError(path, "masses", f"{name!r} is not one of {', '.join(MOUNTINGS)}")
+            raise ConfigError(path, "masses", one_of(name, MOUNTINGS))
     if scenario.hidden:
         _check_hidden(scenario.hidden, path)
     if scenario.calibration is None:
@@ -140,4 +141,4 @@ def _check_hidden(hidden: tuple[Hidden, ...], path: Path) -> None:
 
     for one in hidden:
         if one.effect not in EFFECTS:
-            raise ConfigError(path, "hidden.effect", f"{one.effect!r} is not one of {', '.join(EFFECTS)}")
+            raise ConfigError(path, "hidden.effect", one_of(one.effect, EFFECTS))

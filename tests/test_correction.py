@@ -100,7 +100,9 @@ def test_the_temperature_may_be_in_rows_of_another_log() -> None:
     np.testing.assert_allclose(corrected["total_field"][measured], total(0.3))
 
 
-@pytest.mark.parametrize(("depth", "factor"), [(0.0, 1.0), (181.0, 1.0), (362.0, hypot(1.0, 2.0)), (nan, 1.0)])
+@pytest.mark.parametrize(
+    ("depth", "factor"), [(0.0, 1.0), (181.0, 1.0), (362.0, hypot(1.0, 2.0)), (nan, 1.0)]
+)
 def test_sigma_grows_with_the_depth_beyond_the_calibrated_range(
     calibration: Calibration, depth: float, factor: float
 ) -> None:

@@ -62,7 +62,7 @@ def test_residuals(against: str, label: str, found: tuple[mb.Calibration, Observ
 
 
 def test_residuals_against_nothing(found: tuple[mb.Calibration, Observations]) -> None:
-    with pytest.raises(mb.MagbridgeError, match="against 'moon': expected one of time, heading, battpos"):
+    with pytest.raises(mb.MagbridgeError, match="against: expected one of time, heading, battpos"):
         mb.plot.residuals(*found, against="moon")
 
 

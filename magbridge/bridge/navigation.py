@@ -27,6 +27,7 @@ from magbridge.navigate.gnss import GnssReason, GnssState
 from magbridge.navigate.options import informed
 from magbridge.records import Corrected
 from magbridge.toml import convert
+from magbridge.wording import one_of
 
 __all__ = ["Navigation", "open_navigation"]
 
@@ -166,7 +167,7 @@ def open_navigation(
     FormatError, OutOfRange: the map cannot be read.
     """
     if wanted.fix not in FIX_MESSAGES:
-        raise ConfigError(config.path, "navigation.fix", f"expected one of {', '.join(FIX_MESSAGES)}")
+        raise ConfigError(config.path, "navigation.fix", one_of(wanted.fix, FIX_MESSAGES))
     options = convert(wanted.options, Options, config.path, "navigation.options.")
     if calibration is not None and not wanted.options.keys() & {"noise", "bias_sigma"}:
         options = informed(options, calibration, calibration.noise.sensor)

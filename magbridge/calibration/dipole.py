@@ -27,6 +27,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.terms import Expansion, Parameter, PositionTerm
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
+from magbridge.wording import one_of
 
 __all__ = ["SERIES_ORDER", "Dipole", "dipole_columns", "dipole_tensor", "expand_dipole"]
 
@@ -137,7 +138,7 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
     def check(self, parameters: tuple[str, ...]) -> None:
         """Require that the parameter exists and the mass is not in the sensor."""
         if self.parameter not in parameters:
-            raise CalibrationError(f"dipole: parameter {self.parameter!r} is not one of {list(parameters)}")
+            raise CalibrationError(f"dipole: parameter: {one_of(self.parameter, parameters)}")
         if not np.linalg.norm(self.at) > 0.0:
             raise CalibrationError("dipole: at: expected a place away from the sensor")
 

@@ -22,6 +22,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.kernel import Kernel
 from magbridge.errors import CalibrationError
 from magbridge.plugins import load, plugins
+from magbridge.wording import one_of
 
 __all__ = [
     "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "Parameter", "Polynomial",
@@ -230,6 +231,6 @@ def term_class(kind: str) -> type[Term]:
     else:
         offers = plugins("magbridge.terms")
         if kind not in offers:
-            raise CalibrationError(f"term {kind!r} is not known here: known are {', '.join(sorted(TERMS))}")
+            raise CalibrationError(f"kind of a term: {one_of(kind, [*TERMS, *offers])}")
         found = load(offers[kind])
     return cast("type[Term]", found)

@@ -32,6 +32,7 @@ from magbridge.errors import ConfigError, FormatError, WrongUse
 from magbridge.files import digest, existing
 from magbridge.fleet.catalogue import Catalogue, Row
 from magbridge.toml import Table, check_entries, convert, load_toml
+from magbridge.wording import one_of
 
 __all__ = [
     "Deployment", "Vehicle", "add_logs", "add_vehicle", "current_files", "is_file_name", "logs_of", "masses",
@@ -101,7 +102,9 @@ def vehicle_named(catalogue: Catalogue, name: str) -> Row:
     """Return a vehicle; WrongUse: there is none of that name."""
     known = vehicles(catalogue)
     if name not in known:
-        raise WrongUse(f"{name}: not a vehicle of {catalogue.name} ({', '.join(known) or 'none yet'})")
+        if not known:
+            raise WrongUse(f"{name}: {catalogue.name} has no vehicle yet")
+        raise WrongUse(f"{catalogue.name}: vehicle: {one_of(name, known)}")
     return known[name]
 
 

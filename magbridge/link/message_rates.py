@@ -10,6 +10,7 @@ from magbridge.link.output import Rate, Timers, period_us
 from magbridge.link.parameters import Parameters, rate_name
 from magbridge.link.publish import PUBLISHED
 from magbridge.mavlink import Codec, spec
+from magbridge.wording import one_of
 
 __all__ = ["DEFAULT_RATES_HZ", "LIMITS", "MessageRates", "check_publish"]
 
@@ -33,7 +34,7 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
     """
     for name, rate in publish.items():
         if name not in LIMITS:
-            raise ConfigError(path, f"publish.{name}", f"expected one of {', '.join(sorted(LIMITS))}")
+            raise ConfigError(path, f"publish.{name}", one_of(name, sorted(LIMITS)))
         low, high = LIMITS[name]
         if not low <= rate <= high:
             raise ConfigError(

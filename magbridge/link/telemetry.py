@@ -12,7 +12,7 @@ from magbridge.errors import ConfigError
 from magbridge.link.clock import VehicleClock
 from magbridge.mavlink import Message, Spec, spec
 from magbridge.mavlink.messages import MESSAGE_IDS, Field, split_index
-from magbridge.wording import nearest_name
+from magbridge.wording import suggestion
 
 __all__ = ["TelemetryMap", "own_time", "sent_us"]
 
@@ -75,8 +75,7 @@ def find(layout: Spec, name: str, path: Path, key: str) -> Field:
     try:
         return layout.fields[name]
     except KeyError:
-        near = nearest_name(name, layout.fields)
-        hint = f"; did you mean {near}?" if near else f"; it has {', '.join(layout.fields)}"
+        hint = suggestion(name, layout.fields) or f"; it has {', '.join(layout.fields)}"
         raise ConfigError(path, key, f"{layout.name} has no field {name!r}{hint}") from None
 
 
@@ -114,8 +113,7 @@ class TelemetryMap:
             try:
                 layout = spec(what.message)
             except KeyError:
-                near = nearest_name(what.message, MESSAGE_IDS)
-                hint = f"; did you mean {near}?" if near else ""
+                hint = suggestion(what.message, MESSAGE_IDS)
                 raise ConfigError(
                     path, f"telemetry.{name}.message", f"unknown MAVLink message {what.message!r}{hint}"
                 ) from None

@@ -17,6 +17,7 @@ from magbridge.errors import ConfigError
 from magbridge.plugins import load, plugins
 from magbridge.records import Reading
 from magbridge.toml import convert
+from magbridge.wording import one_of
 
 __all__ = ["DRIVERS", "Driver", "driver_class", "open_driver"]
 
@@ -128,7 +129,5 @@ def driver_class(name: str, source: str | Path) -> Any:
         return getattr(import_module(module), attribute)
     others = plugins("magbridge.sensors")
     if name not in others:
-        raise ConfigError(
-            source, "sensor.driver", f"expected one of {', '.join(sorted({*DRIVERS, *others}))}"
-        )
+        raise ConfigError(source, "sensor.driver", one_of(name, sorted({*DRIVERS, *others})))
     return load(others[name])

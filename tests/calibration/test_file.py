@@ -143,7 +143,7 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
     "unknown key": (lambda c: c.update(colour="red"), FormatError, "colour"),
     "wrong type": (lambda c: c["noise"].update(sensor="low"), FormatError, "noise.sensor: Expected `float`"),
     "missing": (lambda c: c.pop("reference"), FormatError, "reference"),
-    "unknown term": (lambda c: c["terms"][0].update(kind="warp"), FormatError, "term 'warp' is not known"),
+    "unknown term": (lambda c: c["terms"][0].update(kind="warp"), FormatError, "a term: expected one of"),
     "no kind": (lambda c: c["terms"][0].pop("kind"), FormatError, "without its kind"),
     "a coefficient less": (
         lambda c: c["coefficients"].pop(), CalibrationError, "covariance: expected 38 x 38"),
@@ -160,7 +160,7 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
     "no field": (lambda c: c["reference"].update(field=0.0), CalibrationError, "reference: field"),
     "no scale": (lambda c: c["parameters"][0].update(scale=0.0), CalibrationError, "scale > 0"),
     "another parameter": (
-        lambda c: c["parameters"][0].update(name="fin"), CalibrationError, "'battpos' is not one of"),
+        lambda c: c["parameters"][0].update(name="fin"), CalibrationError, "expected one of fin"),
     "exponents": (
         lambda c: c["terms"][0].update(exponents=[[0, 0], [1, 0], [2, 0]]), CalibrationError,
         "one for each parameter"),

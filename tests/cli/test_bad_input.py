@@ -122,7 +122,7 @@ def test_a_position_in_another_unit_is_refused(
         (
             "simulate none -o x.csv",
             2,
-            "none: expected a scenario file (.toml), or one of battery, bolt, bonne_bay, ",
+            "none: scenario: expected one of battery, bolt, bonne_bay, ",
         ),
         ("simulate none.toml -o x.csv", 2, "none.toml: No such file"),
         ("correct {d} --calibration none.json -o x.csv", 1, "none.json: cannot be read"),

@@ -141,7 +141,7 @@ def test_a_name_that_can_be_no_folders_is_refused(empty: Catalogue, name: str) -
 
 
 def test_an_unknown_vehicle_and_a_missing_log(empty: Catalogue, tmp_path: Path) -> None:
-    with pytest.raises(WrongUse, match=r"nemo: not a vehicle of .* \(none yet\)"):
+    with pytest.raises(WrongUse, match=r"nemo: .* has no vehicle yet"):
         add_logs(empty, "nemo", MAY, [])
     add_vehicle(empty, "comet", Vehicle())
     count, (output,) = add_logs(empty, "comet", MAY, [tmp_path / "gone.nc"])

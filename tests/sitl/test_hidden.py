@@ -38,7 +38,7 @@ def test_an_unknown_effect_is_one_line(tmp_path: Path) -> None:
     """It names the key and what there is."""
     text = (SCENARIOS / "bolt.toml").read_text(encoding="utf-8").replace("offset_step", "gremlin")
     (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"hidden.effect.*'gremlin' is not one of temperature_offset"):
+    with pytest.raises(ConfigError, match=r"hidden.effect: expected one of temperature_offset.* not gremlin"):
         load(tmp_path / "mine.toml")
 
 

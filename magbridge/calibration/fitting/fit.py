@@ -19,6 +19,7 @@ from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, NoSolutionError
 from magbridge.estimation.residual import robust_scale
 from magbridge.field.reference import other_units
+from magbridge.wording import one_of
 
 __all__ = ["MAIN_FIELD_SIGMA_NT", "METHODS", "Fit", "fit"]
 
@@ -87,7 +88,7 @@ def fit(
     ``auto`` has no solution, it is ``nominal``, and conversely. The calibration warns of either.
     """
     if method not in METHODS:
-        raise CalibrationError(f"method {method!r} is not known: one of {', '.join(METHODS)}")
+        raise CalibrationError(f"method: {one_of(method, METHODS)}")
     bias = _default_bias(data) if site_bias is None else site_bias
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
     if in_place:
