@@ -30,12 +30,12 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.compare.load_survey import load_survey
-from magbridge.diagnose.compare.problem import Problem, pose
 from magbridge.diagnose.improvement import corrected
-from magbridge.diagnose.inference.fit_noise import autoregressive_order
-from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.joint import Joint, fit_joint
+from magbridge.diagnose.noise import autoregressive_order
+from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.survey import load_survey
 from magbridge.estimation.residual import rms
 
 TELEMETRY = {"sensor_temperature": "degC", "payload_current": "A"}

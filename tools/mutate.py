@@ -41,7 +41,7 @@ TESTS = {
     "bridge/sensor_line": "bridge/test_sensor_line.py",
     "estimation/optimise": "estimation/test_optimise.py",
     "estimation/noise": "estimation/test_noise.py",
-    "diagnose/inference/evidence": "diagnose/test_evidence.py",
+    "diagnose/evidence": "diagnose/test_evidence.py",
     "navigate/estimate": "navigate/test_estimate.py navigate/test_integrity.py",
     "health/axes": "health/test_monitor.py health/test_consistency.py",
     "health/consistency": "health/test_consistency.py",

@@ -10,8 +10,8 @@ import numpy as np
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.causes.candidates import Candidate, of_effect
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.columns import Candidate, of_effect
+from magbridge.diagnose.problem import Problem
 
 SIZE = 50.0
 """nT, a plausible size (1-sigma): a pair of leads half a metre away that carries some amperes."""

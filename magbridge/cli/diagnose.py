@@ -134,7 +134,7 @@ def summary(facts: dict[str, Any], parts: str) -> str:
 
 def causes_of(facts: dict[str, Any]) -> list[str]:
     """Return a line for each cause found, with the alternatives to it, and for the unexplained residual."""
-    from magbridge.diagnose.seen import WHITE
+    from magbridge.diagnose.observed import WHITE
     from magbridge.diagnose.words import number
 
     causes = []

@@ -1,13 +1,18 @@
 """Diagnose errors of the forward model: their physical causes, and the improvement of correcting them.
 
-:func:`~magbridge.diagnose.run.diagnose` is the entry point, and :mod:`.run` has all steps of a diagnosis:
+:func:`~magbridge.diagnose.run.diagnose` is the entry point; start reading there. The package uses the
+calibration and the estimation library, and must not depend on the bridge or on other applications.
 
-1. :mod:`.compare` sets up the problem: the measured less the predicted field, linear in every
-   coefficient.
-2. :mod:`.causes` put forward their candidates: columns of that problem, at a grid of nonlinear parameters.
-3. :mod:`.inference` searches for the candidates that the data support, and for their competing hypotheses.
-4. :mod:`.unexplained` describes the remaining signal, or all of it, without a name; :mod:`.accept` compares
-   names with descriptions.
-5. :mod:`.extend` adds the named causes to a calibration; held-out dives measure the improvement.
-6. :mod:`.diagnosis` is the result; :mod:`.report` writes it for people and for programs.
+1. :mod:`.survey` reads deployments, and :mod:`.problem` compares them with a calibration: the measured less
+   the predicted field, linear in every coefficient.
+2. :mod:`.causes` put forward their candidates: :mod:`.columns` of that problem, at a grid of nonlinear
+   parameters.
+3. :mod:`.joint` fits calibration, effects and :mod:`.noise` together. :mod:`.evidence` weighs one candidate,
+   :mod:`.state` all of them in a round, and :mod:`.search` adds cause after cause and exchanges them for
+   their :mod:`.alternatives`.
+4. :mod:`.leftover` describes the remaining signal, or all of it, without a name, by :mod:`.descriptions` and
+   :mod:`.packets`; names must be likelier.
+5. :mod:`.extend` adds the named causes to a calibration; :mod:`.improvement` corrects held-out dives with it.
+6. :mod:`.diagnosis` is the result, :mod:`.assessment` decides on its use, and :mod:`.report` writes both for
+   people and for programs.
 """

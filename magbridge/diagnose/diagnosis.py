@@ -10,21 +10,16 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.assessment.weigh import Assessment, assess
+from magbridge.diagnose.alternatives import CompetingHypothesis
+from magbridge.diagnose.assessment import Assessment, assess
 from magbridge.diagnose.causes import CAUSES, Cause
-from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.evidence import ODDS
-from magbridge.diagnose.inference.hypothesis import Hypothesis
-from magbridge.diagnose.inference.isolability import Isolability
-from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.left_out import Improvement
-from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.inference.search import Outcome
-from magbridge.diagnose.seen import Seen, memory, seen
-from magbridge.diagnose.unexplained.leftover import Leftover
-from magbridge.diagnose.unexplained.unlisted import far_from_white
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.evidence import ODDS, Hypothesis, Isolability
+from magbridge.diagnose.joint import Improvement, Joint
+from magbridge.diagnose.leftover import Leftover, far_from_white
+from magbridge.diagnose.observed import Seen, memory, seen
+from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.search import Outcome, Outliers
 from magbridge.estimation.residual import rms
 
 __all__ = ["MIN_RMS_REDUCTION", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
@@ -56,7 +51,7 @@ class Finding:
     covariance: FloatArray
     """(k, k)."""
     over_random_walk: float = np.inf
-    """Log odds over a sensor whose offsets wander (:mod:`.accept`); infinite for a cause that
+    """Log odds over a sensor whose offsets wander (:mod:`.run`); infinite for a cause that
     is not slow."""
     further: tuple[Candidate, ...] = ()
     """Further causes of the same family that the fit contains: alternatives, not findings of their own."""

@@ -27,24 +27,19 @@ from magbridge.calibration.file import decode_calibration
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.correction import Correction
-from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.compare.derivatives import derivatives
-from magbridge.diagnose.compare.design_columns import Columns
-from magbridge.diagnose.compare.dives import days_of
-from magbridge.diagnose.compare.prior import floor, isotropic
-from magbridge.diagnose.compare.problem import DELAYS, Problem, samples_of
-from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.columns import Candidate, Columns, slices
 from magbridge.diagnose.extend import (
     extend,
     flyable,
+    loosened,
     relinearised,
     with_map_error,
     with_misfit,
     without_effects_at,
 )
-from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.left_out import HeldOut, held_out, paired
-from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
+from magbridge.diagnose.joint import HeldOut, Joint, fit_joint, held_out, paired
+from magbridge.diagnose.problem import DELAYS, Problem, derivatives, floor, isotropic, samples_of
+from magbridge.diagnose.survey import Survey, days_of
 from magbridge.estimation.residual import Samples, residuals, rms
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
@@ -53,7 +48,7 @@ from magbridge.rows import correct_rows
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Extension", "check_written", "corrected", "error_without", "extension_of", "tightened"]
+__all__ = ["Extension", "check_written", "corrected", "error_without", "extension_of"]
 
 TIGHTENING = (1.0, 0.3, 0.1)
 """Factors on the prior sigma of the calibration's coefficients that are tried until an extension passes."""

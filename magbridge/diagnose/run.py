@@ -14,38 +14,160 @@ from magbridge.arrays import BoolArray
 from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.accept import odds_over_random_walk, settle
+from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.causes import Cause, known
-from magbridge.diagnose.causes.candidates import Candidate, since, slices
 from magbridge.diagnose.causes.time_dependent import interference_tone
-from magbridge.diagnose.compare.dives import days_of
-from magbridge.diagnose.compare.load_survey import load_survey
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.columns import Candidate, Columns, Group, since, slices
 from magbridge.diagnose.diagnosis import MIN_RMS_REDUCTION, Diagnosis, Finding, counted, small, verdict_of
+from magbridge.diagnose.evidence import (
+    ODDS,
+    REMNANT,
+    Hypothesis,
+    bayes_factor_threshold,
+    isolability,
+    log_odds,
+    shaped_ratio,
+)
 from magbridge.diagnose.improvement import Extension, check_written, corrected, error_without, extension_of
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.evidence import ODDS, REMNANT
-from magbridge.diagnose.inference.hypothesis import Hypothesis
-from magbridge.diagnose.inference.isolability import isolability
-from magbridge.diagnose.inference.left_out import paired
-from magbridge.diagnose.inference.outliers import Outliers, outliers
-from magbridge.diagnose.inference.search import Outcome
-from magbridge.diagnose.seen import memory
-from magbridge.diagnose.unexplained.leftover import leftover
-from magbridge.diagnose.unexplained.unlisted import switching, unlisted
+from magbridge.diagnose.joint import Joint, fit_joint, held_out, paired
+from magbridge.diagnose.leftover import Leftover, leftover, switching, unlisted, varying
+from magbridge.diagnose.noise import autoregressive_order
+from magbridge.diagnose.observed import memory
+from magbridge.diagnose.problem import Problem, pose, with_slow_noise
+from magbridge.diagnose.search import Outcome, Outliers, beside_slow_noise, outliers, search
+from magbridge.diagnose.survey import Survey, days_of, load_survey
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["diagnose"]
+__all__ = ["accept", "diagnose", "odds_over_random_walk", "settle"]
 
+AGAINST = 2.0
+"""Log odds of the held-out dives against the names from which on names are rejected. These odds are noisy: of
+14 right names of S/N 8 one had 1.9, of ten wrong ones of unlisted effects four had more."""
 ABSURD = 0.5
 """Fraction of the field; when the corrected field is off by more, no diagnosis is attempted."""
 MIN_SLOW_FRACTION = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
+
+
+def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
+    """Decide whether the names are asserted, and describe the remaining signal, or else the whole signal.
+
+    Names and free descriptions both pay for the number of alternatives they were chosen from. The evidence of
+    a description of the remaining signal is added to the names' evidence; unless it is a remnant of one of
+    the named causes, the names pay for it as for a further cause. A cause that the table lacks competes like
+    any other: names are asserted if they are likelier than every description of the whole signal, and predict
+    every eighth dive as well. They remain possible unless one beats them 20:1, allowing for the error of
+    their regressors.
+    """
+    model = [h.candidate for h in outcome.chosen]
+    uneven = [
+        one for candidate in model if (one := varying(problem, candidate, outcome.look_elsewhere)) is not None
+    ]
+    rest = residual = leftover(problem, model, outcome.fit, tone, also=uneven)
+    if not model:
+        return False, rest
+    ratio = 2.0 * (outcome.fit.log_likelihood - outcome.null.log_likelihood)
+    shaped = shaped_ratio(ratio, model, outcome.fit)
+    names = log_odds(ratio, model, outcome.look_elsewhere, shaped) - float(
+        np.log(len(outcome.look_elsewhere))
+    )
+    if rest is not None:
+        names += rest.among
+        if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
+            rest = None
+    # a description that contains the names' own regressors and nothing else is not an alternative
+    alone = rest is None or _same(outcome.chosen, rest)
+    but = model if alone else ()
+    free = leftover(problem, [], outcome.null, tone, but=but, also=uneven)
+    if not alone:
+        names -= ODDS
+    if free is None:
+        return True, rest
+    ours = _foretold(problem, [candidate.columns for candidate in model], outcome.fit, residual)
+    behind = max(free.among - names, _foretold(problem, [], outcome.null, free) - ours - AGAINST)
+    if behind <= 0.0:
+        return True, rest
+    return False, free._replace(within=_within(outcome, behind))
+
+
+def settle(
+    problem: Problem, candidates: Sequence[Candidate], causes: int, tone: Candidate | None
+) -> tuple[Outcome, bool, Leftover | None]:
+    """Search, and return the selected outcome with the result of :func:`accept`.
+
+    Slow noise absorbs part of the signal that descriptions represent, and so makes names look better. So if
+    the names found without slow noise are not asserted, or something switches, no search with it is made.
+    """
+    plain = search(problem, candidates, causes)
+    asserted, rest = accept(problem, plain, tone)
+    if not asserted or plain.switches:
+        return plain, asserted, rest
+    outcome = beside_slow_noise(plain, candidates, causes)
+    return outcome, *((True, rest) if outcome is plain else accept(outcome.problem, outcome, tone))
+
+
+def _foretold(problem: Problem, model: Sequence[Columns], fit: Joint, best: Leftover | None) -> float:
+    """Return the log odds by which a model with the best description, if any, predicts every eighth dive.
+
+    Descriptions that were picked from many places or periods pay for that, as in the fit.
+    """
+    scores = [held_out(problem, model, fit, interleaved=True).score]
+    for one in best.fitted if best else ():
+        score = held_out(problem, [*model, one.columns], one.fit, interleaved=True).score
+        scores.append(score - float(np.log(one.look_elsewhere)))
+    return max(scores)
+
+
+def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
+    """Return True if the rest is a remnant of the idealised regressor of a stronger named cause."""
+    description = rest.description
+    if description is None or description.wider:
+        return False
+    return any(description.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen)
+
+
+def _within(outcome: Outcome, behind: float) -> tuple[CompetingHypothesis, ...]:
+    """Return the names, and their competing hypotheses, the likeliest first.
+
+    A description beats the names by `behind`; those that it does not beat by their threshold stay. Its
+    shape follows the data, whereas the regressors of all causes are idealised.
+    """
+    found: dict[Group, CompetingHypothesis] = {}
+    for hypothesis, competing in zip(outcome.chosen, outcome.competing, strict=True):
+        limit = bayes_factor_threshold(hypothesis.ratio)
+        for one in (CompetingHypothesis(hypothesis.candidate, 0.0), *competing):
+            known = found.get(one.candidate.group)
+            if one.behind + behind < limit and (known is None or one.behind + behind < known.behind):
+                found[one.candidate.group] = replace(one, behind=one.behind + behind)
+    return tuple(sorted(found.values(), key=lambda one: one.behind))
+
+
+def odds_over_random_walk(outcome: Outcome, own: Hypothesis) -> float:
+    """Return the log odds of one cause that was chosen over offsets that wander in its place.
+
+    Notes
+    -----
+    A random walk has a power of 1/f^2: half waves of variance ``g / k^2`` in place of the ``g / k`` of
+    :mod:`~magbridge.diagnose.problem`. Most of that is of the lowest frequencies, of which a step
+    or a drift of a low signal-to-noise is, too, so a log may not distinguish them. Both are compared by their
+    evidence, each autoregression at Akaike's price: with a walk it is shorter.
+    """
+    slots, noise = outcome.problem.survey.slots, outcome.null.noise
+    others = [one.candidate for one in outcome.chosen if one is not own]
+    columns, spectra = [one.columns for one in others], [one.spectra for one in others]
+    walking = with_slow_noise(outcome.problem, 2)
+    rough = fit_joint(walking, columns, 1, spectra=spectra, rounds=2)
+    order = autoregressive_order(rough.residual, slots)
+    walk = fit_joint(walking, columns, order, spectra=spectra, blocks=noise.uneven)
+    without = fit_joint(outcome.problem, columns, noise.past.order, spectra=spectra, blocks=noise.uneven)
+    # coefficients that the remainder does not need have each gained half a log-likelihood unit by chance
+    price = 0.5 * (noise.past.order + autoregressive_order(outcome.fit.residual, slots))
+    price += float(np.log(outcome.look_elsewhere[own.candidate.cause]))
+    return own.evidence - price + without.log_likelihood - (walk.log_likelihood - order)
 
 
 def diagnose(

@@ -10,10 +10,10 @@ from itertools import groupby
 from math import floor, isfinite, log10
 from operator import itemgetter
 
+from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.seen import Seen
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.observed import Seen
 
 __all__ = [
     "MAX_UNFOLDED_NUMBERS", "bold", "chance", "figure", "goes_with", "label", "listed", "measured",

@@ -8,12 +8,12 @@ from study import deployment
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
-from magbridge.diagnose.compare.load_survey import load_survey
-from magbridge.diagnose.compare.problem import Problem, pose
+from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.joint import fit_joint
+from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.unexplained.descriptions import Description, descriptions
+from magbridge.diagnose.survey import load_survey
 from sitl import load, simulate
 from sitl.dataset import segments
 

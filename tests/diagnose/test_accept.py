@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from posed import candidate, missed, right
 
-from magbridge.diagnose import accept as deciding
-from magbridge.diagnose.accept import _within, accept
+from magbridge.diagnose import run as deciding
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.candidates import GridPoint
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.evidence import ODDS, bayes_factor_threshold
-from magbridge.diagnose.inference.search import Outcome, search
-from magbridge.diagnose.unexplained.varying import varying
+from magbridge.diagnose.columns import GridPoint
+from magbridge.diagnose.evidence import ODDS, bayes_factor_threshold
+from magbridge.diagnose.leftover import varying
+from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.run import _within, accept
+from magbridge.diagnose.search import Outcome, search
 
 ROWS = 300
 

@@ -18,10 +18,10 @@ from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Sensor
-from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report import page
 from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.survey import load_survey
 from magbridge.errors import DataError, WriteError
 from magbridge.field.geodesy import offset, wrap
 from magbridge.logs import write

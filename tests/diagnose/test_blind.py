@@ -19,9 +19,9 @@ from study.rates import worse
 
 from magbridge.calibration.file import load
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.assessment.weigh import useful
+from magbridge.diagnose.assessment import useful
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.inference.left_out import Improvement
+from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected

@@ -11,7 +11,7 @@ import pytest
 import magbridge
 from magbridge.diagnose import causes
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.problem import Problem
 
 ROOM = Path(causes.__file__).parent
 ELSEWHERE = {"magbridge/learning"}

@@ -14,12 +14,19 @@ from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.statistic import PRIOR_SIZES, Statistic
+from magbridge.diagnose.descriptions import (
+    Description,
+    bends,
+    crossing,
+    delayed,
+    descriptions,
+    near_surface,
+    response,
+    swings,
+)
+from magbridge.diagnose.joint import PRIOR_SIZES, Statistic, fit_joint
+from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.unexplained.descriptions import Description, descriptions
-from magbridge.diagnose.unexplained.shapes import bends, crossing, delayed, near_surface, response, swings
 from sitl import load, simulate
 from sitl.dataset import segments
 

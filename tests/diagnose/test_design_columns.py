@@ -8,18 +8,10 @@ from posed import right
 from scipy.sparse import csr_array
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.compare.design_columns import (
-    Columns,
-    Interpolated,
-    Mixture,
-    parts,
-    side_by_side,
-    times,
-    together,
-)
-from magbridge.diagnose.inference import design
-from magbridge.diagnose.inference.information import information
-from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose import joint as design
+from magbridge.diagnose.columns import Columns, Interpolated, Mixture, parts, side_by_side, times, together
+from magbridge.diagnose.evidence import information
+from magbridge.diagnose.joint import fit_joint
 
 ROWS = slice(3, 20)
 

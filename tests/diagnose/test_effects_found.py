@@ -18,9 +18,9 @@ from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, Sou
 from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
-from magbridge.diagnose.compare.design_columns import effect_columns
-from magbridge.diagnose.compare.problem import pose, samples_of
-from magbridge.diagnose.compare.survey import Channel, Survey
+from magbridge.diagnose.columns import effect_columns
+from magbridge.diagnose.problem import pose, samples_of
+from magbridge.diagnose.survey import Channel, Survey
 from magbridge.errors import FormatError
 from magbridge.estimation.residual import residuals
 

@@ -7,16 +7,16 @@ import pytest
 from posed import candidate
 from scipy.stats import chi2
 
-from magbridge.diagnose.causes.candidates import Candidate, slices
-from magbridge.diagnose.inference.evidence import (
+from magbridge.diagnose.columns import Candidate, slices
+from magbridge.diagnose.evidence import (
     FALSE_ALARM_RATE,
+    Information,
     evidence_of,
     log_bayes,
     log_odds,
     look_elsewhere_factors,
     score,
 )
-from magbridge.diagnose.inference.information import Information
 
 
 def sized(cause: str, size: int = 1, **more: object) -> Candidate:

@@ -13,16 +13,15 @@ from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
 from magbridge.calibration.mass_effects import PowersEffect
 from magbridge.calibration.memory_effects import ClockEffect
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.assessment.numbers import level
+from magbridge.diagnose.assessment import level
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.candidates import Candidate, of_effect, since
-from magbridge.diagnose.compare.past import MAX_LAG, Past
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.columns import Candidate, of_effect, since
+from magbridge.diagnose.evidence import IDEAL
 from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with_map_error, with_misfit
-from magbridge.diagnose.inference.evidence import IDEAL
-from magbridge.diagnose.inference.fit_noise import fit_noise
-from magbridge.diagnose.inference.joint import Joint, fit_joint
+from magbridge.diagnose.joint import Joint, fit_joint
+from magbridge.diagnose.noise import fit_noise
+from magbridge.diagnose.problem import Problem, pose
+from magbridge.diagnose.survey import MAX_LAG, Past, Survey
 
 
 def current(size: int) -> Candidate:

@@ -14,13 +14,13 @@ import pytest
 from jsonschema import Draft202012Validator
 from posed import candidate
 
+from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.outliers import Outliers
+from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.report.findings import FINDINGS_FORMAT, findings_json
 from magbridge.diagnose.report.page import report_html
-from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.search import Outliers
 from magbridge.diagnose.words import number
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "findings.schema.json").read_text(encoding="utf-8"))

@@ -9,10 +9,9 @@ import pytest
 from posed import calibrated, surveyed, walk
 from scipy.stats import multivariate_normal
 
-from magbridge.diagnose.compare.past import MAX_LAG
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.left_out import held_out
+from magbridge.diagnose.joint import Joint, fit_joint, held_out
+from magbridge.diagnose.problem import Problem, pose
+from magbridge.diagnose.survey import MAX_LAG
 
 DIVES = 5
 

@@ -8,16 +8,15 @@ from dataclasses import replace
 import numpy as np
 from posed import right
 
-from magbridge.diagnose.assessment.numbers import delays
+from magbridge.diagnose.assessment import delays
 from magbridge.diagnose.causes.time_dependent import offset_drift
 from magbridge.diagnose.causes.timing import channel_skew
-from magbridge.diagnose.compare.interpolation import interpolation_error
-from magbridge.diagnose.compare.problem import AXIS_DELAY_SIGMA_S, DELAYS, Problem, pose
-from magbridge.diagnose.compare.survey import Survey
+from magbridge.diagnose.evidence import information
 from magbridge.diagnose.extend import relinearised
-from magbridge.diagnose.inference.information import information
-from magbridge.diagnose.inference.joint import fit_joint
+from magbridge.diagnose.joint import fit_joint
+from magbridge.diagnose.problem import AXIS_DELAY_SIGMA_S, DELAYS, Problem, interpolation_error, pose
 from magbridge.diagnose.report.page import late
+from magbridge.diagnose.survey import Survey
 
 TAKEN = np.array([0.0, 0.16, 0.32])
 """s, of a converter that takes the channels in turn."""

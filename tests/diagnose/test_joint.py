@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from posed import right
 
-from magbridge.diagnose.inference.joint import RIDGE, fit_joint
+from magbridge.diagnose.joint import RIDGE, fit_joint
 
 ROWS = 300
 

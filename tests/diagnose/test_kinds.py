@@ -12,11 +12,10 @@ from posed import FIELD, T0, calibrated, surveyed, walk
 from magbridge.calibration.effects import lagged
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.compare.kinds import ANY, kinds_of
-from magbridge.diagnose.compare.problem import pose
-from magbridge.diagnose.compare.survey import Channel
+from magbridge.diagnose.problem import pose
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.survey import ANY, Channel, kinds_of
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from posed import right
 
-from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
 from magbridge.diagnose.causes.time_dependent import offset_drift, offset_step
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.search import beside_slow_noise, search
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.joint import Joint, fit_joint
+from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.search import beside_slow_noise, search
 
 N = 1500
 NORTH = 2000.0 * (1.0 - np.abs(np.linspace(-1.0, 1.0, N)))

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.diagnose.compare.past import MAX_LAG, Past
-from magbridge.diagnose.inference.evidence import certainty
-from magbridge.diagnose.inference.fit_noise import MAX_NOISE_ORDER, autoregressive_order, fit_noise
-from magbridge.diagnose.inference.noise import Noise
+from magbridge.diagnose.evidence import certainty
+from magbridge.diagnose.noise import MAX_NOISE_ORDER, Noise, autoregressive_order, fit_noise
+from magbridge.diagnose.survey import MAX_LAG, Past
 
 
 def made(kind: str, n: int = 6000, rho: float = 0.0, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from posed import candidate, right
 
-from magbridge.diagnose.causes.candidates import Candidate, GridPoint
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import normal
-from magbridge.diagnose.inference.evidence import log_bayes
-from magbridge.diagnose.inference.joint import Joint, fit_joint
-from magbridge.diagnose.inference.nonlinear_uncertainty import loosened
+from magbridge.diagnose.columns import Candidate, GridPoint
+from magbridge.diagnose.evidence import log_bayes
+from magbridge.diagnose.extend import loosened
+from magbridge.diagnose.joint import Joint, fit_joint, normal
+from magbridge.diagnose.problem import Problem
 
 ROWS, LAG, CELL = 300, 60.0, 40.0
 

@@ -12,12 +12,12 @@ from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.compare.past import MAX_LAG, Past
-from magbridge.diagnose.inference.fit_noise import fit_noise
-from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.outliers import Outliers, outliers
-from magbridge.diagnose.report.details import remaining
+from magbridge.diagnose.joint import Joint
+from magbridge.diagnose.noise import fit_noise
+from magbridge.diagnose.report.page import remaining
 from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.search import Outliers, outliers
+from magbridge.diagnose.survey import MAX_LAG, Past
 from sitl import load, simulate
 from sitl.dataset import segments
 

@@ -9,8 +9,8 @@ import numpy as np
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Noise, identity
-from magbridge.diagnose.compare.load_survey import load_survey
 from magbridge.diagnose.run import diagnose
+from magbridge.diagnose.survey import load_survey
 from sitl import load, simulate
 from sitl.dataset import segments
 

@@ -9,12 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from posed import missed, right, thinned
 
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.inference.information import information
-from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.inference.statistic import Ridge, Statistic
-from magbridge.diagnose.unexplained.packets import Packets, packets
-from magbridge.diagnose.unexplained.shapes import lower_end, repeated
+from magbridge.diagnose.descriptions import lower_end, repeated
+from magbridge.diagnose.evidence import information
+from magbridge.diagnose.joint import Ridge, Statistic, fit_joint
+from magbridge.diagnose.packets import Packets, packets
+from magbridge.diagnose.problem import Problem, pose
 
 
 def drawn(problem: Problem, rho: float, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from posed import candidate, right
 
-from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.inference.competing import _separate, exchanged, sets_of
-from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE, score
-from magbridge.diagnose.inference.pairs import pairs_of
-from magbridge.diagnose.inference.search import _backward_elimination
-from magbridge.diagnose.inference.state import State
+from magbridge.diagnose.alternatives import _separate, exchanged, pairs_of, sets_of
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.evidence import FALSE_ALARM_RATE, score
+from magbridge.diagnose.search import _backward_elimination
+from magbridge.diagnose.state import State
 
 ROWS = 600
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from posed import missed
 
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.joint import fit_joint
-from magbridge.diagnose.unexplained.packets import passage
+from magbridge.diagnose.joint import fit_joint
+from magbridge.diagnose.packets import passage
+from magbridge.diagnose.problem import Problem
 
 
 def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None:

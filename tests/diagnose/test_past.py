@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.diagnose.compare.past import MAX_LAG, Past
-from magbridge.diagnose.compare.survey import Survey, assemble
+from magbridge.diagnose.survey import MAX_LAG, Past, Survey, assemble
 
 
 def survey(time: np.ndarray, learned: np.ndarray | None = None) -> Survey:

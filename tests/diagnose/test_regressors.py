@@ -18,12 +18,10 @@ from magbridge.diagnose.causes.masses import actuator_order
 from magbridge.diagnose.causes.response import BENT
 from magbridge.diagnose.causes.time_dependent import offset_step
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
-from magbridge.diagnose.compare.design_columns import effect_columns
-from magbridge.diagnose.compare.interpolation import rates
-from magbridge.diagnose.compare.past import MAX_LAG
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.survey import Channel
-from magbridge.diagnose.inference.statistic import Statistic
+from magbridge.diagnose.columns import effect_columns
+from magbridge.diagnose.joint import Statistic
+from magbridge.diagnose.problem import Problem, pose, rates
+from magbridge.diagnose.survey import MAX_LAG, Channel
 
 
 @pytest.fixture(scope="module")

@@ -12,20 +12,17 @@ import pytest
 from posed import candidate, right
 
 from magbridge.cli.diagnose import causes_of, summary
-from magbridge.diagnose.assessment.notes import IMPLAUSIBLE_MULTIPLE, Note, not_separated
-from magbridge.diagnose.assessment.numbers import level, times_usual
+from magbridge.diagnose.alternatives import CompetingHypothesis
+from magbridge.diagnose.assessment import IMPLAUSIBLE_MULTIPLE, Note, level, not_separated, times_usual
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.compare.prior import isotropic
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.compare.survey import Channel, _channels
 from magbridge.diagnose.diagnosis import Finding, small, verdict_of
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.hypothesis import Hypothesis
-from magbridge.diagnose.inference.left_out import Improvement
+from magbridge.diagnose.evidence import Hypothesis
+from magbridge.diagnose.joint import Improvement
+from magbridge.diagnose.leftover import Leftover
+from magbridge.diagnose.problem import Problem, isotropic
 from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.details import _folded, _outliers, nameless
-from magbridge.diagnose.report.page import improved
-from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.report.page import _folded, _outliers, improved, nameless
+from magbridge.diagnose.survey import Channel, _channels
 from magbridge.diagnose.words import chance, measured, number, physics, row, sizes
 
 

@@ -9,16 +9,15 @@ from dataclasses import replace
 import numpy as np
 from posed import candidate
 
-from magbridge.diagnose.assessment.weigh import OWN_LOG_TEXT, Assessment
+from magbridge.diagnose.alternatives import CompetingHypothesis
+from magbridge.diagnose.assessment import OWN_LOG_TEXT, Assessment
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.left_out import Improvement
-from magbridge.diagnose.inference.outliers import Outliers
-from magbridge.diagnose.report.canvas import ends, rolling
-from magbridge.diagnose.report.details import remaining, visible
-from magbridge.diagnose.report.page import report_html
-from magbridge.diagnose.unexplained.leftover import Leftover
+from magbridge.diagnose.joint import Improvement
+from magbridge.diagnose.leftover import Leftover
+from magbridge.diagnose.report.figures import ends, rolling
+from magbridge.diagnose.report.page import remaining, report_html, visible
+from magbridge.diagnose.search import Outliers
 from magbridge.diagnose.words import number
 
 

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from magbridge.arrays import FloatArray
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.compare.returns import Returns, returns
-from magbridge.diagnose.report.details import visible
+from magbridge.diagnose.observed import Returns, returns
 from magbridge.diagnose.report.findings import findings
+from magbridge.diagnose.report.page import visible
 from magbridge.diagnose.run import diagnose
 from sitl.signals import correlated
 

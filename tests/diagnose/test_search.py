@@ -11,21 +11,14 @@ from posed import calibrated, candidate, right, surveyed
 from scipy.signal import lfilter
 
 from magbridge.calibration.instrument_effects import TimeEffect
-from magbridge.diagnose.accept import odds_over_random_walk
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.alternatives import exchanged
 from magbridge.diagnose.causes.reference import reference_bias
-from magbridge.diagnose.compare.problem import pose
-from magbridge.diagnose.inference.competing import exchanged
-from magbridge.diagnose.inference.evidence import ODDS
-from magbridge.diagnose.inference.hypothesis import Hypothesis
-from magbridge.diagnose.inference.outliers import LOST, switches
-from magbridge.diagnose.inference.search import (
-    _forward_selection,
-    _surplus,
-    beside_slow_noise,
-    search,
-)
-from magbridge.diagnose.inference.state import State
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.evidence import ODDS, Hypothesis
+from magbridge.diagnose.problem import pose
+from magbridge.diagnose.run import odds_over_random_walk
+from magbridge.diagnose.search import LOST, _forward_selection, _surplus, beside_slow_noise, search, switches
+from magbridge.diagnose.state import State
 
 
 def fault(cause: str, x: NDArray[np.float64], width: float) -> Candidate:

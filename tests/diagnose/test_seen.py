@@ -18,12 +18,12 @@ from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.cli.diagnose import causes_of
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.survey import Channel
-from magbridge.diagnose.report.details import described
+from magbridge.diagnose.observed import memory, seen
+from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.report.findings import findings
+from magbridge.diagnose.report.page import described
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.seen import memory, seen
+from magbridge.diagnose.survey import Channel
 from sitl import load, simulate
 from sitl.dataset import segments
 from sitl.signals import correlated

@@ -22,8 +22,8 @@ from study.rates import against_ideal, efficiency, share
 from study.table import lines
 from study.theory import SIZES
 
-from magbridge.diagnose.inference.evidence import log_bayes
-from magbridge.diagnose.unexplained.descriptions import Description
+from magbridge.diagnose.descriptions import Description
+from magbridge.diagnose.evidence import log_bayes
 from sitl import Twin, load
 from sitl.signals import correlated
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Effect, Polynomial, Series
-from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.past import MAX_LAG
-from magbridge.diagnose.compare.problem import Problem, pose
-from magbridge.diagnose.compare.survey import Channel, Survey
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.problem import Problem, pose
+from magbridge.diagnose.survey import MAX_LAG, Channel, Survey
 
 __all__ = [
     "FIELD",

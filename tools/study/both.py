@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.inference.evidence import ODDS
+from magbridge.diagnose.evidence import ODDS
 from study.deployment import Background, Injected
 from study.draws import SHOWN, Draws, Span, evidence
 from study.theory import Setting, best_of, information, own_span, true_span

@@ -14,10 +14,10 @@ from foreign import FOREIGN
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.unexplained.descriptions import Description, descriptions
 from sitl.inject import EFFECTS, Hidden
 from study.both import both
 from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of

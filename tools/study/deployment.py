@@ -18,7 +18,7 @@ from magbridge.calibration.correct import regressors
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.compare.prior import floor
+from magbridge.diagnose.problem import floor
 from magbridge.estimation.residual import Samples, jacobian, residuals
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field

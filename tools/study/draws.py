@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.inference.evidence import log_bayes, one_sided
-from magbridge.diagnose.inference.statistic import Statistic
+from magbridge.diagnose.evidence import log_bayes, one_sided
+from magbridge.diagnose.joint import Statistic
 
 DRAWS = 400
 SHOWN = "as shown"
@@ -35,7 +35,7 @@ class Span:
     positive : bool
         Its coefficients cannot be negative.
     spectra : (l, k) array or None
-        Where its coefficients have one common size (:mod:`magbridge.diagnose.inference.statistic`): l
+        Where its coefficients have one common size (:mod:`magbridge.diagnose.joint`): l
         alternatives for their prior variances.
     more : float
         Of a true shape: how many further coefficients its cause has, which fit nothing but noise.

@@ -10,7 +10,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.extend import extend, relinearised, with_misfit
-from magbridge.diagnose.inference.search import search
+from magbridge.diagnose.search import search
 from sitl.dataset import corrected
 from sitl.inject import Hidden
 from study.deployment import DAY, Background, rebuilt

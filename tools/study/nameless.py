@@ -28,8 +28,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.inference.evidence import ODDS, log_bayes
-from magbridge.diagnose.unexplained.descriptions import Description
+from magbridge.diagnose.descriptions import Description
+from magbridge.diagnose.evidence import ODDS, log_bayes
 from study.draws import Draws, Span
 
 

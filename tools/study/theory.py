@@ -26,11 +26,11 @@ from scipy.special import chdtrc
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.causes.candidates import slices
-from magbridge.diagnose.compare.load_survey import load_survey
-from magbridge.diagnose.compare.problem import pose
-from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE, ODDS, log_bayes
-from magbridge.diagnose.unexplained.descriptions import Description
+from magbridge.diagnose.columns import slices
+from magbridge.diagnose.descriptions import Description
+from magbridge.diagnose.evidence import FALSE_ALARM_RATE, ODDS, log_bayes
+from magbridge.diagnose.problem import pose
+from magbridge.diagnose.survey import load_survey
 from study.deployment import Background, Injected, compare, project
 from study.draws import SHOWN, Draws, Span, by_cause, evidence, explained, numbers, with_another
 from study.nameless import against, nameless

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from magbridge.diagnose.causes.candidates import Candidate
 from magbridge.diagnose.causes.masses import actuator_order, hysteresis, unmodelled_actuator
 from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
 from magbridge.diagnose.causes.response import nonlinearity, saturation
@@ -21,11 +20,12 @@ from magbridge.diagnose.causes.telemetry import (
 )
 from magbridge.diagnose.causes.time_dependent import interference_tone, offset_drift, offset_step
 from magbridge.diagnose.causes.timing import channel_skew, clock_offset, eddy_current, filter_lag
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.problem import Problem
 from magbridge.errors import PluginError
 from magbridge.plugins import load, plugins
 
-__all__ = ["CAUSES", "GROUP", "Cause", "known"]
+__all__ = ["CAUSES", "Cause", "known"]
 
 GROUP = "magbridge.causes"
 """Entry points that add a cause: each is a :class:`Cause`, and its name is that of ``findings.json``."""

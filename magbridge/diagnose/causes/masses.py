@@ -10,9 +10,8 @@ import numpy as np
 from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.memory_effects import PlayEffect
 from magbridge.calibration.terms import Polynomial, full_order
-from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect, per
-from magbridge.diagnose.compare.prior import FALL
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect, per
+from magbridge.diagnose.problem import FALL, Problem
 
 __all__ = ["actuator_order", "hysteresis", "unmodelled_actuator"]
 

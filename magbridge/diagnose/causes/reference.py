@@ -10,9 +10,8 @@ from scipy.sparse import csr_array, diags_array
 from scipy.spatial.distance import cdist
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.diagnose.causes.candidates import Candidate, of_reference
-from magbridge.diagnose.compare.design_columns import Interpolated
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.columns import Candidate, Interpolated, of_reference
+from magbridge.diagnose.problem import Problem
 
 __all__ = ["diurnal_variation", "map_error", "reference_bias"]
 

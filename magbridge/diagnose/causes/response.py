@@ -10,8 +10,8 @@ from itertools import product
 import numpy as np
 
 from magbridge.calibration.instrument_effects import ResponseEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect, per
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect, per
+from magbridge.diagnose.problem import Problem
 
 __all__ = ["BENT", "nonlinearity", "saturation"]
 
@@ -29,7 +29,7 @@ def nonlinearity(problem: Problem) -> list[Candidate]:
     coefficients have one common size, because the three axes have the same design, up to :data:`BENT`: nine
     free numbers could otherwise take a wrong reference and a mass' error for one bend.
     """
-    # a common size is at most ten widths (:data:`~magbridge.diagnose.inference.statistic.PRIOR_SIZES`)
+    # a common size is at most ten widths (:data:`~magbridge.diagnose.joint.PRIOR_SIZES`)
     common = [_power(problem, power, 0.1 * BENT) for power in (1, 2, 3)]
     every = replace(reduce(Candidate.with_, common), parts=(), spectra=np.ones((1, 9)))
     return [*(_power(problem, power, BENT) for power in (2, 3)), every]

@@ -11,8 +11,8 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, lagged
-from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect
-from magbridge.diagnose.compare.problem import Problem, once
+from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
+from magbridge.diagnose.problem import Problem, once
 
 __all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import TimeEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect, per
-from magbridge.diagnose.compare.problem import Problem
+from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect, per
+from magbridge.diagnose.problem import Problem
 
 __all__ = ["interference_tone", "offset_drift", "offset_step"]
 

@@ -9,9 +9,8 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.calibration.memory_effects import ClockEffect
-from magbridge.diagnose.causes.candidates import AXES, Candidate, GridPoint, of_effect
-from magbridge.diagnose.compare.interpolation import MAX_MISSING_SAMPLES, rates
-from magbridge.diagnose.compare.problem import Problem, once
+from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
+from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, once, rates
 
 __all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
 
@@ -25,7 +24,7 @@ CENTRAL_STEP_S = 0.01
 
 @once
 def field_rates(problem: Problem) -> FloatArray:
-    """(3, n) dH_r/dt, nT/s (:func:`~.compare.interpolation.rates`)."""
+    """(3, n) dH_r/dt, nT/s (:func:`~.problem.rates`)."""
     return rates(problem.survey, problem.survey.field.T)
 
 
@@ -92,7 +91,7 @@ def _shortened(problem: Problem) -> Candidate:
     For an RC filter sigma is its time constant. A field that turns with omega is shortened by
     ``sigma^2 omega^2 / 2`` of its turning part. As with ``calibrate --filter-cutoff``, the calibration is
     fitted without it, and nothing is added to a field that turns live. The second derivative is that of
-    :attr:`~.compare.problem.Problem.reading`, because it would correlate with the noise of its own sample.
+    :attr:`~.problem.Problem.reading`, because it would correlate with the noise of its own sample.
     """
     bend = rates(problem.survey, problem.reading.T, 2).T
     columns = -0.5 * np.einsum("ij,ij->i", problem.jacobian[:, 6:], bend)[:, None]

@@ -1,5 +1,5 @@
-"""The report: ``findings.json`` for programs, ``report.html`` for people.
+"""The report: ``findings.json`` for programs (:mod:`.findings`), ``report.html`` for people (:mod:`.page`).
 
-:mod:`.files` writes both. :mod:`.page` is the page's first screen, :mod:`.details` the folded parts below it.
-:mod:`.figures` draws on :mod:`.canvas`; :mod:`.words` writes names and numbers.
+:mod:`.figures` draws; :mod:`.page` also writes the files. :mod:`~magbridge.diagnose.words` writes names and
+numbers.
 """

@@ -9,16 +9,13 @@ import msgspec
 import numpy as np
 
 from magbridge.arrays import plain
-from magbridge.diagnose.assessment.notes import Note
-from magbridge.diagnose.assessment.numbers import telemetry_delay
-from magbridge.diagnose.assessment.weigh import Assessment
+from magbridge.diagnose.alternatives import CompetingHypothesis
+from magbridge.diagnose.assessment import Assessment, Note, telemetry_delay
 from magbridge.diagnose.causes import Cause
-from magbridge.diagnose.causes.candidates import Candidate
+from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.design import normal
-from magbridge.diagnose.inference.left_out import CONFIDENCE_LEVEL, Improvement
-from magbridge.diagnose.seen import Seen
+from magbridge.diagnose.joint import CONFIDENCE_LEVEL, Improvement, normal
+from magbridge.diagnose.observed import Seen
 
 __all__ = ["FINDINGS_FORMAT", "findings", "findings_json", "parameters"]
 

@@ -1,45 +1,101 @@
-"""The unexplained part: structure of any kind that no cause of the table accounts for, without a name.
+"""The part of a signal that no cause of the table accounts for.
 
 Notes
 -----
 A free description has more coefficients than the data can determine, so they have one common free size
-(:mod:`~.inference.statistic`). Noise that was fitted without an effect may have absorbed it. So descriptions
+(:mod:`~.joint`). Noise that was fitted without an effect may have absorbed it. So descriptions
 are scored under the noise of the fit and under that which is left when slow curves are fitted as well; the
 best are then compared by the whole likelihood, with the noise refitted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from magbridge.arrays import FloatArray
-from magbridge.diagnose.causes.candidates import Candidate
-from magbridge.diagnose.compare.design_columns import Columns, places, times
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.competing import CompetingHypothesis
-from magbridge.diagnose.inference.design import Design, in_threads, precomputed
-from magbridge.diagnose.inference.evidence import FALSE_ALARM_RATE
-from magbridge.diagnose.inference.fit_noise import fit_noise
-from magbridge.diagnose.inference.information import information
-from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.noise import Noise
-from magbridge.diagnose.inference.statistic import Ridge, Statistic
-from magbridge.diagnose.unexplained.descriptions import Description, descriptions
+from magbridge.arrays import BoolArray, FloatArray
+from magbridge.diagnose.alternatives import CompetingHypothesis
+from magbridge.diagnose.columns import Candidate, Columns, places, times
+from magbridge.diagnose.descriptions import Description, descriptions
+from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, information
+from magbridge.diagnose.joint import Design, Joint, Ridge, Statistic, in_threads, pieces, precomputed
+from magbridge.diagnose.noise import Noise, fit_noise
+from magbridge.diagnose.observed import Memory, memory
+from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.search import Outliers
 from magbridge.estimation.residual import rms, robust_scale
 
-__all__ = ["Leftover", "leftover"]
+__all__ = ["Leftover", "far_from_white", "leftover", "switching", "unlisted", "varying"]
 
+MAX_TESTED_COEFFICIENTS = 6
+"""Coefficients of a cause of which this is asked: with more, it takes almost any shape."""
 COMPARED_DESCRIPTIONS = 3
 """Number of the best descriptions under each noise that are then weighed by the full likelihood."""
 TURNS = 6
 """Alternations between fitting a curve and fitting its direction."""
 CALM = 2
 """Rounds of fitting slow curves and noise in turn."""
+LOUD = 2.0
+"""Multiple of the calibration's stated noise: 1.5 times is still noise, at twice something is wrong."""
+SLOW, SMOOTH, NEGLIGIBLE = 0.4, 5.0, 1e-5
+"""A residual is far from white if so much of its power is left in means over 64 samples, or if its RMS is so
+many times what changes from one sample to the next (autoregressive noise of 0.96); and its RMS, as a share of
+the field, below which that does not matter."""
+
+
+def varying(
+    problem: Problem, candidate: Candidate, look_elsewhere: Mapping[str, float]
+) -> Description | None:
+    """Describe a named cause whose size follows other telemetry, the attitude, or time.
+
+    A cause of the table has one size in a log: its true name leaves nothing of this kind. A name that stands
+    for something else (a current's, where its leads move, or where a joint closes under pressure) leaves its
+    own regressor times a function of that.
+
+    Parameters
+    ----------
+    problem : Problem
+        The survey.
+    candidate : Candidate
+        The cause; None is returned for one that takes almost any shape.
+    look_elsewhere : mapping
+        Cause -> number of independent hypotheses behind it.
+    """
+    if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
+        return None
+    values = _followed(problem, candidate.channel)
+    low = np.array([[value.min()] for value in values])
+    half = np.array([[max(0.5 * float(np.ptp(value)), 1e-12)] for value in values])
+    regressor, n = candidate.columns, len(problem)
+    # an RMS of one: its coefficients are in nT, as those of other descriptions are
+    power = sum(float(np.sum(regressor(rows) ** 2)) for rows in pieces(n)) / (n * candidate.size)
+
+    def columns(rows: slice) -> FloatArray:
+        part = regressor(rows).T / np.sqrt(max(power, 1e-300))
+        between = (np.stack([value[rows] for value in values]) - low) / half - 1.0
+        size = np.concatenate([np.ones((1, part.shape[1])), between])
+        return np.asarray((size[:, None] * part).reshape(-1, part.shape[1]).T)
+
+    width = np.full((1 + len(values)) * candidate.size, 30.0)
+    return Description(
+        columns, (("broadband", width),), candidate.channel, look_elsewhere[candidate.cause],
+        holds=lambda other: other.cause == candidate.cause, turned=candidate.size == 3, wider=True,
+    )  # fmt: skip
+
+
+def _followed(problem: Problem, own: str | None) -> list[FloatArray]:
+    """List what a size might follow, (n,) each: time, telemetry except the cause's `own`, attitude."""
+    survey = problem.survey
+    channels = [c.values for name, c in survey.channels.items() if name not in (own, *survey.still)]
+    if survey.attitude is None:
+        return [survey.time, *channels]
+    roll, pitch, heading = survey.attitude.T
+    heading = np.radians(heading)
+    return [survey.time, *channels, roll, pitch, np.cos(heading), np.sin(heading)]
 
 
 class Scored(NamedTuple):
@@ -101,7 +157,7 @@ def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, whole: 
 
     In turn f is estimated along d, and d by least squares given f, beginning with the direction of the
     `whole` estimate. The two free numbers of the direction pay as in
-    :func:`~.inference.evidence.log_bayes`.
+    :func:`~.evidence.log_bayes`.
     """
     count = len(width) // 3
     direction = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
@@ -227,3 +283,87 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
 def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
     """(m, k) columns along one direction of (m, 3 k) along each axis."""
     return np.asarray(part.reshape(len(part), -1, 3) @ direction)
+
+
+def unlisted(
+    problem: Problem,
+    fit: Joint,
+    named: Sequence[Hypothesis],
+    off: Outliers | None,
+    after: FloatArray,
+    counts: BoolArray,
+) -> Leftover | None:
+    """Return the part that the `named` causes leave unexplained, or None.
+
+    `off` are wrong samples, `after` (n,) is the residual on parts left out, nT, of which `counts` (n,) count.
+    """
+    return _passing(off) or _slow(problem, fit, named) or _loud(problem, after, counts)
+
+
+def switching(
+    problem: Problem, fit: Joint, named: Sequence[Hypothesis], off: Outliers | None, *, ended: bool
+) -> Leftover | None:
+    """Describe a switching signal if it is stronger than all `named` causes, or has ended the search.
+
+    Else return None. The noise's memory has absorbed the signal except for its level shifts, and the names
+    describe that rest; after a search that ended, competing names were not tried.
+    """
+    if off is None or not off.lasting:
+        return None
+    slow = _slow(problem, fit, named)
+    if not ended and (slow is None or any(one.signal_to_noise >= slow.signal_to_noise for one in named)):
+        return None
+    within = tuple(CompetingHypothesis(one.candidate, 0.0) for one in named)
+    rest = slow or _passing(off)
+    return rest and rest._replace(kind="switching", within=within, shifts=tuple(off.rows.tolist()))
+
+
+def _passing(off: Outliers | None) -> Leftover | None:
+    """Describe wrong samples that are not isolated: something passed by, rang for a few samples, switched."""
+    if off is None or off.isolated:
+        return None
+    kind = "switching" if off.lasting else "transient"
+    shifts = tuple(off.rows.tolist()) if off.lasting else ()
+    return Leftover(kind, float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None, shifts=shifts)
+
+
+def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | None:
+    """Describe a structureless residual beyond the calibration's stated noise and coefficient errors."""
+    power = float(np.sum(after[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
+    n = int(counts.sum())
+    if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:
+        return None
+    return Leftover("broadband", float(np.sqrt(power - n)), float(chi2.sf(power, n)), 0.0, None, None)
+
+
+def far_from_white(problem: Problem, found: Memory) -> bool:
+    """Return True if a residual of this memory is more than noise of the sensor."""
+    lasts = found.slow >= SLOW or found.rms >= SMOOTH * found.white
+    return lasts and found.rms >= NEGLIGIBLE * float(np.median(problem.survey.reference))
+
+
+def _slow(problem: Problem, fit: Joint, named: Sequence[Hypothesis]) -> Leftover | None:
+    """Describe a residual that is far from white, though no description of the list stands out of it.
+
+    Noise of a long memory can describe any slow signal, but such a signal is not noise of the sensor. Noise
+    that grows towards low frequencies can, too, unless it may be a remnant of the strongest cause.
+    """
+    slow = problem.slow_noise(fit.z)
+    residual = (fit.residual + slow) / problem.reference_jacobian
+    found = memory(problem, residual)
+    if problem.waves.size:
+        known = fit.prior[problem.slow] * np.diag(fit.covariance)[problem.slow]
+        power, freedom = float(np.sum(fit.noise.whiten(slow) ** 2)), float(np.sum(1.0 - known))
+        if power < (REMNANT * max((h.signal_to_noise for h in named), default=0.0)) ** 2:
+            return None
+        ratio, size = power, rms(slow / problem.reference_jacobian)
+    elif far_from_white(problem, found):
+        power, freedom = found.means * found.samples * found.slow, found.means
+        ratio, size = (
+            power * (found.rms / max(found.white, 1e-9)) ** 2,
+            found.rms * float(np.sqrt(found.slow)),
+        )
+    else:
+        return None
+    p_value = float(chi2.sf(power, freedom))
+    return Leftover("drift", float(np.sqrt(ratio)), p_value, 0.0, None, None, size=size)

@@ -1,7 +1,8 @@
-r"""What lasts for a while: oscillations that ring, surge or burst, and the passage of a distant source.
+r"""Transient signals: oscillations that ring, surge or burst, and the passage of a distant source.
 
 Notes
 -----
+*What lasts for a while: oscillations that ring, surge or burst, and the passage of a distant source.*
 A packet is a wave along the field under a Gaussian, with an amplitude and a phase of its own (Gabor 1946,
 J. IEE 93:429):
 
@@ -29,12 +30,11 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.compare.design_columns import Columns
-from magbridge.diagnose.compare.problem import Problem
-from magbridge.diagnose.inference.design import in_threads
-from magbridge.diagnose.inference.evidence import log_bayes
-from magbridge.diagnose.inference.joint import Joint
-from magbridge.diagnose.inference.noise import Noise
+from magbridge.diagnose.columns import Columns
+from magbridge.diagnose.evidence import log_bayes
+from magbridge.diagnose.joint import Joint, in_threads
+from magbridge.diagnose.noise import Noise
+from magbridge.diagnose.problem import Problem
 
 __all__ = ["Packets", "packets", "passage"]
 

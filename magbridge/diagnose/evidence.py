@@ -1,0 +1,466 @@
+"""The evidence for each candidate, its test, and the causes that a log can show or distinguish.
+
+Notes
+-----
+*Information.* One matrix serves the whole search: the inner products of the whitened columns of *all*
+candidates, summed up in chunks, at a cost linear in samples. From it come scores, Occam factors, which causes
+are confounded, and the distribution of the largest score under no effect.
+
+*Score.* For a candidate with score b and information S, the calibration projected out,
+``R = b^T S^-1 b`` is its likelihood ratio to second order. The size of an effect is not known beforehand, so
+its k coefficients have Zellner's prior ``N(0, g S^-1)`` with the likeliest g: log evidence
+``(R - k)/2 - (k/2) log(R/k)``, 0 below ``R = k`` (Liang et al. 2008, JASA 103:410, sec. 2.4). Every cause
+pays the same price for a coefficient, whatever its unit.
+
+*Test.* A cause's p-value is that of its likelihood ratio, times the number N of independent hypotheses behind
+the cause, times the number of causes; it is found if that is below 1 %. Under no effect scores are
+``N(0, S)``, and N is ``P(any of its n hypotheses passes) / a`` at the level a at which each is tested: even
+hypotheses that correlate strongly are nearly independent far out in the tail. Plain simulation does not reach
+that far, so each hypothesis in turn is made to pass, and with m that pass then ``N = n E[1 / m]`` (Owen,
+Maximov & Chertkov 2019, Electron. J. Statist. 13:231). A size that cannot be negative has one tail
+(:attr:`~magbridge.diagnose.columns.Candidate.tail`).
+
+Two kinds of coefficients have a prior of their own. For those of one common size (:mod:`.joint`) the
+ratio contains the prior: the evidence is R / 2, less the log of the number of spectra that were tried. One
+that cannot be negative has half a Gaussian, of twice the density: ``log 2 Phi(sqrt(R))`` is added.
+
+*Isolability.* The information S of a cause's coefficients needs telemetry, attitude and the noise level, but
+no residual. An effect of signal-to-noise a is found with the chance that a noncentral chi-square of k degrees
+of freedom and noncentrality ``a^2`` passes the threshold. Between two causes whose signatures, whitened and
+projected, correlate by rho, the wrong one wins with the chance ``Phi(-a sqrt(1 - rho^2) / 2)`` (two points in
+Gaussian noise).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.special import chdtri, chndtrinc, log_ndtr
+from scipy.stats import chi2
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.diagnose.columns import (
+    Candidate,
+    Columns,
+    Group,
+    parts,
+    places,
+    side_by_side,
+    slices,
+    together,
+)
+from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statistic, normal, volume_of
+from magbridge.diagnose.noise import Noise
+from magbridge.diagnose.problem import Problem
+
+__all__ = [
+    "CONFOUNDED", "FALSE_ALARM_RATE", "IDEAL", "MOST_REMAINING", "ODDS", "REMNANT", "SMOOTH", "Best",
+    "Hypothesis", "Information", "Isolability", "Visible", "bayes_factor_threshold", "certainty",
+    "evidence_of", "information", "isolability", "likeness", "log_bayes", "log_odds",
+    "look_elsewhere_factors", "most_visible", "one_sided", "regressor_error", "score", "shaped_ratio",
+    "wald_ratio",
+]  # fmt: skip
+
+FALSE_ALARM_RATE = 0.01
+"""Family-wise false-alarm rate."""
+ODDS = float(np.log(20.0))
+"""Log evidence by which a cause with an exact regressor must win to be named alone."""
+IDEAL = 0.2
+"""Error of an idealised regressor, as a share of its norm: a cause that explains less by no more than that
+competes with it."""
+REMNANT = 0.3
+"""Fraction of the strongest cause's signal-to-noise; anything weaker is a remnant of its idealised regressor,
+not another cause.
+
+The price: a second cause of so low a signal-to-noise is not named.
+"""
+SMOOTH, MOST_REMAINING = 0.1, 8.0
+"""Fraction (as REMNANT) for a Gaussian process, and the largest signal-to-noise of its remnant: a process has
+a flexible shape, but not any shape equally, and the remnant of a map's error is slow in time, too."""
+SIMULATIONS = 400
+PIECE, PIECES = 600, 64
+"""Pieces of a column from which its power spectrum is estimated: their length in samples, and most pieces."""
+CONFOUNDED = 0.85
+"""Correlation beyond which two causes are listed as a pair: at this one they are distinguished in 95 of 100
+cases at signal-to-noise 6."""
+MAX_PLAUSIBLE_MULTIPLE = 50.0
+"""Multiple of its plausible size from which on a cause is not plausible at all."""
+FREE = 1e-3
+"""Prior precision, in units of a plausible size's, of coefficients that are each free; it is 1 for those of
+one common size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Score and information of all candidates' coefficients, with calibration (and model) projected out."""
+
+    matrix: FloatArray
+    """(m, m) Fisher information, in units of the prior widths."""
+    score: FloatArray
+    """(m,)."""
+    shift: FloatArray
+    """(q + k, m) by how much calibration and model decrease for one unit of each coefficient."""
+
+    def moved(self, base: Joint, at: slice | IndexArray, taken: FloatArray) -> FloatArray:
+        """Return the likeliest calibration and model (q + k,) if the coefficients `at` these are `taken`."""
+        return np.append(base.z, base.coefficients) - self.shift[:, at] @ taken
+
+    def without(self, index: IndexArray, prior: FloatArray) -> Information:
+        """Project out the coefficients at `index` as well, with their prior precision (i,)."""
+        S = self.matrix[np.ix_(index, index)] + np.diag(prior)
+        K = np.linalg.solve(S, self.matrix[index])
+        return Information(
+            self.matrix - self.matrix[:, index] @ K, self.score - K.T @ self.score[index], self.shift
+        )
+
+    def fitted(self, base: Joint) -> Information:
+        """Project out the model of `base` as well, whose columns are the last."""
+        m = len(self.score) - base.coefficients.size
+        prior = base.prior[len(base.z) :]
+        K: FloatArray = np.asarray(
+            np.linalg.solve(self.matrix[m:, m:] + np.diag(prior), self.matrix[m:, :m]), float
+        )
+        return Information(
+            self.matrix[:m, :m] - self.matrix[:m, m:] @ K,
+            self.score[:m] - K.T @ (self.score[m:] - prior * base.coefficients),
+            np.vstack([self.shift[:, :m] - self.shift[:, m:] @ K, K]),
+        )
+
+    def instead(self, base: Joint, *places: slice) -> Information:
+        """Remove the coefficients at these places from the model of `base`, and project out its others.
+
+        The model's columns are the last. The scores are those of what `base` leaves and of what the
+        coefficients at these places explain in it.
+        """
+        first, own = len(self.score) - base.coefficients.size, np.r_[*places]
+        others = np.setdiff1d(np.arange(first, len(self.score)), own)
+        alone = self.without(others, base.prior[len(base.z) + others - first])
+        return replace(alone, score=alone.score + alone.matrix[:, own] @ base.coefficients[own - first])
+
+
+def information(
+    problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns], unshared: int = 0
+) -> Information:
+    """Sum up the information of columns at `base` under `noise`, only the calibration projected out.
+
+    The first `unshared` of them share no parts with any other, and their products with each other are not
+    computed.
+    """
+    q, shared = problem.calibration_jacobian.shape[1], together(columns).parts
+    alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:unshared]), q)
+    others = slice(alone[-1].stop if alone else q, None)
+    asked = [(slice(q), slice(None)), *zip(alone, alone, strict=True), (others, slice(q, None))]
+    G, b = normal(
+        lambda rows: side_by_side([problem.calibration_jacobian[rows], *(X(rows) for X, _ in shared)]),
+        noise.response(base.residual),
+        noise,
+        asked if unshared else ALL_PRODUCTS,
+    )
+    pull = base.prior[:q] * (problem.centre - base.z)
+    K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])
+    M = csr_array(np.concatenate([M for _, M in shared]))
+    return Information(
+        M.T @ (G[q:, q:] - G[q:, :q] @ K) @ M, M.T @ (b[q:] - K.T @ (b[:q] + pull)), np.asarray(K @ M)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """Score of a candidate under a noise: likelihood ratio, freedoms, log evidence, estimate, prior."""
+
+    ratio: float
+    freedom: int
+    evidence: float
+    estimate: FloatArray
+    prior: FloatArray
+
+
+def score(info: Information, at: slice, candidate: Candidate) -> Score:
+    """Score the candidate whose columns stand at `at`; one of the wrong sign scores zero."""
+    b, statistic = info.score[at], Statistic(info.matrix[at, at], candidate.spectra)
+    freedom = int(statistic.freedom)
+    if not freedom or (candidate.positive and b.min() < 0.0):
+        return Score(0.0, freedom, 0.0, np.zeros(len(b)), np.ones(len(b)))
+    if candidate.spectra is not None:
+        best = statistic.best(b)
+        evidence = evidence_of(candidate, best.ratio, freedom)
+        return Score(best.ratio, freedom, evidence, best.estimate, 1.0 / best.variance)
+    ratio, values, V = float(statistic.ratio(b[:, None])[0]), statistic.values, statistic.vectors
+    evidence = evidence_of(candidate, ratio, freedom)
+    return Score(ratio, freedom, evidence, V @ ((V.T @ b) / (values + 1.0)), np.full(len(b), FLAT_PRECISION))
+
+
+def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
+    """Log evidence of one candidate's likelihood ratio, by the prior that its numbers have."""
+    if candidate.spectra is not None:
+        return 0.5 * ratio - float(np.log(len(candidate.spectra)))
+    sided = float(one_sided(ratio)) if candidate.positive else 0.0
+    return float(log_bayes(ratio, freedom)) + sided + candidate.point.likelier
+
+
+def log_bayes(ratio: float | FloatArray, freedom: float | FloatArray) -> FloatArray:
+    """Log evidence (Bayes factor against no effect) of likelihood ratios (...,) of `freedom` coefficients."""
+    over = np.maximum(ratio / np.maximum(freedom, 1e-12), 1.0)
+    return np.asarray(0.5 * freedom * (over - 1.0 - np.log(over)))
+
+
+def one_sided(ratio: float | FloatArray) -> FloatArray:
+    """Log evidence (...,) that half a prior of twice the density adds where the estimate has its sign."""
+    return np.asarray(np.log(2.0) + log_ndtr(np.sqrt(ratio)))
+
+
+def bayes_factor_threshold(ratio: float) -> float:
+    """Log evidence by which a cause of this likelihood ratio must win to be named alone.
+
+    The error of its regressor is allowed for.
+    """
+    return ODDS + regressor_error(ratio)
+
+
+def regressor_error(ratio: float) -> float:
+    """Log evidence that another cause may gain from the errors of the regressors in a model of this ratio."""
+    return 0.5 * IDEAL**2 * ratio
+
+
+def look_elsewhere_factors(
+    info: Information, candidates: Sequence[Candidate], at: Sequence[slice]
+) -> dict[str, float]:
+    """Return the number of independent hypotheses behind each cause."""
+    causes = dict.fromkeys(candidate.cause for candidate in candidates)
+    found = {}
+    for cause in causes:
+        members = [k for k, candidate in enumerate(candidates) if candidate.cause == cause]
+        index, own = np.r_[*(at[k] for k in members)], slices([candidates[k] for k in members])
+        free = [place for k, place in zip(members, own, strict=True) if candidates[k].spectra is None]
+        count = _independent(info.matrix[np.ix_(index, index)], free, FALSE_ALARM_RATE / len(causes))
+        # candidates of one common size count as independent: an upper bound
+        count += len(members) - len(free)
+        found[cause] = max(1.0, count) * max(candidates[k].look_elsewhere for k in members)
+    return found
+
+
+def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
+    """Return how many independent hypotheses would pass as often as any of those at `places` does.
+
+    All together they are tested at `level`.
+    """
+    rng = np.random.default_rng(20131212)  # the same answer every time
+    values, vectors = np.linalg.eigh(S)
+    draws = (vectors * np.sqrt(np.maximum(values, 0.0))) @ rng.standard_normal((len(S), SIMULATIONS))
+    every = [(place, Statistic(S[place, place])) for place in places]
+    seen = [(place, statistic) for place, statistic in every if statistic.freedom]
+    if not seen:
+        return 0.0
+    limits = [float(chi2.isf(level / len(seen), statistic.freedom)) for _, statistic in seen]
+    for k, (place, statistic) in enumerate(seen):
+        some, away = draws[:, k :: len(seen)], statistic.vectors / np.sqrt(statistic.values)
+        y = away.T @ some[place]
+        tail = level / len(seen) * rng.random(y.shape[1])
+        longer = np.sqrt(chi2.isf(tail, statistic.freedom) / np.sum(y * y, axis=0))
+        some += S[:, place] @ away @ (y * (longer - 1.0))
+    passed = [
+        statistic.ratio(draws[place]) >= (1.0 - 1e-9) * limit
+        for (place, statistic), limit in zip(seen, limits, strict=True)
+    ]
+    return len(seen) * float(np.mean(1.0 / np.sum(passed, axis=0)))
+
+
+def log_odds(
+    ratio: float, model: Sequence[Candidate], look_elsewhere: Mapping[str, float], shaped: float
+) -> float:
+    """Log posterior odds of a whole model of this likelihood ratio against no effect.
+
+    `shaped` is the part of it that causes of flexible shape do not explain (:func:`.shaped_ratio`).
+    The size of the remaining causes is judged by that part.
+
+    Every regressor pays for the number of hypotheses of its cause. Each after the first also pays for the
+    prior odds of a further fault in one log, and for its choice among the causes. How narrowly the data
+    determine nonlinear parameters is not counted here, but only between names: free descriptions are
+    profiled, too, and do not pay for it.
+    """
+    regressors, free = sum(len(c.pieces) for c in model), sum(c.size for c in model if c.spectra is None)
+    further = max(regressors - 1, 0) * (ODDS + float(np.log(len(look_elsewhere))))
+    prices = sum(len(c.pieces) * float(np.log(look_elsewhere[c.cause])) for c in model)
+    prices += sum(float(np.log(len(c.spectra))) for c in model if c.spectra is not None)
+    known = sum(c.point.likelier + float(np.log(2.0)) * c.positive for c in model)
+    worth = float(log_bayes(shaped, free)) if free else 0.5 * shaped
+    return 0.5 * (ratio - shaped) + worth + known - further - prices
+
+
+def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) -> list[float]:
+    r"""Degrees of freedom of the noise's level at the frequencies where each of `columns` has its power.
+
+    `residual` (n,) is what the noise was fitted to, nT.
+
+    Notes
+    -----
+    The fitted coefficients a have the covariance ``C = (L^T L)^-1`` of its regression, with L the p preceding
+    residuals in units of s. A column x has the information ``|w|^2``,
+    ``w_t = x_t - sum_k a_k x_(t-k)``:
+
+    .. math:: D_k = \frac{\partial \ln |w|^2}{\partial a_k} = -\frac{2 \sum_t w_t x_{t-k}}{|w|^2}, \qquad
+              \operatorname{var} \ln |w|^2 = \frac{2}{n} + D^T C D
+
+    The log of a variance estimated with f degrees of freedom has the variance 2 / f. At low frequencies the
+    level is known worst.
+    """
+    n, p = len(residual), len(noise.ar)
+    rows = np.flatnonzero(noise.past.whole)
+    if len(rows) <= 2 * p:
+        return [float(n)] * len(columns)
+    before = np.array([residual[rows - k] for k in range(1, p + 1)]) / noise.scale[rows]
+    C = np.linalg.pinv(before @ before.T)
+    pieces = range(0, max(n - PIECE, 0) + 1, max(PIECE, n // PIECES))
+    found = []
+    for column in columns:
+        power, slope = 1e-300, np.zeros(p)
+        for start in pieces:
+            x = column(slice(start, start + PIECE))
+            lags = np.array([x[p - k : len(x) - k] for k in range(1, p + 1)])
+            w = x[p:] - np.tensordot(noise.ar, lags, 1)
+            power += float(np.sum(w * w))
+            slope += np.tensordot(lags, w, 2)
+        D = -2.0 * slope / power
+        found.append(2.0 / float(2.0 / n + D @ C @ D))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One cause, fitted together with the others of a model."""
+
+    candidate: Candidate
+    ratio: float
+    """Twice the gain in log likelihood."""
+    evidence: float
+    """Log Bayes factor against the model without it."""
+    p_value: float
+    """With the price of the hypotheses behind the cause (look-elsewhere) and of the number of causes."""
+    fit: Joint
+    """Fit of the whole model; this cause's coefficients are the last."""
+
+    @property
+    def signal_to_noise(self) -> float:
+        """Whitened norm of the effect, calibration and model projected out, less what noise alone gives."""
+        own = slice(-self.candidate.size, None)
+        known = self.fit.prior[own] * np.diag(self.fit.covariance)[own]
+        power = self.fit.wald(own) - float(np.sum(1.0 - known))
+        return float(np.sqrt(power)) if power > 0.0 else 0.0
+
+
+class Best(NamedTuple):
+    """The best candidate of a grid under one noise.
+
+    Its place among all, the price of its nonlinear parameters (log of the grid's average evidence, relative
+    to the best), its score, and the information that gave it.
+    """
+
+    place: int
+    price: float
+    score: Score
+    info: Information
+
+
+def shaped_ratio(ratio: float, model: Sequence[Candidate], fit: Joint, *, slow: bool = False) -> float:
+    """Likelihood ratio of a model's causes of fixed shape, given its causes of flexible shape.
+
+    `ratio` is the likelihood ratio of the whole model, with `slow` noise if there is any.
+    """
+    free = np.repeat([one.nonparametric for one in model], [one.size for one in model])
+    return min(ratio, fit.wald(np.flatnonzero(~free))) if slow or free.any() else ratio
+
+
+def wald_ratio(fit: Joint, candidate: Candidate) -> float:
+    """Likelihood ratio of the last candidate's coefficients under the noise that is left."""
+    own = slice(-candidate.size, None)
+    spread = 0.0 if candidate.spectra is None else volume_of(fit.covariance[own, own], fit.prior[own])
+    return fit.wald(own) - 2.0 * spread
+
+
+@dataclass(frozen=True)
+class Visible:
+    """How large one cause must be to be found."""
+
+    cause: str
+    channel: str | None
+    sizes: dict[str, tuple[float, str]]
+    """Coefficient -> (size that is found with 95 %, unit); infinite where the log cannot show it."""
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """What a log can show, before its residual is looked at."""
+
+    visible: tuple[Visible, ...]
+    pairs: tuple[tuple[Visible, Visible, float], ...]
+    """Causes with correlated effects, and their correlation."""
+    untestable: dict[str, str]
+    """Cause that this log cannot test -> what a log would need for it."""
+
+
+def isolability(
+    candidates: Sequence[Candidate],
+    info: Information,
+    look_elsewhere: Mapping[str, float],
+    causes: int,
+    untestable: Mapping[str, str],
+) -> Isolability:
+    """Evaluate `info`; the candidate that the log shows best stands for the whole grid of its cause."""
+    at = slices(candidates)
+    picked = most_visible(candidates, info, at)
+    among = [candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0) for k in picked]
+    visible = [_visible(candidates[k], info, at[k], count) for k, count in zip(picked, among, strict=True)]
+    pairs = [
+        (one, other, likeness(info, candidates[a], at[a], candidates[b], at[b]))
+        for (one, a), (other, b) in combinations(zip(visible, picked, strict=True), 2)
+        if one.cause != other.cause
+    ]
+    alike = sorted((pair for pair in pairs if pair[2] > CONFOUNDED), key=lambda pair: -pair[2])
+    return Isolability(tuple(visible), tuple(alike), dict(untestable))
+
+
+def most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
+    """Return the place of the candidate of each cause and channel that the log shows best."""
+    best: dict[Group, tuple[float, int]] = {}
+    for k, candidate in enumerate(candidates):
+        total = float(np.trace(info.matrix[at[k], at[k]])) / candidate.size
+        if total > best.get(candidate.group, (-1.0, 0))[0]:
+            best[candidate.group] = (total, k)
+    return [k for _, k in best.values()]
+
+
+def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: float) -> Visible:
+    """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
+    freedom = max(score(info, own, candidate).freedom, 1)
+    sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))
+    power = np.diag(info.matrix[own, own])
+    if candidate.spectra is not None:  # what counts is what all of them do together
+        x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
+        sizes = {"size": (_plausible(x), "times the usual one")}
+    else:
+        size = sure / np.sqrt(np.maximum(power, 1e-300))
+        sizes = {
+            name: (_plausible(float(x)) * float(w), unit)
+            for name, x, w, unit in zip(candidate.names, size, candidate.width, candidate.units, strict=True)
+        }
+    return Visible(candidate.cause, candidate.channel, sizes)
+
+
+def _plausible(size: float) -> float:
+    """Return a size in units of a plausible one; infinite where nothing plausible would show."""
+    return size if size < MAX_PLAUSIBLE_MULTIPLE else float("inf")
+
+
+def likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
+    """Correlation of two signatures: root of the mean share that one can imitate of the other, the larger."""
+    A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
+    p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))
+    M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)
+    N = C.T @ np.linalg.solve(A + p * np.eye(len(A)), C)
+    shares = [float(np.trace(X) / (np.trace(Y) + 1e-12)) for X, Y in ((M, A), (N, B))]
+    return float(np.sqrt(np.clip(max(shares), 0.0, 1.0)))

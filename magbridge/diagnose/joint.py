@@ -1,0 +1,491 @@
+r"""The joint fit of calibration, effects and noise, and its prediction of held-out dives.
+
+Notes
+-----
+*The likelihood ratio of one candidate.* With projected information S and score b of k columns in units of
+their widths, coefficients that are each free have the likelihood ratio ``R = b^T S^-1 b``, with as many
+degrees of freedom as the data determine directions.
+
+A smooth function of the place, or a slow curve, has more coefficients than the data can determine. These have
+a Gaussian prior whose variance is a common size g times a spectrum w, the likeliest of each: a Gaussian
+process. With ``w^1/2 S w^1/2 = V diag(lambda) V^T``, ``y = V^T w^1/2 b`` the log evidence is
+
+.. math:: E = \max_{g, w} \tfrac12 \sum_i \left(\frac{g y_i^2}{1 + g \lambda_i} - \ln(1 + g \lambda_i)\right)
+
+half the likelihood ratio of a variance component: under no effect ``R = 2 E`` is at most a chi-square of one
+degree of freedom (Self & Liang 1987), whatever the number of columns.
+
+*The joint likelihood.* Noise that is fitted without an effect absorbs it if it is large and slow, so two
+hypotheses are compared only after the noise has been fitted under each.
+
+The *score* of a model is the log predictive density of every fold of dives, given the others. With l the log
+likelihood of the noise at the fit c to all dives, c_-f the fit without fold f, ``A_f^T A_f`` the information
+of that fold and P that of all folds and the prior, Laplace's approximation (exact for Gaussian noise, by
+Woodbury's identity) is
+
+.. math:: S = l - \tfrac12 |z|^2 - \tfrac12 \sum_f \left[ (c - c_{-f})^T (P - A_f^T A_f) (c - c_{-f})
+              + \log\det P - \log\det (P - A_f^T A_f) \right]
+
+the log likelihood less the price of predicting each fold with coefficients learned from the others. The logs
+that the calibration was fitted to enter by ``|z|``, the distance in sigma between the coefficients and their
+prior: without that, every other dive would predict a constant that the calibration absorbs. The
+difference of two models' scores is the log of the odds that the left-out dives give one against the other:
+the pseudo-Bayes factor (Geisser & Eddy 1979, JASA 74:153).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from threading import current_thread
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray, IntArray
+from magbridge.diagnose.columns import Columns, places, side_by_side, size_of, times
+from magbridge.diagnose.noise import Noise, fit_noise
+from magbridge.diagnose.problem import DELAYS, Problem
+from magbridge.estimation.residual import robust_scale
+
+__all__ = [
+    "ALL_PRODUCTS", "CONFIDENCE_LEVEL", "FLAT_PRECISION", "LONG", "PRIOR_SIZES", "RIDGE", "Design", "HeldOut",
+    "Improvement", "Joint", "Ridge", "Statistic", "fit_joint", "held_out", "in_threads", "normal", "paired",
+    "pieces", "precomputed", "volume_of",
+]  # fmt: skip
+
+S = TypeVar("S")
+T = TypeVar("T")
+WHITENED_ROWS = 2048
+"""Rows that are whitened at a time, few enough for the processor's cache."""
+MAX_STORED_NUMBERS = 12_500_000
+"""Most numbers of columns that are kept in memory: 100 MB."""
+ALL_PRODUCTS = ((slice(None), slice(None)),)
+"""Products of every column with every other."""
+THREADS, LONG, POOL = 2, 32768, "diagnose"
+"""Threads that share the work on a log, rows from which they are worth their while, and their name."""
+PRIOR_SIZES = np.logspace(-7, 2, 64)
+"""Values of g that are tried, in units of the widths squared."""
+VISIBLE = 1e-3
+"""Information, as a fraction of the prior's own, below which a direction is ignored."""
+RIDGE = 0.1
+"""Prior precision of an effect, in units of a plausible size's: ten times that size is hardly believed, a
+hundred times not at all. Without it a nonlinearity and the calibration's scales can cancel each other and
+grow until they fit the noise."""
+FLAT_PRECISION = 1e-6
+"""Prior precision of coefficients that are free, or of no known size."""
+FOLDS = 8
+"""Folds at most: each costs one solution of the normal equations."""
+DRAWS = 2000
+"""Bootstrap samples: an end of the interval then scatters by 1.5 % of its width."""
+QUANTILES = (0.025, 0.975)
+"""Quantiles of the bootstrap samples: the ends of the interval."""
+CONFIDENCE_LEVEL = QUANTILES[1] - QUANTILES[0]
+"""Confidence level of the interval."""
+
+
+def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
+    """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
+    if n * sum(map(size_of, columns)) > MAX_STORED_NUMBERS:
+        return list(columns)
+
+    def whole(column: Columns) -> FloatArray:
+        return np.concatenate([column(rows).T for rows in pieces(n)], axis=1).T
+
+    return [made.__getitem__ for made in in_threads(n, whole, columns)]
+
+
+def pieces(n: int) -> list[slice]:
+    """Return the pieces in which n rows are processed."""
+    return [slice(start, min(start + WHITENED_ROWS, n)) for start in range(0, n, WHITENED_ROWS)]
+
+
+class Design:
+    """The columns of a hypothesis, the calibration's and the effects'.
+
+    Parameters
+    ----------
+    problem : Problem
+    columns : sequence of Columns
+        The effects'.
+    """
+
+    def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
+        self.calibration_jacobian, self.columns = problem.calibration_jacobian, columns
+        self.pieces = pieces(len(problem))
+        sizes = [size_of(column) for column in columns]
+        self.at, self.effects = places(sizes, self.calibration_jacobian.shape[1]), sum(sizes)
+
+    def rows(self, rows: slice) -> FloatArray:
+        """(m, q + k) rows of all columns."""
+        return side_by_side([self.calibration_jacobian[rows], *(column(rows) for column in self.columns)])
+
+    def times(self, c: FloatArray) -> FloatArray:
+        """(n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
+        asked = [(own, column) for own, column in zip(self.at, self.columns, strict=True) if c[own].any()]
+
+        def piece(rows: slice) -> FloatArray:
+            out = np.asarray(self.calibration_jacobian[rows] @ c[: self.calibration_jacobian.shape[1]])
+            for own, column in asked:
+                out += times(column, rows, c[own])
+            return out
+
+        return np.concatenate(in_threads(len(self.calibration_jacobian), piece, self.pieces))
+
+
+def normal(
+    X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL_PRODUCTS
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``X^T X`` (k, k) and ``X^T y`` (k,), X whitened if a noise is given.
+
+    They are summed up in pieces that fit the processor's cache. Long logs are shared out among threads,
+    always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are
+    `asked` for are computed, and their transposes; the others are zero.
+    """
+    k = size_of(X)
+
+    def share(some: Sequence[slice]) -> tuple[FloatArray, FloatArray]:
+        P, b = np.zeros((k, k)), np.zeros(k)
+        for rows in some:
+            A = X(rows) if noise is None else noise.whitened(X, rows)
+            for own, others in asked:
+                P[own, others] += A[:, own].T @ A[:, others]
+            b += A.T @ y[rows]
+        return P, b
+
+    every = pieces(len(y))
+    each = -(-len(every) // THREADS) if len(y) > LONG else len(every)
+    shares = in_threads(len(y), share, [every[n : n + each] for n in range(0, len(every), each)])
+    P = np.asarray(sum(P for P, _ in shares))
+    for own, others in asked:
+        P[others, own] = P[own, others].T
+    return P, np.asarray(sum(b for _, b in shares))
+
+
+def in_threads(n: int, function: Callable[[S], T], given: Iterable[S]) -> list[T]:
+    """Return the function's results for each argument `given`.
+
+    For a log of many rows n the calls are shared out among threads, but not from within one of those.
+    """
+    if n <= LONG or current_thread().name.startswith(POOL):
+        return [function(one) for one in given]
+    return list(_pool().map(function, given))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    # the same threads all the time: the memory that new ones allocate would not be released
+    return ThreadPoolExecutor(THREADS, POOL)
+
+
+@dataclass(frozen=True, eq=False)
+class Ridge:
+    """The estimate at the likeliest size and spectrum."""
+
+    ratio: float
+    estimate: FloatArray
+    """(k,)."""
+    variance: FloatArray
+    """(k,) prior variance of each coefficient."""
+    price: float
+    """Log evidence that the prior costs: its density at the estimate, and the volume (Occam's factor)."""
+    signal_to_noise: float
+    """Whitened norm of the estimate."""
+
+
+class Statistic:
+    """The likelihood ratio of one candidate's coefficients.
+
+    Parameters
+    ----------
+    S : (..., k, k) array
+        Of one candidate or, without spectra, of several with as many coefficients.
+    spectra : (l, k) array, optional
+        Alternatives for the prior variances, up to a common factor; without any, each coefficient is free.
+    """
+
+    def __init__(self, S: FloatArray, spectra: FloatArray | None = None) -> None:
+        self.spectra = spectra
+        if spectra is None:
+            values, self.vectors = np.linalg.eigh(S)
+            self.values = np.where(values > VISIBLE, values, np.inf)  # ignore directions without a signal
+            self.freedom = np.asarray(np.isfinite(self.values).sum(axis=-1))
+            return
+        root = np.sqrt(spectra)
+        values, vectors = np.linalg.eigh(S * root[:, :, None] * root[:, None, :])
+        self.values, self.vectors = np.maximum(values, 0.0), root[:, :, None] * vectors
+        self.freedom = np.asarray(1)
+
+    def ratio(self, b: FloatArray) -> FloatArray:
+        """(..., m) likelihood ratios of scores b (..., k, m)."""
+        if self.spectra is None:
+            y = np.swapaxes(self.vectors, -1, -2) @ b
+            return np.asarray(np.sum(y**2 / self.values[..., None], axis=-2))
+        return np.asarray(
+            2.0 * np.max([self._evidences(k, b).max(axis=0) for k in range(len(self.spectra))], axis=0)
+        )
+
+    def _evidences(self, k: int, b: FloatArray) -> FloatArray:
+        """(sizes, m) log evidence with the k-th spectrum."""
+        y2, grown = (self.vectors[k].T @ b) ** 2, PRIOR_SIZES[:, None] * self.values[k]
+        return np.asarray(
+            0.5 * ((PRIOR_SIZES[:, None] / (1.0 + grown)) @ y2 - np.log1p(grown).sum(axis=1)[:, None])
+        )
+
+    def best(self, b: FloatArray) -> Ridge:
+        """Return the best size and spectrum for a score b (k,)."""
+        assert self.spectra is not None
+        tables = [self._evidences(k, b[:, None])[:, 0] for k in range(len(self.spectra))]
+        k = int(np.argmax([table.max() for table in tables]))
+        at = int(np.argmax(tables[k]))
+        values, g = self.values[k], PRIOR_SIZES[at]
+        c = g * (self.vectors[k].T @ b) / (1.0 + g * values)
+        price = 0.5 * float(c @ c / g + np.log1p(g * values).sum())
+        ratio, norm = 2.0 * float(tables[k][at]), float(np.sqrt(c**2 @ values))
+        return Ridge(ratio, self.vectors[k] @ c, g * self.spectra[k], price, norm)
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A hypothesis at its maximum."""
+
+    log_likelihood: float
+    """Log-likelihood of the noise model, with the prior of the calibration and the effects; coefficients of
+    one common size, as the axes' delays and slow noise are, are integrated out (Laplace's approximation)."""
+    z: FloatArray
+    """(q,)."""
+    coefficients: FloatArray
+    """(k,) of the effects, in units of their prior width."""
+    covariance: FloatArray
+    """(q + k, q + k)."""
+    noise: Noise
+    residual: FloatArray
+    """(n,) nT, residual of the fit."""
+    prior: FloatArray
+    """(q + k,) prior precision of every coefficient, effects in units of their widths."""
+
+    @property
+    def effects_covariance(self) -> FloatArray:
+        """(k, k) of the effects' coefficients."""
+        return self.covariance[len(self.z) :, len(self.z) :]
+
+    def wald(self, at: slice | IndexArray) -> float:
+        """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) `at` these places."""
+        b = self.coefficients[at]
+        return float(b @ np.linalg.solve(self.effects_covariance[at][:, at], b))
+
+
+def fit_joint(
+    problem: Problem,
+    columns: Sequence[Columns],
+    order: int,
+    *starts: FloatArray,
+    plain: bool = True,
+    spectra: Sequence[FloatArray | None] = (),
+    like: Joint | None = None,
+    blocks: bool | None = None,
+    ridge: float | FloatArray = RIDGE,
+    rounds: int = 5,
+    brief: bool = False,
+) -> Joint:
+    """Maximise the joint likelihood of calibration, effects and noise.
+
+    Parameters
+    ----------
+    problem : Problem
+        The survey, with the prior of its q calibration coefficients.
+    columns : sequence of Columns
+        The effects'.
+    order : int
+        Of the noise's autoregression.
+    *starts : (q + k,) array
+        Starting points, of which the best is taken; without any, the prior mean.
+    plain : bool
+        Try the result of plain least squares as a starting point, too.
+    spectra : sequence of (l, k) array or None
+        For each of `columns` whose coefficients have one common size (:mod:`.joint`): l alternatives
+        for their prior variances.
+    like : Joint, optional
+        A fit of similar noise, from which this one's begins: saves time.
+    blocks, brief : bool, optional
+        See :func:`~magbridge.diagnose.noise.fit_noise`.
+    ridge : float or (k,) array
+        Prior precision of the effects, in units of their widths.
+    rounds : int
+        At most.
+    """
+    X = Design(problem, precomputed(len(problem), columns))
+    q, k = X.calibration_jacobian.shape[1], X.effects
+    prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
+    common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]
+    if problem.waves.size:
+        common.append((problem.slow, 1.0 / problem.waves[None]))
+    common += [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
+    centre = np.append(problem.centre, np.zeros(k))
+    past = problem.survey.past(order)
+
+    def at(c: FloatArray) -> tuple[FloatArray, Noise]:
+        residual = problem.residual - X.times(c)
+        known = None if like is None else like.noise
+        return residual, fit_noise(residual, past, blocks=blocks, like=known, brief=brief)
+
+    def value(c: FloatArray, noise: Noise) -> float:
+        return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)
+
+    # noise of a long correlation absorbs a slow effect, and no later step finds it again: so one start is
+    # fitted as if the noise were white
+    first = [*(starts or [centre])]
+    if plain:
+        first.append(_plain(X, problem.residual, prior, centre))
+    for own, _ in common:
+        prior[own] = FLAT_PRECISION  # no size is known yet
+    tries = in_threads(len(problem), lambda c: (c, *at(c)), first)
+    c, residual, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
+    del tries  # of a month each is 15 MB
+    for step in range(rounds + 1):
+        P, b = normal(X.rows, noise.response(residual), noise)
+        for own, spectrum in common:
+            prior[own] = _sized(P, b + P @ c + prior * centre, prior, own, spectrum)
+        P += np.diag(prior)
+        if step == rounds:
+            break
+        moved = c + np.linalg.solve(P, b - prior * (c - centre))
+        tried = at(moved)
+        gained = value(moved, tried[1]) - value(c, noise)
+        if gained > 0.0:
+            c, (residual, noise) = moved, tried
+        if gained < 0.02:  # converged: P need not be computed again
+            break
+    covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
+    volume = sum(volume_of(covariance[own, own], prior[own]) for own, _ in common)
+    return Joint(value(c, noise) - volume, c[:q], c[q:], covariance, noise, residual, prior)
+
+
+def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
+    """Return ``1/2 ln det(1 + g S)``, the log of how much the data narrow coefficients.
+
+    Their posterior covariance is (k, k), their prior's precision (k,).
+    """
+    return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
+
+
+def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra: FloatArray) -> FloatArray:
+    """Prior precision of the coefficients at `own`, by their likeliest common size and spectrum."""
+    others = np.delete(np.arange(len(h)), own)
+    K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, own])
+    S, b = P[own, own] - P[own, others] @ K, h[own] - K.T @ h[others]
+    return np.asarray(1.0 / Statistic(S, spectra).best(b).variance)
+
+
+def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
+    """Least squares as if the noise were white, outliers cut off."""
+    level = robust_scale(residual - np.median(residual)) + 1e-12
+    P, b = normal(X.rows, residual)
+    c = centre + np.linalg.solve(P / level**2 + np.diag(prior), (b - P @ centre) / level**2)
+    residual = residual - X.times(c)
+    level = robust_scale(residual) + 1e-12
+    cut = np.clip(residual, *(np.median(residual) + np.array([-8.0, 8.0]) * level))
+    b = normal(X.rows, cut, asked=())[1]
+    return np.asarray(c + np.linalg.solve(P / level**2 + np.diag(prior), b / level**2 - prior * (c - centre)))
+
+
+class HeldOut(NamedTuple):
+    """Result of leaving out dives, fold by fold."""
+
+    residual: FloatArray
+    """Residual (n,) of every sample under the fit without its fold, by the linear model, nT of the sensor."""
+    score: float
+    """Log predictive density of all folds."""
+    fold: IntArray
+    """Number (n,) of the fold that each sample belongs to."""
+    coefficients: FloatArray
+    """Coefficients (f, q + k) of calibration and effects, fitted without each fold."""
+
+
+def held_out(
+    problem: Problem,
+    columns: Sequence[Columns],
+    fit: Joint,
+    *,
+    interleaved: bool = False,
+    groups: IntArray | None = None,
+) -> HeldOut:
+    """Leave out dives, fold by fold.
+
+    Nonlinear parameters and noise are those of the fit to all dives; every coefficient is refitted without
+    the fold. Folds are stretches of dives, so that a slow change is extrapolated; or, `interleaved`, every
+    eighth dive, so that it is only interpolated. `groups` (n,) takes the place of the dives' numbers.
+    """
+    X, noise, prior = Design(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
+    centre = np.append(problem.centre, np.zeros(X.effects))
+    c = np.append(fit.z, fit.coefficients)
+    y = noise.response(problem.residual - X.times(c))
+    dive = np.unique(problem.survey.dive if groups is None else groups, return_inverse=True)[1]
+    count, dives = min(FOLDS, int(dive.max()) + 1), int(dive.max()) + 1
+    ends = np.cumsum([len(some) for some in np.array_split(np.arange(dives), count)])
+    of = dive % count if interleaved else np.searchsorted(ends, dive, side="right")
+    P, b = np.zeros((count, c.size, c.size)), np.zeros((count, c.size))
+    for rows in X.pieces:
+        A = noise.whitened(X.rows, rows)
+        for k in np.unique(of[rows]):
+            fold_rows = A[of[rows] == k]
+            P[k] += fold_rows.T @ fold_rows
+            b[k] += fold_rows.T @ (y[rows][of[rows] == k] + fold_rows @ c)
+    whole_P, whole_b = P.sum(axis=0) + np.diag(prior), b.sum(axis=0) + prior * centre
+    others = whole_P - P
+    without = np.linalg.solve(others, (whole_b - b)[:, :, None])[:, :, 0]
+    corrected, residual = without.copy(), np.empty(len(problem))
+    corrected[:, problem.slow] = 0.0  # the corrected field keeps its slow noise
+    for rows in X.pieces:
+        residual[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), corrected[of[rows]])
+    away = c - without
+    price = np.einsum("fi,fij,fj->", away, others, away)
+    price += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
+    price += prior[: len(fit.z)] @ (fit.z - problem.centre) ** 2
+    return HeldOut(residual, noise.log_likelihood - 0.5 * float(price), of, without)
+
+
+@dataclass(frozen=True)
+class Improvement:
+    """Held-out RMS before and after, nT, their ratio, its interval over dives (:data:`CONFIDENCE_LEVEL`)."""
+
+    before: float
+    after: float
+    ratio: float
+    interval: tuple[float, float]
+
+    @property
+    def shown(self) -> bool:
+        """Return True if the held-out dives show a gain: the interval lies below 1."""
+        return self.interval[1] < 1.0
+
+
+def paired(before: FloatArray, after: FloatArray, dive: IntArray, counts: BoolArray) -> Improvement:
+    """Compare two residuals on the same samples.
+
+    The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.
+
+    Parameters
+    ----------
+    before, after : (n,) array
+        nT.
+    dive : (n,) int array
+        Number of the dive that each sample belongs to.
+    counts : (n,) bool array
+        Samples that count.
+    """
+    number = np.unique(dive[counts], return_inverse=True)[1]
+    b, a = np.bincount(number, before[counts] ** 2), np.bincount(number, after[counts] ** 2)
+    rng = np.random.default_rng(20131213)  # the same answer every time
+    drawn = rng.integers(0, b.size, (DRAWS, b.size))
+    ratios = np.sqrt(a[drawn].sum(axis=1) / (b[drawn].sum(axis=1) + 1e-300))
+    low, high = np.quantile(ratios, QUANTILES)
+    n = int(counts.sum())
+    return Improvement(
+        float(np.sqrt(b.sum() / n)),
+        float(np.sqrt(a.sum() / n)),
+        float(np.sqrt(a.sum() / (b.sum() + 1e-300))),
+        (float(low), float(high)),
+    )

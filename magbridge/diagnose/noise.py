@@ -1,0 +1,435 @@
+"""The noise of a residual: autoregressive, heavy-tailed, of a level that changes; its model and its fit.
+
+Notes
+-----
+A residual r has p autoregressive coefficients a and innovations v, which have Student's
+distribution of nu degrees of freedom and a scale s that may change from block to block::
+
+    v_t = f_t (r_t - sum_k a_k r_(t-k)),   v_t / s_t ~ t_nu
+
+Without a gap f is 1. After a gap the p samples before have other lags l: there a are the best predictor from
+those lags, and ``1 / f`` is by how much larger its error is, both from the autocovariance C of the
+autoregression (Vecchia 1988, JRSS B 50:297),
+
+    a = G^-1 c,   G_ij = C(|l_i - l_j|),   c_i = C(l_i),   f^-2 = C(0) - c^T a   in units of s^2
+
+One step of Fisher scoring towards the maximum of the likelihood is then ordinary least squares of
+
+    y_t = psi(v_t / s_t) / sqrt(kappa)   on   sqrt(kappa) f (X_t - sum_k a_k X_(t-k)) / s_t
+    psi(x) = (nu + 1) x / (nu + x^2),   kappa = (nu + 1) / (nu + 3)
+
+(kappa is the Fisher information of a t location: Lange, Little & Taylor 1989, JASA 84:881.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided, sliding_window_view
+from scipy.signal import lfilter, lfiltic
+from scipy.special import gammaln
+
+from magbridge.arrays import FloatArray, IntArray
+from magbridge.diagnose.columns import Columns
+from magbridge.diagnose.problem import DERIVATIVE_ROWS
+from magbridge.diagnose.survey import MAX_LAG, Past
+from magbridge.estimation.residual import robust_scale
+
+__all__ = ["BRIEFEST", "MAX_NOISE_ORDER", "TAILS", "Noise", "autoregressive_order", "fit_noise"]
+
+BAND = 32
+"""Rows that are filtered by one product of matrices."""
+SOLVED = 4096
+"""Patterns of lags whose predictors are solved for at a time."""
+TAILS = (2.5, 3.0, 4.0, 5.0, 7.0, 12.0, 1e6)
+NOISE_BLOCK_SAMPLES = 150
+"""Samples over which the noise's level is taken as constant."""
+AR_ORDERS = (1, 2, 3, 5, 8, 13)
+MAX_NOISE_ORDER = AR_ORDERS[-1]
+GAUSSIAN = 1e5
+"""Degrees of freedom from which on the tails are taken for Gaussian."""
+NOISE_ITERATIONS = 3
+"""Rounds of fitting autoregression, tails and level in turn, at most."""
+ALTERNATIONS = 6
+"""Alternations between the weights of the samples and the level, at most."""
+MIN_GAIN = 0.01
+"""Gain in log likelihood below which the fit has converged."""
+LOSS = 0.02
+"""Largest order p as a share of the n samples that have a whole past: fitting p coefficients to them adds
+about p / n to the variance of the prediction."""
+MAX_PARTIAL_CORRELATION = 0.9999
+"""Largest partial correlation."""
+TIMES = 20.0
+"""Time constants of the noise that a log holds at least. Slower noise would swallow slow effects, and so few
+repetitions cannot show its level."""
+BRIEFEST, SLOWEST = 20.0, 2000.0
+"""Samples, the least and the most of the longest time constant, in short and in long logs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise as fitted."""
+
+    ar: FloatArray
+    """(p,) autoregressive coefficients."""
+    scale: FloatArray
+    """(n,) nT, s of every sample."""
+    nu: float
+    """Degrees of freedom of the tails; 1e6 is Gaussian."""
+    past: Past
+    """The samples before each one."""
+    log_likelihood: float
+    innovations: FloatArray
+    """(n,) v / s."""
+
+    @property
+    def kappa(self) -> float:
+        """Fisher information of a location, against a Gaussian's of the same scale."""
+        return (self.nu + 1.0) / (self.nu + 3.0)
+
+    @property
+    def uneven(self) -> bool:
+        """Return True if its level changes: likelihoods are comparable only under one kind of noise."""
+        return bool(np.ptp(self.scale))
+
+    @property
+    def independent(self) -> float:
+        """Number of independent samples that determine a constant as well: ``n (1 - sum a)^2 C(0)``."""
+        return float(len(self.scale) * (1.0 - self.ar.sum()) ** 2 * autocovariance(self.ar, 0)[0])
+
+    @property
+    def slowest(self) -> float:
+        """Longest time constant of the autoregression, in samples."""
+        size = np.abs(np.roots(np.append(1.0, -self.ar))).max(initial=0.0)
+        return 1.0 / (1.0 - float(size))
+
+    @cached_property
+    def near_gaps(self) -> Predictors:
+        """Predictors of the samples shortly after a gap."""
+        return Predictors(self.past, self.ar)
+
+    def whitened(self, columns: Columns, rows: slice) -> FloatArray:
+        """(m, k) these rows of whitened columns, stored column by column."""
+        first = max(rows.start - len(self.ar), 0)
+        return self.filter(columns(slice(first, rows.stop)), first, rows.start - first)
+
+    def filter(self, values: FloatArray, start: int = 0, skip: int = 0) -> FloatArray:
+        """Whiten columns for least squares: a product with a band matrix, computed band by band.
+
+        Parameters
+        ----------
+        values : (m, k) array
+            Rows from `start` on of the whole log's columns, best stored column by column.
+        start : int
+            Place of the first row in the log.
+        skip : int
+            Rows at the beginning that serve only as the past of the others.
+
+        Returns
+        -------
+        (m - skip, k) array
+            Stored column by column.
+        """
+        p, k, own = len(self.ar), values.shape[1], len(values) - skip
+        count = -(-own // BAND)
+        V = np.asfortranarray(values).T[:, max(skip - p, 0) :]
+        lacking = max(p - skip, 0), BAND * count - own
+        if any(lacking):
+            V = np.pad(V, ((0, 0), lacking))
+        weights = np.zeros((BAND * count, p + 1))
+        weights[:own] = self._weights(slice(start + skip, start + len(values)))
+        bands = np.zeros((count, BAND + p, BAND))
+        band, row, each = bands.strides
+        diagonals = as_strided(bands, (count, BAND, p + 1), (band, row + each, row))
+        diagonals[...] = weights[:, ::-1].reshape(diagonals.shape)
+        out = np.empty((k, BAND * count))
+        pieces, filtered = (
+            as_strided(x, (count, k, wide), (BAND * each, x.strides[0], each))
+            for x, wide in ((V, BAND + p), (out, BAND))
+        )
+        np.matmul(pieces, bands, out=filtered)
+        return out[:, :own].T
+
+    def _weights(self, rows: slice) -> FloatArray:
+        """(m, p + 1) weights of each of `rows`, and of the p rows before it, in :meth:`filter`."""
+        past, gaps = self.past, self.near_gaps
+        weights = np.tile(np.append(1.0, -self.ar), (rows.stop - rows.start, 1))
+        some = slice(*np.searchsorted(past.rows, [rows.start, rows.stop]))
+        weights[past.rows[some] - rows.start] = gaps.weights[past.pattern[some]]
+        weights *= (np.sqrt(self.kappa) / self.scale[rows])[:, None]
+        return weights
+
+    def whiten(self, y: FloatArray) -> FloatArray:
+        """(n,) whitened y (n,): :meth:`filter` of a single whole column."""
+        return np.asarray(np.sqrt(self.kappa) * self.near_gaps.innovations(y) / self.scale)
+
+    def back(self, y: FloatArray) -> FloatArray:
+        """(n,) y (n,) filtered backwards: the product with the transpose of :meth:`filter`'s matrix."""
+        y = np.sqrt(self.kappa) * y / self.scale
+        early, gaps = self.past.rows, self.near_gaps
+        whole = np.where(self.past.whole, y, 0.0)
+        out = whole.copy()
+        out[early] = gaps.f[self.past.pattern] * y[early]
+        for k, weight in enumerate(self.ar, 1):
+            out[:-k] -= weight * whole[k:]
+            # a is 0 for samples that do not exist
+            out[early - k] -= (gaps.f * gaps.a[:, k - 1])[self.past.pattern] * y[early]
+        return out
+
+    def response(self, residual: FloatArray) -> FloatArray:
+        """(n,) y of the module's notes; the weights of psi are those of the residual that was fitted."""
+        weight = (self.nu + 1.0) / (self.nu + self.innovations**2)
+        return np.asarray(weight * self.whiten(residual) / self.kappa)
+
+
+class Predictors:
+    """Predictors of the samples shortly after a gap.
+
+    Parameters
+    ----------
+    past : Past
+    ar : (p,) array
+
+    Attributes
+    ----------
+    past, ar
+    a : (l, p) array
+        a of the module's notes, for each pattern of lags.
+    f : (l,) array
+        f of the module's notes.
+    weights : (l, p + 1) array
+        Of a sample, f, and of those before it, ``-f a``.
+    """
+
+    def __init__(self, past: Past, ar: FloatArray) -> None:
+        self.past, self.ar, lags = past, ar, past.lags
+        here = lags < MAX_LAG
+        C = autocovariance(ar, int(lags[here].max(initial=0)))
+        self.a, self.f = np.zeros(lags.shape), np.ones(len(lags))
+        own = np.arange(lags.shape[1])
+        for start in range(0, len(lags), SOLVED):
+            part = slice(start, start + SOLVED)
+            l, there = np.where(here[part], lags[part], 0), here[part]  # noqa: E741 - as in the equation
+            both = there[:, :, None] & there[:, None, :]
+            G = np.where(both, C[np.abs(l[:, :, None] - l[:, None, :])], 0.0)
+            G[:, own, own] = C[0]
+            c = np.where(there, C[l], 0.0)
+            self.a[part] = a = np.linalg.solve(G, c[:, :, None])[:, :, 0]
+            self.f[part] = 1.0 / np.sqrt(np.maximum(C[0] - np.sum(a * c, axis=1), 1.0))
+        self.weights = self.f[:, None] * np.hstack([np.ones((len(lags), 1)), -self.a])
+
+    def innovations(self, residual: FloatArray) -> FloatArray:
+        """(n,) innovations v of a residual (n,)."""
+        past, p = self.past, len(self.ar)
+        # a view of the p samples before each, which takes no memory
+        lags = sliding_window_view(np.append(np.zeros(p), residual), p)[:-1, ::-1]
+        v = np.asarray(residual - lags @ self.ar)
+        # a is 0 for samples that do not exist
+        own = residual[np.maximum(past.rows[:, None] - np.arange(p + 1), 0)]
+        v[past.rows] = np.einsum("ij,ij->i", self.weights[past.pattern], own)
+        return v
+
+
+def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
+    """(reach + 1,) C of an autoregression whose innovations have variance 1.
+
+    Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis
+    1991, sec. 5.2).
+    """
+    p, shorter, variance = len(ar), [ar], 1.0
+    while shorter[-1].size:
+        a = shorter[-1]
+        k = a[-1]
+        shorter.append((a[:-1] + k * a[-2::-1]) / (1.0 - k * k))
+        variance /= 1.0 - k * k
+    C = np.zeros(max(p, reach) + 1)
+    C[0] = variance
+    for m in range(1, p + 1):
+        C[m] = shorter[p - m] @ C[m - 1 :: -1][:m]
+    if reach > p:
+        tail = lfiltic([1.0], np.append(1.0, -ar), C[p:0:-1])
+        C[p + 1 :] = lfilter([1.0], np.append(1.0, -ar), np.zeros(reach - p), zi=tail)[0]
+    return C[: reach + 1]
+
+
+def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
+    r"""Choose p by Akaike's criterion on a residual clipped against outliers; `slots` (n,) count intervals.
+
+    Whitening with too high an order costs little; with too low a one, noise passes for structure.
+
+    Notes
+    -----
+    Autocovariances c_k of all pairs without a gap (Dunsmuir & Robinson 1981, J. Am. Stat. Assoc. 76:560),
+    then Levinson's recursion:
+
+    .. math:: \kappa_p = \frac{c_p - \sum_k a_k c_{p-k}}{v_{p-1}}, \qquad v_p = v_{p-1} (1 - \kappa_p^2)
+    """
+    n = len(residual)
+    scale = robust_scale(residual) + 1e-12
+    r = np.clip(residual, -6.0 * scale, 6.0 * scale)
+    c = np.array([_product(r, slots, k) for k in range(MAX_NOISE_ORDER + 1)])
+    a, v, costs = np.zeros(0), c[0] + 1e-300, {}
+    for p in range(1, MAX_NOISE_ORDER + 1):
+        kappa = np.clip((c[p] - a @ c[p - 1 : 0 : -1]) / v, -MAX_PARTIAL_CORRELATION, MAX_PARTIAL_CORRELATION)
+        a, v = np.append(a - kappa * a[::-1], kappa), v * (1.0 - kappa**2)
+        costs[p] = n * np.log(v) + 2.0 * p
+    determined = [p for p in AR_ORDERS if p <= LOSS * np.count_nonzero(slots[p:] - slots[:-p] == p)]
+    return min(determined, key=lambda p: costs[p], default=1)
+
+
+def _product(r: FloatArray, slots: IntArray, lag: int) -> float:
+    """Return the mean product of samples at a distance of `lag` intervals."""
+    before = np.searchsorted(slots, slots - lag)
+    pair = slots[before] == slots - lag
+    return float(np.mean(r[pair] * r[before[pair]])) if pair.any() else 0.0
+
+
+def fit_noise(
+    residual: FloatArray,
+    past: Past,
+    *,
+    blocks: bool | None = None,
+    like: Noise | None = None,
+    brief: bool = False,
+) -> Noise:
+    """Fit the noise model.
+
+    Parameters
+    ----------
+    residual : (n,) array
+        nT.
+    past : Past
+        The samples before each one; its order is that of the autoregression.
+    blocks : bool, optional
+        Let the level change from block to block; decided by the data if not given.
+    like : Noise, optional
+        A noise that it will resemble: the fit begins from its level and tails.
+    brief : bool
+        Allow no longer time constant than :data:`BRIEFEST`.
+    """
+    n, order, whole = len(residual), past.order, past.whole
+    count = _counts(n)
+    # a view of the p samples before each, which takes no memory
+    lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
+    ar, nu = np.zeros(order), 12.0
+    if like is None:
+        weight, scale = np.ones(n), np.full(n, robust_scale(residual) + 1e-12)
+    else:
+        nu, scale = like.nu, like.scale
+        weight = (nu + 1.0) / (nu + ((residual - lags @ like.ar) / scale) ** 2)
+    v, log_likelihood = residual, -np.inf
+    for _ in range(NOISE_ITERATIONS):
+        if whole.sum() > 2 * order:
+            ar = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
+        near_gaps = Predictors(past, ar)
+        v = near_gaps.innovations(residual)
+        if blocks is None:
+            blocks = _uneven(v, count)
+        before = log_likelihood
+        nu, scale, log_likelihood = _tails(v, count if blocks else np.array([n]), nu)
+        log_likelihood += float(np.log(near_gaps.f)[past.pattern].sum())
+        weight = (nu + 1.0) / (nu + (v / scale) ** 2)
+        if abs(log_likelihood - before) < MIN_GAIN:
+            break
+    return Noise(ar, scale, nu, past, log_likelihood, v / scale)
+
+
+def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:
+    """(p,) coefficients of weighted least squares of r (n,) on lags (n, p), in bounded memory."""
+    p = lags.shape[1]
+    P, b = np.zeros((p, p)), np.zeros(p)
+    for start in range(0, len(r), DERIVATIVE_ROWS):
+        rows = slice(start, start + DERIVATIVE_ROWS)
+        X = np.ascontiguousarray(lags[rows])
+        weighted = X * weight[rows, None]
+        P += weighted.T @ X
+        b += weighted.T @ r[rows]
+    return np.asarray(np.linalg.lstsq(P, b, rcond=None)[0], float)
+
+
+def _counts(n: int) -> IntArray:
+    """(blocks,) samples in each block."""
+    count = np.full(max(n // NOISE_BLOCK_SAMPLES, 1), NOISE_BLOCK_SAMPLES)
+    count[-1] += n - count.sum()
+    return count
+
+
+def _stable(ar: FloatArray, n: int) -> FloatArray:
+    """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
+    roots, longest = np.roots(np.append(1.0, -ar)), np.clip(n / TIMES, BRIEFEST, SLOWEST)
+    size, largest = np.abs(roots), 1.0 - 1.0 / longest
+    if size.max(initial=0.0) < largest:
+        return ar
+    return np.asarray(-np.real(np.poly(roots * np.where(size > largest, largest / size, 1.0)))[1:])
+
+
+def _uneven(v: FloatArray, count: IntArray) -> bool:
+    """Return True if the blocks' mean absolute values differ significantly."""
+    if count.size < 4:
+        return False
+    size = np.abs(v)
+    clipped = np.minimum(size, 5.0 * np.median(size))
+    mean = _sums(clipped, count) / count
+    expected = clipped.var() / count
+    chi2 = float(np.sum((mean - clipped.mean()) ** 2 / expected))
+    return bool(chi2 > count.size + 4.0 * np.sqrt(2.0 * count.size))
+
+
+def _sums(values: FloatArray, count: IntArray) -> FloatArray:
+    """(blocks,) sum of each block."""
+    return np.asarray(np.add.reduceat(values, np.cumsum(count) - count))
+
+
+def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray, float]:
+    """Find the best tails, uphill from `nu`, the level of each sample under them, and the log likelihood."""
+    at = TAILS.index(nu)
+    square = v * v
+    start = np.full(count.size, robust_scale(v) + 1e-12)
+    tried = {at: _levels(square, count, nu, start)}
+    while True:
+        for near in (at - 1, at + 1):
+            if 0 <= near < len(TAILS) and near not in tried:
+                tried[near] = _levels(square, count, TAILS[near], tried[at][1])
+        best = max((k for k in (at - 1, at, at + 1) if k in tried), key=lambda k: (tried[k][0], k == at))
+        if best == at:
+            return TAILS[at], _spread(tried[at][1], count), tried[at][0]
+        at = best
+
+
+def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -> tuple[float, FloatArray]:
+    """Log likelihood and level of each block, from a first guess.
+
+    Each level is shrunk towards that of all blocks, which counts like ten more samples.
+    """
+    n = len(square)
+    power = level**2
+    for _ in range(ALTERNATIONS):
+        before, each = power, _each(power, count)
+        weighted = square if nu > GAUSSIAN else (nu + 1.0) * each * square / (nu * each + square)
+        sums = _sums(weighted, count)
+        whole = float(sums.sum()) / n
+        power = (sums + 10.0 * whole) / (count + 10.0) if count.size > 1 else sums / count
+        power = power + 1e-24
+        if nu > GAUSSIAN or np.abs(power / before - 1.0).max() < 1e-3:
+            break
+    x2 = square / _each(power, count)
+    if nu > GAUSSIAN:
+        value = -0.5 * (float(x2.sum()) + n * np.log(2.0 * np.pi))
+    else:
+        constant = gammaln((nu + 1.0) / 2.0) - gammaln(nu / 2.0) - 0.5 * np.log(nu * np.pi)
+        value = n * constant - 0.5 * (nu + 1.0) * float(np.log1p(x2 / nu).sum())
+    return float(value - 0.5 * count @ np.log(power)), np.sqrt(power)
+
+
+def _spread(levels: FloatArray, count: IntArray) -> FloatArray:
+    """(n,) level of each sample; of a single block it takes no memory."""
+    if count.size == 1:
+        return np.broadcast_to(levels, int(count.sum()))
+    return np.repeat(levels, count)
+
+
+def _each(values: FloatArray, count: IntArray) -> FloatArray | float:
+    """(n,) a block's value for each of its samples; a number where there is one block."""
+    return np.repeat(values, count) if count.size > 1 else float(values[0])

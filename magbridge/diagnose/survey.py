@@ -1,0 +1,544 @@
+"""Deployments as the arrays that a diagnosis compares: columns, channels and their kinds, dives, gaps.
+
+Notes
+-----
+*Kinds.* A cause that contradicts the kind is never proposed: a throttle that the field follows is not a
+temperature. Only a series without a meaningful unit or name may be of every kind.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray, IntArray
+from magbridge.calibration.fitting.survey_samples import beside_motion
+from magbridge.calibration.model import Calibration
+from magbridge.columns import AGE, CHANNELS, require, require_units
+from magbridge.errors import DataError
+from magbridge.field.geodesy import separation, wrap
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.reference import positions, reference_field
+from magbridge.one_time import interpolate_to_rows
+from magbridge.records import MAX_MEASURED_NT
+from magbridge.wording import counted
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["ANY", "MAX_LAG", "Channel", "Past", "Survey", "assemble", "days_of", "kinds_of", "load_survey"]
+
+ANY = ("temperature", "current", "pressure", "position")
+DRIVE = ("current", "position")
+"""Quantities of a drive: its current flows when it turns, and the part that it turns may carry iron."""
+UNIT_KINDS: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("degC", "K", "degF"), ("temperature",)),
+    **dict.fromkeys(("A", "mA", "uA", "W", "mW"), ("current",)),
+    **dict.fromkeys(("dbar", "bar", "mbar", "Pa", "hPa", "kPa"), ("pressure",)),
+    **dict.fromkeys(("rpm", "1/min", "rad/s", "us", "PWM"), DRIVE),
+    **dict.fromkeys(("V", "mV"), DRIVE),
+}
+"""Kinds of a series by its unit, where that decides."""
+VAGUE = {"", "1", "%", "m"}
+"""Units that any kind of series may have, or that lengths and depths share: there the name decides."""
+NAME_KINDS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("temp therm", ("temperature",)),
+    ("current curr amps ampere", ("current",)),
+    ("press depth baro alt altitude", ("pressure",)),
+    ("throttle motor thrust thruster esc rpm pwm servo prop propeller winch pump", DRIVE),
+    ("pos position fin rudder elevator aileron flap ballast vbd ctl ctrl piston valve gear", ("position",)),
+)
+"""Kinds by the words of a name. The quantity comes first: a motor's temperature is a temperature."""
+PART = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")
+BEGINNING, END = 4, 3
+"""Letters from which a word is also recognised as the beginning, or the end, of a longer one."""
+DAY_S, NIGHT_S = 86400.0, 21600.0
+"""Longest day, and the gap after which another day begins, s."""
+MIN_SAMPLES_A_DAY = 100
+"""Fewest samples of a day that is left out by itself."""
+Table = dict[str, FloatArray]
+"""Columns (n,) in order of time, each with a value somewhere; ``learned`` is 1 where it was learned from."""
+MAX_LAG = 1000
+"""Lag, in sampling intervals, from which on a sample says nothing about the noise; longer ones are cut
+to it."""
+MIN_SURVEY_SAMPLES = 60
+"""Samples below which noise and effect cannot both be estimated."""
+SHORT = 0.25
+"""Quantile of the time steps that is taken for the sampling interval: some gliders sample faster near
+the surface."""
+INTERNAL_PREFIXES = ("mag_", "truth_", AGE)
+FIELDS = {"nT", "uT", "\N{MICRO SIGN}T", "mG", "G", "T"}
+"""Units of another magnetometer, which follows everything that this one does and so explains nothing."""
+NOT_TELEMETRY = {
+    "time", "fitted", "learned", "reference_field", "roll", "pitch", "heading", "latitude", "longitude",
+    "run", "dive", "quality", "total_field", "total_field_sigma", "field_x", "field_y", "field_z", "anomaly",
+    "power_cycle",
+}  # fmt: skip
+TRUSTED = 0.5
+"""Largest cubic term in the interpolation of an axis to the time of its row, as a multiple of the noise;
+where it is exceeded the sample is not used."""
+MAX_HALF_RANGES = 10.0
+"""Distance from the middle of the calibrated range, in half ranges, beyond which a parameter's value is
+not the position of a mass but a code for "not known"."""
+
+
+def kinds_of(name: str, unit: str) -> tuple[str, ...]:
+    """Return the kinds that a telemetry series may be, of ``temperature current pressure position``.
+
+    Parameters
+    ----------
+    name : str
+        The column's.
+    unit : str
+        As declared; empty if it is not.
+    """
+    if unit in UNIT_KINDS:
+        return UNIT_KINDS[unit]
+    parts = [part.lower() for part in PART.findall(name)]
+    named = next((kinds for words, kinds in NAME_KINDS if any(_among(part, words) for part in parts)), ())
+    if unit not in VAGUE:
+        # of a temperature or a pressure we know the units; anything else may be what drives, or moves
+        return DRIVE if named == DRIVE else ("position",)
+    if unit == "m":
+        return named if named in (("pressure",), ("position",)) else ("pressure",)
+    return named or ANY
+
+
+def _among(part: str, words: str) -> bool:
+    return any(
+        part == word
+        or (len(word) >= BEGINNING and part.startswith(word))
+        or (len(word) >= END and part.endswith(word))
+        for word in words.split()
+    )
+
+
+def dives_of(table: Table) -> IntArray:
+    """(n,) number of each sample's dive: as the log counts, else from surface to surface, else eighths.
+
+    Of two logs, that which was learned from and that which is diagnosed, one may count its dives alone.
+    """
+    for name in ("dive", "run"):
+        if name in table and np.unique(table[name]).size > 3:
+            dive = np.unique(table[name], return_inverse=True)[1].astype(np.int64)
+            for log in (table["learned"] > 0.5, table["learned"] < 0.5):
+                if log.any() and not np.isfinite(table[name][log]).any():
+                    dive[log] = dive.max() + 1 + dives_of(_part(table, log))
+            return dive
+    if "depth" in table and np.nanmax(table["depth"]) > 5.0:
+        depth = held(table["depth"])
+        shallow = depth < 0.15 * np.quantile(depth, 0.98)
+        start = shallow & ~np.append(False, shallow[:-1])
+        if 4 <= start.sum() <= 0.05 * len(depth):
+            return np.cumsum(start)
+    return eighths(len(table["time"]))
+
+
+def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
+    """Return the number of each sample's day, or None where the diagnosed log is of fewer than two days.
+
+    Parameters
+    ----------
+    time : (n,) array
+        Times of the samples, s.
+    learned : (n,) bool array
+        Samples that serve only as a comparison; they have the number -1.
+
+    Notes
+    -----
+    A day begins with the first sample, after :data:`DAY_S`, and after a gap of :data:`NIGHT_S`. Days of fewer
+    than :data:`MIN_SAMPLES_A_DAY` samples count to the day before.
+    """
+    day, number, start, last = np.full(len(time), -1), -1, -np.inf, -np.inf
+    fresh = np.flatnonzero(~learned)
+    t = time[fresh]
+    bounds = []
+    for k, moment in enumerate(t.tolist()):
+        if moment - start >= DAY_S or moment - last > NIGHT_S:
+            start = moment
+            bounds.append(k)
+        last = moment
+    for first, end in zip(bounds, [*bounds[1:], len(t)], strict=True):
+        if end - first >= MIN_SAMPLES_A_DAY or number < 0:
+            number += 1
+        day[fresh[first:end]] = number
+    return day if number > 0 else None
+
+
+def held(values: FloatArray) -> FloatArray:
+    """Fill the gaps of (n,) values with the last known one, and the beginning with the first."""
+    known = np.flatnonzero(np.isfinite(values))
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), known[0]))
+    return np.asarray(values[np.maximum(last, known[0])])
+
+
+def eighths(n: int) -> IntArray:
+    """(n,) number of the eighth of a log that each sample is in."""
+    return np.arange(n) * 8 // n
+
+
+def _part(table: Table, rows: BoolArray) -> Table:
+    """Return these rows of the columns that have any value there."""
+    part = {name: column[rows] for name, column in table.items()}
+    return {name: column for name, column in part.items() if np.isfinite(column).any()}
+
+
+class Past:
+    """The p samples before each sample, and their lags.
+
+    Parameters
+    ----------
+    steps : (n,) int array
+        Intervals since the sample before, at least 1; :data:`MAX_LAG` where there is none.
+    order : int
+        p.
+
+    Attributes
+    ----------
+    order : int
+    whole : (n,) bool array
+        True if no gap precedes: the p previous samples have the lags 1 to p.
+    rows : (m,) int array
+        Samples where there is one.
+    lags : (l, p) int array
+        Patterns of lags at `rows`, in intervals; :data:`MAX_LAG` where a sample is too long ago,
+        or there is none.
+    pattern : (m,) int array
+        Pattern of each of `rows`.
+    """
+
+    def __init__(self, steps: IntArray, order: int) -> None:
+        n, self.order = len(steps), order
+        index = np.arange(n)
+        broken = np.where(steps == 1, 0, index)
+        broken[:1] = 0
+        self.whole = index - np.maximum.accumulate(broken) >= order
+        self.rows = np.flatnonzero(~self.whole)
+        place = np.append(np.cumsum(np.minimum(steps, MAX_LAG)), -MAX_LAG)
+        before = np.maximum(self.rows[:, None] - np.arange(1, order + 1), -1)
+        lags = np.minimum(place[self.rows, None] - place[before], MAX_LAG)
+        self.lags, inverse = np.unique(lags, axis=0, return_inverse=True)
+        self.pattern: IntArray = inverse.ravel()
+
+
+class Channel(NamedTuple):
+    """A telemetry series, as a channel is throughout a diagnosis: values (n,), unit, kinds that it may be."""
+
+    values: FloatArray
+    unit: str
+    kinds: tuple[str, ...]
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Its smallest and its largest value."""
+        return float(self.values.min()), float(self.values.max())
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A deployment as arrays, of the rows that have field, reference and the position of every mass."""
+
+    time: FloatArray
+    """(n,) s since 1970 UTC."""
+    field: FloatArray
+    """(n, 3) nT, the sensor's raw axes at `time`."""
+    reference: FloatArray
+    """(n,) nT."""
+    channels: dict[str, Channel]
+    """All telemetry that varies, and what the calibration needs."""
+    still: tuple[str, ...]
+    """Telemetry that never changes."""
+    steps: IntArray
+    """(n,) intervals since the previous sample; :data:`~.survey.MAX_LAG` if it is too long ago to predict
+    this one's noise."""
+    dive: IntArray
+    """(n,) number of the dive, the unit of cross-validation."""
+    place: FloatArray | None
+    """(n, 3) m north and east of the middle, and below the surface: 0 in a log without a depth."""
+    attitude: FloatArray | None
+    """(n, 3) deg, roll, pitch, heading."""
+    fitted: BoolArray
+    """(n,) the calibration was fitted to this sample."""
+    learned: BoolArray
+    """(n,) it was, and the sample is given only to be compared with: its log is not diagnosed."""
+    cycles: FloatArray
+    """(c,) s, when the instrument was power-cycled, as the log says."""
+    source: str
+    """The logs that are diagnosed, for people to read."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def interval(self) -> float:
+        """Sampling interval, s."""
+        known = self.steps[1:] < MAX_LAG
+        return float(np.median(np.diff(self.time)[known] / self.steps[1:][known])) if known.any() else 1.0
+
+    @cached_property
+    def slots(self) -> IntArray:
+        """(n,) intervals since the first sample; a gap counts at most :data:`~.survey.MAX_LAG`."""
+        return np.asarray(np.cumsum(self.steps) - self.steps[0])
+
+    def follows(self, lost: int = 0) -> BoolArray:
+        """(n,) the sample follows the previous one at the median interval, with at most `lost` missing."""
+        apart = np.diff(self.time, prepend=np.inf)
+        return np.asarray((apart > 0.0) & (apart < (lost + 1.5) * np.median(apart)) & (self.steps < MAX_LAG))
+
+    @property
+    def parts(self) -> str:
+        """The units of cross-validation, in words."""
+        return "eighths of the log" if np.array_equal(self.dive, eighths(len(self))) else "dives"
+
+    def past(self, order: int) -> Past:
+        """Return the samples before each one that autoregressive noise of this order depends on."""
+        if order not in self._pasts:
+            self._pasts[order] = Past(self.steps, order)
+        return self._pasts[order]
+
+    @cached_property
+    def _pasts(self) -> dict[int, Past]:
+        return {}
+
+    def values(self, names: Sequence[str]) -> FloatArray:
+        """(n, k) channels, in this order; DataError: one is missing."""
+        missing = [name for name in names if name not in self.channels]
+        if missing:
+            raise DataError(
+                f"{self.source}: the calibration needs the column {missing[0]!r}, which is missing or empty"
+            )
+        return (
+            np.stack([self.channels[name].values for name in names], axis=1)
+            if names
+            else np.empty((len(self), 0))
+        )
+
+
+def assemble(
+    table: dict[str, FloatArray], units: dict[str, str], source: str, needed: Sequence[str]
+) -> Survey:
+    """Make a survey from complete columns: find channels, dives and gaps.
+
+    Parameters
+    ----------
+    table : dict of (n,) arrays
+        In order of time; ``fitted`` and ``learned`` are 1 where the survey's are true.
+    units : dict
+        Column -> unit.
+    source : str
+        The logs that are diagnosed, for people to read.
+    needed : sequence of str
+        Channels that are kept even if they never change.
+    """
+    time = table["time"]
+    step = np.diff(time, prepend=np.nan)
+    interval = float(np.nanquantile(step, SHORT))
+    steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), MAX_LAG), MAX_LAG).astype(
+        np.int64
+    )
+    steps[1:][table["learned"][1:] != table["learned"][:-1]] = MAX_LAG
+    channels, still = _channels(table, units, needed)
+    table = {name: column for name, column in table.items() if np.isfinite(column).any()}
+    cycles = np.empty(0)
+    if "power_cycle" in table:
+        cycles = time[1:][np.diff(table["power_cycle"]) > 0]
+    attitude = None
+    if {"roll", "pitch", "heading"} <= set(table):
+        attitude = np.stack([held(table[name]) for name in ("roll", "pitch", "heading")], axis=1)
+    return Survey(
+        time=time,
+        field=np.stack([table[f"mag_{axis}"] for axis in "xyz"], axis=1),
+        reference=table["reference_field"],
+        channels=channels,
+        still=still,
+        steps=steps,
+        dive=dives_of(table),
+        place=_place(table),
+        attitude=attitude,
+        fitted=table["fitted"] > 0.5,
+        learned=table["learned"] > 0.5,
+        cycles=cycles,
+        source=source,
+    )
+
+
+def _channels(
+    table: dict[str, FloatArray], units: dict[str, str], needed: Sequence[str]
+) -> tuple[dict[str, Channel], tuple[str, ...]]:
+    """Return the telemetry that varies or is needed, and the names of the channels that never change."""
+    channels, still = {}, []
+    for name in sorted(table):
+        if name in NOT_TELEMETRY or name.startswith(INTERNAL_PREFIXES):
+            continue
+        values, unit = table[name], units.get(name, "")
+        unit = "" if unit == "1" else unit
+        if unit in FIELDS and name not in needed:
+            continue
+        known = values[np.isfinite(values)]
+        if known.size < MIN_SURVEY_SAMPLES or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
+            still.append(name)
+            if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
+                channels[name] = Channel(held(values), unit, ())
+            continue
+        channels[name] = Channel(held(values), unit, kinds_of(name, unit))
+    return channels, tuple(still)
+
+
+def _place(table: dict[str, FloatArray]) -> FloatArray | None:
+    """(n, 3) m north and east of the middle, and below the surface; None without positions."""
+    if not {"latitude", "longitude"} <= set(table):
+        return None
+    latitude, longitude = table["latitude"], table["longitude"]
+    along = wrap(longitude - longitude[0])  # also across the date line
+    middle = float(np.median(latitude)), float(longitude[0] + np.median(along))
+    north, east = separation(*middle, latitude, longitude)
+    down = held(table["depth"]) if "depth" in table else np.zeros_like(north)
+    return np.stack([north, east, down], axis=1)
+
+
+def load_survey(
+    datasets: Sequence[xr.Dataset],
+    calibration: Calibration,
+    training_logs: Sequence[xr.Dataset] = (),
+    grid: AnomalyGrid | None = None,
+) -> Survey:
+    """Gather deployments.
+
+    Parameters
+    ----------
+    datasets : sequence of Dataset
+        To be diagnosed.
+    calibration : Calibration
+        Decides which channels a deployment must have.
+    training_logs : sequence of Dataset
+        The logs that the calibration was fitted to, if available; those of them that are among `datasets`,
+        too, are diagnosed.
+    grid : AnomalyGrid, optional
+        Added to the main field where a log has no reference of its own.
+
+    Raises
+    ------
+    DataError
+        A column is missing, too few samples are complete, or a parameter is out of all range: one line
+        that says which.
+    """
+    own = [any(ds is one for one in training_logs) for ds in datasets]
+    apart = [ds for ds in training_logs if not any(ds is one for one in datasets)]
+    logs = (*datasets, *apart)
+    source = _sources(logs)
+    table = _joined(
+        [
+            *(_columns(ds, calibration, grid, fitted) for ds, fitted in zip(datasets, own, strict=True)),
+            *(_columns(ds, calibration, grid, fitted=True, learned=True) for ds in apart),
+        ]
+    )
+    twice = int(np.sum(np.diff(table["time"]) == 0.0))
+    if twice > 0.1 * table["time"].size:
+        raise DataError(
+            f"{source}: {twice} samples are given twice: a log is either diagnosed or learned from"
+        )
+    table = _comparable(table, calibration, source)
+    for parameter in calibration.parameters:
+        far = np.abs(table[parameter.name] - parameter.centre) > MAX_HALF_RANGES * parameter.scale
+        if far.any():
+            raise DataError(
+                f"{source}: {parameter.name!r} is {table[parameter.name][far][0]:g} in {int(far.sum())} of "
+                f"{far.size} samples, and {parameter.low:g} to {parameter.high:g} in the calibration: "
+                "expected its unit, and nothing where it is not known"
+            )
+    if not any(np.ptp(table[f"mag_{axis}"]) for axis in "xyz"):
+        raise DataError(f"{source}: columns mag_x, mag_y, mag_z never change: nothing was measured")
+    units = {str(k): str(v.attrs.get("units", "")) for ds in logs for k, v in ds.data_vars.items()}
+    return assemble(table, units, _sources(datasets), calibration.channels)
+
+
+def _sources(logs: Sequence[xr.Dataset]) -> str:
+    """Name logs, each once."""
+    return ", ".join(dict.fromkeys(str(ds.attrs.get("source", "deployment")) for ds in logs))
+
+
+def _joined(parts: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return the columns of all logs in order of time; NaN where a log lacks one."""
+    names = {name for part in parts for name in part}
+    table = {
+        name: np.concatenate([part.get(name, np.full(part["time"].size, np.nan)) for part in parts])
+        for name in names
+    }
+    order = np.argsort(table["time"], kind="stable")
+    return {name: column[order] for name, column in table.items()}
+
+
+def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: str) -> dict[str, FloatArray]:
+    """Return the rows that have field, reference and parameters, each instant once."""
+    needed = [*CHANNELS, "reference_field", *calibration.units]
+    size = table["time"].size
+    if size < MIN_SURVEY_SAMPLES:
+        raise DataError(f"{source}: {counted(size, 'sample')}, at least {MIN_SURVEY_SAMPLES} needed")
+    for name in CHANNELS:
+        table[name][~(np.abs(table[name]) < MAX_MEASURED_NT)] = np.nan
+    whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
+    if whole.sum() < MIN_SURVEY_SAMPLES:
+        worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))
+        raise DataError(
+            f"{source}: only {int(whole.sum())} of {whole.size} samples can be compared, at least "
+            f"{MIN_SURVEY_SAMPLES} "
+            f"needed (column {worst!r} has {int(np.isfinite(table[worst]).sum())} numbers)"
+        )
+    table = {name: column[whole] for name, column in table.items()}
+    once = np.diff(table["time"], prepend=-np.inf) > 0.0  # a sample that two logs share is kept once
+    return {name: column[once] for name, column in table.items()}
+
+
+def _columns(
+    ds: xr.Dataset, calibration: Calibration, grid: AnomalyGrid | None, fitted: bool, learned: bool = False
+) -> dict[str, FloatArray]:
+    """Return every numeric column, the axes interpolated to the rows' times, and the reference field."""
+    source = str(ds.attrs.get("source", "deployment"))
+    sensor = str(ds.attrs.get("sensor", ""))
+    if not calibration.sensor.may_be(sensor):
+        raise DataError(f"{source}: sensor {sensor!r}, but the calibration is of {calibration.sensor.name!r}")
+    require(ds, (*CHANNELS, *calibration.units))
+    require_units(ds, calibration.units)
+    once = np.unique(ds["time"], return_index=True)[1]
+    if once.size < ds.sizes["time"]:
+        ds = ds.isel(time=once)
+    time = ds["time"].to_numpy().astype(float)
+    table = {
+        str(name): column.to_numpy().astype(float)
+        for name, column in ds.data_vars.items()
+        if column.dtype.kind in "fiub" and not str(name).startswith("truth_")
+    }
+    in_turn, trusted = False, TRUSTED * calibration.noise.sensor
+    for axis in "xyz":  # a log of axes that were sampled in turn has a time for each
+        sampled = table.pop(f"mag_time_{axis}", None)
+        if sampled is not None and np.isfinite(sampled).all() and not np.array_equal(sampled, time):
+            values, cubic = interpolate_to_rows(time, sampled, table[f"mag_{axis}"])
+            # where the cubic term is large or unknown, the channel is not known well enough
+            table[f"mag_{axis}"] = np.where(np.abs(cubic) <= trusted, values, np.nan)
+            in_turn = True
+    marks = {"fitted": fitted, "learned": learned}
+    table |= {"time": time} | {name: np.full(time.size, float(mark)) for name, mark in marks.items()}
+    if in_turn:
+        for axis in "xyz":
+            table[f"mag_{axis}"][_moving(table, calibration)] = np.nan
+    table["reference_field"] = reference_field(ds, grid, calibration.reference.bias)
+    if {"latitude", "longitude"} <= set(table):
+        table["longitude"], table["latitude"], _ = positions(ds)
+    return table
+
+
+def _moving(table: dict[str, FloatArray], calibration: Calibration) -> BoolArray:
+    """(n,) samples next to which a mass moves, by the bridge's own criterion.
+
+    There the axes, sampled in turn, saw the mass at different places and form no vector. With
+    simultaneous sampling such samples are kept: only they reveal an offset of the clocks.
+    """
+    parameters = calibration.parameters
+    time = table["time"]
+    values = np.array([table[one.name] for one in parameters]).reshape(len(parameters), time.size)
+    return beside_motion(time, values.T, np.array([one.high - one.low for one in parameters]))
