@@ -11,7 +11,7 @@ from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Start
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
+from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import load
 
@@ -38,7 +38,12 @@ directory = "logs"
 
 
 def small_bridge(
-    folder: Path, start: Start, battery: Parameter, publish: Sequence[str], more: str = ""
+    folder: Path,
+    start: Start,
+    battery: Parameter,
+    publish: Sequence[str],
+    more: str = "",
+    boresight: Boresight | None = None,
 ) -> Pipeline:
     """Return a bridge that is configured in a folder; events are fed by hand.
 
@@ -54,6 +59,8 @@ def small_bridge(
         Messages that are sent with every sample.
     more : str
         Further lines of the configuration; first more keys of ``[publish]``, if any.
+    boresight : Boresight or None
+        That of the calibration; with one, the bridge computes a heading.
     """
     size = 4 * 9
     cal = Calibration(
@@ -63,6 +70,7 @@ def small_bridge(
         covariance=np.eye(size),
         noise=Noise(1.0),
         reference=Reference(50_000.0),
+        boresight=boresight,
         method="auto",
     )
     save(cal, folder / "cal.json")
