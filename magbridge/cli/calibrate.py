@@ -244,6 +244,7 @@ def _with_scalar(
     options: dict[str, Any],
 ) -> tuple[Calibration, str]:
     """Return the calibration with its scalar sensor, and a summary; add to the facts to print as JSON."""
+    from magbridge.calibration.figure_of_merit import merit_text
     from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns
 
     names = names or telemetry_columns(deployment, scalar)
@@ -255,6 +256,7 @@ def _with_scalar(
         "rms_nT": fit.rms_after,
         "contribution_nT": fit.contribution,
         "left_out": fit.left_out,
+        "figure_of_merit": fit.merit and {**fit.merit, "fitted": True},
     }
     largest = sorted(fit.contribution.items(), key=lambda one: -one[1])
     parts = ", ".join(
@@ -264,6 +266,8 @@ def _with_scalar(
         f"; scalar {scalar}: {fit.rms_before:.2f} -> {fit.rms_after:.2f} nT about the mean with "
         f"{counted(len(names), 'channel')} ({parts} nT)"
     )
+    if fit.merit:
+        text += f"; {merit_text(fit.merit)} (fitted)"
     return replace(calibration, sensors=(fit.sensor,)), text
 
 

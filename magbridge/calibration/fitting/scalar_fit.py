@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -89,6 +90,8 @@ class ScalarFit:
     left_out: int
     """Samples that were left out as outliers."""
     log_evidence: float
+    merit: dict[str, Any] | None = None
+    """Figure of merit of the fitted log, :func:`.figure_of_merit`; None if the log holds no box flight."""
 
 
 @dataclass(frozen=True, eq=False)

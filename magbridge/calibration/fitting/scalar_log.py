@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
+from magbridge.calibration.figure_of_merit import box_flight, figure_of_merit
 from magbridge.calibration.fitting.observe import at_one_time
 from magbridge.calibration.fitting.scalar_fit import ScalarFit, adapt_to_log, fit_scalar
 from magbridge.calibration.model import Calibration
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
 
     from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["SCALAR_COLUMNS", "calibrate_scalar", "telemetry_columns", "with_scalar"]
+__all__ = ["SCALAR_COLUMNS", "calibrate_scalar", "merit_of", "telemetry_columns", "with_scalar"]
 
 SCALAR_COLUMNS = "scalar_field", "scalar_field_sigma", "scalar_level_sigma", "scalar_quality"
 """Columns that compensation adds."""
@@ -126,9 +128,28 @@ def calibrate_scalar(
     corrected = correct(calibration, field, np.stack(channels, axis=1) if channels else field[:, :0], time)
     series = _series(ds, column, names, corrected.vector, reference)
     units = tuple(str(ds[name].attrs.get("units", "")) for name in names)
-    return fit_scalar(
+    fit = fit_scalar(
         series, tuple(names), column=column, units=units, lag=lag, map_known=map_known, lever=lever
     )
+    after = correct_scalar(fit.sensor, series).field - reference
+    return replace(fit, merit=merit_of(ds, reading - reference, after))
+
+
+def merit_of(ds: xr.Dataset, before: FloatArray, after: FloatArray) -> dict[str, Any] | None:
+    """Return the figure of merit of a log's box flight; None if it holds none, or no attitude.
+
+    Parameters
+    ----------
+    ds : Dataset
+        The log, n samples.
+    before, after : (n,) array
+        nT, the scalar minus its reference, before and after compensation.
+    """
+    if not {"roll", "pitch", "heading"} <= set(ds.variables):
+        return None
+    roll, pitch, heading = (ds[name].to_numpy().astype(float) for name in ("roll", "pitch", "heading"))
+    box = box_flight(np.asarray(ds["time"].to_numpy(), float), roll, pitch, heading)
+    return None if box is None else figure_of_merit(box, before, after)
 
 
 def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[ScalarSensor]) -> xr.Dataset:
