@@ -24,10 +24,9 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from bound import BestFit
 from scipy.optimize import least_squares
 from studies import Column, Row, Study, fraction_within, percentile, study_options
-from study_worlds import METHODS, NOISES, Glider, glider, true_field
+from study_worlds import METHODS, NOISES, BestFit, Glider, glider, true_field
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations

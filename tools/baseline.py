@@ -78,13 +78,13 @@ def live(change: str, seed: int) -> Figures:
     """Change a vehicle after its calibration while the bridge learns."""
     import live as study  # noqa: PLC0415
 
-    row = study.run(change, seed, 6.0, 20.0)
+    row = study.run(change, seed, 6.0, 20.0)[0]
     return {
-        f"{change}: published error / noise": row.published,
-        f"{change}: normalised error": row.sigma,
-        f"{change}: alarm delay / optimal": row.delay,
-        f"{change}: cause among the candidates": row.among,
-        f"{change}: false alarms": row.false,
+        f"{change}: published error / noise": row["published"],
+        f"{change}: normalised error": row["sigma"],
+        f"{change}: alarm delay / optimal": row.get("delay", np.nan),
+        f"{change}: cause among the candidates": row.get("among", np.nan),
+        f"{change}: false alarms": row["false"],
     }
 
 
@@ -115,7 +115,7 @@ def diagnosis(entry: dict[str, Any]) -> Figures:
 def navigation(rms: float, length: float, seed: int) -> Figures:
     """Navigate a glider over a random map."""
     import navigation as study  # noqa: PLC0415
-    from navigation_studies.simulated import LEFT, Map  # noqa: PLC0415
+    from voyages import LEFT, Map  # noqa: PLC0415
 
     kind = Map(rms, length)
     score = study.one(kind, LEFT["auto"], 1.0, seed)
@@ -190,7 +190,7 @@ def replay() -> Figures:
 
 def parts(data: Path) -> dict[str, list[Case]]:
     """Return the cases of each part."""
-    from live_changes import CHANGES  # noqa: PLC0415
+    from live import CHANGES  # noqa: PLC0415
     from study.cases import plan  # noqa: PLC0415
 
     measured: list[Case] = (

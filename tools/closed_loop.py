@@ -1,40 +1,32 @@
-"""How far a bridge and an autopilot that takes its fixes lead each other astray, over hours.
+"""Measure how far a bridge and an autopilot that uses its fixes mislead each other over hours.
 
-    nice python tools/closed_loop.py [--runs 1] [--hours 6] [--maps 2] [--telemetry speed ...] [--workers 1]
+    python tools/closed_loop.py [--runs 1] [--hours 6] [--maps 2] [--telemetry speed ...]
 
-Gliders of tools/navigation.py's study, on its maps: GPS for ten minutes, then none, and for the last five
-again. Each is sailed twice for every kind of fix and every kind of telemetry that an autopilot may send: with
-one that ignores fixes, and with one that takes them by the rules of ArduPilot or PX4 (``tools/referee``).
+The gliders of tools/navigation.py have GPS for ten minutes, then none, and for the last five minutes again.
+Each is run twice for every kind of fix and of telemetry: with an autopilot that ignores fixes, and with one
+that uses them by the rules of ArduPilot or PX4 (``tools/referee``).
 
-follows       what the bridge's dead reckoning followed while GPS was lost
-obeying m     root mean square error of the bridge's position without GPS, with the autopilot that takes fixes
-ignoring m    with the one that does not
-ratio         the former over the latter
-autopilot m   error of the autopilot's own position
-alone m       that of the one that ignores fixes
-claims m      its claim (1-sigma, an axis), root mean square
-standardised  its error an axis over its claimed sigma, root mean square: 1 is consistent
-back s        from the return of GPS until the autopilot is within 3 sigma of it
-taken         of the sent fixes
+bridge, m     RMS error of the bridge's position without GPS, with the autopilot that uses fixes
+ratio         the same over that with the autopilot that ignores them
+autopilot     RMS error of the autopilot's own position; *alone*: of the one that ignores fixes
+claimed       its 1-sigma on an axis, RMS; *normalised*: its error on an axis over that
+back, s       from the return of GPS until the autopilot is within 3 sigma of it
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
-from navigation_studies.simulated import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 from referee import ArduPilot, Autopilot, Px4
 from referee.loop import Passage, Run, sail
-from studies import command_line
+from studies import Column, Row, Study, study_options
+from voyages import GLIDER, HOUR, SPEEDS, Map, synthetic, track_over
 
-LOST, BACK = 600.0, 300.0
-"""s: GPS is lost after the first, and back the second before the end."""
+LOST_S, BACK_S = 600.0, 300.0
+"""GPS is lost after the first, and back the second before the end."""
 FOLLOWS = "dead reckoning by "
 MAPS = (Map(20, 1000), Map(60, 2000))
 STREAMS = {
@@ -45,34 +37,19 @@ STREAMS = {
     "global": ("GLOBAL_POSITION_INT",),
     "all": ("VFR_HUD", "LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT"),
 }
-PAIRS: tuple[tuple[str, type[Autopilot]], ...] = (
-    ("EXTERNAL_POSITION_ESTIMATE", ArduPilot),
-    ("ODOMETRY", ArduPilot),
-    ("EXTERNAL_POSITION_ESTIMATE", Px4),
-    ("GLOBAL_POSITION_SENSOR", Px4),
+AUTOPILOTS: dict[str, type[Autopilot]] = {"ArduPilot": ArduPilot, "PX4": Px4}
+PAIRS = (
+    ("EXTERNAL_POSITION_ESTIMATE", "ArduPilot"),
+    ("ODOMETRY", "ArduPilot"),
+    ("EXTERNAL_POSITION_ESTIMATE", "PX4"),
+    ("GLOBAL_POSITION_SENSOR", "PX4"),
 )
-HEADER = (
-    "fix", "autopilot", "telemetry", "map", "follows", "obeying m", "ignoring m", "ratio", "autopilot m",
-    "alone m", "claims m", "standardised", "back s", "taken",
-)  # fmt: skip
 
 
-class Case(NamedTuple):
-    """One pair of runs."""
-
-    fix: str
-    stack: type[Autopilot]
-    streams: str
-    kind: Map
-    seed: int
-    hours: float
-
-
-def passage(case: Case) -> Passage:
+def passage(kind: Map, seed: int, hours: float) -> Passage:
     """Return a track of the navigation study."""
-    grid = synthetic(case.kind, case.seed % 10)
-    ds = track_over(grid, GLIDER, 1000 + case.seed, hours=case.hours, speed=SPEEDS[case.seed % 3])
-    last = case.hours * HOUR
+    grid = synthetic(kind, seed % 10)
+    ds = track_over(grid, GLIDER, 1000 + seed, hours=hours, speed=SPEEDS[seed % 3])
     return Passage(
         ds["time"].to_numpy(),
         ds["truth_latitude"].to_numpy(),
@@ -81,69 +58,74 @@ def passage(case: Case) -> Passage:
         ds["total_field"].to_numpy(),
         ds["total_field_sigma"].to_numpy(),
         30.0,
-        lambda s: s < LOST or s > last - BACK,
+        lambda s: s < LOST_S or s > hours * HOUR - BACK_S,
     )
 
 
 def rms(values: np.ndarray) -> float:
-    """Return the root mean square."""
+    """Return the root mean square of the values that are not NaN."""
     return float(np.sqrt(np.nanmean(np.square(values))))
 
 
-def one(case: Case) -> list[str]:
-    """Return one line of the table."""
-    grid, way = synthetic(case.kind, case.seed % 10), passage(case)
+def run(fix: str, stack: str, streams: str, kind: Map, seed: int, hours: float) -> list[Row]:
+    """Run a glider with an autopilot that uses the fixes, and with one that ignores them."""
+    grid, way = synthetic(kind, seed % 10), passage(kind, seed, hours)
     options = replace(GLIDER, start_sigma=0.2 * grid.correlation_length)
 
-    def run(obeys: bool) -> tuple[Run, Autopilot]:
-        make = partial(case.stack, streams=STREAMS[case.streams], obeys=obeys)
-        return sail(way, grid, options, case.fix, make)[:2]
+    def sailed(obeys: bool) -> tuple[Run, Autopilot]:
+        make = partial(AUTOPILOTS[stack], streams=STREAMS[streams], obeys=obeys)
+        return sail(way, grid, options, fix, make)[:2]
 
-    with_us, autopilot = run(True)
-    without, _ = run(False)
-    lost = (with_us.seconds > LOST) & (with_us.seconds < case.hours * HOUR - BACK)
-    fed = lost & (with_us.sent > 0)
-    fed &= np.cumsum(fed) > LOST  # once it has converged
-    if not fed.any():  # none was sent
-        fed = lost
-    obeying, ignoring = rms(with_us.error[lost]), rms(without.error[lost])
-    reported = [
-        text for second, text in with_us.texts if FOLLOWS in text and second < case.hours * HOUR - BACK
-    ]
-    back = with_us.seconds > case.hours * HOUR - BACK
-    far = np.flatnonzero(np.hypot(*with_us.autopilot[back].T) > 3.0 * 2.5)
+    using, autopilot = sailed(True)
+    ignoring, _ = sailed(False)
+    end = hours * HOUR - BACK_S
+    lost = (using.seconds > LOST_S) & (using.seconds < end)
+    fed = lost & (using.sent > 0)
+    fed &= np.cumsum(fed) > LOST_S  # after it has converged
+    fed = fed if fed.any() else lost
+    reported = [text for second, text in using.texts if FOLLOWS in text and second < end]
+    far = np.flatnonzero(np.hypot(*using.autopilot[using.seconds > end].T) > 3.0 * 2.5)
+    bridge = rms(using.error[lost])
     return [
-        case.fix, case.stack.__name__, case.streams, str(case.kind),
-        reported[-1].removeprefix(FOLLOWS).partition(":")[0],
-        f"{obeying:.1f}", f"{ignoring:.1f}", f"{obeying / ignoring:.2f}",
-        f"{rms(np.hypot(*with_us.autopilot[fed].T)):.1f}", f"{rms(np.hypot(*without.autopilot[fed].T)):.1f}",
-        f"{rms(with_us.claimed[fed]):.1f}", f"{rms(with_us.autopilot[fed] / with_us.claimed[fed, None]):.2f}",
-        f"{far[-1] + 1 if far.size else 0}",
-        ", ".join(f"{name} {number}" for name, number in autopilot.taken.most_common(3)),
+        {
+            "fix": fix, "autopilot": stack, "telemetry": streams, "map": str(kind),
+            "follows": reported[-1].removeprefix(FOLLOWS).partition(":")[0] if reported else "",
+            "bridge": bridge, "ratio": bridge / rms(ignoring.error[lost]),
+            "own": rms(np.hypot(*using.autopilot[fed].T)), "alone": rms(np.hypot(*ignoring.autopilot[fed].T)),
+            "claimed": rms(using.claimed[fed]),
+            "normalised": rms(using.autopilot[fed] / using.claimed[fed, None]),
+            "back": float(far[-1] + 1 if far.size else 0), "fixes": float(sum(autopilot.taken.values())),
+        }
     ]  # fmt: skip
 
 
-def cases(runs: int, hours: float, maps: int, telemetry: Collection[str]) -> Iterator[Case]:
-    """Yield all pairs of runs."""
-    for (fix, stack), streams, kind, seed in product(PAIRS, telemetry, MAPS[:maps], range(runs)):
-        yield Case(fix, stack, streams, kind, seed, hours)
+STUDY = Study(
+    run,
+    ("fix", "autopilot", "telemetry", "map", "follows"),
+    {
+        "bridge, m": Column("bridge", form=".0f"),
+        "ratio": Column("ratio"),
+        "autopilot": Column("own", form=".0f"),
+        "alone": Column("alone", form=".0f"),
+        "claimed": Column("claimed", form=".0f"),
+        "normalised": Column("normalised"),
+        "back, s": Column("back", np.max, ".0f"),
+        "fixes": Column("fixes", form=".0f"),
+    },
+)
 
 
 def main() -> None:
     """Print the table."""
-    parser = command_line(__doc__)
+    parser = study_options(__doc__)
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--hours", type=float, default=6.0)
     parser.add_argument("--maps", type=int, default=len(MAPS))
-    parser.add_argument("--telemetry", nargs="+", choices=STREAMS, default=STREAMS)
-    parser.add_argument("--workers", type=int, default=1)
-    arguments = parser.parse_args()
-    print(f"| {' | '.join(HEADER)} |\n|{'---|' * len(HEADER)}")
-    with ProcessPoolExecutor(arguments.workers) as pool:
-        for line in pool.map(
-            one, cases(arguments.runs, arguments.hours, arguments.maps, arguments.telemetry)
-        ):
-            print(f"| {' | '.join(line)} |", flush=True)
+    parser.add_argument("--telemetry", nargs="+", choices=STREAMS, default=list(STREAMS))
+    options = parser.parse_args()
+    kinds = product(PAIRS, options.telemetry, MAPS[: options.maps], range(options.runs))
+    cases = [(*pair, streams, kind, seed, options.hours) for pair, streams, kind, seed in kinds]
+    STUDY.main(f"{options.runs} gliders, {options.hours:g} h", cases, options)
 
 
 if __name__ == "__main__":

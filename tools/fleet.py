@@ -19,10 +19,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import xarray as xr
-from bound import BestFit
 from rich.console import Console
 from studies import Column, Row, Study, in_order, percentile, study_options
-from study_worlds import MASSES, Glider
+from study_worlds import MASSES, BestFit, Glider
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit

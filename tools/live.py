@@ -1,39 +1,32 @@
-"""What a bridge that learns in flight makes of a calibration that no longer fits, on simulated gliders.
-
-Each glider flies the paper's Table 1 and is calibrated; then it surveys a crustal field of 60 nT on another
-day, with one thing changed, and the bridge has nothing but the IGRF to compare with. A sample's telemetry
-is two seconds old: a mass's motion begins before it is reported. Samples in a motion are left out. Printed
-for each change, the median of the gliders unless stated otherwise:
-
-- fixed, MagNav, bound, published (and the 95th percentile): RMS error about its mean after the first three
-  hours, over the noise floor, of the fixed field, the field by MagNav.jl's online filter
-  (:mod:`magnav_online`), by one that knows the cause and its onset (:mod:`live_bound`) and the published one;
-- sigma: normalised error of the published field, from the alarm on;
-- beyond: how many samples are off by more than three sigmas, over those that the optimal detector needs,
-  which knows cause, direction, size and calibration, but the crustal field no better than the bridge does
-  (95th percentile);
-- delay: samples until the alarm, over the same;
-- among, alone: how often the cause is among those named, and the only one;
-- false: alarms without a cause;
-- moved: by how many sigmas a coefficient has moved (95th percentile).
+"""Measure in-flight calibration on simulated gliders that change after their calibration.
 
     python tools/live.py --seeds 10 --hours 12
+
+Each glider flies the paper's Table 1 and is calibrated; then it surveys a crustal field of 60 nT on another
+day, with one change. The reference is the IGRF. A sample's telemetry is two seconds old, so a motion begins
+before it is reported; samples in a motion are left out.
+
+fixed, MagNav, bound, published   RMS error about its mean after three hours, over the noise floor: of the
+              fixed calibration, of MagNav.jl's online filter (:mod:`magnav_online`), of a filter that knows
+              the cause and its onset, and of the published field
+normalised    normalised error of the published field, from the alarm on
+delay         samples until the alarm, over those of an optimal detector, which knows cause and calibration
+among, alone  how often the true cause is among the named ones, and the only one
+false         alarms without a cause
 """
 
 from __future__ import annotations
 
-import sys
-import warnings
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
-from live_bound import best_delay, best_field
-from live_changes import CHANGES, MASSES, hours
 from magnav_online import online
-from rich.console import Console
-from studies import add_engine, command_line, in_order, table
+from studies import Column, Row, Study, study_options
+from study_worlds import MASSES
 
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
@@ -46,36 +39,25 @@ from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
 from magbridge.learning import Learner
-from magbridge.learning.nuisance import LENGTH
+from magbridge.learning.doubt import LEARNING_ALARM_LOG_RATIO
+from magbridge.learning.nuisance import LENGTH, STATES, Nuisance
 from magbridge.records import Quality, Reading
 from sitl import load, segments, simulate
 from sitl.dataset import channels, side_by_side
 from sitl.mission import CrissCross, Leg, Legs, Spirals
 from sitl.world import Geology
 
-ROCK = Geology(rms=60.0, top=1000.0, bottom=5000.0)
-AGE = 2.0
-"""s that a sample's telemetry is old; the next comes as long after the sample."""
+CRUST = Geology(rms=60.0, top=1000.0, bottom=5000.0)
+AGE_S = 2.0
+"""Age of a sample's telemetry; the next telemetry comes as long after the sample."""
+CHANGE_SIGMA_NT = 200.0
+"""1-sigma of a change on an axis, as the bound assumes it."""
+Change = Callable[[xr.Dataset, np.random.Generator, float], np.ndarray]
+"""Takes the log, a generator and a size, nT; returns the field added to the channels (n, 3), nT."""
 
 
-class Row(NamedTuple):
-    """One survey: errors over the floor; delays over the optimal one; NaN where it does not apply."""
-
-    fixed: float
-    peer: float
-    bound: float
-    published: float
-    sigma: float
-    beyond: float
-    delay: float
-    among: float
-    alone: float
-    false: float
-    moved: float
-
-
-class Seen(NamedTuple):
-    """What the bridge published of every sample, and each alarm: its row and its causes."""
+class Published(NamedTuple):
+    """Total field, sigma (nT) and quality of every sample, and each alarm with its row and its causes."""
 
     total: np.ndarray
     sigma: np.ndarray
@@ -83,8 +65,152 @@ class Seen(NamedTuple):
     alarms: list[tuple[int, tuple[str, ...]]]
 
 
+# ---- the changes -------------------------------------------------------------------------------------------
+
+
+def direction(rng: np.random.Generator) -> np.ndarray:
+    """Return a random unit vector (3,)."""
+    vector = rng.normal(size=3)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def hours(log: xr.Dataset) -> np.ndarray:
+    """Return the hours since the start (n,)."""
+    time = log["time"].to_numpy()
+    return np.asarray((time - time[0]) / 3600.0)
+
+
+def nothing(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:  # noqa: ARG001
+    """Change nothing."""
+    return np.zeros((log.sizes["time"], 3))
+
+
+def turn_on(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+    """Change the offset from the start on."""
+    return np.tile(size * direction(rng), (log.sizes["time"], 1))
+
+
+def bolt(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+    """Change the offset after 40 % of the survey."""
+    return np.asarray((hours(log) > 0.4 * hours(log)[-1])[:, None] * size * direction(rng))
+
+
+def drift(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+    """Let the offset drift from 20 % of the survey on."""
+    later = np.maximum(hours(log) - 0.2 * hours(log)[-1], 0.0)
+    return np.asarray((later / later[-1])[:, None] * 3.0 * size * direction(rng))
+
+
+def warming(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+    """Warm the sensor from -10 to +2 degC within half an hour, as in the paper's trial 1."""
+    warmer = 12.0 * (1.0 - np.exp(-hours(log) / 0.5))
+    log["sensor_temperature"] = "time", -10.0 + warmer
+    return np.asarray((warmer / 12.0)[:, None] * 3.0 * size * direction(rng))
+
+
+def pump(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+    """Run a pump for two of every ten minutes; its wiring changes after 40 % of the survey."""
+    current = 2.0 * ((hours(log) * 6.0) % 1.0 < 0.2)
+    log["pump_current"] = "time", current, {"units": "A"}
+    return np.asarray((current * (hours(log) > 0.4 * hours(log)[-1]))[:, None] * 0.5 * size * direction(rng))
+
+
+def clock(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+    """Delay the telemetry of the masses by half of `size`, in s, after 40 % of the survey."""
+    time = log["time"].to_numpy()
+    later = hours(log) > 0.4 * hours(log)[-1]
+    for name in MASSES:
+        values = log[name].to_numpy()
+        log[name] = "time", np.where(later, np.interp(time - 0.5 * size, time, values), values)
+    return nothing(log, rng, size)
+
+
+def sheet(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
+    """Shift the reference after 40 % of the survey, as another sheet of a map does."""
+    log["reference_error"] = "time", 3.0 * size * (hours(log) > 0.4 * hours(log)[-1])
+    return nothing(log, rng, size)
+
+
+CHANGES: dict[str, tuple[Change, str, float]] = {
+    "nothing": (nothing, "", 0.0),
+    "turn-on step": (turn_on, "offset_step", 0.0),
+    "bolt magnetised": (bolt, "offset_step", 0.4),
+    "drift": (drift, "offset_drift", 0.2),
+    "warming (trial 1)": (warming, "temperature_offset", 0.0),
+    "pump": (pump, "current_field", 0.4),
+    "clock": (clock, "clock_offset", 0.4),
+    "map": (sheet, "map_error", 0.4),
+    "straight over rock": (nothing, "", 0.0),
+}
+"""Name -> the change, its cause, and the fraction of the survey after which it begins."""
+
+# ---- the bounds --------------------------------------------------------------------------------------------
+
+
+def transitions(nuisance: Nuisance, log: xr.Dataset) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the nuisance's transition and its noise before each of the n samples."""
+    latitude, longitude = (log[name].to_numpy() for name in ("latitude", "longitude"))
+    north, east = separation(latitude[:-1], longitude[:-1], latitude[1:], longitude[1:])
+    metres, seconds = np.hypot(north, east), np.diff(log["time"].to_numpy())
+    return [nuisance.transition(0.0, 0.0), *map(nuisance.transition, metres.tolist(), seconds.tolist())]
+
+
+def best_delay(
+    effect: FloatArray, log: xr.Dataset, rest: BoolArray, calibration: Calibration, since: int
+) -> int:
+    """Return after how many samples `rest` a known `effect` (n,) on the total field, nT, is significant.
+
+    The effect begins with the sample `since`. It is significant when the expected log-likelihood ratio, half
+    the whitened energy of the effect, reaches the threshold of the bridge.
+    """
+    nuisance = Nuisance(calibration.noise, Align().reference_sigma)
+    P, m, h = nuisance.initial.copy(), np.zeros(STATES), -nuisance.row(1.0)
+    energy, count = 0.0, 0
+    for k, (F, Q) in enumerate(transitions(nuisance, log)):
+        P, m = F @ P @ F.T + Q, F @ m
+        if rest[k]:
+            S = float(h @ P @ h) + nuisance.white_variance
+            v, gain = float(effect[k] - h @ m), P @ h / S
+            energy += 0.5 * v * v / S
+            m, P, count = m + gain * v, P - np.outer(gain, h @ P), count + (k >= since)
+            if energy > LEARNING_ALARM_LOG_RATIO:
+                break
+    return count
+
+
+def best_field(
+    added: FloatArray, log: xr.Dataset, rest: BoolArray, calibration: Calibration, reference: FloatArray
+) -> FloatArray:
+    """Return the total field (n,), nT, by a Kalman filter that knows the time course of a change.
+
+    It knows neither amplitude nor direction of `added` (n, 3), nT. The field of a sample is computed before
+    the sample updates the filter. `reference` (n,), nT, is the main field.
+    """
+    seen, values, time = channels(log), side_by_side(log, MASSES), log["time"].to_numpy()
+    total = correct(calibration, seen, values, time).total
+    amount = np.linalg.norm(added, axis=1) / np.linalg.norm(added, axis=1).max()
+    by_axis = [correct(calibration, seen + one, values, time).total - total for one in np.eye(3)]
+    by_change = np.stack(by_axis, axis=1) * amount[:, None]
+    nuisance = Nuisance(calibration.noise, Align().reference_sigma)
+    x, P = np.zeros(3 + STATES), np.diag(np.r_[np.full(3, CHANGE_SIGMA_NT**2), np.diag(nuisance.initial)])
+    A, h, best = np.eye(3 + STATES), np.r_[np.zeros(3), -nuisance.row(1.0)], total.copy()
+    for k, (F, Q) in enumerate(transitions(nuisance, log)):
+        A[3:, 3:], h[:3] = F, by_change[k]
+        x, P = A @ x, A @ P @ A.T
+        P[3:, 3:] += Q
+        best[k] -= by_change[k] @ x[:3]
+        if rest[k]:
+            S = float(h @ P @ h) + nuisance.white_variance
+            gain = P @ h / S
+            x, P = x + gain * (total[k] - reference[k] - h @ x), P - np.outer(gain, h @ P)
+    return best
+
+
+# ---- the flight, and the bridge ----------------------------------------------------------------------------
+
+
 def fly(name: str, seed: int, length: float) -> tuple[xr.Dataset, xr.Dataset]:
-    """Return the calibration runs, and the survey with what telemetry says between the samples, too."""
+    """Return the calibration runs, and the survey with the telemetry between its samples."""
     straight = Leg(
         duration=3600.0 * length,
         pitch=0.0,
@@ -95,23 +221,24 @@ def fly(name: str, seed: int, length: float) -> tuple[xr.Dataset, xr.Dataset]:
     )
     survey = Legs((straight,)) if name == "straight over rock" else CrissCross(hours=length, roll=(1.0, 2.0))
     scenario = load("random_glider").replace(
-        world={"geology": ROCK}, mission=(Spirals(), survey), instrument={"rate": 1.0 / AGE}
+        world={"geology": CRUST}, mission=(Spirals(), survey), instrument={"rate": 1.0 / AGE_S}
     )
     runs, mission = segments(simulate(scenario, seed)).values()
     return runs.isel(time=slice(0, None, 2)), mission.copy()
 
 
 def sampled(log: xr.Dataset) -> xr.Dataset:
-    """Return every second row, with what telemetry said the row before."""
+    """Return every second row, with the telemetry of the row before it."""
     sent, samples = (log.isel(time=slice(k, log.sizes["time"] & ~1, 2)) for k in (0, 1))
     return samples.assign({name: ("time", sent[name].to_numpy()) for name in (*MASSES, *currents(log))})
 
 
 def currents(log: xr.Dataset) -> tuple[str, ...]:
+    """Return the names of the currents in a log."""
     return ("pump_current",) * ("pump_current" in log)
 
 
-def learn(learner: Learner, calibration: Calibration, log: xr.Dataset) -> Seen:
+def learn(learner: Learner, calibration: Calibration, log: xr.Dataset) -> Published:
     """Correct a survey as the bridge does."""
     correction = Correction(calibration, learner=learner)
     n = log.sizes["time"]
@@ -123,36 +250,29 @@ def learn(learner: Learner, calibration: Calibration, log: xr.Dataset) -> Seen:
     fields, warmth = channels(log).tolist(), log["sensor_temperature"].to_numpy().tolist()
     for k in range(n):
         for key, values in telemetry.items():
-            correction.telemetry(key, values[k], stamps[k] - round(AGE * 1e6))
+            correction.telemetry(key, values[k], stamps[k] - round(AGE_S * 1e6))
         reading = Reading(tuple(fields[k]), temperature=warmth[k])
         _, one = correction.reading(reading, stamps[k], main_field=reference[k], where=where[k])
         total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
         if any(notice.text.startswith("unexplained") for notice in learner.notices):
             alarms.append((k, learner.state.causes))
-        if "-v" in sys.argv and learner.notices:
-            print(
-                k,
-                "; ".join(n.text for n in learner.notices),
-                learner.state.causes,
-                np.round(learner.state.rms, 1),
-            )
         learner.notices.clear()
-    return Seen(total, sigma, quality, alarms)
+    return Published(total, sigma, quality, alarms)
 
 
 def at_rest(quality: np.ndarray) -> np.ndarray:
-    """Return whether the masses were at rest until what telemetry said next."""
+    """Return whether the masses were at rest up to the next telemetry (n,)."""
     rest = (quality & int(Quality.MOVING | Quality.STALE_TELEMETRY)) == 0
     rest[:-1] &= rest[1:]
     return np.asarray(rest)
 
 
 def wrong_by(log: xr.Dataset) -> np.ndarray | float:
-    """Return by how much the reference is wrong, nT (n,)."""
+    """Return the error of the reference, nT (n,)."""
     return log["reference_error"].to_numpy() if "reference_error" in log else 0.0
 
 
-def run(name: str, seed: int, length: float, size: float) -> Row:
+def run(name: str, seed: int, length: float, size: float) -> list[Row]:
     """Simulate, calibrate, change, correct while learning, and score."""
     change, cause, begins = CHANGES[name]
     runs, log = fly(name, seed, length)
@@ -166,74 +286,76 @@ def run(name: str, seed: int, length: float, size: float) -> Row:
     values, time = side_by_side(log, MASSES), log["time"].to_numpy()
     fixed = correct(calibration, channels(log), values, time)
     exact = correct(calibration, channels(clean), side_by_side(clean, MASSES), time)
-    learner = Learner(calibration, currents=currents(log))
-    seen = learn(learner, calibration, log)
+    seen = learn(Learner(calibration, currents=currents(log)), calibration, log)
     rest = at_rest(seen.quality)
-    metres = separation(*(log[name].to_numpy()[[0, 100]].tolist()[0] for name in ("latitude", "longitude")),
-                        *(log[name].to_numpy()[100] for name in ("latitude", "longitude")))  # fmt: skip
-    speed = float(np.hypot(*metres)) / (time[100] - time[0])
-    rock = Align().reference_sigma, LENGTH / speed
     reference = magnitude(main_field(log))
-    peer = online(fixed.vector, fixed.total, reference, time, rest, calibration.noise.sensor, rock)
+    peer = online(
+        fixed.vector, fixed.total, reference, time, rest, calibration.noise.sensor, field_model(log)
+    )
     best = best_field(added, log, rest, calibration, reference) if added.any() else fixed.total
     late = rest & (hours(log) > min(3.0, 0.5 * length))
-    floor = calibration.noise.sensor
+    row: Row = {"change": name, "seed": seed}
+    for label, total in (("fixed", fixed.total), ("peer", peer), ("bound", best), ("published", seen.total)):
+        row[label] = float(np.std((total - truth)[late])) / calibration.noise.sensor
     since = int(begins * len(time))
     real = [(k, causes) for k, causes in seen.alarms if cause and k >= since]
     found = real[0] if real else None
-    effect = np.where(np.arange(len(time)) >= since, fixed.total - exact.total - wrong_by(log), 0.0)
-    optimal = best_delay(effect, log, rest, calibration, since)
-    until = np.count_nonzero(rest[since : found[0]]) + 1 if found else np.nan
     after = late & (np.arange(len(time)) >= (found[0] if found else 0))
-    error = seen.total - truth
-    beyond = rest & (np.abs(error) > 3.0 * seen.sigma)
-    moved = learner.learned().coefficients[: len(calibration.coefficients)] - calibration.coefficients
-    spread = np.sqrt(np.diag(calibration.covariance) + 20.0**2)
-    return Row(
-        fixed=float(np.std((fixed.total - truth)[late])) / floor,
-        peer=float(np.std((peer - truth)[late])) / floor,
-        bound=float(np.std((best - truth)[late])) / floor,
-        published=float(np.std(error[late])) / floor,
-        sigma=rms((error / seen.sigma)[after]),
-        beyond=np.count_nonzero(beyond[since:]) / optimal if cause else np.nan,
-        delay=until / optimal if cause else np.nan,
-        among=np.nan if not cause else float(found is not None and cause in found[1]),
-        alone=np.nan if not cause else float(found is not None and found[1] == (cause,)),
-        false=len(seen.alarms) - len(real),
-        moved=float(np.abs(moved / spread).max()),
-    )
+    row["sigma"] = rms(((seen.total - truth) / seen.sigma)[after])
+    row["false"] = float(len(seen.alarms) - len(real))
+    if cause:
+        effect = np.where(np.arange(len(time)) >= since, fixed.total - exact.total - wrong_by(log), 0.0)
+        optimal = best_delay(effect, log, rest, calibration, since)
+        until = np.count_nonzero(rest[since : found[0]]) + 1 if found else np.nan
+        row |= {
+            "delay": until / optimal,
+            "among": float(found is not None and cause in found[1]),
+            "alone": float(found is not None and found[1] == (cause,)),
+        }
+    return [row]
+
+
+def field_model(log: xr.Dataset) -> tuple[float, float]:
+    """Return standard deviation (nT) and time constant (s) of the crustal field along a track."""
+    latitude, longitude, time = (log[name].to_numpy() for name in ("latitude", "longitude", "time"))
+    metres = separation(latitude[0], longitude[0], latitude[100], longitude[100])
+    speed = float(np.hypot(*metres)) / (time[100] - time[0])
+    return Align().reference_sigma, LENGTH / speed
+
+
+STUDY = Study(
+    run,
+    ("change",),
+    {
+        "fixed": Column("fixed"),
+        "MagNav": Column("peer"),
+        "bound": Column("bound"),
+        "published": Column("published"),
+        "maximum": Column("published", np.max),
+        "normalised": Column("sigma"),
+        "its minimum": Column("sigma", np.min),
+        "its maximum": Column("sigma", np.max),
+        "delay": Column("delay", form=".1f"),
+        "its maximum ": Column("delay", np.max, ".1f"),
+        "among": Column("among", np.mean, ".0%"),
+        "alone": Column("alone", np.mean, ".0%"),
+        "false": Column("false", np.sum, ".0f"),
+    },
+)
 
 
 def main() -> None:
     """Run, and print a table."""
-    parser = command_line(__doc__)
+    parser = study_options(__doc__)
     parser.add_argument("--seeds", type=int, default=10, help="gliders")
     parser.add_argument("--first", type=int, default=0, help="the first glider")
     parser.add_argument("--hours", type=float, default=12.0, help="of the survey")
     parser.add_argument("--size", type=float, default=20.0, help="nT of a change, in times its kind's unit")
     parser.add_argument("--changes", nargs="+", default=list(CHANGES), choices=list(CHANGES))
-    parser.add_argument("-v", action="store_true", help="print the notices")
-    add_engine(parser)
-    asked = parser.parse_args()
-    shown = table(
-        f"{asked.seeds} gliders, {asked.hours:g} h, {asked.size:g} nT",
-        "", "fixed", "MagNav", "bound", "published", "95 %", "sigma", "beyond", "delay", "among",
-        "alone", "false", "moved",
-    )  # fmt: skip
-    seeds = range(asked.first, asked.first + asked.seeds)
-    cases = [(name, seed, asked.hours, asked.size) for name in asked.changes for seed in seeds]
-    done = np.array(in_order(run, cases, asked)).reshape(len(asked.changes), len(seeds), -1)
-    for name, rows in zip(asked.changes, done, strict=True):
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            middle, high, mean = np.nanmedian(rows, 0), np.nanquantile(rows, 0.95, 0), np.nanmean(rows, 0)
-        shown.add_row(
-            name,
-            *(f"{one:.2f}" for one in middle[:4]), f"{high[3]:.2f}", f"{middle[4]:.2f}",
-            f"{high[5]:.1f}", f"{middle[6]:.1f}", f"{mean[7]:.0%}", f"{mean[8]:.0%}",
-            f"{rows[:, 9].sum():.0f}", f"{high[10]:.1f}",
-        )  # fmt: skip
-    Console(width=120).print(shown)
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.seeds)
+    cases = [(name, seed, options.hours, options.size) for name in options.changes for seed in seeds]
+    STUDY.main(f"{options.seeds} gliders, {options.hours:g} h, {options.size:g} nT", cases, options)
 
 
 if __name__ == "__main__":

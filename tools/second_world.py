@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from studies import command_line
-from study.rates import fraction, one_of
+from studies import command_line, fraction
+from study.ideal import cause_names
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.fit import fit
@@ -245,9 +245,9 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
 
 def reported(name: str, found: Diagnosis) -> dict[str, Any]:
     """Return the hidden, the named and the possible causes."""
-    named = one_of(one.candidate.cause for one in found.findings)
+    named = cause_names(one.candidate.cause for one in found.findings)
     named |= {"outliers"} if found.wrong is not None else set()
-    sets = named | one_of(r.candidate.cause for one in found.findings for r in one.competing)
+    sets = named | cause_names(r.candidate.cause for one in found.findings for r in one.competing)
     return {"hidden": name, "named": sorted(named), "sets": sorted(sets), "verdict": found.verdict}
 
 

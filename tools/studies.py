@@ -23,8 +23,20 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
+from scipy.stats import binomtest
 
-__all__ = ["Column", "Study", "add_engine", "as_done", "command_line", "in_order", "table"]
+__all__ = [
+    "Column",
+    "Study",
+    "add_engine",
+    "command_line",
+    "fraction",
+    "fraction_within",
+    "in_order",
+    "percentile",
+    "study_options",
+    "table",
+]
 
 Row = dict[str, Any]
 Statistic = Callable[[np.ndarray], float]
@@ -81,23 +93,36 @@ class Column:
 
     Attributes
     ----------
-    of : str
-        Column of the rows.
+    source : str or tuple of str
+        Column of the rows, or several.
     statistic : callable
-        Takes the finite values (n,), and returns a number.
+        Takes the finite values, (n,) or (n, columns), and returns a number.
     form : str
         Format of the number.
     """
 
-    of: str
+    source: str | tuple[str, ...]
     statistic: Statistic = np.median
     form: str = ".2f"
 
     def cell(self, rows: pd.DataFrame) -> str:
         """Return the statistic of the rows, as text; empty where no row has a value."""
-        values = rows[self.of].to_numpy(dtype=float) if self.of in rows else np.empty(0)
-        values = values[np.isfinite(values)]
-        return f"{self.statistic(values):{self.form}}" if values.size else ""
+        names = [self.source] if isinstance(self.source, str) else list(self.source)
+        if not set(names) <= set(rows):
+            return ""
+        values = rows[names].to_numpy(dtype=float)
+        values = values[np.isfinite(values).all(axis=1)]
+        values = values[:, 0] if len(names) == 1 else values
+        return f"{self.statistic(values):{self.form}}" if len(values) else ""
+
+
+def fraction(good: Sequence[bool] | np.ndarray) -> str:
+    """Return the percentage of the true values with its 95 % interval (Clopper and Pearson 1934) | count."""
+    n, k = len(good), int(np.sum(good))
+    if not n:
+        return "not run | 0"
+    low, high = binomtest(k, n).proportion_ci()
+    return f"{100 * k / n:.1f} % ({100 * low:.1f}-{100 * high:.1f}) | {k}/{n}"
 
 
 def percentile(per_cent: float) -> Statistic:
@@ -140,7 +165,9 @@ class Study:
             kept = pd.concat([kept, new], ignore_index=True) if len(kept) else new
             if path is not None:
                 kept.to_parquet(path)
-        return kept[kept["case"].isin(names)].reset_index(drop=True)
+        order = {name: number for number, name in enumerate(names)}
+        rows = kept[kept["case"].isin(names)]
+        return rows.sort_values("case", key=lambda case: case.map(order), kind="stable", ignore_index=True)
 
     def table(self, title: str, rows: pd.DataFrame) -> Table:
         """Return the table of rows."""

@@ -19,9 +19,8 @@ from typing import Any
 import harmonica as hm
 import numpy as np
 import xarray as xr
-from bound import SurveyBound, oracle
 from studies import Column, Row, Study, fraction_within, percentile, study_options
-from study_worlds import MASSES, NOISES, GaussianRock, drifted, fly_survey, true_field
+from study_worlds import MASSES, NOISES, GaussianRock, SurveyBound, drifted, fly_survey, oracle, true_field
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from navigation_studies.simulated import Map, synthetic
 from referee.loop import Passage
 from referee.receiver import Receiver, honest
+from voyages import Map, synthetic
 
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid

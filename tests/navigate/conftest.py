@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from navigation_studies.simulated import Map, synthetic
+from voyages import Map, synthetic
 
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.options import Options

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import xarray as xr
 from msgspec.structs import replace
-from navigation_studies.others import flight
-from navigation_studies.simulated import PLACE, Map, synthetic, track_over
 from pace import cost
+from voyages import PLACE, Map, magnav_flight, synthetic, track_over
 
 from magbridge.errors import FormatError
 from magbridge.field.geodesy import metres_per_degree
@@ -214,7 +213,7 @@ def test_magnavs_published_flight(real_data: Path) -> None:
     Its own filter's error on this flight is not stated with the data; asked here is that the field does no
     harm over so short a time, and that the innovations agree with what was claimed.
     """
-    grid, ds = flight(real_data / "magnav_example")
+    grid, ds = magnav_flight(real_data / "magnav_example")
     options = Options(start_sigma=10.0, current_sigma=0.5, bias_sigma=5.0, map_sigma=3.0, drift=0.1)
     result = navigate(ds, grid, options)
     assert rms(result) < 60.0

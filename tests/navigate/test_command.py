@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
-from navigation_studies.simulated import track_over
+from voyages import track_over
 
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from msgspec.structs import replace
-from navigation_studies.dived import dived
-from navigation_studies.simulated import GLIDER, Map, sail, synthetic, track_over
+from voyages import GLIDER, Map, dived, sail, synthetic, track_over
 
 from magbridge.cli.navigate import _continued
 from magbridge.field.continuation import continued, smoothed

@@ -7,7 +7,7 @@ from math import hypot
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from navigation_studies.simulated import Map, blocks, synthetic, track_over
+from voyages import Map, blocks, synthetic, track_over
 
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.estimate import SPREADS, Estimate

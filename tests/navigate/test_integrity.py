@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from navigation_studies.lost import misled
-from navigation_studies.simulated import OUTSIDE, PLACE, Map, sail, track_over
+from voyages import OUTSIDE, PLACE, Map, misled, sail, track_over
 
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid

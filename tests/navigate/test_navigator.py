@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from msgspec.structs import replace
-from navigation_studies.lost import carried
-from navigation_studies.simulated import PLACE, Map, sail, synthetic, track_over
+from voyages import PLACE, Map, carried, sail, synthetic, track_over
 
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from navigation_studies.simulated import PLACE
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
+from voyages import PLACE
 
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid

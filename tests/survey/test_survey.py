@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import Command
 from msgspec import structs
-from navigation_studies.simulated import GLIDER, PLACE, Map, sail, synthetic, track_over
+from voyages import GLIDER, PLACE, Map, sail, synthetic, track_over
 
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset, separation

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from bound import BestFit, SurveyBound, oracle
+from study_worlds import BestFit, SurveyBound, oracle
 
 from magbridge.estimation.residual import rms
 from sitl import Twin, load, segments, simulate
@@ -52,8 +52,8 @@ def test_a_best_fit_s_error_is_its_bound(flight: tuple[Vehicle, xr.Dataset, xr.D
 
 def test_with_only_the_hard_iron_unknown_the_bound_is_three_sines(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bare vehicle: the hard iron's information is the sum of the field's directions, over the variance."""
-    monkeypatch.setattr("bound.SOFT_IRON", 1e-12)
-    monkeypatch.setattr("bound.HARD_IRON", 1e6)
+    monkeypatch.setattr("study_worlds.SOFT_IRON", 1e-12)
+    monkeypatch.setattr("study_worlds.HARD_IRON", 1e6)
     scenario = SCENARIO.replace(vehicle=Vehicle())
     parts = segments(simulate(scenario, 1))
     u, v = (

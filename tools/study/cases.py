@@ -1,9 +1,8 @@
-"""The cases: which effects each part of the study hides, and what is recorded of a case's diagnosis."""
+"""The cases: the hidden effects of each part of the study, and the result of a case's diagnosis."""
 
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,18 +11,28 @@ import numpy as np
 import xarray as xr
 from foreign import FOREIGN
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray
+from magbridge.calibration.model import Calibration
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
+from sitl.dataset import corrected
 from sitl.inject import EFFECTS, Hidden
-from study.both import both
-from study.deployment import CHARTS, SEEDS, Background, Injected, deployment_of
-from study.improvement import DELAYS, harm, improvement
-from study.noise import FLICKER, GLIDER, LOSSES, NOISES
-from study.theory import Setting, ideal
+from study.deployment import (
+    CHARTS,
+    DAY,
+    FLICKER,
+    GLIDER,
+    LOSSES,
+    NOISES,
+    SEEDS,
+    Background,
+    add_noise,
+    deployment_of,
+    rebuilt,
+)
+from study.ideal import ideal
 
 Row = dict[str, Any]
 NAMES = tuple(EFFECTS)
@@ -40,14 +49,14 @@ LASTING = (
 of one log."""
 NAMELESS = ("unknown", "seen", "foreign")
 """Parts in which the hidden effect is not among the causes of the table."""
-PREDICTED = ("named", "ladder", "pair", *NAMELESS)
-"""Parts for which theory predicts the outcome."""
+PREDICTED = ("named", "ladder")
+"""Parts for which the ideal detector is computed."""
 STRANGE = ("jettison", "duet", "winch", "mooring")
-"""Foreign effects made after the detector was frozen; its descriptions were not designed for them either."""
+"""Foreign effects that were made after the detector was frozen."""
 SEEN = (
     "pan", "loose", "corrosion", "pulsation", "needle", "thermostat", "perming", "staircase",
 )  # fmt: skip
-"""Foreign effects that were once made for this purpose, but before the detector was last improved."""
+"""Foreign effects that were made before the detector was last improved."""
 GOLDEN = 0.6180339887498949
 
 
@@ -96,7 +105,7 @@ def _gain(k: int) -> Row:
 
 
 def _charted(k: int) -> Row:
-    """As the paper's log: the reference is a map, the vehicle surfaces; a third of the cases hide nothing."""
+    """Return a case like the paper's log: the reference is a map; a third of the cases hide nothing."""
     names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
     return {
         "names": names, "wanted": LOUD[k % len(LOUD)] * bool(names), "noise": GLIDER,
@@ -105,7 +114,7 @@ def _charted(k: int) -> Row:
 
 
 def _flicker(k: int) -> Row:
-    """In flicker noise, nothing or a cause that lasts; S/N is counted in white noise of the same RMS."""
+    """Return a case in flicker noise; its signal-to-noise refers to white noise of the same RMS."""
     names = () if k % 3 == 0 else (LASTING[k % len(LASTING)],)
     return {"names": names, "wanted": 25.0 * bool(names), "noise": FLICKER}
 
@@ -126,9 +135,9 @@ PARTS: dict[str, Part] = {
 
 
 def losses(k: int) -> str:
-    """Return how the k-th case of a part loses samples: one in three does, in one of the four ways.
+    """Return how the k-th case of a part loses samples: every third does, in one of four ways.
 
-    Multiples of the golden section keep no step with the cycles of causes, noises and sizes.
+    Multiples of the golden section are not in step with the cycles of causes, noises and sizes.
     """
     place = int(3 * len(LOSSES) * (GOLDEN * k % 1.0))
     return LOSSES[place] if place < len(LOSSES) else ""
@@ -137,8 +146,8 @@ def losses(k: int) -> str:
 def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> list[Row]:
     """Return the study's entries, the parts evenly mixed; a longer study contains the shorter one.
 
-    Another `seed` hides the same causes at the same signal-to-noise in other vehicles, and draws everything
-    else anew.
+    Another `seed` hides the same causes at the same signal-to-noise in other vehicles; all else is drawn
+    again.
     """
     made = []
     # the last two share their hundred thousand: a seed has no more numbers
@@ -157,7 +166,7 @@ def plan(cases: int, parts: tuple[str, ...] = tuple(PARTS), seed: int = 0) -> li
 
 
 def case(entry: Row) -> Row:
-    """Hide the effects of an entry, diagnose the log, and return the outcome beside theory's prediction."""
+    """Hide the effects of an entry, diagnose the log, and return the result with the ideal detector's."""
     began = time.process_time()
     number, noise, names, without = entry["number"], entry["noise"], entry["names"], entry.get("without", "")
     deployment = deployment_of(number, noise, entry.get("reference", "true"))
@@ -178,13 +187,13 @@ def case(entry: Row) -> Row:
         ],
         "p_value": result.outcome.p_value,
         "scores": _scores(found, names, whole),
-        "theory": _theory(entry["part"], hidden, background, ds, result),
+        "theory": [],
     }
-    if entry["part"] == "gain":
-        row["gain"] = improvement(hidden[0].hidden, background, ds, result)
+    if entry["part"] in PREDICTED and names != ("outliers",):
+        row["theory"] = [ideal(hidden[0], background, ds, result.outcome.look_elsewhere)]
     if entry["part"] == "charted":
         row["gain"] = harm(tuple(one.hidden for one in hidden), background, ds, result)
-    return row | {"seconds": time.process_time() - began, "worker": os.getpid()}
+    return row | {"seconds": time.process_time() - began}
 
 
 def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float]:
@@ -200,39 +209,29 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
     ]
 
 
-def _theory(
-    part: str, hidden: list[Injected], background: Background, ds: xr.Dataset, result: Diagnosis
-) -> list[dict[str, Any]]:
-    """Return theory's prediction for a case of one hidden effect, or of two at once."""
-    names = [one.hidden.name for one in hidden]
-    if part not in PREDICTED or "outliers" in names:  # nothing else comes one by one
-        return []
-    late = next((one for one in hidden if one.hidden.name in DELAYS), hidden[0])
-    others = {
-        other: alike(other, late, background)
-        for other in DELAYS
-        if late.hidden.name in DELAYS and other not in names
-    }
-    free: list[Description] = []
-    if part in NAMELESS:
-        tones = CAUSES[names[0]].candidates(result.problem) if names[0] == "interference_tone" else []
-        free = descriptions(result.problem, result.outcome.null, *tones[:1])
-    setting = Setting(CAUSES, result.outcome.look_elsewhere, free, others)
-    if len(hidden) > 1:
-        return [both(hidden, background, ds, setting)]
-    return [ideal(hidden[0], background, ds, setting)]
+def harm(
+    hidden: tuple[Hidden, ...], background: Background, ds: xr.Dataset, result: Diagnosis
+) -> dict[str, float]:
+    """Return mean square errors (nT²) against the true field, as calibrated and extended.
 
-
-def alike(other: str, late: Injected, background: Background) -> FloatArray:
-    """Signature of the other delay cause, at this delay, in the log that hides `late`, of a possible sign.
-
-    A field that is late looks like a clock that is early, except where a mass starts or stops within the
-    delay of a sample. There the telemetry of an early clock shows the motion one delay earlier, when a filter
-    has covered ``1 - 1/e`` of its response; so, with the same telemetry, 1/e of the two signatures'
-    difference remains. The telemetry of a log whose filter lags fits an early clock just as well.
+    They are computed on this log, and on one of another day (keys with " elsewhere").
     """
-    d = late.signature
-    if other == "clock_offset":
-        return d
-    f = background.show(Hidden(other, late.hidden.size, background.number)).signature
-    return d + np.exp(-1.0) * (f - d) if f @ d > 0.0 else f
+    calibration, number = background.deployment.calibration, background.number + 1
+    other = rebuilt(background.deployment, DAY).measure(hidden, number)
+    errors: dict[str, float] = {}
+    for log, where in ((ds, ""), (add_noise(other, background.noise, number), " elsewhere")):
+        truth = log["truth_total_field"].to_numpy()
+        inside = _inside(log, ds, calibration)
+        for name, one in (("before", calibration), ("after", result.calibration)):
+            error = (corrected(log, one).total - truth)[inside]
+            errors[name + where] = float(np.nanmean(error**2))
+    return errors
+
+
+def _inside(other: xr.Dataset, ds: xr.Dataset, calibration: Calibration) -> BoolArray:
+    """Return the samples of a log whose masses stand within the range that those of `ds` covered."""
+    inside = np.ones(other.sizes["time"], bool)
+    for parameter in calibration.parameters:
+        known = ds[parameter.name]
+        inside &= ((other[parameter.name] >= known.min()) & (other[parameter.name] <= known.max())).to_numpy()
+    return inside

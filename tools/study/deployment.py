@@ -1,4 +1,4 @@
-"""Vehicles with their calibrations, their deployments, and effects of a wanted size hidden in them."""
+"""Vehicles with their calibrations, their deployments, and effects of a requested size hidden in them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 from foreign import FOREIGN
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import FloatArray, IndexArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
@@ -25,11 +25,25 @@ from magbridge.field.reference import reference_field
 from sitl import Twin, load, simulate
 from sitl.inject import EFFECTS, Hidden, disturb
 from sitl.mission import CrissCross, Spirals
-from sitl.signals import first_order
+from sitl.signals import correlated, first_order
 from sitl.trajectory import Track
 from sitl.world import Water, World
-from study.noise import GLIDER, Rows, add_noise, kept_rows, statistics, whiten
 
+Rows = IndexArray
+MEMORY = 0.8
+"""Correlation of neighbouring samples in autoregressive noise."""
+SLOWER = 0.95
+"""Correlation of neighbouring samples in the autoregressive third (by power) of mixed noise."""
+NOISES = ("white", "ar", "mixed", "heavy", "uneven", "half", "map")
+"""White; autoregressive; white plus slower autoregressive; heavy-tailed; of varying level; 1.5 times as large
+as in the calibration; white over a stronger crustal field."""
+FLICKER, CORNER = "flicker", 0.1
+"""Noise of 1 nT RMS with a 1/f spectrum below a corner, and that corner over the sampling frequency."""
+GLIDER = "glider"
+"""The noise of the paper's twin: eight times as large, and correlated."""
+LOSSES = ("single", "bursts", "hole", "surfacing")
+"""Lost samples: one in twenty; about two minutes, twelve times; a sixth of the log at once; 44 s of every
+dive."""
 HOURS = 6.0
 """Length of a deployment; the tests' are shorter."""
 VEHICLES = 23
@@ -86,7 +100,7 @@ class Deployment(NamedTuple):
 
 @lru_cache(maxsize=VEHICLES)
 def vehicle(seed: int, rms: float = 60.0, reference: str = "true") -> Deployment:
-    """Draw a vehicle, calibrate it on a log of its own, fly its survey; `rms` (nT) is the rock's field.
+    """Draw a vehicle, calibrate it on a log of its own, fly its survey; `rms` (nT) is the crustal field.
 
     Where the reference is a map, one of :data:`CHARTS`, it is a glider like the paper's: its noise is larger,
     and its offset has changed between calibration and survey.
@@ -249,3 +263,62 @@ class Background(NamedTuple):
                 return made
             size *= wanted / max(found, 1e-9)
         raise RuntimeError(f"{name}, seed {seed}: no size gives S/N {wanted:g}; the last gave {found:.3g}")
+
+
+# ---- noise and lost samples --------------------------------------------------------------------------------
+
+
+def statistics(noise: str) -> tuple[float, float]:
+    """Correlation of neighbouring samples, and 1-sigma (nT), with which theory whitens this noise."""
+    return (MEMORY if noise in ("ar", GLIDER) else 0.0), {"half": 1.5, GLIDER: 8.0}.get(noise, 1.0)
+
+
+def add_noise(ds: xr.Dataset, kind: str, seed: int) -> xr.Dataset:
+    """Add noise of its `kind` to each channel, of unit variance unless the kind says otherwise."""
+    rng = np.random.default_rng([seed, 99])
+    n = ds.sizes["time"]
+    noise = rng.standard_normal((n, 3))
+    if kind == "heavy":
+        noise = rng.standard_t(4.0, (n, 3)) / np.sqrt(2.0)
+    if kind == FLICKER:
+        power = 1.0 + CORNER / np.maximum(np.fft.rfftfreq(n), 1.0 / n)[:, None]
+        noise = np.fft.irfft(np.fft.rfft(noise, axis=0) * np.sqrt(power), n, axis=0)
+        noise /= noise.std()
+    if kind in ("ar", GLIDER):
+        noise = correlated(noise, MEMORY)
+    if kind == "mixed":
+        noise = np.sqrt(2 / 3) * noise + np.sqrt(1 / 3) * correlated(rng.standard_normal((n, 3)), SLOWER)
+    if kind == "uneven":
+        noise *= np.repeat(np.exp(rng.normal(0, 0.5, n // 300 + 1)), 300)[:n, None]
+    out = ds.copy()
+    for k, axis in enumerate("xyz"):
+        out[f"mag_{axis}"] = out[f"mag_{axis}"] + statistics(kind)[1] * noise[:, k]
+    return out
+
+
+def kept_rows(losses: str, n: int, seed: int) -> Rows:
+    """Rows of a log that are kept; all of its n rows where `losses` is empty."""
+    rng = np.random.default_rng([seed, 98])
+    there = np.ones(n, bool)
+    if losses == "single":
+        there = rng.random(n) > 0.05
+    if losses == "bursts":
+        for start, length in zip(rng.integers(0, n, 12), rng.geometric(1 / 30, 12), strict=True):
+            there[start : start + length] = False
+    if losses == "hole":
+        start = rng.integers(1, n - n // 6)
+        there[start : start + n // 6] = False
+    if losses == "surfacing":
+        dive = rng.integers(50, 300)
+        there[(np.arange(n) + rng.integers(dive)) % dive < 11] = False
+    return np.flatnonzero(there)
+
+
+def whiten(x: FloatArray, noise: str, rows: Rows) -> FloatArray:
+    """Innovations, in units of their 1-sigma under the true noise, of a signal x sampled at `rows` alone.
+
+    Over a step of k rows an AR(1) is one of ``rho^k``. The first row has no past and is left out.
+    """
+    memory, sigma = statistics(noise)
+    rho = (memory ** np.diff(rows)).reshape(-1, *[1] * (x.ndim - 1))
+    return np.asarray((x[1:] - rho * x[:-1]) / (sigma * np.sqrt(1 - rho**2)))

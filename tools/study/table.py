@@ -1,225 +1,281 @@
-"""The study's figures against targets, each beside an ideal detector's, with its count and interval.
+"""The table of the blind study, each figure with that of an ideal detector, and its two plots.
 
-Intervals are of 95 %.
+Intervals are of 95 %. ``theory`` in a row holds what :func:`study.ideal.ideal` predicts for that case.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import binomtest, norm
+from studies import fraction
 
-from sitl.inject import EFFECTS
-from study.by_cause import by_cause
-from study.deployment import CHARTS
-from study.noise import LOSSES, NOISES
-from study.rates import (
-    Row,
-    against_ideal,
-    beyond_any_name,
-    chance,
-    curve,
-    efficiency,
-    found,
-    fraction,
-    gained,
-    hidden,
-    holds,
-    in_named_set,
-    nameable,
-    off,
-    percent,
-    reached,
-    right,
-    right_alone,
-    scores,
-    second,
-    sets,
-    share,
-    unexplained,
-    worse,
-)
+from magbridge.arrays import FloatArray
+from study.cases import KNOWN, NAMELESS
+from study.deployment import CHARTS, NOISES
+from study.ideal import EQUIVALENT, SIZES, cause_names
 
-Parts = dict[str, list[Row]]
-OFF = 0.15
-"""Most by which the point of half detection may differ from theory's, as a fraction."""
-Line = tuple[str, str, str, str]
-"""Figure, target, what an ideal detector does, what was measured | in how many cases."""
+Row = dict[str, Any]
+Line = tuple[str, str, str]
+"""Figure, value of an ideal detector, measured value | number of cases."""
+MIN_CHANCE = 0.95
+"""Chance of the ideal detector to name the truth alone, from which on a case is held to it."""
+MAX_IDEAL_P_VALUE = 0.1
+"""Largest p-value of the ideal detector for which the sensitivities are compared: p-values end at one."""
+NEITHER = "no name"
+
+
+# ---- the result of one case --------------------------------------------------------------------------------
+
+
+def hidden(row: Row) -> set[str]:
+    """Return the hidden causes."""
+    return cause_names(row["names"])
+
+
+def found(row: Row) -> bool:
+    """Return True if the diagnosis finds anything."""
+    return bool(row["verdict"] != "nothing_found")
+
+
+def asserted(row: Row) -> set[str]:
+    """Return the causes that the diagnosis names."""
+    return cause_names(entry[0] for entry in row["found"])
+
+
+def sets(row: Row) -> set[str]:
+    """Return the named causes, their alternatives, and those that an unexplained residual keeps."""
+    kept = (row["unexplained"] or {}).get("alternatives", ())
+    alternatives = [cause_names(entry[3]) for entry in row["found"]]
+    return asserted(row).union(*alternatives, cause_names(a["cause"] for a in kept))
+
+
+def is_right_alone(row: Row) -> bool:
+    """Return True if exactly the truth is named, without alternatives."""
+    return asserted(row) == sets(row) == hidden(row)
+
+
+def holds(row: Row) -> bool:
+    """Return True if the truth is in the set of names."""
+    return hidden(row) <= sets(row)
+
+
+def has_second(row: Row) -> bool:
+    """Return True if more causes are named than are hidden."""
+    return len(asserted(row)) > max(len(hidden(row)), 1)
+
+
+def is_nameable(row: Row) -> bool:
+    """Return True if an ideal detector names the truth alone."""
+    return all(theory["alone"] >= MIN_CHANCE for theory in row["theory"])
+
+
+def is_worse(row: Row) -> bool:
+    """Return True if an extension does harm, on its own log or on another day's."""
+    error = row["gain"]
+    return any(error["after" + log] > 1.02 * error["before" + log] for log in ("", " elsewhere"))
+
+
+# ---- rates over many cases ---------------------------------------------------------------------------------
+
+
+def share(rows: Sequence[Row], good: Callable[[Row], bool]) -> str:
+    """Return the percentage of the rows that are good, with its interval and the count."""
+    return fraction([good(row) for row in rows])
+
+
+def scores(rows: Sequence[Row]) -> FloatArray:
+    """Return (value - truth) / sigma of all parameters of known truth."""
+    return np.array([z for row in rows for z in row["scores"]])
+
+
+def chance(rows: Sequence[Row], key: str) -> str:
+    """Return the mean chance of the ideal detector, as text."""
+    values = [theory[key] for row in rows for theory in row["theory"]]
+    return f"{100 * np.mean(values):.0f} %" if values else "-"
+
+
+def detection_curve(rows: Sequence[Row], size: FloatArray | float) -> FloatArray:
+    """Return the ideal detector's mean chance to find the rows' effects at a signal-to-noise."""
+    theory = [theory for row in rows for theory in row["theory"]]
+    if not theory:
+        return np.full(np.shape(size), np.nan)
+    half, sure = np.array([(one["half"], one["sure"]) for one in theory]).T
+    width = (sure - half) / norm.ppf(0.95)
+    return np.asarray(norm.cdf((np.asarray(size)[..., None] - half) / width).mean(axis=-1))
+
+
+def needed_size(rows: Sequence[Row]) -> tuple[float, float, float] | None:
+    """Return the signal-to-noise that the detector needs over the ideal one's, with a 68 % interval.
+
+    Both have the same noise, which cancels. So one log that is compared in this way has the information of
+    dozens that are only counted as found or not.
+    """
+    known = [row for row in rows if row["theory"]]
+    known = [r for r in known if np.interp(r["wanted"], SIZES, r["theory"][0]["here"]) < MAX_IDEAL_P_VALUE]
+    if len(known) < 3:
+        return None
+    logs = np.log([row["wanted"] / equal_size(row) for row in known])
+    middle, error = float(np.mean(logs)), float(np.std(logs, ddof=1) / np.sqrt(len(logs)))
+    return float(np.exp(middle)), float(np.exp(middle - error)), float(np.exp(middle + error))
+
+
+def equal_size(row: Row) -> float:
+    """Return the signal-to-noise at which the ideal detector has the diagnosis' p-value in the same noise."""
+    surprise = -np.log(np.minimum.accumulate(row["theory"][0]["here"]))
+    return float(np.interp(-np.log(row["p_value"]), surprise, SIZES))
+
+
+# ---- the table ---------------------------------------------------------------------------------------------
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return the tables: the figures, logs with losses beside whole ones, and cause by cause."""
+    """Return the lines of the table, in Markdown."""
     part = {name: [r for r in rows if r["part"] == name] for name in {r["part"] for r in rows}}
-    true = [r for r in rows if r["part"] not in ("charted", "flicker")]
     figures = [
-        *_nulls(part.get("null", [])), *_flicker(part.get("flicker", [])), *_detection(part),
-        *_sets(part.get("named", [])), *_parameters(true), *_gains(part.get("gain", [])), *_harm(part),
-        *_nameless(part), *_pairs(part.get("pair", [])),
-    ]  # fmt: skip
-    return [
-        "| figure | target | ideal detector | measured (95 % interval) | cases |",
-        "|---|---|---|---|---|",
-        *(f"| {' | '.join(line)} |" for line in figures),
-        "",
-        *_losses(true),
-        "",
-        *by_cause(part),
+        *_nulls(part.get("null", [])),
+        *_detection(part),
+        *_names(part.get("named", [])),
+        *_parameters([r for r in rows if r["part"] not in ("charted", "flicker")]),
+        *_others(part),
     ]
+    header = ("| figure | ideal detector | measured (95 % interval) | cases |", "|---|---|---|---|")
+    return [*header, *(f"| {' | '.join(line)} |" for line in figures)]
 
 
-def _nulls(nulls: Sequence[Row]) -> list[Line]:
-    def of(label: str, rows: Sequence[Row], target: str = "") -> Line:
-        return label, target, "1 %", share(rows, found)
-
-    return [
-        of("false alarm on nulls", nulls, "at most 1 %"),
-        *(of(f"... {noise}", [r for r in nulls if r["noise"] == noise]) for noise in NOISES),
-        *(of(f"... samples lost, {how}", [r for r in nulls if r["losses"] == how]) for how in LOSSES),
-    ]
+def _nulls(rows: Sequence[Row]) -> list[Line]:
+    kinds = [(f"... {noise}", [r for r in rows if r["noise"] == noise]) for noise in NOISES]
+    return [(label, "1 %", share(own, found)) for label, own in (("false alarms", rows), *kinds)]
 
 
-def _flicker(rows: Sequence[Row]) -> list[Line]:
-    one, none = ([r for r in rows if bool(r["names"]) == hides] for hides in (True, False))
-    return [
-        ("in flicker noise, nothing hidden: a name", "", "", share(none, lambda r: bool(r["found"]))),
-        ("... one hidden: named", "", "", share(one, right)),
-        ("... a false second name", "", "", share(one, second)),
-    ]
-
-
-def _detection(part: Parts) -> list[Line]:
+def _detection(part: dict[str, list[Row]]) -> list[Line]:
     single = [r for name in ("ladder", "named", "gain", "loud") for r in part.get(name, [])]
     known = part.get("ladder", []) + part.get("named", [])
-    targets = {8.0: "at least 95 %"} | dict.fromkeys((15.0, 20.0, 25.0, 50.0, 100.0), "no loss")
     out: list[Line] = []
-    for size in sorted({r["wanted"] for r in single} | {8.0}):
+    for size in sorted({r["wanted"] for r in single}):
         own = [r for r in single if r["wanted"] == size]
-        expected = percent(float(curve(known, size)))
-        out.append((f"detection at S/N {size:g}", targets.get(size, ""), expected, share(own, found)))
-        each = [[r for r in own if list(r["names"]) == [name]] for name in EFFECTS]
-        least = min(filter(None, each), key=lambda rows: np.mean([*map(found, rows)]), default=[])
-        if size == 8.0 and least:
-            rare = percent(float(curve(least, size)))
-            label = f"... each cause; least often {least[0]['names'][0]}"
-            out.append((label, "at least 95 %", rare, share(least, found)))
-    for label, factor in (
-        ("point of half detection, against theory's (68 % interval): by what is found", efficiency(known)),
-        ("... by p-values, theory's with the same noise", against_ideal(known)),
-    ):
-        if factor:
-            out.append((label, "within 15 %", "0 %", f"{off(factor)} | {len(known)}"))
-    factors = [against_ideal([r for r in known if list(r["names"]) == [name]]) for name in EFFECTS]
-    if within := [abs(factor[0] - 1.0) <= OFF for factor in factors if factor]:
-        share_within = f"{sum(within)} of {len(within)} | {len(known)}"
-        out.append(("... cause by cause: within 15 %", "all", "all", share_within))
+        out.append((f"S/N {size:g}: found", f"{100 * detection_curve(known, size):.0f} %", share(own, found)))
+    if factor := needed_size(known):
+        middle, low, high = (100 * (f - 1) for f in factor)
+        text = f"{middle:+.0f} % ({low:+.0f} to {high:+.0f} %, of 68 %) | {len(known)}"
+        out.append(("S/N needed beyond an ideal detector's", "0 %", text))
     return out
 
 
-def _sets(named: Sequence[Row]) -> list[Line]:
-    """Lines on a case's set: what is named, its alternatives, and those of what is 'unexplained'."""
-    out: list[Line] = [("one hidden: a false second name", "at most 3 %", "", share(named, second))]
-    for label, rows, targets in (
-        ("where theory allows 95 %", [*filter(nameable, named)], ("at least 90 %", "", "at most 1.5")),
-        ("elsewhere", [r for r in named if not nameable(r)], ("", "at least 97 %", "")),
-    ):
-        alone, inside = (percent(chance(rows, key)) for key in ("alone", "inside"))
-        size = f"{chance(rows, 'size'):.2f}"
+def _names(rows: Sequence[Row]) -> list[Line]:
+    nameable = [r for r in rows if is_nameable(r)]
+    other = [r for r in rows if not is_nameable(r)]
+    out: list[Line] = [("S/N 8: a false second name", "", share(rows, has_second))]
+    for label, own in (("where the ideal detector can", nameable), ("elsewhere", other)):
         out += [
-            (f"S/N 8, {label}: named alone and right", targets[0], alone, share(rows, right_alone)),
-            ("... the set holds the truth", targets[1], inside, share(rows, holds)),
-            ("... mean size of the set", targets[2], size, _mean_size(rows, sets)),
-            ("... without what an 'unexplained' keeps: holds the truth", "", inside,
-             share(rows, lambda r: hidden(r) <= in_named_set(r))),
-            ("... mean size of that", "", size, _mean_size(rows, in_named_set)),
-        ]  # fmt: skip
+            (f"S/N 8, {label}: named alone and right", chance(own, "alone"), share(own, is_right_alone)),
+            ("... truth in the set of names", chance(own, "inside"), share(own, holds)),
+        ]
     return out
-
-
-def _mean_size(rows: Sequence[Row], of: Callable[[Row], set[str]]) -> str:
-    """Mean size of the sets that are not empty."""
-    sizes = [len(of(r)) for r in rows if of(r)]
-    return f"{np.mean(sizes):.2f} | {len(sizes)}" if sizes else "not run | 0"
 
 
 def _parameters(rows: Sequence[Row]) -> list[Line]:
     out: list[Line] = []
     for label, low, high in (("S/N 8 to 25", 8.0, 25.0), ("S/N 50 and 100", 50.0, 100.0)):
-        own = [r for r in rows if len(r["names"]) == 1 and low <= r["wanted"] <= high]
-        z = scores(own)
-        bias = f"{np.median(z):+.2f} sigma (mean {z.mean():+.2f})" if z.size else "not run"
-        cases = f"{z.size} of {sum(bool(r['scores']) for r in own)} cases"
-        out += [
-            (f"parameters, {label}: median bias", "under 0.2 sigma", "0", f"{bias} | {cases}"),
-            ("... 95 % intervals cover", "92-97 %", "95 %", fraction(np.abs(z) < 1.96)),
-        ]
+        z = scores([r for r in rows if len(r["names"]) == 1 and low <= r["wanted"] <= high])
+        out.append((f"95 % intervals cover, {label}", "95 %", fraction(np.abs(z) < 1.96)))
     return out
 
 
-def _gains(rows: Sequence[Row]) -> list[Line]:
-    label = "gain on another deployment (S/N 20), of an oracle's"
+def _others(part: dict[str, list[Row]]) -> list[Line]:
+    charted, flicker = part.get("charted", []), part.get("flicker", [])
+    outside = [r for name in NAMELESS for r in part.get(name, [])]
+    lines: list[Line] = [
+        (f"harm against a {kind}", "0 %", share([r for r in charted if r["reference"] == kind], is_worse))
+        for kind in CHARTS
+    ]
     return [
-        (f"{label}: median", "at least 80 %", "100 %", f"{percent(gained(rows))} | {len(rows)}"),
-        ("... cases with 80 % of an oracle's", "", "100 %", share(rows, reached)),
+        *lines,
+        ("an effect outside the list gets a name", "0 %", share(outside, lambda r: bool(r["found"]))),
+        ("two at S/N 10, both named", "", share(part.get("pair", []), lambda r: hidden(r) <= asserted(r))),
+        ("flicker noise: a false name", "0 %", share(flicker, lambda r: bool(asserted(r) - hidden(r)))),
     ]
 
 
-def _harm(part: Parts) -> list[Line]:
-    """Lines on harm: errors against the true field, or on another deployment against the true reference."""
-    extended, charted = part.get("gain", []), part.get("charted", [])
-    groups = {"harm: extension makes the corrected field worse": extended + charted}
-    groups |= {f"... against a {kind}": [r for r in charted if r["reference"] == kind] for kind in CHARTS}
-    return [(label, "0", "0 %", share(rows, worse)) for label, rows in groups.items()]
+# ---- the plots ---------------------------------------------------------------------------------------------
 
 
-def _nameless(part: Parts) -> list[Line]:
-    """Lines on effects without a name; a wrong name counts if the diagnosis asserts it."""
-    unknown = part.get("unknown", [])
-    out: list[Line] = []
-    for label, rows in (
-        ("unknown cause, where theory gives no name", [*filter(beyond_any_name, unknown)]),
-        ("foreign, seen before", part.get("seen", [])),
-        ("foreign, sealed until now", part.get("foreign", [])),
-    ):
-        at_best, so = (chance(rows, key) for key in ("unnamed", "described"))
-        ideal = f"{percent(at_best)}; with these descriptions {percent(so)}"
-        out += [
-            (f"{label}: 'unexplained'", "at least 90 %", ideal, share(rows, unexplained)),
-            ("... a wrong name", "at most 15 %", percent(1.0 - at_best),
-             share(rows, lambda r: bool(r["found"]))),
-        ]  # fmt: skip
-    return out
+def confusion(rows: Sequence[Row]) -> tuple[FloatArray, FloatArray]:
+    """Return predicted and measured shares: hidden by row, named first by column, the last without a name."""
+    columns = [*KNOWN, NEITHER]
+    predicted, measured = np.full((2, len(KNOWN), len(columns)), np.nan)
+    for i, name in enumerate(KNOWN):
+        own = [r for r in rows if list(r["names"]) == [name] and r["theory"]]
+        if not own:
+            continue
+        predicted[i], measured[i] = 0.0, 0.0
+        for r in own:
+            for cause, value in r["theory"][0]["first"].items():
+                predicted[i, columns.index(cause)] += value / len(own)
+            named = [EQUIVALENT.get(f[0], f[0]) for f in r["found"] if f[0] in KNOWN]
+            measured[i, columns.index(named[0] if named else NEITHER)] += 1.0 / len(own)
+    return predicted, measured
 
 
-def _pairs(pairs: Sequence[Row]) -> list[Line]:
-    out: list[Line] = []
-    for label, rows in (("where theory names both in 95 %", [*filter(nameable, pairs)]), ("any", pairs)):
-        at_best, so, inside = (percent(chance(rows, key)) for key in ("both", "regressed", "inside"))
-        ideal = f"{at_best}; with these regressors {so}"
-        out += [
-            (f"two at S/N 10, {label}: both named", "at least 80 %", ideal, share(rows, right)),
-            ("... both in the sets", "", inside, share(rows, holds)),
-        ]
-    return out
+def plot_confusion(rows: Sequence[Row], path: Path) -> None:
+    """Draw both matrices of :func:`confusion`."""
+    named = [r for r in rows if r["part"] == "named" and r["theory"]]
+    figure = Figure(figsize=(17, 8.7), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    titles = ("predicted: an ideal detector on the same cases", f"measured in {len(named)} cases")
+    ticks = [name.replace("_", " ") for name in (*KNOWN, NEITHER)]
+    for axis, matrix, title in zip(axes, confusion(named), titles, strict=True):
+        image = axis.imshow(100 * matrix, cmap="Blues", vmin=0.0, vmax=100.0, aspect="auto")
+        axis.set_xticks(range(len(ticks)), ticks, rotation=55, ha="right", rotation_mode="anchor")
+        axis.set_yticks(range(len(KNOWN)), ticks[:-1])
+        axis.axvline(len(KNOWN) - 0.5, color="0.3", linewidth=1.0)
+        axis.set(title=title, xlabel="named first")
+        for i, j in zip(*np.nonzero(np.nan_to_num(matrix) > 0.015), strict=True):
+            dark = "white" if matrix[i, j] > 0.6 else "black"
+            axis.text(j, i, f"{100 * matrix[i, j]:.0f}", ha="center", va="center", fontsize=8, color=dark)
+    axes[0].set_ylabel("hidden, at signal-to-noise 8")
+    figure.colorbar(image, ax=axes, label="% of the cases with this cause", shrink=0.6, pad=0.01)
+    figure.savefig(path, dpi=110)
 
 
-def _losses(rows: Sequence[Row]) -> list[str]:
-    """Return the same figures for cases whose logs are whole and for those that lost samples."""
-    groups = [r for r in rows if not r["losses"]], [r for r in rows if r["losses"]]
+def plot_detection(rows: Sequence[Row], path: Path) -> None:
+    """Draw the share found against signal-to-noise, and the signal-to-noise that each cause needs."""
+    single = [r for r in rows if r["part"] in ("named", "ladder", "loud", "gain")]
+    figure = Figure(figsize=(13, 5.2), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+    sizes = sorted({r["wanted"] for r in single})
+    for size in sizes:
+        own = [found(r) for r in single if r["wanted"] == size]
+        mean, ends = float(np.mean(own)), binomtest(sum(own), len(own)).proportion_ci()
+        error = [[100 * (mean - ends.low)], [100 * (ends.high - mean)]]
+        left.errorbar(size, 100 * mean, error, fmt="o", color="tab:blue", capsize=2)
+    if any(r["theory"] for r in single):
+        a = np.geomspace(1.5, 100.0, 200)
+        left.plot(a, 100 * detection_curve(single, a), color="0.4", label="an ideal detector")
+        left.legend(loc="lower right", title="points: measured, with 95 % interval")
+    left.set(xscale="log", xlabel="signal-to-noise", ylabel="found, %", ylim=(-2, 104))
+    left.set_xticks(sizes, [f"{size:g}" for size in sizes])
+    left.minorticks_off()
+    _plot_needed_sizes(right, single)
+    for axis in (left, right):
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)
 
-    def line(figure: str, parts: tuple[str, ...], good: Callable[[Row], bool]) -> str:
-        shares = [share([r for r in group if r["part"] in parts], good) for group in groups]
-        return f"| {figure} | " + " | ".join(cell.replace(" | ", ", ") for cell in shares) + " |"
 
-    covered = [np.abs(scores([r for r in group if 8.0 <= r["wanted"] <= 25.0])) < 1.96 for group in groups]
-    return [
-        "| | whole logs | samples lost |",
-        "|---|---|---|",
-        line("false alarm on nulls", ("null",), found),
-        line("found at S/N 2 to 6", ("ladder",), found),
-        line("found at S/N 8", ("named",), found),
-        line("... the set holds the truth", ("named",), holds),
-        "| 95 % intervals cover | " + " | ".join(fraction(z).replace(" | ", ", ") for z in covered) + " |",
-        line("cases with 80 % of an oracle's gain", ("gain",), reached),
-        line("no name for it: 'unexplained'", ("unknown", "seen", "foreign"), unexplained),
-        line("two: both named", ("pair",), right),
-    ]
+def _plot_needed_sizes(axis: Axes, rows: Sequence[Row]) -> None:
+    """Draw the signal-to-noise that each cause needs over the ideal detector's, with its 68 % interval."""
+    factors = {name: needed_size([r for r in rows if list(r["names"]) == [name]]) for name in KNOWN}
+    excess = {name: 100.0 * (np.array(each) - 1.0) for name, each in factors.items() if each}
+    for place, (middle, low, high) in enumerate(excess.values()):
+        error = [[middle - low], [high - middle]]
+        axis.errorbar(middle, place, xerr=error, fmt="o", color="tab:blue", capsize=2)
+    axis.axvspan(-15.0, 15.0, color="0.4", alpha=0.12, linewidth=0)
+    axis.axvline(0.0, color="0.4")
+    axis.set_yticks(range(len(excess)), [name.replace("_", " ") for name in excess])
+    axis.invert_yaxis()
+    axis.set_xlabel("signal-to-noise needed on the same logs,\n% beyond an ideal detector's (grey: target)")

@@ -1,0 +1,286 @@
+r"""The best that a detector can do that knows the noise and the true shape of the hidden effect.
+
+Notes
+-----
+Let d be the hidden signature and X the columns of all hypotheses, whitened, with the calibration projected
+out. The scores of all columns are then ``N(X^T d, X^T X)``, whatever the data are. So the ideal detector's
+results are drawn from that distribution, and no deployment is simulated. It compares the truth (a single
+column d, with as many degrees of freedom k as the cause has in the table) with every other cause of the
+table, by the evidence that the real detector uses. Its set of names holds all causes within 20:1 of the best.
+
+An effect is *found* if one of the table's tests, or that of the truth, passes: ``chi2_k`` beyond its quantile
+at 1 % divided among all causes and their independent hypotheses. The signal-to-noise of half detection, and
+that of 95 %, follow from the draws with d scaled to other sizes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy.special import chdtrc
+
+from magbridge.arrays import FloatArray
+from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.columns import slices
+from magbridge.diagnose.evidence import FALSE_ALARM_RATE, ODDS, log_bayes, one_sided
+from magbridge.diagnose.joint import Statistic
+from magbridge.diagnose.problem import pose
+from magbridge.diagnose.survey import load_survey
+from study.deployment import Background, Injected, compare, project, whiten
+
+DRAWS = 400
+SIZES = np.linspace(1.0, 12.0, 45)
+"""Signal-to-noise ratios at which the chance of detection is computed."""
+EQUIVALENT = {"clock_offset": "filter_lag"}
+"""Causes that count as one: in a uniform field a late field and an early clock leave the same trace."""
+
+
+def cause_names(causes: Iterable[str]) -> set[str]:
+    """Return the names of causes; equivalent ones have one name."""
+    return {EQUIVALENT.get(cause, cause) for cause in causes}
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """One of a cause's hypotheses.
+
+    Attributes
+    ----------
+    cause : str
+    channel : str or None
+    own : slice
+        Places of its columns.
+    price : float
+        Log of the number of hypotheses that it stands for.
+    positive : bool
+        Its coefficients cannot be negative.
+    spectra : (l, k) array or None
+        Where its coefficients have one common size (:mod:`magbridge.diagnose.joint`): l
+        alternatives for their prior variances.
+    more : float
+        Of a true shape: how many further coefficients its cause has, which fit nothing but noise.
+    """
+
+    cause: str
+    channel: str | None
+    own: slice
+    price: float = 0.0
+    positive: bool = False
+    spectra: FloatArray | None = None
+    more: float = 0.0
+
+    @property
+    def tail(self) -> float:
+        """Share of a chi-square's tail that counts in a test: half where a size cannot be negative."""
+        return 0.5 if self.positive or self.spectra is not None else 1.0
+
+
+class Draws(NamedTuple):
+    """Fisher information S of all columns, the truth's last, and draws of their scores' noise (m, DRAWS)."""
+
+    S: FloatArray
+    noise: FloatArray
+
+    @classmethod
+    def of(cls, S: FloatArray) -> Draws:
+        """Draw the noise of scores whose covariance is S."""
+        values, vectors = np.linalg.eigh(0.5 * (S + S.T))
+        drawn = np.random.default_rng(20131212).standard_normal((len(S), DRAWS))
+        return cls(S, vectors @ (drawn * np.sqrt(np.maximum(values, 0.0))[:, None]))
+
+    @property
+    def wanted(self) -> float:
+        """Signal-to-noise of the truth."""
+        return float(np.sqrt(self.S[-1, -1]))
+
+    def ratio(self, span: Span, scale: float | FloatArray = 1.0) -> tuple[FloatArray, float]:
+        """Likelihood ratios of a hypothesis, with the truth scaled by `scale`, and its degrees of freedom."""
+        statistic = Statistic(self.S[span.own, span.own], span.spectra)
+        given, scale = self.S[span.own, -1], np.asarray(scale)[..., None]
+        scores = np.moveaxis(self.noise[span.own] + scale[..., None] * given[:, None], -2, 0)
+        value = statistic.ratio(scores.reshape(len(given), -1)).reshape(scores.shape[1:])
+        if span.more:
+            value = value + 2.0 * np.random.default_rng(20131213).standard_gamma(0.5 * span.more, DRAWS)
+        if span.positive:
+            value = np.where(scores[0] > 0.0, value, 0.0)
+        return value, float(statistic.freedom + span.more)
+
+    def conditional_on(self, span: Span) -> Draws:
+        """Return the draws with one hypothesis projected out."""
+        taken = self.S[:, span.own] @ root_of(self.S, span)
+        own = root_of(self.S, span).T @ self.noise[span.own]
+        return Draws(self.S - taken @ taken.T, self.noise - taken @ own)
+
+
+def explained(S: FloatArray, span: Span) -> float:
+    """Power of the truth's signature that a hypothesis explains; one of the wrong sign explains nothing."""
+    if span.positive and S[span.own, -1].min() < 0.0:
+        return 0.0
+    return float(np.sum((root_of(S, span).T @ S[span.own, -1]) ** 2))
+
+
+def evidence(span: Span, ratio: FloatArray, freedom: float) -> FloatArray:
+    """Log evidence of likelihood ratios; coefficients of one common size are already integrated out."""
+    if span.spectra is not None:
+        return np.asarray(0.5 * ratio - np.log(len(span.spectra)))
+    # of a known sign: the share of the posterior that has it, over half of the prior
+    return log_bayes(ratio, freedom) + (one_sided(ratio) if span.positive else 0.0)
+
+
+def root_of(S: FloatArray, span: Span) -> FloatArray:
+    """Return R (k, f): ``R R^T`` is the covariance of a hypothesis' coefficients, where the data see them."""
+    own = S[span.own, span.own]
+    if span.spectra is not None:  # with their prior, at the likeliest size given the truth
+        own = own + np.diag(1.0 / Statistic(own, span.spectra).best(S[span.own, -1]).variance)
+    statistic = Statistic(own)
+    return np.asarray(statistic.vectors / np.sqrt(statistic.values))
+
+
+def numbers(S: FloatArray, span: Span) -> float:
+    """Number of coefficients that the data determine: of one common size, those not held by the prior."""
+    root = root_of(S, span)
+    return float(np.trace(root.T @ S[span.own, span.own] @ root))
+
+
+def by_cause(
+    evidences: Mapping[Span, FloatArray], name: str = "", truth: FloatArray | None = None
+) -> dict[str, FloatArray]:
+    """Each cause's log evidence, averaged over its grid, for its best channel; the truth pays as much."""
+    groups: dict[tuple[str, str | None], list[tuple[FloatArray, float]]] = {}
+    for span, evidence in evidences.items():
+        groups.setdefault((span.cause, span.channel), []).append((evidence, span.price))
+    found: dict[str, FloatArray] = {}
+    for (cause, _), members in groups.items():
+        table = np.array([evidence for evidence, _ in members])
+        top = table.max(axis=0)
+        price = np.log(np.mean(np.exp(table - top), axis=0)) - members[0][1]
+        own = (truth if cause == name and truth is not None else top) + price
+        found[cause] = np.maximum(found.get(cause, own), own)
+    return found if name in found or truth is None else found | {name: truth}
+
+
+def ideal(
+    hidden: Injected, background: Background, ds: xr.Dataset, look_elsewhere: Mapping[str, float]
+) -> dict[str, Any]:
+    """Return the chances of an ideal detector.
+
+    Parameters
+    ----------
+    hidden : Injected
+        The hidden effect.
+    background : Background
+        The log that it is hidden in.
+    ds : Dataset
+        The deployment that is diagnosed.
+    look_elsewhere : mapping
+        Cause -> number of its independent hypotheses.
+
+    Returns
+    -------
+    dict
+        ``alone``: chance to name the truth alone; ``inside``: that the set holds it; ``size``: the set's mean
+        size; ``first``: cause -> chance to be named first; ``half``, ``sure``: signal-to-noise at which 50
+        and 95 % are found; ``here``: p-value with the noise of this log, if the truth had the sizes
+        :data:`SIZES`; ``left``: cause -> signal-to-noise that its best hypotheses leave.
+    """
+    name = EQUIVALENT.get(hidden.hidden.name, hidden.hidden.name)
+    spans, S, noise = information(hidden, background, ds)
+    draws, competing = Draws.of(S), [span for span in spans if span.cause != name]
+    own = own_span(S, spans, name)
+    true = true_span(S, own, name)
+    given = {span: draws.ratio(span) for span in (*spans, true)}
+    truth = evidence(true, *given[true])
+    weighed = by_cause({span: evidence(span, *given[span]) for span in spans}, name, truth)
+    names, table = list(weighed), np.array([*weighed.values()])
+    inside, first, me = table > table.max(axis=0) - ODDS, np.argmax(table, axis=0), names.index(name)
+    tests = [true, *competing]
+    return {
+        "alone": float(np.mean((first == me) & (inside.sum(axis=0) == 1))) * bool(own),
+        "inside": float(np.mean(inside[me])) * bool(own),
+        "size": float(np.mean(inside.sum(axis=0))),
+        "first": {cause: float(np.mean(first == j)) for j, cause in enumerate(names) if (first == j).any()},
+        **found_at(p_values(draws, tests, look_elsewhere)),
+        "here": np.median(p_values(Draws(S, noise), tests, look_elsewhere), axis=1).tolist(),
+        "left": left_by_causes(draws, competing),
+    }
+
+
+def information(
+    hidden: Injected, background: Background, ds: xr.Dataset
+) -> tuple[list[Span], FloatArray, FloatArray]:
+    """Return spans, Fisher information (m, m) of all columns, and scores (m, 1) of the log's own noise.
+
+    The hidden signature is the last column.
+    """
+    noise, rows, calibration = background.noise, background.rows, background.deployment.calibration
+    problem = pose(load_survey([ds], calibration), calibration)
+    candidates = [c for cause in CAUSES.values() for c in cause.candidates(problem)]
+    table = whiten(np.hstack([c.columns(slice(0, len(problem))) for c in candidates]), noise, rows)
+    X = np.column_stack([table, hidden.signature])
+    spans = [
+        Span(
+            EQUIVALENT.get(c.cause, c.cause),
+            c.channel,
+            own,
+            float(np.log(c.look_elsewhere)),
+            c.positive,
+            c.spectra,
+        )
+        for c, own in zip(candidates, slices(candidates, 0), strict=True)
+    ]
+    projected = project(X, background.columns, background.deployment.prior)
+    measured = whiten(compare(ds, calibration)[0], noise, rows)
+    return spans, X.T @ projected, projected.T @ (measured - hidden.signature)[:, None]
+
+
+def own_span(S: FloatArray, spans: Sequence[Span], name: str) -> Span | None:
+    """Return the hypothesis of the true cause with the largest evidence; None if the log cannot test it."""
+
+    def worth(span: Span) -> float:
+        freedom = numbers(S, span)
+        return float(log_bayes(explained(S, span) + freedom, freedom))  # at its mean likelihood ratio
+
+    return max((span for span in spans if span.cause == name), key=worth, default=None)
+
+
+def true_span(S: FloatArray, own: Span | None, name: str) -> Span:
+    """Return the true shape, the last column, with as many coefficients as its cause's `own` hypothesis."""
+    shape = slice(len(S) - 1, len(S))
+    if own is None:
+        return Span(name, None, shape)
+    return Span(name, None, shape, positive=own.positive, more=max(numbers(S, own), 1.0) - 1.0)
+
+
+def left_by_causes(draws: Draws, spans: Sequence[Span]) -> dict[str, float]:
+    """Return the signal-to-noise that the best two hypotheses of each cause leave of the truth."""
+    causes: dict[str, list[Span]] = {}
+    for span in spans:
+        causes.setdefault(span.cause, []).append(span)
+    left = {}
+    for cause, group in causes.items():
+        first = max(group, key=lambda span: explained(draws.S, span))
+        S = draws.conditional_on(first).S if explained(draws.S, first) else draws.S
+        power = min(S[-1, -1] - explained(S, span) for span in group)
+        left[cause] = float(np.sqrt(max(power, 0.0)))
+    return left
+
+
+def p_values(draws: Draws, spans: Sequence[Span], look_elsewhere: Mapping[str, float]) -> FloatArray:
+    """Return the smallest p-value of all tests for each of :data:`SIZES` and each draw."""
+    scale, least = SIZES / draws.wanted, np.ones((len(SIZES), 1))
+    for span in spans:
+        ratio, freedom = draws.ratio(span, scale)
+        if freedom:
+            tests = span.tail * len(CAUSES) * look_elsewhere.get(span.cause, 1.0)
+            least = np.minimum(least, tests * chdtrc(freedom, np.maximum(ratio, 0.0)))
+    return least
+
+
+def found_at(p: FloatArray) -> dict[str, float]:
+    """Return the signal-to-noise ratios at which 50 % and 95 % are found."""
+    chance = np.maximum.accumulate(np.mean(p < FALSE_ALARM_RATE, axis=1))
+    return {"half": float(np.interp(0.5, chance, SIZES)), "sure": float(np.interp(0.95, chance, SIZES))}

@@ -1,0 +1,579 @@
+"""Simulated voyages over magnetic maps and their navigation: gliders, dives, wrong maps, and no map.
+
+``tools/navigation.py`` tabulates them; tests use them as well.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from math import inf
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from msgspec.structs import replace as with_options
+from scipy.stats import chi2
+from study_worlds import MASSES, METHODS, true_field
+
+from magbridge.arrays import BoolArray, FloatArray, IntArray
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.observe import observations
+from magbridge.correction import Correction
+from magbridge.estimation.residual import rms
+from magbridge.field.continuation import smoothed
+from magbridge.field.geodesy import metres_per_degree, offset, separation
+from magbridge.field.grid import AnomalyGrid
+from magbridge.field.igrf import total_field
+from magbridge.field.read import read_grid
+from magbridge.navigate.batch import navigate
+from magbridge.navigate.bound import position_bound
+from magbridge.navigate.collect import Collector
+from magbridge.navigate.deadreckoning import DeadReckoning
+from magbridge.navigate.depth import at_depth
+from magbridge.navigate.model import Block, block_length
+from magbridge.navigate.navigator import Navigator
+from magbridge.navigate.options import Options, informed
+from magbridge.navigate.own_survey import localise
+from magbridge.navigate.record import State
+from magbridge.navigate.reference_track import errors as track_errors
+from magbridge.rows import correct_rows
+from sitl import Twin, load, segments, simulate
+from sitl.dataset import at_rest
+from sitl.signals import autoregressive
+
+START = 1_386_201_600.0
+"""s, 2013-12-05."""
+PLACE = (49.5, -57.9)
+"""deg, Bonne Bay."""
+HOUR = 3600.0
+SPEEDS = (0.35, 0.25, 0.5)
+"""m/s, from run to run."""
+LEFT = {"auto": 0.5, "nominal": 125.0}
+"""nT, slow, beside 1 nT of white noise: what tools/accuracy.py finds on a survey, auto rounded up."""
+GLIDER = Options(current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0)
+"""A glider moves 14 m in 40 s: less than 2 % of any correlation length here."""
+AT_HOURS = (3.0, 4.0, 5.0, 6.0)
+OUTSIDE = float(chi2.ppf(0.9999, 2))
+"""Squared distance beyond which the filter is wrong."""
+
+
+@dataclass(frozen=True)
+class Map:
+    """A synthetic anomaly: its scatter nT, correlation length m, and spectrum."""
+
+    rms: float
+    length: float
+    rough: bool = False  # waves down to a quarter of the length, as k^-3, instead of a Gaussian
+
+    def __str__(self) -> str:
+        return f"{self.rms:g} nT, {self.length:g} m{', rough' if self.rough else ''}"
+
+
+@cache
+def synthetic(kind: Map, seed: int, extent: float = 16_000.0) -> AnomalyGrid:
+    """Return a random map: the sum of 600 plane waves."""
+    rng = np.random.default_rng(seed)
+    size = 600
+    k = rng.normal(size=(size, 2))
+    if kind.rough:  # wavenumbers between 1/2 and 4 over the length, fewer the finer
+        k *= (0.5 * 8.0 ** (rng.uniform(size=size) ** 2) / np.linalg.norm(k, axis=1))[:, None]
+    k, phase = k / kind.length, rng.uniform(0.0, 2.0 * np.pi, size)
+    y = np.arange(-extent, extent + 1.0, kind.length / (16 if kind.rough else 8))
+    east, north = np.exp(1j * np.outer(y, k[:, 0])), np.exp(1j * (np.outer(y, k[:, 1]) + phase))
+    values = np.real(north @ east.T)
+    per_latitude, per_longitude = metres_per_degree(PLACE[0])
+    return AnomalyGrid(
+        PLACE[1] + y / per_longitude, PLACE[0] + y / per_latitude, kind.rms * values / values.std()
+    )
+
+
+def track_over(
+    grid: AnomalyGrid,
+    options: Options,
+    seed: int,
+    *,
+    hours: float = 6.0,
+    speed: float = 0.35,
+    every: float = 4.0,
+    jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> xr.Dataset:
+    """Return a deployment drawn from the options' own model: legs of 45 minutes at random headings.
+
+    A sample has 1 nT of white noise.
+
+    Parameters
+    ----------
+    grid : AnomalyGrid
+        The true anomaly, of which the filter's map differs by the options' map error.
+    options : Options
+        The filter's.
+    seed : int
+        Of everything that is drawn.
+    hours : float
+        How long it lasts.
+    speed : float
+        m/s through the water.
+    every : float
+        s between samples.
+    jump : (hour, north, east)
+        Metres by which the vehicle is displaced at once, unnoticed by its dead reckoning.
+    """
+    rng = np.random.default_rng(seed)
+    n = int(hours * HOUR / every)
+    legs = np.cumsum(rng.uniform(-100.0, 100.0, n // int(2700 / every) + 1)) + rng.uniform(0.0, 360.0)
+    heading = np.radians(legs[np.arange(n) // int(2700 / every)])
+    bias = autoregressive(rng, (n,), options.bias_sigma, options.bias_time / every)
+    errors = bias + rng.normal(size=n)
+    velocity = speed * np.column_stack([np.cos(heading), np.sin(heading)])
+    return adrift(grid, options, rng, velocity, errors, np.ones(n), every=every, jump=jump)
+
+
+def adrift(
+    grid: AnomalyGrid,
+    options: Options,
+    rng: np.random.Generator,
+    velocity: FloatArray,
+    errors: FloatArray,
+    sigma: FloatArray,
+    *,
+    every: float = 4.0,
+    jump: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> xr.Dataset:
+    """Return the measurements of a vehicle that moves through water with a current, over a map with errors.
+
+    Parameters
+    ----------
+    grid, options
+        As for :func:`track_over`.
+    rng : Generator
+        Of current, drift, start and the map's error.
+    velocity : FloatArray, (n, 2)
+        m/s north and east through the water, each `every` s up to its sample.
+    errors, sigma : FloatArray, (n,)
+        nT: errors of the corrected total field, and the 1-sigma that the calibration claims.
+    every, jump
+        As for :func:`track_over`.
+    """
+    o, n = options, len(velocity)
+    time = START + every * np.arange(1, n + 1)
+    current = autoregressive(rng, (n, 2), o.current_sigma, o.current_time / every)
+    drift = rng.normal(size=(n, 2)) * o.drift * every**0.5
+    away = rng.normal(size=2) * o.start_sigma + np.cumsum(current * every + drift, axis=0)
+    away[time > START + jump[0] * HOUR] += jump[1:]
+    metres = every * float(np.hypot(*velocity.T).mean())
+    errors = errors + autoregressive(rng, (n,), o.map_sigma, o.map_length / metres)
+    reckoned, true = np.empty((n, 2)), np.empty((n, 2))
+    where = PLACE
+    for i, (north, east) in enumerate((every * velocity).tolist()):
+        where = offset(*where, north, east)
+        reckoned[i], true[i] = where, offset(*where, *away[i].tolist())
+    anomaly = np.nan_to_num(grid.evaluate(true[:, 1], true[:, 0]).anomaly)
+    columns = {
+        "total_field": total_field(true[:, 1], true[:, 0], 30.0, time) + anomaly + errors,
+        "total_field_sigma": sigma,
+        "velocity_north": velocity[:, 0],
+        "velocity_east": velocity[:, 1],
+        "depth": np.full(n, 30.0),
+        "truth_latitude": true[:, 0],
+        "truth_longitude": true[:, 1],
+        "away_north": away[:, 0],
+        "away_east": away[:, 1],
+    }
+    return xr.Dataset({k: ("time", v) for k, v in columns.items()}, {"time": time}, {"source": "voyage"})
+
+
+@dataclass(frozen=True)
+class Run:
+    """The result of one track; arrays over the records."""
+
+    hours: FloatArray
+    error: FloatArray  # m
+    nees: FloatArray  # squared distance of the truth, two degrees of freedom
+    state: IntArray
+    valid: BoolArray
+    bound: float  # m, RMS of the second half
+    unaided: float  # m, the same of dead reckoning alone
+    length: float  # m, correlation length of the map
+    seconds: float  # of a processor, a sample
+
+    @property
+    def second_half(self) -> BoolArray:
+        """Records of the second half."""
+        return np.asarray(self.hours > 0.5 * self.hours[-1])
+
+    def score(self) -> Score:
+        """Return what the tables need."""
+        half = self.second_half
+        away = longest(self.nees > OUTSIDE, self.hours)
+        return Score(
+            drms=rms(self.error[half]),
+            bound=self.bound,
+            unaided=self.unaided,
+            lost=longest(self.nees[half] > OUTSIDE, self.hours[half]) > 0.5,
+            nees=float(np.mean(self.nees[half])) / 2,
+            at_hours=tuple(self.nees[np.searchsorted(self.hours, AT_HOURS) - 1].tolist()),
+            false_alarm=bool((self.state == State.LOST).any()) and away <= 0.1,
+            valid=float(np.mean(self.valid)),
+            waited=float(self.hours[self.valid][0]) if self.valid.any() else inf,
+            seconds=self.seconds,
+        )
+
+
+class Score(NamedTuple):
+    """One run in numbers: errors in m over the second half; NEES over its two degrees of freedom."""
+
+    drms: float
+    bound: float
+    unaided: float
+    lost: bool  # the truth lay outside for half an hour on end, in the second half
+    nees: float
+    at_hours: tuple[float, ...]  # NEES at AT_HOURS
+    false_alarm: bool  # said to be lost, and the truth was never outside for more than 6 minutes
+    valid: float  # share of the time
+    waited: float  # hours, until its position was first valid
+    seconds: float  # of a processor, a sample
+
+
+def longest(flags: BoolArray, hours: FloatArray) -> float:
+    """Return the longest time, in hours, that the flags were set without a break."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+    spans = [hours[min(b, hours.size) - 1] - hours[a] for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return float(max(spans, default=0.0))
+
+
+def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
+    """Run the navigator over a track."""
+    navigator = Navigator(grid, options)
+    every = float(ds["time"][1] - ds["time"][0])
+    navigator.fix(round(1e6 * (float(ds["time"][0]) - every)), *PLACE)
+    begun = clock.process_time()
+    found = []
+    for t, motion, field, sigma in telemetry(ds):
+        navigator.telemetry(round(1e6 * (t - every)), **motion)
+        record = navigator.measure(round(1e6 * t), field, sigma)
+        if record is not None:
+            place, spread = navigator.estimate.x[:2], navigator.estimate.P[:2, :2].ravel()
+            found.append((record.time_us * 1e-6, *place, *spread, record.state, record.valid))
+    seconds = clock.process_time() - begun
+    table = np.array(found, float)
+    away = np.stack(
+        [np.interp(table[:, 0], ds["time"], ds[f"away_{axis}"]) for axis in ("north", "east")], axis=1
+    )
+    error = table[:, 1:3] - away
+    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(table[:, 3:7].reshape(-1, 2, 2)), error)
+    corners = slice(None, None, 5)
+    best = position_bound(
+        grid,
+        ds["time"].to_numpy()[corners],
+        ds["truth_latitude"].to_numpy()[corners],
+        ds["truth_longitude"].to_numpy()[corners],
+        options,
+        float(ds["total_field_sigma"].median()),
+        30.0,
+        every,
+    )
+    half = best.time > 0.5 * (best.time[0] + best.time[-1])
+    return Run(
+        (table[:, 0] - START) / HOUR,
+        np.hypot(*error.T),
+        nees,
+        table[:, 7].astype(int),
+        table[:, 8] > 0,
+        rms(best.sigma[half]),
+        rms(best.unaided[half]),
+        grid.correlation_length,
+        seconds / ds.sizes["time"],
+    )
+
+
+def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Iterator[tuple[Block, float]]:
+    """Yield the measurements that the navigator makes of a track, and the metres travelled until each."""
+    where = DeadReckoning()
+    where.place(*PLACE)
+    collector = Collector(options, block_length(grid))
+    every = float(ds["time"][1] - ds["time"][0])
+    for t, motion, field, sigma in telemetry(ds):
+        where.telemetry(t - every, motion)
+        where.advance(t)
+        block = collector.add(round(t * 1e6), where, field, sigma)
+        if block is not None:
+            yield block, where.travelled
+
+
+def telemetry(ds: xr.Dataset) -> Iterator[tuple[float, dict[str, float], float, float]]:
+    """Yield the time of each sample, the motion up to it, the total field and its sigma."""
+    motion = {name: ds[name].to_numpy().tolist() for name in ("velocity_north", "velocity_east", "depth")}
+    columns = [ds[name].to_numpy().tolist() for name in ("time", "total_field", "total_field_sigma")]
+    for t, field, sigma, *moved in zip(*columns, *motion.values(), strict=True):
+        yield t, dict(zip(motion, moved, strict=True)), field, sigma
+
+
+# ---- wrong positions and wrong maps ------------------------------------------------------------------------
+
+
+LEVEL = 60.0
+"""nT by which the field is measured too large."""
+
+
+def carried(kind: Map, seed: int) -> tuple[float, float]:
+    """Displace a tracking vehicle by 1.5 correlation lengths at 2 h; return as :func:`silence`."""
+    grid = synthetic(kind, seed % 10)
+    length, angle = 1.5 * grid.correlation_length, np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
+    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
+    away = (2.0, float(length * np.cos(angle)), float(length * np.sin(angle)))
+    return silence(
+        sail(track_over(grid, options, 5000 + seed, speed=SPEEDS[seed % 3], jump=away), grid, options)
+    )
+
+
+def misled(kind: Map, seed: int) -> tuple[float, float]:
+    """Start a filter with a tenth of its true start error, 1-sigma one length; return as :func:`silence`."""
+    grid = synthetic(kind, seed % 10)
+    options = with_options(GLIDER, start_sigma=grid.correlation_length)
+    ds = track_over(grid, options, 7000 + seed, speed=SPEEDS[seed % 3])
+    return silence(sail(ds, grid, with_options(options, start_sigma=0.1 * grid.correlation_length)))
+
+
+def level(kind: Map, seed: int) -> tuple[float, float]:
+    """Measure 60 nT too much all along, where 0.5 nT is claimed; return as :func:`standing`."""
+    grid = synthetic(kind, seed % 10)
+    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
+    ds = track_over(grid, options, 9000 + seed, speed=SPEEDS[seed % 3])
+    return standing(sail(ds.assign(total_field=ds["total_field"] + LEVEL), grid, options))
+
+
+def half(kind: Map, seed: int) -> tuple[float, float]:
+    """Sail on a field of which the map holds half the variance; return as :func:`standing`."""
+    grid, other = synthetic(kind, seed % 10), synthetic(kind, 10 + seed % 10)
+    field = AnomalyGrid(grid.longitude, grid.latitude, (grid.anomaly + other.anomaly) / 2**0.5)
+    options = with_options(GLIDER, start_sigma=0.2 * grid.correlation_length)
+    return standing(sail(track_over(field, options, 9000 + seed, speed=SPEEDS[seed % 3]), grid, options))
+
+
+def outside(run: Run) -> BoolArray:
+    """Return when the vehicle is outside the filter's ellipse and over a quarter correlation length away."""
+    return (run.nees > OUTSIDE) & (run.error > 0.25 * run.length)
+
+
+def silence(run: Run) -> tuple[float, float]:
+    """Return the longest spells (hours) in which a wrong position counted as valid, and of being wrong."""
+    return longest(outside(run) & run.valid, run.hours), longest(outside(run), run.hours)
+
+
+def standing(run: Run) -> tuple[float, float]:
+    """Return the share of the time in which a right position counted as valid, and a wrong one."""
+    return float(np.mean(run.valid & ~outside(run))), float(np.mean(run.valid & outside(run)))
+
+
+# ---- maps at another altitude, and smoothed maps -----------------------------------------------------------
+
+
+class Dived(NamedTuple):
+    """RMS error (m), mean squared error over covariance of two axes, share of the time it is valid."""
+
+    error: float
+    nees: float
+    valid: float
+
+
+def dived(seed: int) -> tuple[Dived, Dived]:
+    """Fly the demo's spirals and survey over its own world, in the true field; without and with depth."""
+    scenario = load("demo")
+    grid, log = Twin.draw(scenario, seed).anomaly_map(), simulate(scenario, seed)
+    log = log.assign(total_field=log["truth_total_field"])
+    found = [
+        navigate(log, *how) for how in ((grid, Options()), at_depth(grid, Options(), log["depth"].to_numpy()))
+    ]
+    return _score(found[0]), _score(found[1])
+
+
+def _score(track: xr.Dataset) -> Dived:
+    error = np.stack([track["error_north"], track["error_east"]], axis=-1)
+    nn, ne, ee = (track[f"covariance_{axes}"].to_numpy() for axes in ("nn", "ne", "ee"))
+    P = np.stack([nn, ne, ne, ee], axis=-1).reshape(-1, 2, 2)
+    squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error)
+    return Dived(rms(np.hypot(*error.T)), float(squared.mean()) / 2, float(track["valid"].mean()))
+
+
+ROUGH = Map(40, 1000, rough=True)
+WAVELENGTHS = (0.0, 1_000.0, 2_000.0)
+"""m, of which half the amplitude stays; 0: all of it."""
+
+
+def on_smoothed(seed: int) -> tuple[Score, ...]:
+    """Return one flight's score on the map of every wavelength."""
+    raw = synthetic(ROUGH, seed % 10)
+    options = with_options(GLIDER, start_sigma=0.2 * raw.correlation_length)
+    flown = track_over(raw, options, 1000 + seed, speed=SPEEDS[seed % 3])
+    maps = (smoothed(raw, length) if length else raw for length in WAVELENGTHS)
+    return tuple(sail(flown, grid, options).score() for grid in maps)
+
+
+# ---- calibrated gliders ------------------------------------------------------------------------------------
+
+
+class Flown(NamedTuple):
+    """RMS error (nT) of the corrected field on the survey, the median claimed sigma, the navigation."""
+
+    error: float
+    claimed: float
+    score: Score
+
+
+def calibrated(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown]:
+    """Return how a glider navigates on each map (by number) with each calibration, all else the same."""
+    parts = segments(simulate(load("random_glider"), seed))
+    runs, survey = at_rest(parts["calibration"], MASSES), parts["survey"]
+    places = separation(*PLACE, *(survey[f"truth_{name}"].to_numpy() for name in ("latitude", "longitude")))
+    every = float(survey["time"][1] - survey["time"][0])
+    velocity = np.gradient(np.column_stack(places), every, axis=0)
+    found = {}
+    for method, options in METHODS.items():
+        fitted = fit(observations(runs, () if method == "nominal" else MASSES), method, **options).calibration
+        corrected = correct_rows(Correction(fitted), survey)
+        error = corrected["total_field"].to_numpy() - true_field(survey)
+        sigma = corrected["total_field_sigma"].to_numpy()
+        claimed = float(np.median(sigma))
+        for k, kind in enumerate(kinds):
+            grid = synthetic(kind, seed % 10)
+            known = with_options(GLIDER, start_sigma=grid.correlation_length)
+            known = informed(known, fitted, claimed)
+            ds = adrift(grid, known, np.random.default_rng(seed), velocity, error, sigma, every=every)
+            found[k, method] = Flown(rms(error), claimed, sail(ds, grid, known).score())
+    return found
+
+
+# ---- without a map -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What flies a survey that crosses itself.
+
+    Attributes
+    ----------
+    options : Options
+        Those its errors are drawn from, and that localisation is given.
+    hours, speed, every : float
+        h, m/s, and s between samples.
+    leg : (float, float)
+        s, shortest and longest leg of a survey.
+    star : bool
+        Whether every leg turns by 125 to 150 degrees; else they zigzag out along an axis, and back.
+    extent : float
+        m, half the side of the rock.
+    """
+
+    options: Options
+    hours: float
+    speed: float
+    every: float
+    leg: tuple[float, float]
+    star: bool
+    extent: float
+
+
+SURVEYOR = Vehicle(
+    Options(start_sigma=20.0, current_sigma=0.02, drift=0.2, bias_sigma=0.5, bias_time=1800.0, map_sigma=0.0),
+    hours=6.0,
+    speed=0.35,
+    every=4.0,
+    leg=(1500.0, 3600.0),
+    star=False,
+    extent=10_000.0,
+)
+"""A current of 2 cm/s is what is left when its mean is known from the last surfacings."""
+AIRCRAFT = Vehicle(
+    Options(
+        start_sigma=10.0, current_sigma=0.5, current_time=3600.0, drift=0.1,
+        bias_sigma=0.5, bias_time=1800.0, map_sigma=0.0,
+    ),
+    hours=100 / 60,
+    speed=70.0,
+    every=1.0,
+    leg=(150.0, 250.0),
+    star=True,
+    extent=30_000.0,
+)  # fmt: skip
+"""100 minutes with an inertial platform that drifts by a nautical mile an hour."""
+
+
+class Located(NamedTuple):
+    """One survey: RMS in m over the whole track, NEES over its two degrees of freedom, processor seconds."""
+
+    error: float
+    reckoned: float  # of dead reckoning alone
+    sigma: float
+    bound: float
+    nees: float
+    valid: float  # share of the time
+    seconds: float
+
+
+def located(vehicle: Vehicle, kind: Map, seed: int) -> Located:
+    """Fly a survey and localise it."""
+    flown = survey(vehicle, kind, seed)
+    begun = clock.process_time()
+    track = localise(flown, vehicle.options, start=PLACE)
+    seconds = clock.process_time() - begun
+    off, reckoned = (one.to_numpy() for one in track_errors(track))
+    nn, ne, ee = (track[f"covariance_{axes}"].to_numpy() for axes in ("nn", "ne", "ee"))
+    north, east = track["error_north"].to_numpy(), track["error_east"].to_numpy()
+    nees = (ee * north**2 - 2.0 * ne * north * east + nn * east**2) / (nn * ee - ne**2)
+    return Located(
+        rms(off),
+        rms(reckoned),
+        rms(np.sqrt(nn + ee)),
+        rms(track["bound_sigma"].to_numpy()),
+        float(nees.mean()) / 2,
+        float(track["valid"].mean()),
+        seconds,
+    )
+
+
+def survey(vehicle: Vehicle, kind: Map, seed: int) -> xr.Dataset:
+    """Return a survey's measurements by a vehicle whose drift nobody knows, with its true track."""
+    rng, o = np.random.default_rng([seed, 44]), vehicle.options
+    velocity = _velocity(vehicle, rng)
+    n = len(velocity)
+    errors = autoregressive(rng, (n,), o.bias_sigma, o.bias_time / vehicle.every) + rng.normal(size=n)
+    grid = synthetic(kind, seed, vehicle.extent)
+    return adrift(grid, o, rng, velocity, errors, np.ones(n), every=vehicle.every)
+
+
+def _velocity(vehicle: Vehicle, rng: np.random.Generator) -> FloatArray:
+    """Return velocities (n, 2), m/s north and east, of legs of a random shape."""
+    n = int(vehicle.hours * HOUR / vehicle.every)
+    leg = np.arange(n) // int(rng.uniform(*vehicle.leg) / vehicle.every)
+    first = rng.uniform(0.0, 360.0)
+    if vehicle.star:
+        turns = rng.uniform(125.0, 150.0, leg[-1] + 1)
+        heading = np.radians(first + np.cumsum(turns)[leg])
+    else:
+        back = 180.0 * (leg >= (leg[-1] + 1) // 2)
+        heading = np.radians(first + back + rng.uniform(35.0, 65.0) * np.where(leg % 2, 1.0, -1.0))
+    return vehicle.speed * np.column_stack([np.cos(heading), np.sin(heading)])
+
+
+# ---- a published flight ------------------------------------------------------------------------------------
+
+
+def magnav_flight(folder: Path) -> tuple[AnomalyGrid, xr.Dataset]:
+    """Return the map of MagNav.jl's simple example, and its flight: field, inertial and true track."""
+    log = np.genfromtxt(folder / "xyz.csv", delimiter=",", names=True)
+    time = 1.5e9 + log["tt"]
+    columns = {
+        "total_field": total_field(log["lon"], log["lat"], -log["alt"], time) + log["mag_1_c"],
+        "total_field_sigma": np.full(time.size, 3.0),
+        "dr_latitude": log["ins_lat"],
+        "dr_longitude": log["ins_lon"],
+        "gps_latitude": log["lat"],
+        "gps_longitude": log["lon"],
+        "depth": -log["alt"],
+    }
+    ds = xr.Dataset({name: ("time", values) for name, values in columns.items()}, {"time": time})
+    return read_grid(folder / "map"), ds
