@@ -47,7 +47,7 @@ FOREIGN = ("relay",)
 
 
 def with_telemetry(log: xr.Dataset, seed: int) -> xr.Dataset:
-    """Return the log with a temperature that settles and varies, and a current that switches."""
+    """Return the log with a temperature that converges and varies, and a current that switches."""
     rng = np.random.default_rng([4, seed])
     time = log["time"].to_numpy() - float(log["time"][0])
     x = time / max(float(time[-1]), 1.0)

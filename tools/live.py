@@ -96,7 +96,7 @@ def bolt(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
 
 
 def drift(log: xr.Dataset, rng: np.random.Generator, size: float) -> np.ndarray:
-    """Let the offset drift from 20 % of the survey on."""
+    """Add an offset that drifts from 20 % of the survey on."""
     later = np.maximum(hours(log) - 0.2 * hours(log)[-1], 0.0)
     return np.asarray((later / later[-1])[:, None] * 3.0 * size * direction(rng))
 

@@ -42,12 +42,12 @@ def step(track: Track, direction: FloatArray) -> FloatArray:
 
 
 def drift(track: Track, direction: FloatArray) -> FloatArray:
-    """Let the offset drift by 60 nT over the survey."""
+    """Add an offset that drifts by 60 nT over the survey."""
     return np.asarray(60.0 * np.linspace(0.0, 1.0, len(track.time))[:, None] * direction)
 
 
 def temperature(track: Track, direction: FloatArray) -> FloatArray:
-    """Let the offset follow the temperature by 1 nT/degC."""
+    """Add an offset of 1 nT/degC."""
     return np.asarray((track.temperature - 10.0)[:, None] * direction)
 
 

@@ -46,14 +46,14 @@ from sitl.dataset import at_rest
 from sitl.signals import autoregressive
 
 START = 1_386_201_600.0
-"""s, 2013-12-05."""
+"""2013-12-05, s since 1970 UTC."""
 PLACE = (49.5, -57.9)
-"""deg, Bonne Bay."""
+"""Latitude and longitude of Bonne Bay, deg."""
 HOUR = 3600.0
 SPEEDS = (0.35, 0.25, 0.5)
 """m/s, from run to run."""
 LEFT = {"auto": 0.5, "nominal": 125.0}
-"""nT, slow, beside 1 nT of white noise: what tools/accuracy.py finds on a survey, auto rounded up."""
+"""Slow error that a calibration leaves in addition to 1 nT of white noise, nT (tools/accuracy.py)."""
 GLIDER = Options(current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0)
 """A glider moves 14 m in 40 s: less than 2 % of any correlation length here."""
 AT_HOURS = (3.0, 4.0, 5.0, 6.0)
@@ -452,7 +452,7 @@ def calibrated(kinds: tuple[Map, ...], seed: int) -> dict[tuple[int, str], Flown
 
 @dataclass(frozen=True)
 class Vehicle:
-    """What flies a survey that crosses itself.
+    """A vehicle that flies a survey that crosses itself.
 
     Attributes
     ----------
@@ -465,7 +465,7 @@ class Vehicle:
     star : bool
         Whether every leg turns by 125 to 150 degrees; else they zigzag out along an axis, and back.
     extent : float
-        m, half the side of the rock.
+        Half the side of the map, m.
     """
 
     options: Options
@@ -486,7 +486,7 @@ SURVEYOR = Vehicle(
     star=False,
     extent=10_000.0,
 )
-"""A current of 2 cm/s is what is left when its mean is known from the last surfacings."""
+"""A current of 2 cm/s remains when its mean is known from the last surfacings."""
 AIRCRAFT = Vehicle(
     Options(
         start_sigma=10.0, current_sigma=0.5, current_time=3600.0, drift=0.1,
@@ -536,7 +536,7 @@ def located(vehicle: Vehicle, kind: Map, seed: int) -> Located:
 
 
 def survey(vehicle: Vehicle, kind: Map, seed: int) -> xr.Dataset:
-    """Return a survey's measurements by a vehicle whose drift nobody knows, with its true track."""
+    """Return a survey's measurements by a vehicle of unknown drift, with its true track."""
     rng, o = np.random.default_rng([seed, 44]), vehicle.options
     velocity = _velocity(vehicle, rng)
     n = len(velocity)
