@@ -33,6 +33,9 @@ MIN_DIFFERENCE_M, DIFFERENCE_SIGMA = 40.0, 4.0
 PX4_KEEPS_CLAIM = 1, 16
 """Version of PX4 up to which EXTERNAL_POSITION_ESTIMATE replaces the autopilot's own uncertainty; a later one
 fuses it (EKF/ekf.cpp, resetGlobalPosToExternalObservation, since December 2025)."""
+ARDUPILOT_FUSES: tuple[int, int] | None = None
+"""Version from which ArduPilot fuses EXTERNAL_POSITION_ESTIMATE and accepts GLOBAL_POSITION_SENSOR; None as
+long as no release does (pull request 31738)."""
 UNANSWERED = 3
 """Commands in a row without an answer before that is reported."""
 HINTS = {
@@ -117,13 +120,21 @@ class Fixing:
     @property
     def velocity_stays(self) -> bool:
         """Whether a fix leaves the autopilot's velocity alone: ArduPilot's setLatLng does, PX4 does not."""
-        return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4
+        return not self._kind.fused and self.stack != MAV_AUTOPILOT.PX4 and not self._ardupilot_fuses
 
     @property
     def is_fused(self) -> bool:
         """Return True if the autopilot fuses a fix with its own position, so that it must be widened."""
         replaced = self._version is not None and self._version <= PX4_KEEPS_CLAIM
-        return self._kind.fused or (self.stack == MAV_AUTOPILOT.PX4 and not replaced)
+        fused_by_px4 = self.stack == MAV_AUTOPILOT.PX4 and not replaced
+        return self._kind.fused or fused_by_px4 or self._ardupilot_fuses
+
+    @property
+    def _ardupilot_fuses(self) -> bool:
+        """Return True if the autopilot is an ArduPilot of :data:`ARDUPILOT_FUSES` or later."""
+        if ARDUPILOT_FUSES is None or self._version is None:
+            return False
+        return self.stack == MAV_AUTOPILOT.ARDUPILOTMEGA and self._version >= ARDUPILOT_FUSES
 
     def receive(self, message: Message, time_us: int) -> None:
         """Process a message of the autopilot."""
@@ -178,7 +189,8 @@ class Fixing:
 
     def _unwanted(self, now_us: int) -> str:
         """Return the reason why the autopilot needs or takes no fix; empty if it does."""
-        if self.stack in self._kind.refused_by:
+        accepted = self._ardupilot_fuses and not self._kind.local
+        if self.stack in self._kind.refused_by and not accepted:
             return self._kind.refused_by[self.stack]
         if self.gps.good(now_us):
             return "GPS is good"

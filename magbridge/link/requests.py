@@ -8,7 +8,7 @@ from typing import Final
 
 from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.enums import MAV_CMD, MAV_RESULT, MAV_SEVERITY
+from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
 __all__ = ["AIRCRAFT", "StreamRequests", "needed_rates"]
 
@@ -99,6 +99,8 @@ class StreamRequests:
             return
         if message.id == HEARTBEAT:
             self._is_aircraft = message["type"] in AIRCRAFT
+            if message["autopilot"] == MAV_AUTOPILOT.PX4 and EKF_STATUS in self.needed:
+                self.needed[PX4_STATUS] = self.needed.pop(EKF_STATUS)
             if not self._present:
                 self._present = True
                 self._timers.every("streams", self.interval_us, self._look, time_us + self.interval_us)
@@ -164,4 +166,6 @@ class StreamRequests:
 
 
 HEARTBEAT: Final = spec("HEARTBEAT").id
+EKF_STATUS, PX4_STATUS = spec("EKF_STATUS_REPORT").id, spec("ESTIMATOR_STATUS").id
+"""Messages with the flags of the estimator: ArduPilot's and PX4's."""
 ACK: Final = spec("COMMAND_ACK").id

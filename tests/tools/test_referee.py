@@ -10,14 +10,22 @@ import numpy as np
 import pytest
 from passages import BACK, LAST, LOST, OPTIONS, PLACE, hills, passage
 from referee import ArduPilot, Autopilot, Px4, Truth
+from referee.ardupilot import COPTER_RATES_HZ, PLANE_RATES_HZ
 from referee.filter import PositionFilter
 from referee.loop import Run, sail
+from referee.px4 import PX4_RATES_HZ
 
 from magbridge.bridge.motion import Motion
+from magbridge.config import Link
+from magbridge.link.component import Component
 from magbridge.link.fixes import Kind
+from magbridge.link.requests import needed_rates
 from magbridge.mavlink import Codec
+from magbridge.mavlink.enums import MAV_RESULT
 
 BRIDGE = Codec(1, 191)
+FIXED_WING = 1
+"""MAV_TYPE"""
 ORIGIN = (*PLACE, 0.0)
 START_US = 1_780_000_000_000_000
 POSE = {
@@ -142,6 +150,54 @@ def test_ardupilot_cannot_arm_without_visual_odometry_and_reports_that_nothing_a
     assert flags & 128
     rover.receive(BRIDGE.pack("ODOMETRY", **POSE), now_us + 1_000_000)
     assert rover.can_arm
+
+
+@pytest.mark.parametrize(
+    ("make", "rates", "before", "status"),
+    [
+        (ArduPilot, PLANE_RATES_HZ, 1.0, "EKF_STATUS_REPORT"),
+        (ArduPilot, COPTER_RATES_HZ, 0.0, "EKF_STATUS_REPORT"),
+        (Px4, PX4_RATES_HZ, 15.0, "ESTIMATOR_STATUS"),
+    ],
+)
+def test_the_bridge_requests_the_rates_that_a_started_autopilot_does_not_send(
+    make: type[Autopilot], rates: dict[str, float], before: float, status: str
+) -> None:
+    autopilot = make(ORIGIN, START_US, rates=rates, vehicle=FIXED_WING)
+    needed = needed_rates(attitude=True, navigation=True, telemetry=())
+    bridge = Component(Link("udpout:127.0.0.1:14550"), {}, start_us=START_US, streams=needed)
+    measured, answers = [], b""
+    for k in range(500):
+        now_us = START_US + 100_000 * k
+        bridge.advance(now_us)
+        for _, frame in bridge.outbox.drain():
+            answers += autopilot.receive(frame, now_us)
+        bridge.receive(answers + autopilot.step(now_us, Truth(PLACE, 22.0, 0.0, 0.0, 0.0, PLACE)), now_us)
+        answers = b""
+        measured.append(dict(bridge.streams.measured))
+    assert measured[120]["ATTITUDE"] == pytest.approx(min(before, 10.0), rel=0.1)  # the steps are 0.1 s
+    rate = dict(zip(needed, (pair[0] for pair in needed.values()), strict=True))
+    rate[status] = rate.pop("EKF_STATUS_REPORT")
+    for name, wanted in rate.items():
+        assert measured[-1][name] >= 0.9 * wanted, name
+    assert bridge.streams.denied == {}
+
+
+def test_a_message_that_the_autopilot_does_not_have_is_refused() -> None:
+    autopilot = Px4(ORIGIN, START_US, rates=PX4_RATES_HZ)
+    request = BRIDGE.pack("COMMAND_LONG", command=511, param1=193.0, param2=1e6)
+    (answer,) = Codec(255, 1).parse(autopilot.receive(request, START_US))
+    assert (answer["command"], answer["result"]) == (511, MAV_RESULT.FAILED)
+
+
+@pytest.mark.parametrize("airspeed", [True, False])
+def test_px4_reports_whether_its_velocity_holds(airspeed: bool) -> None:
+    autopilot, now_us = flown(Px4, 20, airspeed=airspeed)
+    report = autopilot.step(now_us + 1_000_000, Truth(PLACE, 0.0, 0.0, 0.0, 0.0, None))
+    (flags,) = [m["flags"] for m in Codec(255, 1).parse(report) if m.name == "ESTIMATOR_STATUS"]
+    assert bool(flags & 2) is airspeed
+    assert bool(flags & 128) is not airspeed
+    assert not flags & 16, "no absolute position"
 
 
 def test_px4_locks_gps_out_while_another_position_aids() -> None:

@@ -7,9 +7,17 @@ from typing import Any
 
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
-from referee.autopilot import Autopilot, finite
+from referee.autopilot import Autopilot, Truth, finite
 
-__all__ = ["ArduPilot"]
+__all__ = ["COPTER_RATES_HZ", "PLANE_RATES_HZ", "ArduPilot"]
+
+PLANE_RATES_HZ = dict.fromkeys(
+    ("ATTITUDE", "VFR_HUD", "GPS_RAW_INT", "GLOBAL_POSITION_INT", "LOCAL_POSITION_NED", "EKF_STATUS_REPORT"),
+    1.0,
+)
+"""Hz after a start: ArduPlane/GCS_MAVLink_Plane.cpp, var_info (SRn_*); Rover's and Sub's are the same."""
+COPTER_RATES_HZ: dict[str, float] = {}
+"""ArduCopter/GCS_MAVLink_Copter.cpp, var_info: all SRn_* are 0."""
 
 DECLARED = 1.0
 """s without GPS after which it dead-reckons: AP_NavEKF3.h, deadReckonDeclare_ms."""
@@ -51,6 +59,7 @@ class ArduPilot(Autopilot):
     """
 
     STACK = MAV_AUTOPILOT.ARDUPILOTMEGA
+    STATUS = "EKF_STATUS_REPORT"
     WALK = 5e-4
     """AP_NavEKF3_core.cpp: each 12 ms the variance grows by sq(dt * EK3_WIND_P_NSE), 0.2."""
 
@@ -120,7 +129,7 @@ class ArduPilot(Autopilot):
         """Whether it passes the check 'VisOdom: not healthy' (AP_Arming.cpp), with VISO_TYPE 1."""
         return self.healthy
 
-    def _status(self) -> bytes:
+    def _status(self, truth: Truth) -> bytes:  # noqa: ARG002 - as the other messages
         # AP_NavEKF3_Outputs.cpp, send_status_report: without aiding the position is held
         flags = ATTITUDE | (VELOCITY_HORIZ | POS_HORIZ_ABS if self.aiding else CONST_POS_MODE)
         return self._codec.pack("EKF_STATUS_REPORT", flags=flags)

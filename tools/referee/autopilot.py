@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from math import cos, hypot, isfinite, radians, sin
 from typing import NamedTuple
 
 from magbridge.field.geodesy import offset, separation
 from magbridge.mavlink import Codec, Message, spec
 from magbridge.mavlink.enums import MAV_CMD, MAV_FRAME, MAV_RESULT, MAV_TYPE
-from magbridge.mavlink.messages import east_e7
+from magbridge.mavlink.messages import MESSAGES, east_e7
 from referee.filter import PositionFilter
 
 __all__ = ["GPS_SIGMA", "Autopilot", "Truth", "finite"]
@@ -19,6 +19,11 @@ GPS_SIGMA = 2.5
 """m."""
 FIX_3D, NO_FIX = 3, 1
 """GPS_RAW_INT.fix_type"""
+HEARTBEAT_HZ = 1.0
+EARLY_US = 1_000
+"""µs by which a message may be early, so that steps of the time that are rounded do not skip one."""
+OPTIONAL = frozenset(("VFR_HUD", "LOCAL_POSITION_NED", "ODOMETRY"))
+"""Messages that are sent only if they are named."""
 Place = tuple[float, float]
 
 
@@ -64,6 +69,10 @@ class Autopilot:
         It measures its speed through the water or air.
     obeys : bool
         It takes fixes; else it does as if none had come.
+    rates : mapping of str to float, optional
+        Rate of each message in Hz, as after a start; a request changes it. None: each with every step.
+    vehicle : int
+        MAV_TYPE of its heartbeat.
 
     Attributes
     ----------
@@ -74,6 +83,8 @@ class Autopilot:
 
     STACK = 0
     """MAV_AUTOPILOT"""
+    STATUS = ""
+    """Message in which it reports what its filter vouches for."""
     WALK = 1e-3
     """(m/s)²/s, of the wind."""
     GPS_GATE = 5.0
@@ -87,6 +98,8 @@ class Autopilot:
         *,
         airspeed: bool = True,
         obeys: bool = True,
+        rates: Mapping[str, float] | None = None,
+        vehicle: int = MAV_TYPE.SUBMARINE,
     ) -> None:
         self.filter = PositionFilter(self.WALK)
         self.taken: Counter[str] = Counter()
@@ -99,6 +112,14 @@ class Autopilot:
         self._gps_seen_us: int | None = None  # since when it was refused
         self._resets = 0
         self._takes: dict[int, Callable[[Message], str]] = {}
+        self._vehicle, self.rates = vehicle, None if rates is None else dict(rates)
+        self._next_us: dict[str, int] = {}
+        self._messages = {
+            "HEARTBEAT": self._heartbeat, "ATTITUDE": self._attitude, self.STATUS: self._status,
+            "GPS_RAW_INT": self._gps_raw, "GLOBAL_POSITION_INT": self._global_position,
+            "VFR_HUD": self._vfr_hud, "LOCAL_POSITION_NED": self._local_position,
+            "ODOMETRY": self._own_odometry,
+        }  # fmt: skip
 
     @property
     def place(self) -> Place:
@@ -167,11 +188,14 @@ class Autopilot:
         number = message["command"]
         if number == MAV_CMD.REQUEST_MESSAGE and message["param1"] == spec("GPS_GLOBAL_ORIGIN").id:
             return self._origin() if self._gps_us is not None else b""
-        if number != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self._obeys:
+        if number == MAV_CMD.SET_MESSAGE_INTERVAL:
+            result = self._set_interval(message)
+        elif number != MAV_CMD.EXTERNAL_POSITION_ESTIMATE or not self._obeys:
             return b""
-        known = message.id == spec("COMMAND_INT").id
-        result = self._external(message) if known else MAV_RESULT.COMMAND_INT_ONLY
-        self.taken[result.name] += 1
+        else:
+            known = message.id == spec("COMMAND_INT").id
+            result = self._external(message) if known else MAV_RESULT.COMMAND_INT_ONLY
+            self.taken[result.name] += 1
         return self._codec.pack(
             "COMMAND_ACK",
             command=number,
@@ -184,9 +208,23 @@ class Autopilot:
         """Answer EXTERNAL_POSITION_ESTIMATE."""
         raise NotImplementedError
 
-    def _status(self) -> bytes:
+    def _set_interval(self, message: Message) -> MAV_RESULT:
+        """Answer SET_MESSAGE_INTERVAL.
+
+        ``GCS_Common.cpp``, set_message_interval: from 1 ms to 60 s, FAILED for a message that is not known;
+        ``mavlink_receiver.cpp``, set_message_interval: FAILED for a stream that is not known.
+        """
+        layout = MESSAGES.get(int(message["param1"]))
+        if layout is None or layout.msgname not in self._messages:
+            return MAV_RESULT.FAILED
+        if self.rates is not None:
+            self.rates[layout.msgname] = 1e6 / min(max(message["param2"], 1e3), 6e7)
+            self._next_us.pop(layout.msgname, None)
+        return MAV_RESULT.ACCEPTED
+
+    def _status(self, truth: Truth) -> bytes:
         """Return what it reports of its filter."""
-        return b""
+        raise NotImplementedError
 
     # ---- telemetry -----------------------------------------------------------------------------------
 
@@ -195,46 +233,71 @@ class Autopilot:
         return self._codec.pack("GPS_GLOBAL_ORIGIN", **where, altitude=round(self.origin[2] * 1e3))
 
     def _telemetry(self, truth: Truth) -> bytes:
-        pack, boot_ms = self._codec.pack, (self._now_us - self._start_us) // 1000
-        north, east = self.filter.position
-        vn, ve = self.filter.velocity
-        data = pack("HEARTBEAT", type=MAV_TYPE.SUBMARINE, autopilot=self.STACK)
-        yaw, pitch = radians(truth.heading), radians(truth.pitch)
-        data += pack("ATTITUDE", time_boot_ms=boot_ms, yaw=yaw, pitch=pitch) + self._status()
+        """Return the messages that are due."""
+        return b"".join(make(truth) for name, make in self._messages.items() if self._is_due(name))
+
+    def _is_due(self, name: str) -> bool:
+        """Return True if a message is to be sent now; without rates, each is sent at every step."""
+        if self.rates is None:
+            return name not in OPTIONAL or name in self._streams
+        rate = HEARTBEAT_HZ if name == "HEARTBEAT" else self.rates.get(name, 0.0)
+        if rate <= 0.0 or self._now_us < self._next_us.get(name, 0):
+            return False
+        self._next_us[name] = self._now_us + round(1e6 / rate) - EARLY_US
+        return True
+
+    def _boot_ms(self) -> int:
+        return (self._now_us - self._start_us) // 1000
+
+    def _heartbeat(self, _: Truth) -> bytes:
+        return self._codec.pack("HEARTBEAT", type=self._vehicle, autopilot=self.STACK)
+
+    def _attitude(self, truth: Truth) -> bytes:
+        angles = {"yaw": radians(truth.heading), "pitch": radians(truth.pitch)}
+        return self._codec.pack("ATTITUDE", time_boot_ms=self._boot_ms(), **angles)
+
+    def _gps_raw(self, truth: Truth) -> bytes:
         gps = {"fix_type": NO_FIX}
         if truth.gps is not None:
             gps = {"fix_type": FIX_3D, "h_acc": round(truth.accuracy * 1e3)}
             gps |= {"lat": round(truth.gps[0] * 1e7), "lon": east_e7(truth.gps[1])}
-        data += pack("GPS_RAW_INT", time_usec=self._now_us, **gps)
+        return self._codec.pack("GPS_RAW_INT", time_usec=self._now_us, **gps)
+
+    def _global_position(self, truth: Truth) -> bytes:
         latitude, longitude = self.place
+        vn, ve = self.filter.velocity
         speed = {}
         if "GLOBAL_POSITION_INT" in self._streams:
             speed = {"vx": round(vn * 100.0), "vy": round(ve * 100.0)}
         where = {"lat": round(latitude * 1e7), "lon": east_e7(longitude), "alt": round(-1e3 * truth.depth)}
-        data += pack("GLOBAL_POSITION_INT", time_boot_ms=boot_ms, **where, **speed)
-        if "VFR_HUD" in self._streams:
-            # GCS_Common.cpp, vfr_hud_airspeed: without a sensor, the speed over ground by GPS
-            ground = hypot(vn, ve)
-            data += pack("VFR_HUD", airspeed=truth.speed if self._airspeed else ground, groundspeed=ground)
-        down = truth.depth + self.origin[2]
-        if "LOCAL_POSITION_NED" in self._streams:
-            local = {"x": north, "y": east, "z": down, "vx": vn, "vy": ve}
-            data += pack("LOCAL_POSITION_NED", time_boot_ms=boot_ms, **local)
-        if "ODOMETRY" in self._streams:
-            data += pack(
-                "ODOMETRY",
-                time_usec=self._now_us,
-                frame_id=MAV_FRAME.LOCAL_NED,
-                child_frame_id=MAV_FRAME.BODY_FRD,
-                x=north,
-                y=east,
-                z=down,
-                q=(cos(0.5 * yaw), 0.0, 0.0, sin(0.5 * yaw)),
-                vx=vn * cos(yaw) + ve * sin(yaw),
-                vy=ve * cos(yaw) - vn * sin(yaw),
-                reset_counter=self._resets & 0xFF,
-            )
-        return data
+        return self._codec.pack("GLOBAL_POSITION_INT", time_boot_ms=self._boot_ms(), **where, **speed)
+
+    def _vfr_hud(self, truth: Truth) -> bytes:
+        # GCS_Common.cpp, vfr_hud_airspeed: without a sensor, the speed over ground by GPS
+        ground = hypot(*self.filter.velocity)
+        speed = truth.speed if self._airspeed else ground
+        return self._codec.pack("VFR_HUD", airspeed=speed, groundspeed=ground)
+
+    def _local_position(self, truth: Truth) -> bytes:
+        (north, east), (vn, ve) = self.filter.position, self.filter.velocity
+        local = {"x": north, "y": east, "z": truth.depth + self.origin[2], "vx": vn, "vy": ve}
+        return self._codec.pack("LOCAL_POSITION_NED", time_boot_ms=self._boot_ms(), **local)
+
+    def _own_odometry(self, truth: Truth) -> bytes:
+        (north, east), (vn, ve), yaw = self.filter.position, self.filter.velocity, radians(truth.heading)
+        return self._codec.pack(
+            "ODOMETRY",
+            time_usec=self._now_us,
+            frame_id=MAV_FRAME.LOCAL_NED,
+            child_frame_id=MAV_FRAME.BODY_FRD,
+            x=north,
+            y=east,
+            z=truth.depth + self.origin[2],
+            q=(cos(0.5 * yaw), 0.0, 0.0, sin(0.5 * yaw)),
+            vx=vn * cos(yaw) + ve * sin(yaw),
+            vy=ve * cos(yaw) - vn * sin(yaw),
+            reset_counter=self._resets & 0xFF,
+        )
 
 
 def finite(*values: float) -> bool:

@@ -16,6 +16,7 @@ from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.link.component import Component
 from magbridge.link.fixes import FIX_MESSAGES
+from magbridge.link.requests import needed_rates
 from magbridge.navigate import Options
 from magbridge.records import Corrected
 from referee.autopilot import GPS_SIGMA, Autopilot, Truth
@@ -102,10 +103,19 @@ def sail(
     kind: str,
     make: Callable[[tuple[float, float, float], int], Autopilot],
     seed: int = 0,
+    *,
+    step_s: float = 1.0,
+    requests: bool = False,
 ) -> tuple[Run, Autopilot, Navigation]:
-    """Sail a passage with the autopilot that ``make(origin, start_us)`` returns, by fixes of one `kind`."""
+    """Sail a passage with the autopilot that ``make(origin, start_us)`` returns, by fixes of one `kind`.
+
+    The autopilot sends its telemetry every `step_s`, at most; with `requests`, the bridge requests rates.
+    """
     start_us = round(passage.time[0] * 1e6) // 4 * 4
-    component = Component(Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us)
+    needed = needed_rates(attitude=True, navigation=True, telemetry=()) if requests else None
+    component = Component(
+        Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us, streams=needed
+    )
     navigation = Navigation(grid, options, FIX_MESSAGES[kind], component)
     origin = float(passage.latitude[0]), float(passage.longitude[0]), 3.0
     autopilot = make(origin, start_us)
@@ -114,8 +124,8 @@ def sail(
     answers = b""
     columns = passage.time.tolist(), passage.total_field.tolist(), passage.sigma.tolist()
     samples = deque(zip(*columns, strict=True))
-    for seconds, truth in truths(passage, seed):
-        now_us = start_us + round(seconds * SECOND_US)
+    for seconds, truth in truths(passage, seed, step_s):
+        now_us = start_us + round(seconds * SECOND_US) // 4 * 4
         for when_us, corrected in due(samples, now_us - 1):
             navigation.sample(when_us, corrected)
         component.advance(now_us)
@@ -161,20 +171,20 @@ def own_error(navigation: Navigation, now_us: int, truth: Truth) -> float:
     return hypot(*separation(*truth.place, *offset(*navigator.reckoned(now_us), north, east)))
 
 
-def truths(passage: Passage, seed: int) -> Iterator[tuple[float, Truth]]:
-    """Yield the vehicle's state once a second, and when; between samples it moves evenly."""
+def truths(passage: Passage, seed: int, step_s: float = 1.0) -> Iterator[tuple[float, Truth]]:
+    """Yield the vehicle's state every `step_s` seconds, and when; between samples it moves evenly."""
     rng = np.random.default_rng(seed)
     time, every = passage.time, float(passage.time[1] - passage.time[0])
     heading = np.degrees(np.arctan2(passage.velocity[:, 1], passage.velocity[:, 0])) % 360.0
     speed = np.hypot(*passage.velocity.T)
-    seconds = np.arange(0.0, time[-1] - time[0])
+    seconds = np.arange(0.0, time[-1] - time[0], step_s)
     latitude = np.interp(seconds, time - time[0], passage.latitude)
     longitude = np.interp(seconds, time - time[0], passage.longitude)
-    noise = rng.normal(size=(seconds.size, 2)) * GPS_SIGMA
+    noise = rng.normal(size=(int(seconds[-1]) + 1, 2)) * GPS_SIGMA  # of a second: GPS is that slow
     for k, second in enumerate(seconds.tolist()):
         place = float(latitude[k]), float(longitude[k])
         i = int(second / every)
         measured = passage.receiver(second, place) if passage.gps(second) else None
-        gps = offset(*measured[0], *noise[k].tolist()) if measured else None
+        gps = offset(*measured[0], *noise[int(second)].tolist()) if measured else None
         accuracy = measured[1] if measured else GPS_SIGMA
         yield second, Truth(place, float(speed[i]), float(heading[i]), 0.0, passage.depth, gps, accuracy)

@@ -8,9 +8,15 @@ from typing import Any
 
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_FRAME, MAV_RESULT
-from referee.autopilot import Autopilot, finite
+from referee.autopilot import Autopilot, Truth, finite
 
-__all__ = ["Px4"]
+__all__ = ["PX4_RATES_HZ", "Px4"]
+
+PX4_RATES_HZ = {
+    "ATTITUDE": 15.0, "VFR_HUD": 4.0, "GPS_RAW_INT": 5.0, "GLOBAL_POSITION_INT": 5.0,
+    "LOCAL_POSITION_NED": 1.0, "ESTIMATOR_STATUS": 0.5,
+}  # fmt: skip
+"""Hz after a start: mavlink/mavlink_main.cpp, configure_streams_to_default, MAVLINK_MODE_NORMAL."""
 
 STOPPED = 5.0
 """s without data, after which an auxiliary position stops: aux_global_position_control.cpp in ekf2/EKF."""
@@ -20,6 +26,8 @@ GATE = 3.0
 """Sigmas: EKF2_AGPn_GATE."""
 EXTERNAL_GATE = 10.0
 """Sigmas: ekf2/EKF/ekf.cpp, resetGlobalPosToExternalObservation."""
+ATTITUDE, VELOCITY_HORIZ, POS_HORIZ_REL, POS_HORIZ_ABS, CONST_POS_MODE = 1, 2, 8, 16, 128
+"""ESTIMATOR_STATUS.flags"""
 DEFAULT_ACCURACY = 50.0
 """m: ekf2/EKF2.cpp, kDefaultExternalPosAccuracy."""
 
@@ -39,6 +47,7 @@ class Px4(Autopilot):
     """
 
     STACK = MAV_AUTOPILOT.PX4
+    STATUS = "ESTIMATOR_STATUS"
     WALK = 2.5e-3
     """EKF2_WIND_NSD, 0.05 m/s²/√Hz."""
 
@@ -93,6 +102,14 @@ class Px4(Autopilot):
             self.filter.pp = before * variance / (before + variance)
         self._resets += 1
         return MAV_RESULT.ACCEPTED
+
+    def _status(self, truth: Truth) -> bytes:  # noqa: ARG002 - as the other messages
+        # ekf2/EKF/ekf_helper.cpp, get_ekf_soln_status: a velocity as long as dead reckoning is possible
+        aided = self._airspeed or self.since_gps() < STOPPED or self._active()
+        flags = ATTITUDE | (VELOCITY_HORIZ | POS_HORIZ_REL if aided else CONST_POS_MODE)
+        if self.since_gps() < STOPPED or self._active():
+            flags |= POS_HORIZ_ABS
+        return self._codec.pack("ESTIMATOR_STATUS", time_usec=self._now_us, flags=flags)
 
     def _sensor(self, message: Message) -> str:
         # mavlink/mavlink_receiver.cpp: one slot an id, the arrival is the time
