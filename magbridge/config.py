@@ -18,7 +18,7 @@ from magbridge.toml import Table, check_entries, convert, load_toml
 
 __all__ = [
     "Align", "CalibrationFile", "Config", "HeadingOutput", "Learning", "Link", "Log", "Navigation",
-    "NotNegative", "Positive", "Sensor", "Telemetry", "load",
+    "NotNegative", "Positive", "Sensor", "Telemetry", "load", "parse",
 ]  # fmt: skip
 
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
@@ -31,8 +31,12 @@ Baudrate = Annotated[int, Meta(gt=0, le=20_000_000)]
 """Bounded: what does not fit 32 bits is refused only when the port is opened."""
 
 
+MAX_SENSORS = 4
+"""Sensors of a bridge at most: the log numbers their ports."""
+
+
 class Sensor(Table, frozen=True):
-    """``[sensor]``: which instrument, on which port."""
+    """``[sensor]``, or ``[sensor.NAME]`` for each of several sensors: which instrument, on which port."""
 
     driver: str
     """A name from the driver table (:data:`magbridge.sensors.DRIVERS`)."""
@@ -47,6 +51,30 @@ class Sensor(Table, frozen=True):
     """s without a reading after which the sensor counts as silent."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
     """The driver's own settings."""
+    name: Annotated[str, Meta(max_length=16, pattern=r"^\w*$")] = ""
+    """NAME of ``[sensor.NAME]``: what messages and the log call the sensor; not a key of the file."""
+    id: Annotated[int, Meta(ge=0, lt=MAX_SENSORS)] | None = None
+    """``sensor_id`` in all messages; by default the sensors are numbered from 0 in the order of the file.
+    Sensor 0 is the main sensor: heading, learning and navigation use it."""
+    calibration: Name | None = None
+    """The ``cal.json`` of this sensor; for sensor 0 this may be ``calibration.file``, too. A scalar sensor's
+    default is the calibration of sensor 0, if that has an entry for it."""
+    sigma: Positive | None = None
+    """Scalar sensors only: nT, 1-sigma of the reading where the instrument is mounted. With it the reading
+    needs no calibration."""
+    filter_delay: NotNegative | None = None
+    """s by which the sensor's own filter delays the reading, in place of ``align.filter_delay``. Default for
+    a scalar sensor: 0, because its calibration includes the lag."""
+
+    @property
+    def label(self) -> str:
+        """Return what messages call the sensor."""
+        return self.name or self.driver
+
+    @property
+    def key(self) -> str:
+        """Return the dotted key of the sensor's table."""
+        return f"sensor.{self.name}" if self.name else "sensor"
 
 
 class Link(Table, frozen=True):
@@ -225,7 +253,8 @@ class Config(Table, frozen=True):
     """A whole ``bridge.toml``.
 
     `publish` holds Hz of each message: 0 is with every sample, a negative rate never. `path` is the file
-    itself, `digest` the first 8 bytes of its SHA-256 in hex.
+    itself, `digest` the first 8 bytes of its SHA-256 in hex. With several ``[sensor.NAME]`` tables, `sensor`
+    is the one with the id 0, and `more_sensors` are the others.
     """
 
     sensor: Sensor
@@ -238,8 +267,14 @@ class Config(Table, frozen=True):
     heading: HeadingOutput = HeadingOutput()
     navigation: Navigation | None = None
     learning: Learning | None = None
+    more_sensors: tuple[Sensor, ...] = ()
     path: Path = Path("bridge.toml")
     digest: str = ""
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """All sensors: `sensor`, with the id 0, and the others by id."""
+        return self.sensor, *self.more_sensors
 
     @property
     def files(self) -> dict[str, str | None]:
@@ -251,6 +286,7 @@ class Config(Table, frozen=True):
             "navigation.map": self.navigation.map if self.navigation else None,
             "learning.reference": learning.reference if learning.reference != "igrf" else None,
             "learning.prior": learning.prior,
+            **{f"sensor.{one.name}.calibration": one.calibration for one in self.more_sensors},
         }
 
     def resolve(self, name: str) -> Path:
@@ -265,16 +301,75 @@ def load(path: str | Path) -> Config:
     range, or a file that it names does not exist.
     """
     path = Path(path)
-    table = load_toml(path)
-    for reserved in ("path", "digest"):
-        if reserved in table:
-            raise ConfigError(path, reserved, "unknown key")
-    check_entries(table, "telemetry", Telemetry, path)
-    check_entries(table, "publish", Rate, path)
     config = msgspec.structs.replace(
-        convert(table, Config, path), path=path, digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        parse(load_toml(path), path), digest=hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     )
     for key, name in config.files.items():
         if name is not None and not config.resolve(name).exists():
             raise ConfigError(path, key, f"no such file: {config.resolve(name)}")
     return config
+
+
+def parse(table: dict[str, Any], path: Path) -> Config:
+    """Return the configuration in the table of a ``bridge.toml``, without its digest.
+
+    ConfigError: a key is unknown or missing, or a value has the wrong type or range.
+    """
+    for reserved in ("path", "digest", "more_sensors"):
+        if reserved in table:
+            raise ConfigError(path, reserved, "unknown key")
+    check_entries(table, "telemetry", Telemetry, path)
+    check_entries(table, "publish", Rate, path)
+    named = _named_sensors(table.get("sensor"))
+    tables = {f"sensor.{name}": one for name, one in named.items()} or {"sensor": table.get("sensor")}
+    for key, one in tables.items():
+        if isinstance(one, dict) and "name" in one:
+            raise ConfigError(path, f"{key}.name", "unknown key: name the table, [sensor.NAME]")
+    if not named:
+        config = convert(table, Config, path)
+        sensors = [config.sensor]
+    else:
+        check_entries(table, "sensor", Sensor, path)
+        sensors = [
+            convert({**one, "name": name}, Sensor, path, f"sensor.{name}.") for name, one in named.items()
+        ]
+        config = convert({**table, "sensor": next(iter(named.values()))}, Config, path)
+    main, *others = _numbered(sensors, path)
+    calibration = config.calibration
+    if main.calibration is not None:
+        if calibration is not None:
+            raise ConfigError(
+                path, "calibration.file", f"{main.label} has a calibration of its own: remove one"
+            )
+        calibration = CalibrationFile(file=main.calibration)
+    return msgspec.structs.replace(
+        config, sensor=main, more_sensors=tuple(others), calibration=calibration, path=path
+    )
+
+
+def _named_sensors(sensor: Any) -> dict[str, Any]:
+    """Return the tables ``[sensor.NAME]`` by name; empty for a plain ``[sensor]``."""
+    if not isinstance(sensor, dict) or sensor.keys() & {"driver", "port"}:
+        return {}
+    tables = {name: one for name, one in sensor.items() if isinstance(one, dict)}
+    return tables if tables.keys() - {"options"} and len(tables) == len(sensor) else {}
+
+
+def _numbered(sensors: list[Sensor], path: Path) -> list[Sensor]:
+    """Return the sensors by id, each with its own; ConfigError: too many, or ids or names that clash."""
+    if len(sensors) > MAX_SENSORS:
+        raise ConfigError(path, "sensor", f"expected at most {MAX_SENSORS} sensors, got {len(sensors)}")
+    names = [one.name for one in sensors]
+    if len(set(names)) < len(names):
+        raise ConfigError(
+            path, "sensor", f"expected a different name for each sensor, got {', '.join(names)}"
+        )
+    ids = [one.id for one in sensors if one.id is not None]
+    if len(set(ids)) < len(ids):
+        raise ConfigError(path, "sensor", f"expected a different id for each sensor, got {ids}")
+    free = iter(sorted(set(range(MAX_SENSORS)) - set(ids)))
+    numbered = [msgspec.structs.replace(one, id=next(free) if one.id is None else one.id) for one in sensors]
+    numbered.sort(key=lambda one: one.id or 0)
+    if numbered[0].id != 0:
+        raise ConfigError(path, "sensor", f"expected a sensor with the id 0, the main sensor, got {ids}")
+    return numbered

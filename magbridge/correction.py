@@ -51,6 +51,8 @@ class Correction:
     ----------
     notices : list of str
         Messages about flagged samples since the caller last emptied the list, each once.
+    stated_sigma : float
+        1-sigma of the last sample's total field without what the plausibility checks added, nT.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class Correction:
         self.direction = None if calibration.boresight is None else DirectionCheck(self._messages)
         self._was_moving = False
         self._conditions = _unmodelled_conditions(calibration)
+        self.stated_sigma = nan
 
     @property
     def calibration(self) -> Calibration:
@@ -157,14 +160,17 @@ class Correction:
             )
             quality |= flags
             judged += variance
+        beyond = 0.0
         if self._conditions:
             self._hold("depth", max(depth, 0.0))
             self._hold(TEMPERATURE, reading.temperature)
-            variance, flags = self._extrapolation(sigma)
+            beyond, flags = self._extrapolation(sigma)
             quality |= flags
-            judged += variance
-        if sample.sigma or sample.spans or judged or turned:
-            more = judged + (self._more(sample) if sample.sigma or sample.spans else 0.0)
+        self.stated_sigma = sigma
+        if sample.sigma or sample.spans or judged or turned or beyond:
+            more = beyond + (self._more(sample) if sample.sigma or sample.spans else 0.0)
+            self.stated_sigma = sqrt(sigma * sigma + more)
+            more += judged
             sigma = sqrt(sigma * sigma + more)
             more += turned
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)

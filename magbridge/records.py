@@ -77,7 +77,7 @@ class Reading(msgspec.Struct, frozen=True, gc=False):
     """One measurement of the three channels, as the instrument sent it."""
 
     field: Vector
-    """Field, nT, sensor axes, uncorrected."""
+    """Field, nT, sensor axes, uncorrected; (total field, 0, 0) of a scalar instrument."""
     counts: tuple[int, int, int] | None = None
     """The converter's own numbers, where the instrument sends counts."""
     sequence: int | None = None

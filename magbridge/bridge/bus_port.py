@@ -9,11 +9,12 @@ import time
 from contextlib import suppress
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from magbridge.bridge.port import READ_BYTES, Port
 from magbridge.bridge.serial_port import SerialPort, serial_line
-from magbridge.config import Config
+from magbridge.config import Sensor
 from magbridge.errors import ConfigError, PortError
 from magbridge.sensors import open_driver
 from magbridge.sensors.rm3100 import Bus, Rm3100
@@ -181,24 +182,24 @@ class BusPort(Port):
                 os.close(self._waker)  # the reader sees an end of file: the port is lost
 
 
-def sensor_port(config: Config) -> SerialPort | BusPort:
-    """Return the (unopened) port of ``[sensor]``: a serial line, or a part on a bus.
+def sensor_port(sensor: Sensor, path: Path) -> SerialPort | BusPort:
+    """Return the (unopened) port of a sensor in the configuration `path`: a serial line, or a part on a bus.
 
     Raises
     ------
     ConfigError
         A name that is neither, a driver that does not read a bus, or a library that is not installed.
     """
-    sensor, source = config.sensor, str(config.path)
+    source, key = str(path), sensor.key
     if not sensor.port.startswith(("i2c:", "spi:")):
-        return serial_line(sensor.port, sensor.baudrate, source, "sensor.port")
+        return serial_line(sensor.port, sensor.baudrate, source, f"{key}.port")
     if not BUS_ADDRESS.fullmatch(sensor.port):
         expected = "expected i2c:BUS:ADDRESS such as i2c:1:0x20, or spi:BUS.DEVICE such as spi:0.0"
-        raise ConfigError(source, "sensor.port", f"{expected}, got {sensor.port!r}")
-    driver = open_driver(sensor.driver, sensor.options, config.path)
+        raise ConfigError(source, f"{key}.port", f"{expected}, got {sensor.port!r}")
+    driver = open_driver(sensor.driver, sensor.options, source, key)
     if not isinstance(driver, Rm3100):
-        raise ConfigError(source, "sensor.driver", f"expected rm3100 on a bus, got {sensor.driver!r}")
+        raise ConfigError(source, f"{key}.driver", f"expected rm3100 on a bus, got {sensor.driver!r}")
     library = "smbus2" if sensor.port.startswith("i2c:") else "spidev"
     if find_spec(library) is None:
-        raise ConfigError(source, "sensor.port", f"{library} is not installed: pip install 'magbridge[bus]'")
+        raise ConfigError(source, f"{key}.port", f"{library} is not installed: pip install 'magbridge[bus]'")
     return BusPort(sensor.port, driver)

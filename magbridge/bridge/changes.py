@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from magbridge.bridge.events import source_of
 from magbridge.bridge.position import CLOCK_SET_US
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.link.output import Announcer
@@ -28,7 +31,8 @@ class StateChanges:
     codec : Codec
         The link's: its ``utc_offset_us`` follows the host's clock.
     announcer : Announcer
-    sensor : SensorLine
+    sensors : mapping of int to SensorLine
+        By sensor id.
 
     Attributes
     ----------
@@ -39,8 +43,8 @@ class StateChanges:
         µs: inputs up to `until_us` may have waited since `since_us`.
     """
 
-    def __init__(self, codec: Codec, announcer: Announcer, sensor: SensorLine) -> None:
-        self._codec, self._announcer, self._sensor = codec, announcer, sensor
+    def __init__(self, codec: Codec, announcer: Announcer, sensors: Mapping[int, SensorLine]) -> None:
+        self._codec, self._announcer, self._sensors = codec, announcer, sensors
         self.log_state, self.log_lost = MAG_LOG_STATE.OFF, 0
         self.since_us = self.until_us = 0
         self._clock_unset = False
@@ -87,12 +91,13 @@ class StateChanges:
 
     def _port(self, port: int, well: bool, reason: str, dropped: int, time_us: int) -> None:
         severity = MAV_SEVERITY.INFO if well else MAV_SEVERITY.ERROR
-        if port == MAG_PORT_NAME.SENSOR:
-            self._sensor.opened(time_us) if well else self._sensor.lost(reason)
-        elif port == MAG_PORT_NAME.LOG:
+        if port == MAG_PORT_NAME.LOG:
             self.log_state = MAG_LOG_STATE.OK if well else MAG_LOG_STATE.FAILED
             self.log_lost = dropped
             self._announcer.state("log", f"log: {reason or 'being written'}", severity)
+        elif port != MAG_PORT_NAME.LINK:
+            if (sensor := self._sensors.get(source_of(port)[1])) is not None:
+                sensor.opened(time_us) if well else sensor.lost(reason)
         else:
             severity = MAV_SEVERITY.WARNING if well and reason else severity
             self._announcer.state("link", f"link: {reason or 'open'}", severity)

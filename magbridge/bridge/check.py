@@ -11,21 +11,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
-
 from magbridge.bridge.bus_port import sensor_port
 from magbridge.bridge.learning import first_calibration, open_learner
 from magbridge.bridge.links import LINKS, open_link
 from magbridge.bridge.needs import unmet
 from magbridge.bridge.nmea import nmea_port
+from magbridge.bridge.sensor_stream import open_correction, open_drivers, other_calibrations
 from magbridge.calibration.model import Calibration
-from magbridge.config import Config, load
+from magbridge.config import Config, Sensor, load, parse
 from magbridge.errors import ConfigError, MagbridgeError
 from magbridge.link.message_rates import check_publish
 from magbridge.link.telemetry import TelemetryMap
 from magbridge.mavlink import load_key
-from magbridge.sensors import open_driver
-from magbridge.toml import convert, load_toml
+from magbridge.sensors import is_scalar, open_driver
+from magbridge.toml import load_toml
 
 __all__ = ["ConfigFault", "access", "findings"]
 
@@ -56,12 +55,9 @@ def findings(path: Path) -> list[ConfigFault]:
     except ConfigError as error:
         return [ConfigFault(fatal=True, text=str(error))]
     left = deepcopy(table)
-    found = [
-        ConfigFault(fatal=True, text=str(error))
-        for error in _errors(left, lambda: convert(left, Config, path))
-    ]
+    found = [ConfigFault(fatal=True, text=str(error)) for error in _errors(left, lambda: parse(left, path))]
     try:
-        config = msgspec.structs.replace(convert(left, Config, path), path=path)
+        config = parse(left, path)
     except ConfigError:  # without sensor or link nothing more can be checked
         pass
     else:
@@ -105,9 +101,13 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
             calibration = first_calibration(config)
         except MagbridgeError as error:
             yield ConfigFault(fatal=True, text=str(error))
-    yield from _driver(config)
-    yield from _tried(lambda: sensor_port(config))
-    yield from _device(config, "sensor.port", config.sensor.port)
+    faults = [fault for sensor in config.sensors for fault in _driver(config, sensor)]
+    yield from faults
+    for sensor in config.sensors:
+        yield from _tried(partial(sensor_port, sensor, path))
+        yield from _device(config, f"{sensor.key}.port", sensor.port)
+    if not faults:
+        yield from _other_sensors(config, calibration)
     yield from _tried(lambda: open_link(config.link.url, config.link.baudrate, str(path)))
     if config.link.url.partition(":")[0] not in LINKS:
         yield from _device(config, "link.url", config.link.url.removeprefix("serial:"))
@@ -137,12 +137,35 @@ def _files(config: Config) -> Iterator[ConfigFault]:
             yield ConfigFault(fatal=True, text=str(ConfigError(config.path, key, f"no such file: {file}")))
 
 
-def _driver(config: Config) -> Iterator[ConfigFault]:
-    """Yield the faults of the driver and its options."""
-    options, sensor = deepcopy(config.sensor.options), config.sensor.driver
-    left = {"sensor": {"options": options}}
-    for error in _errors(left, lambda: open_driver(sensor, options, config.path)):
+def _driver(config: Config, sensor: Sensor) -> Iterator[ConfigFault]:
+    """Yield the faults of a sensor's driver and its options."""
+    options = deepcopy(sensor.options)
+    left: dict[str, Any] = {"options": options}
+    for part in reversed(sensor.key.split(".")):
+        left = {part: left}
+    for error in _errors(left, lambda: open_driver(sensor.driver, options, config.path, sensor.key)):
         yield ConfigFault(fatal=True, text=str(error))
+
+
+def _other_sensors(config: Config, main: Calibration | None) -> Iterator[ConfigFault]:
+    """Yield the faults of the sensors after the first: their calibrations, and what these need."""
+    try:
+        drivers, calibrations = open_drivers(config), other_calibrations(config)
+    except MagbridgeError as error:
+        if all(config.resolve(one.calibration).exists() for one in config.more_sensors if one.calibration):
+            yield ConfigFault(fatal=True, text=str(error))
+        return
+    for sensor, driver in zip(config.more_sensors, drivers[1:], strict=True):
+        own = calibrations.get(sensor.id or 0)
+        try:
+            _, used = open_correction(sensor, driver, config, own, main)
+        except MagbridgeError as error:
+            yield ConfigFault(fatal=True, text=str(error))
+            continue
+        if used is None and not (is_scalar(driver) and sensor.sigma is not None):
+            why = f"the calibration is of {own.sensor.name!r}" if own is not None else "no calibration"
+            text = f"{config.path}: {sensor.key}: {why}: every sample would be uncalibrated"
+            yield ConfigFault(fatal=False, text=text)
 
 
 def _tried(attempt: Callable[[], object]) -> Iterator[ConfigFault]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, Start, port_number
 from magbridge.bridge.learning import first_calibration
 from magbridge.bridge.pipeline import Pipeline
+from magbridge.bridge.sensor_stream import other_calibrations
 from magbridge.config import Config
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import load_key
@@ -23,8 +24,8 @@ class Edge(Protocol):
         """Yield events in order; one, if only an empty one, by `deadline` (µs)."""
         ...
 
-    def send(self, channel: Channel, data: bytes) -> None:
-        """Send to the link or to the sensor."""
+    def send(self, number: int, data: bytes) -> None:
+        """Send to the link or to a sensor, by its MAG_PORT_NAME."""
         ...
 
     def credit(self, frames: list[bytes]) -> None:
@@ -45,7 +46,7 @@ def set_up(config: Config, start: Start) -> Pipeline:
         from magbridge.bridge.navigation import open_navigation  # noqa: PLC0415 - it brings filterpy
 
         navigate = open_navigation(config, config.navigation, calibration)
-    return Pipeline(config, calibration, start, key, navigate)
+    return Pipeline(config, calibration, start, key, navigate, other_calibrations(config))
 
 
 def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:
@@ -56,9 +57,10 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callabl
             edge.credit(pipeline.component.genuine)
         if sent:
             edge.send(Channel.LINK, b"".join([frame for _, frame in sent]))
-        if pipeline.sensor.to_send:
-            edge.send(Channel.SENSOR, b"".join(pipeline.sensor.to_send))
-            pipeline.sensor.to_send.clear()
+        for stream in pipeline.streams:
+            if commands := stream.line.to_send:
+                edge.send(port_number(stream.sensor_id), b"".join(commands))
+                commands.clear()
         records = pipeline.recorder.drain()
         if log is not None and records:
             log.extend(records)

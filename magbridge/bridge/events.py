@@ -7,9 +7,10 @@ import time
 import msgspec
 
 from magbridge.mavlink import Stream
+from magbridge.mavlink.enums import MAG_PORT_NAME
 from magbridge.records import Channel
 
-__all__ = ["Event", "HostClock", "Start"]
+__all__ = ["Event", "HostClock", "Start", "port_number", "source_of"]
 
 
 class Start(msgspec.Struct, frozen=True):
@@ -34,6 +35,20 @@ class Event(msgspec.Struct, frozen=True, gc=False):
     """``SENSOR``: bytes as read; ``LINK``: bytes as read; ``STATE``: one MAVLink frame of our own dialect
     that says what changed (a port, the host's clock, the log), or nothing when only time has passed."""
     data: bytes
+    sensor_id: int = 0
+    """``SENSOR``: which sensor."""
+
+
+def port_number(sensor_id: int) -> int:
+    """Return the MAG_PORT_NAME of a sensor's port."""
+    return MAG_PORT_NAME.LOG + sensor_id if sensor_id else MAG_PORT_NAME.SENSOR
+
+
+def source_of(port: int) -> tuple[Channel, int]:
+    """Return channel and sensor id of the bytes that come from a port, by its MAG_PORT_NAME."""
+    if port > MAG_PORT_NAME.LOG:
+        return Channel.SENSOR, port - MAG_PORT_NAME.LOG
+    return Channel(port), 0
 
 
 class HostClock:

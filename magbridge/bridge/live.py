@@ -1,7 +1,7 @@
-"""The live edge: two ports and the one clock, turned into events.
+"""The live edge: the ports and the one clock, turned into events.
 
 One thread reads, corrects and sends. Each port has a thread of its own that opens it when it is down, so that
-an open that takes long (a host name that does not resolve) never holds up the other port.
+an open that takes long (a host name that does not resolve) never holds up another port.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import queue
 import select
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from magbridge.bridge import states
-from magbridge.bridge.events import Event, HostClock
+from magbridge.bridge.events import Event, HostClock, source_of
 from magbridge.bridge.port import Port
 from magbridge.errors import PortError
 from magbridge.records import Channel
@@ -40,25 +40,25 @@ class LiveEdge:
 
     Parameters
     ----------
-    ports : dict of Channel to Port
-        The sensor's and the link's; opened here, in their order.
+    ports : dict of int to Port
+        By MAG_PORT_NAME: the link and the sensors; opened here, in their order.
     clock : HostClock
     """
 
-    def __init__(self, ports: dict[Channel, Port], clock: HostClock) -> None:
+    def __init__(self, ports: Mapping[int, Port], clock: HostClock) -> None:
         self._ports = ports
         self._clock = clock
         self._changes: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._woken, self._waker = os.pipe()
         self._stopping = False
         self._overrun = self._slow_us = 0
-        self._openers: dict[Channel, threading.Thread] = {}
-        for channel, port in ports.items():
+        self._openers: dict[int, threading.Thread] = {}
+        for number, port in ports.items():
             tried = threading.Event()
             opener = threading.Thread(
-                target=self._keep_open, args=(channel, port, tried), name="port opener", daemon=True
+                target=self._keep_open, args=(number, port, tried), name="port opener", daemon=True
             )
-            self._openers[channel] = opener
+            self._openers[number] = opener
             opener.start()
             tried.wait(PORT_RETRY_S)  # so that a report on the next port can go out over this one
 
@@ -68,16 +68,16 @@ class LiveEdge:
         look_us = turned_us + CLOCK_CHECK_INTERVAL_US
         while not self._stopping:
             wait = (min(deadline(), look_us) - self._clock.now_us()) * 1e-6
-            lines = {fd: channel for channel, port in self._ports.items() for fd in port.fds()}
-            full = [channel for channel, port in self._ports.items() if port.waiting]
-            blocked = [fd for channel in full for fd in self._ports[channel].blocked()]
+            lines = {fd: number for number, port in self._ports.items() for fd in port.fds()}
+            full = [number for number, port in self._ports.items() if port.waiting]
+            blocked = [fd for number in full for fd in self._ports[number].blocked()]
             try:
                 ready = select.select([*lines, self._woken], blocked, [], max(wait, 0.0))[0]
             except (OSError, ValueError):  # a descriptor was closed between asking for it and waiting
                 continue
             now_us = self._clock.now_us()
-            for channel in full:
-                self._flush(channel)
+            for number in full:
+                self._flush(number)
             if self._woken in ready:
                 os.read(self._woken, 4096)
             while not self._changes.empty():  # the news that a port opened comes before its data
@@ -87,7 +87,8 @@ class LiveEdge:
             turned_us = now_us
             for fd in ready:
                 if fd != self._woken and (data := self._waiting(lines[fd], fd, held)):
-                    yield Event(now_us, lines[fd], data)
+                    channel, sensor_id = source_of(lines[fd])
+                    yield Event(now_us, channel, data, sensor_id)
             if now_us >= look_us:
                 look_us = now_us + CLOCK_CHECK_INTERVAL_US
                 for state in self._look(now_us):
@@ -104,16 +105,16 @@ class LiveEdge:
         if self._too_slow(now_us):
             yield states.too_slow(Channel.LINK, self._ports[Channel.LINK])
 
-    def send(self, channel: Channel, data: bytes) -> None:
+    def send(self, number: int, data: bytes) -> None:
         """Send to a port; while the port is down, data are dropped and counted."""
-        port = self._ports[channel]
+        port = self._ports[number]
         if not port.is_open:
             port.dropped += len(data)
             return
         try:
             port.write(data)
         except PortError as error:
-            self._lost(channel, error)
+            self._lost(number, error)
 
     def answer(self, sender: tuple[int, int], data: bytes) -> None:
         """Send over the link what only one system and component wants."""
@@ -128,12 +129,12 @@ class LiveEdge:
         """Report to the link which frames that it read last are signed with the key."""
         self._ports[Channel.LINK].credit(frames)
 
-    def _flush(self, channel: Channel) -> None:
+    def _flush(self, number: int) -> None:
         """Go on sending what waits for a slow line."""
         try:
-            self._ports[channel].flush()
+            self._ports[number].flush()
         except PortError as error:
-            self._lost(channel, error)
+            self._lost(number, error)
 
     def notify(self, state: bytes) -> None:
         """Add a state frame to the events; from any thread."""
@@ -149,30 +150,30 @@ class LiveEdge:
     def close(self) -> None:
         """Close the ports; one that is still being opened is left to the end of the process."""
         self._stopping = True
-        for channel, opener in self._openers.items():
+        for number, opener in self._openers.items():
             opener.join(CLOSE_TIMEOUT_S)
             if not opener.is_alive():
-                self._ports[channel].close()
+                self._ports[number].close()
         if not any(opener.is_alive() for opener in self._openers.values()):
             os.close(self._woken)
             os.close(self._waker)
 
-    def _read(self, channel: Channel, fd: int) -> bytes:
-        port = self._ports[channel]
+    def _read(self, number: int, fd: int) -> bytes:
+        port = self._ports[number]
         if fd not in port.fds():  # send() has lost the port since select() returned
             return b""
         try:
             return port.read()
         except PortError as error:
-            self._lost(channel, error)
+            self._lost(number, error)
             return b""
 
-    def _waiting(self, channel: Channel, fd: int, held: bool) -> bytes:
+    def _waiting(self, number: int, fd: int, held: bool) -> bytes:
         """Return what waits; after a standstill, all of the link: readings need the telemetry then."""
-        data = self._read(channel, fd)
-        while held and data and channel == Channel.LINK and len(data) < BACKLOG:
-            more = select.select([fd], [], [], 0)[0] if fd in self._ports[channel].fds() else []
-            piece = self._read(channel, fd) if more else b""
+        data = self._read(number, fd)
+        while held and data and number == Channel.LINK and len(data) < BACKLOG:
+            more = select.select([fd], [], [], 0)[0] if fd in self._ports[number].fds() else []
+            piece = self._read(number, fd) if more else b""
             if not piece:
                 break
             data += piece
@@ -186,10 +187,10 @@ class LiveEdge:
         self._overrun, self._slow_us = overrun, now_us + SLOW_US
         return True
 
-    def _lost(self, channel: Channel, error: PortError) -> None:
-        self.notify(states.port(channel, self._ports[channel], error.reason))
+    def _lost(self, number: int, error: PortError) -> None:
+        self.notify(states.port(number, self._ports[number], error.reason))
 
-    def _keep_open(self, channel: Channel, port: Port, tried: threading.Event) -> None:
+    def _keep_open(self, number: int, port: Port, tried: threading.Event) -> None:
         """Open the port whenever it is down, report each change once; set `tried` after the first attempt."""
         reported: str | None = None
         while not self._stopping:
@@ -202,7 +203,7 @@ class LiveEdge:
                 except PortError as error:
                     reason = error.reason
                 if not reason or reported != reason:
-                    self.notify(states.port(channel, port, reason))
+                    self.notify(states.port(number, port, reason))
                 reported = reason
             tried.set()
             time.sleep(PORT_RETRY_S)

@@ -17,7 +17,8 @@ from magbridge.bridge.learning import first_calibration
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.port import cut
-from magbridge.bridge.run import ports
+from magbridge.bridge.run import leave_wrong_devices, ports
+from magbridge.bridge.sensor_stream import other_calibrations
 from magbridge.config import Config
 from magbridge.link.clock import VehicleClock
 from magbridge.link.requests import MIN_RATE_FRACTION
@@ -82,15 +83,15 @@ class LiveCheck:
     ----------
     arrived : list of Arrived
         Messages by sender, the needed ones first.
-    readings_hz : float
-        Rate of the sensor's readings.
+    readings_hz : dict of str to float
+        Rate of each sensor's readings, by the sensor's name.
     faults : list of ConfigFault
         One warning for each thing that is missing, with its remedy.
     """
 
     def __init__(self, config: Config, duration_s: float) -> None:
         self.arrived: list[Arrived] = []
-        self.readings_hz = 0.0
+        self.readings_hz: dict[str, float] = {}
         self.faults: list[ConfigFault] = []
         own = self._link = config.link
         self._config, self._duration_us, self._begin_us = config, round(duration_s * 1e6), 0
@@ -108,17 +109,16 @@ class LiveCheck:
         keeper, clock = Keeper(config), HostClock()
         key = load_key(config.resolve(link.signing_key)) if link.signing_key else None
         start = keeper.start(clock.now_us())
-        pipeline = Pipeline(replace(config, log=None), first_calibration(config), start, key)
+        others = other_calibrations(config)
+        pipeline = Pipeline(replace(config, log=None), first_calibration(config), start, key, more=others)
         pipeline.component.streams.interval_us = self._duration_us // RATE_INTERVALS
         self._begin_us = start.time_us
-        link_port, sensor_port = ports(config)
-        edge = LiveEdge({Channel.LINK: link_port, Channel.SENSOR: sensor_port}, clock)
+        link_port, sensor_ports = ports(config)
+        edge = LiveEdge({Channel.LINK: link_port, **sensor_ports}, clock)
         keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
 
         def finish_event(time_us: int) -> None:
-            if pipeline.sensor.wrong_device:
-                pipeline.sensor.wrong_device = False
-                sensor_port.move_on()
+            leave_wrong_devices(pipeline, sensor_ports)
             if time_us - self._begin_us > self._duration_us:
                 edge.stop()
 
@@ -189,10 +189,12 @@ class LiveCheck:
             self._warn("link", f"{text}: set it by NTP or GPS")
 
     def _compare_sensor(self, pipeline: Pipeline) -> None:
-        self.readings_hz = pipeline.samples * 1e6 / self._duration_us
-        if not pipeline.samples:
-            name, remedy = self._config.sensor.driver, NO_READING[MAG_PORT_STATE(pipeline.sensor.state)]
-            self._warn("sensor", f"{name}: no reading in {self._duration_us * 1e-6:.0f} s: {remedy}")
+        for stream in pipeline.streams:
+            self.readings_hz[stream.sensor.label] = stream.samples * 1e6 / self._duration_us
+            if not stream.samples:
+                name, remedy = stream.sensor.driver, NO_READING[MAG_PORT_STATE(stream.line.state)]
+                text = f"{name}: no reading in {self._duration_us * 1e-6:.0f} s: {remedy}"
+                self._warn(stream.sensor.key, text)
 
     def _no_autopilot(self) -> str:
         """Return what is missing where no heartbeat of the autopilot came."""
@@ -242,12 +244,12 @@ class _Tap:
                 self._receive(event)
             yield event
 
-    def send(self, channel: Channel, data: bytes) -> None:
-        """Send to the sensor, and to the link what a check may send."""
-        if channel is Channel.LINK:
+    def send(self, number: int, data: bytes) -> None:
+        """Send to a sensor, and to the link what a check may send."""
+        if number == Channel.LINK:
             data = b"".join(frame for frame in cut(data) if int.from_bytes(frame[7:10], "little") in SENT)
         if data:
-            self._edge.send(channel, data)
+            self._edge.send(number, data)
 
     def credit(self, frames: list[bytes]) -> None:
         """Report to the link which frames are signed with the key."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from magbridge.bridge.events import Start
-from magbridge.config import Config, Telemetry
+from magbridge.config import Config, Sensor, Telemetry
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAV_PARAM_TYPE
+from magbridge.sensors import Driver, is_scalar
 from magbridge.version import __version__
 
 __all__ = ["beginning", "declarations"]
@@ -45,6 +46,7 @@ def declarations(
     telemetry: Mapping[str, Telemetry],
     nt_per_count: float = 0.0,
     settings: Mapping[str, float] | None = None,
+    sensors: Sequence[tuple[Sensor, Driver]] = (),
 ) -> list[bytes]:
     """Return the frames that tell a reader of the log what each column comes from, and how it was corrected.
 
@@ -59,6 +61,9 @@ def declarations(
         counts, because MAG_RAW's float32 fields are less precise than the values that were corrected.
     settings : mapping of str to float, optional
         What decides about flags and sigmas, by its key in the configuration: attributes of the log.
+    sensors : sequence of (Sensor, Driver)
+        The sensors after the first. Their columns have the name of the sensor: ``NAME`` for a scalar, else
+        ``NAME_x``, ``NAME_y`` and ``NAME_z``; ``NAME_time`` is the time of the reading.
     """
     codec = Codec(system, component)
     columns: list[dict[str, Any]] = [
@@ -80,4 +85,17 @@ def declarations(
     if nt_per_count:
         raw = {"unit": "nT", "message": "MAG_RAW", "scale": nt_per_count}
         columns += [raw | {"column": f"mag_{axis}", "field": f"count_{axis}"} for axis in "xyz"]
+    for sensor, driver in sensors:
+        columns += _sensor_columns(sensor, driver)
     return [codec.pack("MAG_COLUMN", **column) for column in columns]
+
+
+def _sensor_columns(sensor: Sensor, driver: Driver) -> list[dict[str, Any]]:
+    """Return the columns of a sensor after the first."""
+    raw: dict[str, Any] = {"message": "MAG_RAW", "match": f"sensor_id={sensor.id}", "unit": "nT"}
+    prefix = "count_" if driver.nt_per_count else ""
+    raw["scale"] = driver.nt_per_count or 1.0
+    names = {"x": sensor.name} if is_scalar(driver) else {axis: f"{sensor.name}_{axis}" for axis in "xyz"}
+    columns = [raw | {"column": name, "field": f"{prefix}{axis}"} for axis, name in names.items()]
+    time = {"column": f"{sensor.name}_time", "field": "time_usec", "unit": "s", "scale": 1e-6}
+    return [*columns, raw | time]

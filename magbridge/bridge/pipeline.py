@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from glob import has_magic
-from math import nan
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import nan, sqrt
 from typing import TYPE_CHECKING, Final
 
 from magbridge.align import Sample
@@ -15,14 +13,14 @@ from magbridge.bridge.events import Event, Start
 from magbridge.bridge.heading import LiveHeading
 from magbridge.bridge.learning import Learning, open_learner
 from magbridge.bridge.log_header import beginning, declarations
-from magbridge.bridge.needs import check
 from magbridge.bridge.position import Position
 from magbridge.bridge.recorder import Recorder
-from magbridge.bridge.sensor_line import SensorLine
+from magbridge.bridge.sensor_stream import SensorStream, open_correction, open_drivers
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.config import Align, Config
 from magbridge.correction import Correction
+from magbridge.health.comparison import SensorComparison
 from magbridge.link.attitude import NO_ATTITUDE, Attitude
 from magbridge.link.authority import Sources
 from magbridge.link.component import Component
@@ -35,8 +33,9 @@ from magbridge.link.validity import is_possible
 from magbridge.mavlink import Message, Signing, Spec, spec
 from magbridge.mavlink.enums import MAG_PORT_STATE, MAV_SEVERITY
 from magbridge.records import Channel, Corrected, Quality, Reading
-from magbridge.sensors import open_driver
-from magbridge.sensors.clock import DeviceClock, Stamp
+from magbridge.scalar_correction import CorrectedReading, ScalarCorrection
+from magbridge.sensors import Driver
+from magbridge.sensors.clock import Stamp
 from magbridge.version import __version__
 
 if TYPE_CHECKING:
@@ -44,13 +43,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Pipeline"]
 
+NOT_USED = "calibration is not of a {}: not used"
+
 LINK: Final = Channel.LINK
 SENSOR: Final = Channel.SENSOR
 ATTITUDE_ID: Final = spec("ATTITUDE").id
 HEADING_INPUTS: Final = frozenset((ATTITUDE_ID, spec("HEARTBEAT").id))
 """Messages from which the heading is computed and sent."""
-LATELY = 64
-"""Samples over which the sample rate is computed."""
 ANNOUNCED_FLAGS = int(
     Quality.STALE_TELEMETRY
     | Quality.SATURATED
@@ -59,8 +58,6 @@ ANNOUNCED_FLAGS = int(
     | Quality.UNEXPLAINED
 )
 """Flags whose changes are announced; the others change with every manoeuvre."""
-SILENCES = "sensor", "autopilot"
-"""Timers that say who is silent."""
 
 
 class Pipeline:
@@ -75,6 +72,8 @@ class Pipeline:
         The signing key.
     navigate : callable or None
         Makes the navigation of ``[navigation]`` for the component that sends its messages.
+    more : mapping of int to Calibration, optional
+        Calibrations of the sensors after the first, by sensor id.
 
     Attributes
     ----------
@@ -82,8 +81,8 @@ class Pipeline:
         The MAVLink side.
     recorder : Recorder
         All inputs and outputs since it was last drained: the records for the log.
-    sensor : SensorLine
-        Holds the commands that are to be sent to the sensor.
+    streams : list of SensorStream
+        The sensors; the first is the main sensor.
     navigation : Navigation or None
     learning : Learning or None
 
@@ -101,19 +100,17 @@ class Pipeline:
         start: Start,
         key: bytes | None = None,
         navigate: Callable[[Component], Navigation] | None = None,
+        more: Mapping[int, Calibration] | None = None,
     ) -> None:
         self._config, self._start = config, start
-        self._driver = open_driver(config.sensor.driver, config.sensor.options, config.path)
-        self._clock = DeviceClock.of(self._driver)
+        drivers = open_drivers(config)
         self._telemetry = TelemetryMap(config.telemetry, config.link.autopilot, config.path)
-        foreign = calibration is not None and not calibration.sensor.may_be(config.sensor.driver)
         check_publish(config.publish, config.path)
-        if calibration is not None:
-            check(calibration, config)
-        used = None if foreign else calibration
-        learner = open_learner(config, used)
-        self._correction = Correction(used, config.align, learner)
-        self._notices, self._direction = self._correction.notices, self._correction.direction
+        foreign = calibration is not None and not calibration.sensor.may_be(config.sensor.driver)
+        learner = open_learner(config, None if foreign else calibration)
+        main, used = open_correction(config.sensor, drivers[0], config, calibration, None, learner)
+        self._correction = main
+        self._direction = main.direction if isinstance(main, Correction) else None
         self._calibration_id = calibration_id(used) if used else 0
         autopilot = config.link.system, config.link.autopilot
         stamps = start.signing_timestamp, start.signing_streams
@@ -133,31 +130,49 @@ class Pipeline:
             version=__version__,
             kept=start.parameters,
             status=self._status,
-            speaking=lambda: self.sensor.state == MAG_PORT_STATE.OK,
+            speaking=lambda: self.streams[0].line.state == MAG_PORT_STATE.OK,
             streams=self._streams(),
         )
         own = config.link
         self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
-        self.sensor = SensorLine(
-            config.sensor.driver, self._driver.start, round(config.sensor.timeout * 1e6),
-            self.component.announcer, self.component.timers, start.time_us,
-            searching=has_magic(config.sensor.port),
-        )  # fmt: skip
-        self._changes = StateChanges(self.component.codec, self.component.announcer, self.sensor)
+        stream = SensorStream(
+            config.sensor, drivers[0], main, self.component, start.time_us, self.component.publisher
+        )
+        self.streams = [stream, *self._other_streams(drivers[1:], more or {}, used)]
+        self._by_id = {one.sensor_id: one for one in self.streams}
+        lines = {one.sensor_id: one.line for one in self.streams}
+        if len(self.streams) > 1:
+            self.component.more_reports += [one.report for one in self.streams]
+        self._changes = StateChanges(self.component.codec, self.component.announcer, lines)
+        self._comparisons = [
+            SensorComparison((config.sensor.label, one.label)) for one in config.more_sensors
+        ]
         self.recorder = Recorder(config.link.system, config.link.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None
         self.learning = Learning(learner, self.component) if learner is not None else None
         self._raw_rate = self.component.rates["MAG_RAW"]
-        self._parts, self._ignored_positions = self._correction.parts, set[int]()
+        self._parts, self._ignored_positions = main.parts, set[int]()
         self._position = Position(self._report_no_anomaly)
         has_boresight = used is not None and used.boresight is not None
         self.heading = LiveHeading(config.heading, self.component) if has_boresight else None
-        self._samples = self._lost = self._quality = 0
         self._late = False
-        self._times: deque[int] = deque(maxlen=LATELY)
         self.component.parameters.watch(self._tune)
         self._tune()
         self._begin(start, used, foreign=foreign)
+
+    def _other_streams(
+        self, drivers: Sequence[Driver], calibrations: Mapping[int, Calibration], main: Calibration | None
+    ) -> Iterator[SensorStream]:
+        """Yield the sensors after the first, each with its own calibration; `main` is that of the first."""
+        config, component = self._config, self.component
+        for sensor, driver in zip(config.more_sensors, drivers, strict=True):
+            number = sensor.id or 0
+            own = calibrations.get(number)
+            correction, used = open_correction(sensor, driver, config, own, main)
+            if own is not None and used is None:
+                component.announcer.send_statustext(NOT_USED.format(sensor.driver), MAV_SEVERITY.ERROR)
+            publisher = component.another_publisher(number, calibration_id(used) if used else 0)
+            yield SensorStream(sensor, driver, correction, component, self._start.time_us, publisher)
 
     def _streams(self) -> dict[str, tuple[float, float]]:
         """Return the rates at which the bridge needs messages of the autopilot."""
@@ -169,18 +184,14 @@ class Pipeline:
         )
 
     @property
-    def samples(self) -> int:
-        """Number of readings so far."""
-        return self._samples
-
-    @property
     def declarations(self) -> list[bytes]:
         """The frames that every file of the log begins with."""
         own, parameters = self._config.link, self.component.parameters
         keys = [row.key for row in parameters.table.values()]
         settings = {key: parameters.of(key) for key in keys if key.startswith(("align.", "telemetry."))}
-        telemetry, nt_per_count = self._config.telemetry, self._driver.nt_per_count
-        return declarations(own.system, own.component, telemetry, nt_per_count, settings)
+        telemetry, nt_per_count = self._config.telemetry, self.streams[0].driver.nt_per_count
+        others = [(one.sensor, one.driver) for one in self.streams[1:]]
+        return declarations(own.system, own.component, telemetry, nt_per_count, settings, others)
 
     @property
     def deadline(self) -> int:
@@ -192,17 +203,19 @@ class Pipeline:
         component, recorder = self.component, self.recorder
         outbox, time_us, channel, data = component.outbox, event.time_us, event.channel, event.data
         if channel is Channel.STATE and data and (held_us := self._changes.held_up(data)):
-            for name in SILENCES:  # who was not listened to was not silent
-                component.timers.delay(name, held_us)
+            for name in ("autopilot", *(stream.line.timer for stream in self.streams)):
+                component.timers.delay(name, held_us)  # who was not listened to was not silent
         component.advance(time_us)
         due = outbox.drain()
         recorder.sent(due)
         if self._late and time_us > self._changes.until_us:
             self._late = False
-            self._correction.aligner.late_since_us = 0
+            self._set_late(0)
         if channel is SENSOR:
-            recorder.sensor(time_us, data)
-            self._receive_sensor(data, time_us)
+            recorder.sensor(time_us, data, event.sensor_id)
+            if (stream := self._by_id.get(event.sensor_id)) is not None:
+                for reading, stamp in stream.receive(data, time_us):
+                    self._sample(stream, reading, stamp)
         elif channel is LINK:
             self._receive_link(data, time_us)
         elif data:
@@ -210,7 +223,7 @@ class Pipeline:
             self._changes.receive(data, time_us)
             if self._changes.until_us >= time_us:
                 self._late = True
-                self._correction.aligner.late_since_us = self._changes.since_us
+                self._set_late(self._changes.since_us)
         answers = outbox.drain()
         recorder.sent(answers)
         return due + answers if due else answers
@@ -221,57 +234,81 @@ class Pipeline:
         self.recorder.state(codec.now_us, states.interleaved(len(messages)))
         return b"".join([codec.frame(layout, payload) for layout, payload in messages])
 
-    def _receive_sensor(self, data: bytes, time_us: int) -> None:
-        readings = self._driver.feed(data)
-        if not readings:
-            self.sensor.on_unparsed(data, time_us)
-            return
-        self.sensor.on_reading(time_us)
-        stamps = self._clock.stamp(readings, time_us)
-        for reading, stamp in zip(readings, stamps):  # noqa: B905 - one stamp per reading; without strict= it compiles to a plain loop
-            self._sample(reading, stamp)
+    def _set_late(self, since_us: int) -> None:
+        """Set since when inputs may have waited, µs; 0: they did not."""
+        for stream in self.streams:
+            stream.correction.aligner.late_since_us = since_us
 
-    def _sample(self, reading: Reading, stamp: Stamp) -> None:
-        time_us, missing, restarted = stamp.time_us, stamp.missing, stamp.restarted
-        component, position = self.component, self._position
-        self._samples += 1
-        self._lost += missing
-        self._times.append(time_us)
-        self.sensor.read(reading.field, time_us)
-        utc_us = time_us + component.codec.utc_offset_us
-        main_field = self._parts.call("position", nan, position.main_field, time_us, utc_us)
-        sample, corrected = self._correction.reading(
-            reading,
-            time_us,
-            restarted=restarted,
-            missing=missing,
-            main_field=main_field,
-            where=position.where,
-            depth=position.depth,
-        )
-        if self._notices:
-            self._report_implausible()
+    def _sample(self, stream: SensorStream, reading: Reading, stamp: Stamp) -> None:
+        position, main = self._position, self.streams[0]
+        utc_us = stamp.time_us + self.component.codec.utc_offset_us
+        main_field = self._parts.call("position", nan, position.main_field, stamp.time_us, utc_us)
+        for result in stream.correct(reading, stamp, main_field, position.where, position.depth):
+            self._process(stream, result)
+        if stream is main:
+            for other in self.streams[1:]:
+                for result in other.complete():
+                    self._process(other, result)
+
+    def _process(self, stream: SensorStream, result: CorrectedReading) -> None:
+        """Check, use and publish a corrected sample."""
+        sample, corrected, main_field, _ = result
+        if self._comparisons:
+            compare = self._compare
+            corrected = self._parts.call("comparison of sensors", corrected, compare, stream, result)
+        if stream.correction.notices:
+            self._report_implausible(stream)
         doubtful = corrected.quality & ANNOUNCED_FLAGS
-        if doubtful != self._quality:
-            self._report_doubtful(doubtful)
-        anomaly = corrected.total_field - main_field
-        if self.navigation is not None:
-            self._parts.call("navigation", None, self.navigation.sample, sample.time_us, corrected)
-        publisher = component.publisher
-        attitude = self._parts.call("heading", NO_ATTITUDE, self._attitude, sample, corrected)
-        publisher.publish(sample, corrected, anomaly, attitude)
-        if self.heading is not None:
+        if doubtful != stream.quality:
+            self._report_doubtful(stream, doubtful)
+        anomaly, attitude = corrected.total_field - main_field, NO_ATTITUDE
+        is_main = stream is self.streams[0]
+        if is_main:
+            for other in self.streams[1:]:
+                other.use_vector(sample.time_us, corrected.field)
+            if self.navigation is not None:
+                self._parts.call("navigation", None, self.navigation.sample, sample.time_us, corrected)
+            attitude = self._parts.call("heading", NO_ATTITUDE, self._attitude, sample, corrected)
+        stream.publisher.publish(sample, corrected, anomaly, attitude)
+        if is_main and self.heading is not None:
             self.heading.send(attitude, sample.time_us, corrected.quality)
         if self.recorder.active and self._raw_rate.hertz != 0:
-            self.recorder.raw(component.codec.now_us, publisher.raw_payload(sample))
-        if self.learning is not None:
+            self.recorder.raw(self.component.codec.now_us, stream.publisher.raw_payload(sample))
+        if is_main and self.learning is not None:
             self._parts.call("learning", None, self.learning.sample, sample.time_us)
+
+    def _compare(self, stream: SensorStream, result: CorrectedReading) -> Corrected:
+        """Return a sample with the flags and the sigma that the comparison of the sensors adds."""
+        sample, corrected, main_field, stated = result
+        total = corrected.total_field, stated
+        main = main_field, stream.correction.aligner.settings.reference_sigma
+        variance, flags = 0.0, 0
+        for other, comparison in zip(self.streams[1:], self._comparisons, strict=True):
+            if stream is not other and stream is not self.streams[0]:
+                continue
+            side = 1 if stream is other else 0
+            more, flag = comparison.update(side, sample.time_us, total, main, corrected.quality)
+            variance, flags = max(variance, more), flags | flag
+            if comparison.message:
+                severity = MAV_SEVERITY.ERROR if comparison.is_wrong else MAV_SEVERITY.INFO
+                self.component.announcer.send_statustext(comparison.message, severity)
+                comparison.message = ""
+        # the checks of the sensor itself may have added that difference already
+        missing = stated * stated + variance - corrected.total_field_sigma**2
+        if not flags and not (variance and missing > 0.0):
+            return corrected
+        missing = max(missing, 0.0)
+        sigma = sqrt(corrected.total_field_sigma**2 + missing)
+        x, y, z = (sqrt(component * component + missing) for component in corrected.field_sigma)
+        quality = corrected.quality | flags
+        return Corrected(corrected.total_field, sigma, corrected.field, (x, y, z), quality)
 
     def _attitude(self, sample: Sample, corrected: Corrected) -> Attitude:
         """Return the attitude at a sample with the heading that follows from the corrected field."""
         if self.heading is None:
             return NO_ATTITUDE
         time_us, correction = sample.time_us, self._correction
+        assert isinstance(correction, Correction)
         main = self._position.direction(time_us, time_us + self.component.codec.utc_offset_us)
         crustal = correction.aligner.settings.reference_sigma
         return self.heading.compute(sample, corrected, correction.calibration, main, crustal)
@@ -283,7 +320,8 @@ class Pipeline:
                 if self._sources.admit(name, message.component, time_us):
                     guessed = self._late and when_us == time_us
                     true_us = when_us - self._telemetry.delays_us[name]
-                    self._correction.telemetry(name, value, true_us, guessed=guessed)
+                    for stream in self.streams:
+                        stream.correction.telemetry(name, value, true_us, guessed=guessed)
             if not is_possible(message):
                 self.component.announcer.state(
                     f"impossible {message.name}", f"{message.name} with impossible values ignored",
@@ -327,18 +365,25 @@ class Pipeline:
         parameters = self.component.parameters
         settings = {name: parameters.of(f"align.{name}") for name in Align.__struct_fields__}
         ages = {name: parameters.of(f"telemetry.{name}.max_age") for name in self._config.telemetry}
-        self._correction.aligner.tune(Align(**settings), ages)
+        for stream in self.streams:
+            stream.tune(Align(**settings), ages)
 
-    def _report_doubtful(self, doubtful: int) -> None:
+    def _report_doubtful(self, stream: SensorStream, doubtful: int) -> None:
         names = Quality(doubtful).names().replace("_", " ")
         severity = MAV_SEVERITY.WARNING if names else MAV_SEVERITY.INFO
-        self.component.announcer.state("quality", f"field: {names or 'good'}", severity)
-        self._quality = doubtful
+        key = f"quality {stream.sensor_id}" if stream.sensor_id else "quality"
+        self.component.announcer.state(key, f"{self._field_of(stream)}: {names or 'good'}", severity)
+        stream.quality = doubtful
 
-    def _report_implausible(self) -> None:
-        for text in self._notices:
-            self.component.announcer.send_statustext(text, MAV_SEVERITY.ERROR)
-        self._notices.clear()
+    def _report_implausible(self, stream: SensorStream) -> None:
+        prefix = f"{stream.sensor.label}: " if len(self.streams) > 1 else ""
+        for text in stream.correction.notices:
+            self.component.announcer.send_statustext(prefix + text, MAV_SEVERITY.ERROR)
+        stream.correction.notices.clear()
+
+    def _field_of(self, stream: SensorStream) -> str:
+        """Return what messages call the field of a sensor."""
+        return f"field of {stream.sensor.label}" if len(self.streams) > 1 else "field"
 
     def _report_no_anomaly(self, reason: str) -> None:
         self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
@@ -350,9 +395,10 @@ class Pipeline:
         self._changes.check_clock()
         send_statustext = self.component.announcer.send_statustext
         if foreign:
-            send_statustext(
-                f"calibration is not of a {self._config.sensor.driver}: not used", MAV_SEVERITY.ERROR
-            )
+            send_statustext(NOT_USED.format(self._config.sensor.driver), MAV_SEVERITY.ERROR)
+        elif isinstance(self._correction, ScalarCorrection):
+            if self._config.sensor.sigma is None:
+                send_statustext("scalar without sigma: field of the vehicle unknown", MAV_SEVERITY.WARNING)
         elif calibration is None:
             send_statustext("no calibration: raw field", MAV_SEVERITY.WARNING)
         elif calibration.method == "none":
@@ -368,9 +414,7 @@ class Pipeline:
 
     def _status(self) -> Condition:
         """Return what MAG_STATUS says of the sensor, the samples and the log."""
-        times, now_us = self._times, self.component.codec.now_us
-        # of a sensor that is silent, no rate is known: that of its last samples is not the present one
-        span_us = times[-1] - times[0] if times and self.sensor.state == MAG_PORT_STATE.OK else 0
+        now_us, main = self.component.codec.now_us, self.streams[0]
         tracks = self._correction.aligner.by_name
         stale = sum(
             1 << bit
@@ -378,13 +422,13 @@ class Pipeline:
             if bit < 32 and name in tracks and tracks[name].stale(now_us)
         )
         return Condition(
-            self._samples,
-            self._lost,
-            self._driver.bytes_skipped,
-            self._driver.frames_bad,
-            self.sensor.state,
-            -self._clock.drift_ppm,
-            (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan,
+            main.samples,
+            main.lost,
+            main.driver.bytes_skipped,
+            main.driver.frames_bad,
+            main.line.state,
+            -main.clock.drift_ppm,
+            main.sample_rate,
             stale,
             # with the frames yet to be sent: in a replay several timers may fire before the outbox is drained
             self.recorder.count + len(self.component.outbox.frames) if self.recorder.active else 0,

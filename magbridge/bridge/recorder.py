@@ -46,13 +46,13 @@ class Recorder:
         for frame in frames:
             self._add(time_us, LINK, frame)
 
-    def sensor(self, time_us: int, data: bytes) -> None:
-        """Record bytes as they came from the sensor."""
+    def sensor(self, time_us: int, data: bytes, sensor_id: int = 0) -> None:
+        """Record bytes as they came from a sensor."""
         if not self.active:
             return
         while data:
             piece, data = data[:RECORDED_BYTES], data[RECORDED_BYTES:]
-            frame = self._scribe.frame(BYTES, BYTES_HEADER.pack(0, len(piece)) + piece)
+            frame = self._scribe.frame(BYTES, BYTES_HEADER.pack(sensor_id, len(piece)) + piece)
             self._add(time_us, SENSOR, frame)
 
     def state(self, time_us: int, frame: bytes) -> None:

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections import deque
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
@@ -15,7 +16,7 @@ from threading import Thread
 from magbridge.bridge import states
 from magbridge.bridge.bus_port import BusPort, sensor_port
 from magbridge.bridge.drive import drive, set_up
-from magbridge.bridge.events import HostClock
+from magbridge.bridge.events import HostClock, port_number
 from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.keeper import Keeper
 from magbridge.bridge.links import open_link
@@ -29,7 +30,7 @@ from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.records import Channel
 
-__all__ = ["ports", "run"]
+__all__ = ["leave_wrong_devices", "ports", "run"]
 
 SWITCH = 0.0005
 """s the log's thread may hold up the bridge (Python's switch interval); 5 ms would show in the latency."""
@@ -58,10 +59,10 @@ def run(path: Path) -> None:
     keeper = Keeper(config)
     clock = HostClock()
     pipeline = set_up(config, keeper.start(clock.now_us()))
-    link, sensor = ports(config)
+    link, sensors = ports(config)
     nmea = nmea_port(config)
     # the link first, so that a sensor's port that does not open can be reported over it
-    edge = LiveEdge({Channel.LINK: link, Channel.SENSOR: sensor}, clock)
+    edge = LiveEdge({Channel.LINK: link, **sensors}, clock)
     keeper.attach(edge)
     keeper.save(pipeline)  # signing stamps are reserved on disk before the first frame uses one
     log = _open_log(config, edge, pipeline)
@@ -93,9 +94,7 @@ def run(path: Path) -> None:
         watch.look(time_us)
         if sentences is not None and pipeline.heading is not None:
             sentences.send(pipeline.heading.nmea, time_us)
-        if pipeline.sensor.wrong_device:
-            pipeline.sensor.wrong_device = False
-            sensor.move_on()
+        leave_wrong_devices(pipeline, sensors)
 
     try:
         drive(pipeline, edge, log, finish_event)
@@ -109,8 +108,16 @@ def run(path: Path) -> None:
             log.close()
 
 
-def ports(config: Config) -> tuple[Port, SerialPort | BusPort]:
-    """Return the (unopened) ports of the link and of the sensor.
+def leave_wrong_devices(pipeline: Pipeline, sensors: Mapping[int, SerialPort | BusPort]) -> None:
+    """Try the next device for each sensor on whose port another instrument is."""
+    for stream in pipeline.streams:
+        if stream.line.wrong_device:
+            stream.line.wrong_device = False
+            sensors[port_number(stream.sensor_id)].move_on()
+
+
+def ports(config: Config) -> tuple[Port, dict[int, SerialPort | BusPort]]:
+    """Return the (unopened) ports of the link and of the sensors, these by MAG_PORT_NAME.
 
     ConfigError: a name that no port can have.
     """
@@ -123,7 +130,8 @@ def ports(config: Config) -> tuple[Port, SerialPort | BusPort]:
         budget=1e3 * own.max_other_peers_rate,
         signed=own.signing_key is not None,
     )
-    return link, sensor_port(config)
+    sensors = {port_number(one.id or 0): sensor_port(one, config.path) for one in config.sensors}
+    return link, sensors
 
 
 def _stop_on_signals(edge: LiveEdge) -> None:

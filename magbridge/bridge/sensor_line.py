@@ -49,10 +49,14 @@ class SensorLine:
         The link's.
     start_us : int
         µs since 1970 UTC.
+    sensor_id : int
+        Which sensor.
 
     Attributes
     ----------
     state : MAG_PORT_STATE
+    timer : str
+        Name of the timer that fires if the sensor is silent.
     to_send : list of bytes
         Commands that are due; the caller of the pipeline sends them and empties the list.
     wrong_device : bool
@@ -70,7 +74,11 @@ class SensorLine:
         start_us: int,
         *,
         searching: bool = False,
+        sensor_id: int = 0,
     ) -> None:
+        suffix = f" {sensor_id}" if sensor_id else ""
+        self.timer, self._command_timer = f"sensor{suffix}", f"command{suffix}"
+        self._reading_key = f"reading{suffix}"
         self._name, self._start, self._timeout_us = name, start, timeout_us
         self._announcer, self._timers = announcer, timers
         self.state = MAG_PORT_STATE.ABSENT
@@ -85,14 +93,14 @@ class SensorLine:
         self._field: Vector | None = None
         self._repeats = self._since_us = 0
         self._hangs = False
-        timers.every("sensor", LINE_CHECK_INTERVAL_US, self._look, start_us + LINE_CHECK_INTERVAL_US)
+        timers.every(self.timer, LINE_CHECK_INTERVAL_US, self._look, start_us + LINE_CHECK_INTERVAL_US)
 
     def on_reading(self, time_us: int) -> None:
         """Record a reading."""
         self._received_us, self._known = time_us, True
         if self.state != OK:
             self.state = OK
-            self._announcer.state("sensor", f"{self._name} speaks")
+            self._announcer.state(self.timer, f"{self._name} speaks")
 
     def read(self, field: Vector, time_us: int) -> None:
         """Check the values of a reading (nT); one that stays the same for long is announced."""
@@ -100,13 +108,13 @@ class SensorLine:
             self._field, self._repeats, self._since_us = field, 0, time_us
             if self._hangs:
                 self._hangs = False
-                self._announcer.state("reading", f"{self._name}'s readings change again")
+                self._announcer.state(self._reading_key, f"{self._name}'s readings change again")
             return
         self._repeats += 1
         if not self._hangs and self._repeats >= MIN_REPEATED_READINGS and time_us - self._since_us >= SAME_US:
             self._hangs = True
             text = f"{self._name} sends the same reading for {SAME_US // 1_000_000} s"
-            self._announcer.state("reading", text, MAV_SEVERITY.WARNING)
+            self._announcer.state(self._reading_key, text, MAV_SEVERITY.WARNING)
 
     def on_unparsed(self, data: bytes, time_us: int) -> None:
         """Record bytes that complete no reading."""
@@ -115,7 +123,7 @@ class SensorLine:
         self._tail = received[-MAX_SENTENCE_BYTES:]
         if self._listen_us and not self._known and NMEA_SENTENCE.search(received):
             self._commands, self.wrong_device = (), True
-            self._timers.cancel("command")
+            self._timers.cancel(self._command_timer)
 
     def opened(self, time_us: int) -> None:
         """Begin to send the start-up commands: it may have been without power. SILENT until it sends."""
@@ -125,15 +133,15 @@ class SensorLine:
     def lost(self, reason: str) -> None:
         """Record that the port is gone."""
         self.state = MAG_PORT_STATE.LOST
-        self._timers.cancel("command")
-        self._announcer.state("sensor", f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)
+        self._timers.cancel(self._command_timer)
+        self._announcer.state(self.timer, f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)
 
     def _look(self, time_us: int) -> None:
         if time_us - self._received_us < self._timeout_us or self.state == MAG_PORT_STATE.LOST:
             return
         sends = time_us - self._unparsed_us < self._timeout_us // 2
         what = self._unparsed() if sends else "is silent"
-        self._announcer.state("sensor", f"{self._name} {what}", MAV_SEVERITY.ERROR)
+        self._announcer.state(self.timer, f"{self._name} {what}", MAV_SEVERITY.ERROR)
         self.wrong_device = not self._known
         self._wake(time_us)
 
@@ -148,11 +156,15 @@ class SensorLine:
     def _wake(self, time_us: int, listen_us: int = 0) -> None:
         self.state, self._received_us = MAG_PORT_STATE.SILENT, time_us
         if listen_us:
-            self._timers.once("command", time_us + listen_us, lambda t: self._command(t, self._commands))
+            self._timers.once(
+                self._command_timer, time_us + listen_us, lambda t: self._command(t, self._commands)
+            )
         else:
             self._command(time_us, self._commands)
 
     def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
         if commands:
             self.to_send.append(commands[0])
-            self._timers.once("command", time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:]))
+            self._timers.once(
+                self._command_timer, time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:])
+            )

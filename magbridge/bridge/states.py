@@ -5,7 +5,6 @@ from __future__ import annotations
 from magbridge.bridge.port import Port
 from magbridge.mavlink.codec import Codec
 from magbridge.mavlink.enums import MAG_PORT_NAME, MAG_PORT_STATE, MAV_SEVERITY
-from magbridge.records import Channel
 
 __all__ = ["clock_step", "interleaved", "log_state", "notice", "opened", "port", "standstill", "too_slow"]
 
@@ -34,22 +33,22 @@ def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:
     return _frame("STATUSTEXT", severity=int(severity), text=text)
 
 
-def port(channel: Channel, what: Port, reason: str) -> bytes:
+def port(number: int, what: Port, reason: str) -> bytes:
     """Return the frame that says that a port opened (no `reason`) or which one is not open, and why."""
     state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
     # the name last, because the end of a long text is cut off
     why = f"{reason}: {what.name}" if reason else ""
-    return _frame("MAG_PORT", port=int(channel), state=int(state), dropped=what.dropped, reason=why)
+    return _frame("MAG_PORT", port=number, state=int(state), dropped=what.dropped, reason=why)
 
 
-def too_slow(channel: Channel, what: Port) -> bytes:
+def too_slow(number: int, what: Port) -> bytes:
     """Return the frame that says that an open port does not take all that is sent."""
     why = f"too slow, {what.overrun} bytes not sent so far"
     state = int(MAG_PORT_STATE.OK)
-    return _frame("MAG_PORT", port=int(channel), state=state, dropped=what.dropped, reason=why)
+    return _frame("MAG_PORT", port=number, state=state, dropped=what.dropped, reason=why)
 
 
-def opened(name: MAG_PORT_NAME) -> bytes:
+def opened(name: int) -> bytes:
     """Return the frame that says that a port opened, for a replay, which has no `Port`."""
     return _frame("MAG_PORT", port=int(name), state=int(MAG_PORT_STATE.OK))
 

@@ -141,7 +141,8 @@ def _listen(config: Path) -> list[ConfigFault]:
     print(f"{config}: {LISTEN_TIME_S:.0f} s on {loaded.link.url} and {loaded.sensor.port}", flush=True)
     check = LiveCheck(loaded, LISTEN_TIME_S)
     check.listen()
-    print(f"sensor {loaded.sensor.driver}: {check.readings_hz:.4g} readings/s")
+    for name, rate_hz in check.readings_hz.items():
+        print(f"sensor {name}: {rate_hz:.4g} readings/s")
     print(f"{'message':30} {'from':>8} {'Hz':>8} {'needed':>8}")
     for one in check.arrived:
         needed = f"{one.needed_hz:g}" if one.needed_hz else "-"

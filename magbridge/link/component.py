@@ -68,6 +68,8 @@ class Component:
         The signed frames of the last :meth:`receive` that were accepted.
     file_requests : deque of Message
         Requests for files; the bridge takes them out.
+    more_reports : list of callable
+        Functions that send what is sent with each MAG_STATUS.
     metadata : mapping of str to bytes
         The files that describe the parameters, by path.
     parameters, rates, announcer, vehicle, publisher
@@ -95,6 +97,7 @@ class Component:
         self._frame_log = FrameLogWriter(link.system, link.component)
         self.outbox, self.timers = Outbox(self.codec), Timers()
         self.received: list[bytes] = []
+        self.more_reports: list[Callable[[], None]] = []
         self.genuine: list[bytes] = []
         self._whole = link.shared
         self._refusals_reported = 0
@@ -121,7 +124,7 @@ class Component:
             self.outbox, self.vehicle, start_us, version, calibration_id, status, speaking,
             self.metadata[metadata.GENERAL],
         )  # fmt: skip
-        by_clock = {"HEARTBEAT": self._reports.heartbeat, "MAG_STATUS": self._reports.status}
+        by_clock = {"HEARTBEAT": self._reports.heartbeat, "MAG_STATUS": self._report_status}
         self._authority = Authority(link.system, link.autopilot)
         self._service = ParameterService(
             self.parameters, self.outbox, self.timers, self.announcer, self._authority
@@ -148,6 +151,12 @@ class Component:
             self._message_rates.send_by_clock(name, report)
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
+    def _report_status(self) -> None:
+        """Send MAG_STATUS, and what is sent with it."""
+        self._reports.status()
+        for report in self.more_reports:
+            report()
+
     @property
     def peer(self) -> tuple[int, int]:
         """System and component of the autopilot."""
@@ -156,6 +165,11 @@ class Component:
     def use_calibration(self, calibration_id: int) -> None:
         """Name another calibration in every message from now on."""
         self.publisher.calibration_id = self._reports.calibration_id = calibration_id
+
+    def another_publisher(self, sensor_id: int, calibration_id: int) -> Publisher:
+        """Return the sender of another sensor's samples: MAG_RAW and MAG_FIELD with its id."""
+        rates = {name: self._message_rates.another(name) for name in ("MAG_RAW", "MAG_FIELD")}
+        return Publisher(self.outbox, rates, calibration_id, sensor_id=sensor_id)
 
     @property
     def next_deadline(self) -> int:

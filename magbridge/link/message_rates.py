@@ -49,7 +49,14 @@ class MessageRates:
         self._parameters, self._timers, self._codec = parameters, timers, codec
         self.by_name = {name: Rate(parameters[rate_name(name)]) for name in LIMITS}
         self._by_clock: dict[str, Callable[[], None]] = {}
+        self._more: list[tuple[str, Rate]] = []
         parameters.watch(self._changed)
+
+    def another(self, name: str) -> Rate:
+        """Return one more rate of a message, with its own times: for the samples of another sensor."""
+        rate = Rate(self.by_name[name].hertz)
+        self._more.append((name, rate))
+        return rate
 
     def send_by_clock(self, name: str, report: Callable[[], None]) -> None:
         """Send a message at times of the clock, not with the samples; here a rate of 0 is off."""
@@ -75,6 +82,9 @@ class MessageRates:
 
     def _changed(self, parameter: str) -> None:
         """Apply a parameter that was changed, if it is a message's rate."""
+        for name, rate in self._more:
+            if rate_name(name) == parameter:
+                rate.set(self._parameters[parameter])
         for name, rate in self.by_name.items():
             if rate_name(name) == parameter:
                 rate.set(self._parameters[parameter])

@@ -44,19 +44,28 @@ class Publisher:
     ----------
     outbox : Outbox
     rates : mapping of str to Rate
-        By message name; those of `PUBLISHED` are used.
+        By message name; of those of `PUBLISHED`, the messages that are sent.
     calibration_id : int
         CRC-32 of the calibration's file; 0 is none.
     start_us : int
         µs, when the bridge started: NAMED_VALUE_FLOAT counts from there.
+    sensor_id : int
+        Which sensor the samples are of.
     """
 
     def __init__(
-        self, outbox: Outbox, rates: Mapping[str, Rate], calibration_id: int = 0, start_us: int = 0
+        self,
+        outbox: Outbox,
+        rates: Mapping[str, Rate],
+        calibration_id: int = 0,
+        start_us: int = 0,
+        sensor_id: int = 0,
     ) -> None:
         self._outbox, self._codec = outbox, outbox.codec
-        self.calibration_id, self._start_us = calibration_id, start_us
-        self._messages = [(rates[name], getattr(self, method)) for name, method in PUBLISHED.items()]
+        self.calibration_id, self._start_us, self._sensor_id = calibration_id, start_us, sensor_id
+        self._messages = [
+            (rates[name], getattr(self, method)) for name, method in PUBLISHED.items() if name in rates
+        ]
         self.latest: tuple[Sample, Corrected, float, Attitude] | None = None
         self.samples = 0
 
@@ -112,7 +121,7 @@ class Publisher:
             max(sample.reading_us + self._codec.utc_offset_us, 0), (sequence or 0) & MASK,
             x, y, z, x_count, y_count, z_count,
             nearest(x_late * 1e6), nearest(y_late * 1e6), nearest(z_late * 1e6),
-            reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, 0, flags,
+            reading.temperature, reading.supply, (cycle or 0) & 0xFFFF, self._sensor_id, flags,
         )  # fmt: skip
 
     def _field(self, sample: Sample, corrected: Corrected, anomaly: float, attitude: Attitude) -> None:
@@ -122,7 +131,7 @@ class Publisher:
             max(sample.time_us + self._codec.utc_offset_us, 0), corrected.total_field,
             self.samples & MASK, self.calibration_id, corrected.total_field_sigma,
             x, y, z, x_sigma, y_sigma, z_sigma, anomaly, sample.age,
-            (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, 0,
+            (self._codec.now_us - sample.time_us) * 1e-6, corrected.quality, self._sensor_id,
             *(attitude.heading_fields if attitude.is_known else NO_HEADING),
         )  # fmt: skip
         self._outbox.put(FIELD_MESSAGE, payload)

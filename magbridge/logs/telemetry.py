@@ -37,7 +37,7 @@ from magbridge.columns import AGE, CHANNEL_TIMES, CORRECTED
 from magbridge.logs.compasses import LogCompass, by_columns, choose
 from magbridge.logs.deployment import deployment, sliced
 from magbridge.logs.resample import MAX_AGE
-from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction
+from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction, is_of_main_sensor
 from magbridge.logs.telemetry_survey import AUTOPILOT, LogContents, survey
 from magbridge.logs.telemetry_writer import FileWriter
 from magbridge.mavlink import LogReader, Message, Record, Source, spec
@@ -64,6 +64,8 @@ MAX_TELEMETRY_AGE_US = round(MAX_AGE * 1e6)
 NEVER = -(1 << 62)
 SINGLE = 1e-7
 """Relative error of a float32; counts that differ from the channel by more belong to another sensor."""
+SENSOR_ID, OTHER_TIME = "sensor_id", "_time"
+"""Field by which a column belongs to a sensor after the first; ending of the column with the times."""
 FIELD, STEP, NAMED = spec("MAG_FIELD").id, spec("MAG_CLOCK_STEP").id, spec("NAMED_VALUE_FLOAT")
 TIME_COLUMNS = ("time", *CHANNEL_TIMES)
 
@@ -128,7 +130,10 @@ class TelemetryRows:
             ]
             for number, values in TELEMETRY.items()
         }
-        self._counted = [one for one in survey.declared if one.message == self._source]
+        of_source = [one for one in survey.declared if one.message == self._source]
+        self._counted = [one for one in of_source if SENSOR_ID not in one.match]
+        # of the sensors after the first: the last reading, and when it was taken
+        self._others = [(self._slot[one.column], one) for one in of_source if SENSOR_ID in one.match]
         self._declared: dict[int, list[tuple[int, Callable[[bytes], float | None]]]] = {}
         for one in survey.declared:
             if one.message != self._source:
@@ -154,7 +159,10 @@ class TelemetryRows:
             return
         if not (self._survey.ours and record.channel == Channel.SENT):
             self._receive(message, record.time_us)
-        if number == self._source and message.component == self._survey.component:
+        if not is_of_main_sensor(number, message.payload):
+            if number == self._source and message.component == self._survey.component:
+                self._note_other(record.time_us, message.payload)
+        elif number == self._source and message.component == self._survey.component:
             columns = self._make(message.payload)
             for one in self._counted:
                 exact = one.find(message.payload)
@@ -163,6 +171,14 @@ class TelemetryRows:
             self._row(record.time_us, columns)
         elif number == FIELD and self.rows:
             self._correct(correction(message.payload))
+
+    def _note_other(self, time_us: int, payload: bytes) -> None:
+        """Note the reading of a sensor after the first."""
+        for slot, declared in self._others:
+            value = declared.find(payload)
+            if value is not None:
+                step_s = self._to_step_us / 1e6 if declared.column.endswith(OTHER_TIME) else 0.0
+                self._note(time_us, slot, value + step_s)
 
     def _receive(self, message: Message, time_us: int) -> None:
         """Note the telemetry in a message, from the component that each column is taken from."""
@@ -214,10 +230,23 @@ class TelemetryRows:
         attrs = {"bytes_skipped": lost[0] - self._skipped, "damages": lost[1] - self._damages}
         self._skipped, self._damages = lost
         columns = {name: array[:, k] for name, k in self._slot.items() if k}
+        self._bring_to_rows(array[:, 0], columns)
         if "heading" in columns:
             columns["heading"] %= 360.0
         units = {name: self._survey.columns.get(name, "") for name in columns}
         return deployment(self._path, array[:, 0], columns, units, self._survey.attrs | attrs)
+
+    def _bring_to_rows(self, time: FloatArray, columns: dict[str, FloatArray]) -> None:
+        """Interpolate the readings of the sensors after the first to the rows' times (s)."""
+        names = [declared.column for _, declared in self._others]
+        for time_name in [name for name in names if name.endswith(OTHER_TIME)]:
+            sampled, sensor = columns.pop(time_name), time_name.removesuffix(OTHER_TIME)
+            times, first = np.unique(sampled[np.isfinite(sampled)], return_index=True)
+            for name in names:
+                if len(times) and name in (sensor, *(f"{sensor}_{axis}" for axis in "xyz")):
+                    values = columns[name][np.isfinite(sampled)][first]
+                    rows = np.interp(time, times, values, left=np.nan)
+                    columns[name] = np.where(np.isfinite(columns[name]), rows, np.nan)
 
 
 def read_at_once(

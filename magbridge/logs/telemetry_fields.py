@@ -26,6 +26,7 @@ __all__ = [
     "DeclaredField",
     "Value",
     "correction",
+    "is_of_main_sensor",
     "sample",
 ]  # fmt: skip
 
@@ -170,6 +171,15 @@ def correction(payload: bytes) -> Columns:
         "time": time_us / 1e6,
         **dict(zip(CORRECTED, (total, sigma, x, y, z, anomaly, flags), strict=True)),
     }
+
+
+SENSOR_IDS = {spec(message).id: spec(message).fields["sensor_id"] for message in ("MAG_RAW", "MAG_FIELD")}
+
+
+def is_of_main_sensor(number: int, payload: bytes) -> bool:
+    """Return True unless a message (by id) is a sample of a sensor after the first."""
+    field = SENSOR_IDS.get(number)
+    return field is None or not field.get(payload)
 
 
 IMUS = {

@@ -17,7 +17,15 @@ from magbridge.columns import AGE, CHANNELS
 from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass
 from magbridge.logs.deployment import CHANGES_SETTING
-from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, DeclaredField, Value, correction, sample
+from magbridge.logs.telemetry_fields import (
+    SOURCES,
+    TELEMETRY,
+    DeclaredField,
+    Value,
+    correction,
+    is_of_main_sensor,
+    sample,
+)
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.tlog import Block, blocks
 from magbridge.records import Channel
@@ -217,9 +225,11 @@ class LogContents:
         if number in (RAW, FIELD, COLUMN, STEP):
             known = self._known.setdefault((system, component, number), {})
             for k in which.tolist():
-                self._declares(block.message(k), known)
-                if number == FIELD:
-                    return True
+                message = block.message(k)
+                if is_of_main_sensor(number, message.payload):
+                    self._declares(message, known)
+                    if number == FIELD:
+                        return True
             return False
         return True
 

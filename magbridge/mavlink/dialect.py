@@ -420,11 +420,17 @@ enums["MAG_PORT_NAME"].bitmask = False
 MAG_PORT_NAME_LINK = 1
 enums["MAG_PORT_NAME"][1] = EnumEntry("MAG_PORT_NAME_LINK", """The MAVLink side.""")
 MAG_PORT_NAME_SENSOR = 2
-enums["MAG_PORT_NAME"][2] = EnumEntry("MAG_PORT_NAME_SENSOR", """The sensor's line.""")
+enums["MAG_PORT_NAME"][2] = EnumEntry("MAG_PORT_NAME_SENSOR", """The line of the sensor with sensor_id 0.""")
 MAG_PORT_NAME_LOG = 3
 enums["MAG_PORT_NAME"][3] = EnumEntry("MAG_PORT_NAME_LOG", """The log's folder.""")
-MAG_PORT_NAME_ENUM_END = 4
-enums["MAG_PORT_NAME"][4] = EnumEntry("MAG_PORT_NAME_ENUM_END", """""")
+MAG_PORT_NAME_SENSOR_1 = 4
+enums["MAG_PORT_NAME"][4] = EnumEntry("MAG_PORT_NAME_SENSOR_1", """The line of the sensor with sensor_id 1.""")
+MAG_PORT_NAME_SENSOR_2 = 5
+enums["MAG_PORT_NAME"][5] = EnumEntry("MAG_PORT_NAME_SENSOR_2", """The line of the sensor with sensor_id 2.""")
+MAG_PORT_NAME_SENSOR_3 = 6
+enums["MAG_PORT_NAME"][6] = EnumEntry("MAG_PORT_NAME_SENSOR_3", """The line of the sensor with sensor_id 3.""")
+MAG_PORT_NAME_ENUM_END = 7
+enums["MAG_PORT_NAME"][7] = EnumEntry("MAG_PORT_NAME_ENUM_END", """""")
 
 # MAG_LOG_STATE
 enums["MAG_LOG_STATE"] = Enum()
@@ -539,6 +545,7 @@ MAVLINK_MSG_ID_MAG_PORT = 60108
 MAVLINK_MSG_ID_MAG_COLUMN = 60109
 MAVLINK_MSG_ID_MAG_HOST_STALL = 60110
 MAVLINK_MSG_ID_MAG_LEARNING = 60111
+MAVLINK_MSG_ID_MAG_SENSOR = 60112
 MAVLINK_MSG_ID_MAG_SIGNING_STREAM = 60120
 MAVLINK_MSG_ID_MAG_INTERLEAVED = 60121
 MAVLINK_MSG_ID_COMPONENT_INFORMATION_BASIC = 396
@@ -1128,6 +1135,56 @@ class MAVLink_mag_learning_message(MAVLink_message):
 setattr(MAVLink_mag_learning_message, "name", mavlink_msg_deprecated_name_property())
 
 
+class MAVLink_mag_sensor_message(MAVLink_message):
+    """
+    State of one sensor of a bridge that has several; sent with
+    MAG_STATUS. Counters run from the start of the bridge.
+    """
+
+    id = MAVLINK_MSG_ID_MAG_SENSOR
+    msgname = "MAG_SENSOR"
+    fieldnames = ["time_usec", "calibration_id", "samples", "samples_lost", "bytes_skipped", "frames_bad", "sample_rate", "clock_drift", "sensor_id", "state", "name"]
+    ordered_fieldnames = ["time_usec", "calibration_id", "samples", "samples_lost", "bytes_skipped", "frames_bad", "sample_rate", "clock_drift", "sensor_id", "state", "name"]
+    fieldtypes = ["uint64_t", "uint32_t", "uint32_t", "uint32_t", "uint32_t", "uint32_t", "float", "float", "uint8_t", "uint8_t", "char"]
+    fielddisplays_by_name: Dict[str, str] = {}
+    fieldenums_by_name: Dict[str, str] = {"state": "MAG_PORT_STATE"}
+    fieldunits_by_name: Dict[str, str] = {"time_usec": "us", "bytes_skipped": "bytes", "sample_rate": "Hz", "clock_drift": "ppm"}
+    native_format = bytearray(b"<QIIIIIffBBc")
+    orders = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]
+    lengths = [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1]
+    array_lengths = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 16]
+    crc_extra = 169
+    unpacker = struct.Struct("<QIIIIIffBB16s")
+    instance_field = "sensor_id"
+    instance_offset = 36
+
+    def __init__(self, time_usec: int, calibration_id: int, samples: int, samples_lost: int, bytes_skipped: int, frames_bad: int, sample_rate: float, clock_drift: float, sensor_id: int, state: int, name: bytes):
+        MAVLink_message.__init__(self, MAVLink_mag_sensor_message.id, MAVLink_mag_sensor_message.msgname)
+        self._fieldnames = MAVLink_mag_sensor_message.fieldnames
+        self._instance_field = MAVLink_mag_sensor_message.instance_field
+        self._instance_offset = MAVLink_mag_sensor_message.instance_offset
+        self.time_usec = time_usec
+        self.calibration_id = calibration_id
+        self.samples = samples
+        self.samples_lost = samples_lost
+        self.bytes_skipped = bytes_skipped
+        self.frames_bad = frames_bad
+        self.sample_rate = sample_rate
+        self.clock_drift = clock_drift
+        self.sensor_id = sensor_id
+        self.state = state
+        self._name_raw = name
+        self.name = name.split(b"\x00", 1)[0].decode("ascii", errors="replace")
+
+    def pack(self, mav: "MAVLink", force_mavlink1: bool = False) -> bytes:
+        return self._pack(mav, self.crc_extra, self.unpacker.pack(self.time_usec, self.calibration_id, self.samples, self.samples_lost, self.bytes_skipped, self.frames_bad, self.sample_rate, self.clock_drift, self.sensor_id, self.state, self._name_raw), force_mavlink1=force_mavlink1)
+
+
+# Define name on the class for backwards compatibility (it is now msgname).
+# Done with setattr to hide the class variable from mypy.
+setattr(MAVLink_mag_sensor_message, "name", mavlink_msg_deprecated_name_property())
+
+
 class MAVLink_mag_signing_stream_message(MAVLink_message):
     """
     In logs: the last time stamp accepted of one signed stream when
@@ -1355,6 +1412,7 @@ mavlink_map: Dict[int, Type[MAVLink_message]] = {
     MAVLINK_MSG_ID_MAG_COLUMN: MAVLink_mag_column_message,
     MAVLINK_MSG_ID_MAG_HOST_STALL: MAVLink_mag_host_stall_message,
     MAVLINK_MSG_ID_MAG_LEARNING: MAVLink_mag_learning_message,
+    MAVLINK_MSG_ID_MAG_SENSOR: MAVLink_mag_sensor_message,
     MAVLINK_MSG_ID_MAG_SIGNING_STREAM: MAVLink_mag_signing_stream_message,
     MAVLINK_MSG_ID_MAG_INTERLEAVED: MAVLink_mag_interleaved_message,
     MAVLINK_MSG_ID_COMPONENT_INFORMATION_BASIC: MAVLink_component_information_basic_message,
@@ -2205,6 +2263,46 @@ class MAVLink(object):
 
         """
         self.send(self.mag_learning_encode(time_usec, alarm_since, calibration_id, first_calibration_id, samples, rms_first, rms_published, rms_learned, better, alarm_amplitude, causes, state, sensor_id), force_mavlink1=force_mavlink1)
+
+    def mag_sensor_encode(self, time_usec: int, calibration_id: int, samples: int, samples_lost: int, bytes_skipped: int, frames_bad: int, sample_rate: float, clock_drift: float, sensor_id: int, state: int, name: bytes) -> MAVLink_mag_sensor_message:
+        """
+        State of one sensor of a bridge that has several; sent with
+        MAG_STATUS. Counters run from the start of the bridge.
+
+        time_usec                 : UNIX time. [us] (type:uint64_t)
+        calibration_id            : As in MAG_FIELD. (type:uint32_t)
+        samples                   : Readings received. (type:uint32_t)
+        samples_lost              : Readings missing by the instrument's own numbering. (type:uint32_t)
+        bytes_skipped             : Bytes that belonged to no frame. [bytes] (type:uint32_t)
+        frames_bad                : Frames with a wrong checksum. (type:uint32_t)
+        sample_rate               : Rate of the last readings. [Hz] (type:float)
+        clock_drift               : The instrument's clock relative to the bridge's: positive is fast. [ppm] (type:float)
+        sensor_id                 : Which sensor. (type:uint8_t)
+        state                     : The sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
+        name                      : Name of the sensor in the configuration. (type:char)
+
+        """
+        return MAVLink_mag_sensor_message(time_usec, calibration_id, samples, samples_lost, bytes_skipped, frames_bad, sample_rate, clock_drift, sensor_id, state, name)
+
+    def mag_sensor_send(self, time_usec: int, calibration_id: int, samples: int, samples_lost: int, bytes_skipped: int, frames_bad: int, sample_rate: float, clock_drift: float, sensor_id: int, state: int, name: bytes, force_mavlink1: bool = False) -> None:
+        """
+        State of one sensor of a bridge that has several; sent with
+        MAG_STATUS. Counters run from the start of the bridge.
+
+        time_usec                 : UNIX time. [us] (type:uint64_t)
+        calibration_id            : As in MAG_FIELD. (type:uint32_t)
+        samples                   : Readings received. (type:uint32_t)
+        samples_lost              : Readings missing by the instrument's own numbering. (type:uint32_t)
+        bytes_skipped             : Bytes that belonged to no frame. [bytes] (type:uint32_t)
+        frames_bad                : Frames with a wrong checksum. (type:uint32_t)
+        sample_rate               : Rate of the last readings. [Hz] (type:float)
+        clock_drift               : The instrument's clock relative to the bridge's: positive is fast. [ppm] (type:float)
+        sensor_id                 : Which sensor. (type:uint8_t)
+        state                     : The sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
+        name                      : Name of the sensor in the configuration. (type:char)
+
+        """
+        self.send(self.mag_sensor_encode(time_usec, calibration_id, samples, samples_lost, bytes_skipped, frames_bad, sample_rate, clock_drift, sensor_id, state, name), force_mavlink1=force_mavlink1)
 
     def mag_signing_stream_encode(self, stamp: int, link: int, system: int, sender: int, ahead: int) -> MAVLink_mag_signing_stream_message:
         """

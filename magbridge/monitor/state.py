@@ -168,6 +168,8 @@ class State:
             one.error = "expected a number"
 
     def _field(self, message: Message, now: float) -> None:
+        if message["sensor_id"]:  # the page shows the main sensor
+            return
         self.interval = now - self.sampled if self.field else 0.0
         self.field, self.sampled = message.fields, now
         for name in Quality(self.field["flags"]).names().split():
@@ -179,7 +181,8 @@ class State:
         )
 
     def _raw(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
-        self._measured(TEMPERATURE_SERIES, message["time_usec"] * 1e-6, message["temperature"])
+        if not message["sensor_id"]:
+            self._measured(TEMPERATURE_SERIES, message["time_usec"] * 1e-6, message["temperature"])
 
     def _named_value(self, message: Message, now: float) -> None:
         self._measured(message["name"], self.time(now), message["value"])

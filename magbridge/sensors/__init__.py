@@ -19,7 +19,7 @@ from magbridge.records import Reading
 from magbridge.toml import convert
 from magbridge.wording import one_of
 
-__all__ = ["DRIVERS", "Driver", "driver_class", "open_driver"]
+__all__ = ["DRIVERS", "Driver", "driver_class", "is_scalar", "open_driver"]
 
 DRIVERS: dict[str, tuple[str, str]] = {
     "ascii": ("magbridge.sensors.ascii", "Ascii"),
@@ -52,6 +52,8 @@ class Driver(Protocol):
         s, at which ``Reading.device_time`` wraps; 0 where it does not.
     period : float
         s, nominal, between the readings of an instrument without a clock; 0 where unknown or irrelevant.
+    is_scalar : bool
+        The instrument measures the total field F only: its readings are (F, 0, 0).
     """
 
     Options: ClassVar[Any]
@@ -60,6 +62,7 @@ class Driver(Protocol):
     sequence_modulo: int = 0
     time_modulo: float = 0.0
     period: float = 0.0
+    is_scalar: bool = False
 
     def __init__(self, options: Any) -> None: ...
 
@@ -91,7 +94,9 @@ MEMBERS = (
 """What an open driver must have besides its methods."""
 
 
-def open_driver(name: str, options: Mapping[str, Any], source: str | Path = "bridge.toml") -> Driver:
+def open_driver(
+    name: str, options: Mapping[str, Any], source: str | Path = "bridge.toml", key: str = "sensor"
+) -> Driver:
     """Return the driver called `name`, with its options checked.
 
     Parameters
@@ -102,6 +107,8 @@ def open_driver(name: str, options: Mapping[str, Any], source: str | Path = "bri
         As they stand in ``[sensor.options]``.
     source : path
         The file they stand in, for the error.
+    key : str
+        Dotted key of the sensor's table, for the error.
 
     Raises
     ------
@@ -109,25 +116,30 @@ def open_driver(name: str, options: Mapping[str, Any], source: str | Path = "bri
         No such driver, or one that lacks a member; an option that is unknown, missing, of the wrong type or
         out of range.
     """
-    driver: type[Driver] = driver_class(name, source)
-    _check(name, driver, ("Options", "feed", "start"), source)
-    opened = driver(convert(dict(options), driver.Options, source, "sensor.options."))
-    _check(name, opened, MEMBERS, source)
+    driver: type[Driver] = driver_class(name, source, key)
+    _check(name, driver, ("Options", "feed", "start"), source, key)
+    opened = driver(convert(dict(options), driver.Options, source, f"{key}.options."))
+    _check(name, opened, MEMBERS, source, key)
     return opened
 
 
-def _check(name: str, driver: object, members: tuple[str, ...], source: str | Path) -> None:
+def is_scalar(driver: Driver) -> bool:
+    """Return True if the instrument measures the total field F only; a driver need not say."""
+    return getattr(driver, "is_scalar", False)
+
+
+def _check(name: str, driver: object, members: tuple[str, ...], source: str | Path, key: str) -> None:
     """Raise :class:`ConfigError` where a driver, its class or an instance, lacks some of `members`."""
     if lacking := [member for member in members if not hasattr(driver, member)]:
-        raise ConfigError(source, "sensor.driver", f"driver {name!r} lacks {', '.join(lacking)}")
+        raise ConfigError(source, f"{key}.driver", f"driver {name!r} lacks {', '.join(lacking)}")
 
 
-def driver_class(name: str, source: str | Path) -> Any:
+def driver_class(name: str, source: str | Path, key: str = "sensor") -> Any:
     """Return the class of the driver called `name`; ConfigError, naming `source`: there is none."""
     if name in DRIVERS:
         module, attribute = DRIVERS[name]
         return getattr(import_module(module), attribute)
     others = plugins("magbridge.sensors")
     if name not in others:
-        raise ConfigError(source, "sensor.driver", one_of(name, sorted({*DRIVERS, *others})))
+        raise ConfigError(source, f"{key}.driver", one_of(name, sorted({*DRIVERS, *others})))
     return load(others[name])

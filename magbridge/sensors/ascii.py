@@ -1,4 +1,4 @@
-"""``ascii``: any line of text that holds three channels, described in the configuration.
+"""``ascii``: any line of text that holds three channels or a total field, described in the configuration.
 
 An APS 1540 in its autosend mode (gauss and degrees, separated by blanks)::
 
@@ -37,7 +37,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from math import inf, isfinite, nan
-from operator import itemgetter
 from typing import Annotated, Any, ClassVar, Literal
 from zlib import crc32
 
@@ -54,6 +53,8 @@ MAX_LINE_BYTES = 512
 """Longest line, in bytes."""
 MAX_ASCII_COUNT = 2**31
 """A count that no converter reaches and no message can hold."""
+SCALAR_STEP_NT = 1e-4
+"""nT per count in which the total field of a scalar instrument is logged."""
 MAX_DEVICE_COUNT = 2**63
 """Larger than any count that an instrument can hold."""
 ENCODING = "latin-1"
@@ -110,8 +111,9 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """``[sensor.options]`` of a line protocol."""
 
     columns: list[str] = msgspec.field(default_factory=lambda: ["x", "y", "z"])
-    """Meaning of each column: ``x y z`` (required), ``time temperature supply sequence power_cycle``; ``-``
-    for a column to ignore; ``*`` at the end for any number of further ones."""
+    """Meaning of each column: ``x y z``, or ``total_field`` of a scalar instrument (one of both is required);
+    ``time temperature supply sequence power_cycle``; ``-`` for a column to ignore; ``*`` at the end for any
+    number of further ones."""
     keys: list[str] = msgspec.field(default_factory=list)
     """For lines of JSON, or of text such as ``x:"14"``: the key of each column, in the order of columns."""
     separator: str = ""
@@ -121,7 +123,7 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     terminator: Literal["\n", "\r"] = "\n"
     """The last byte of a line; a carriage return before it is dropped."""
     unit: Literal["nT", "uT", "mT", "T", "pT", "fT", "G", "mG", "uG", "counts"] = "nT"
-    """Unit of the x, y and z columns."""
+    """Unit of the columns x, y and z, or total_field."""
     scale: float = 1.0
     """Factor on the channels, with its sign; for counts: nT per count."""
     range: Positive | None = None
@@ -146,12 +148,15 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
                 raise ValueError(f"{key}: expected a finite number, got {getattr(self, key)}")
         named = self.columns[:-1] if self.columns[-1:] == ["*"] else self.columns
         for name in named:
-            if name not in ("x", "y", "z", "-", *COLUMN_READERS):
-                raise ValueError(f"columns: {name!r} is none of x y z {' '.join(COLUMN_READERS)} -")
+            if name not in ("x", "y", "z", "total_field", "-", *COLUMN_READERS):
+                raise ValueError(
+                    f"columns: {name!r} is none of x y z total_field {' '.join(COLUMN_READERS)} -"
+                )
             if name != "-" and named.count(name) > 1:
                 raise ValueError(f"columns: {name!r} stands there twice")
-        if not {"x", "y", "z"} <= set(named):
-            raise ValueError("columns: x, y and z must be among them")
+        field = {"x", "y", "z", "total_field"} & set(named)
+        if field not in ({"x", "y", "z"}, {"total_field"}):
+            raise ValueError("columns: expected x, y and z, or total_field, among them")
         if self.keys and (len(self.keys) != len(self.columns) or "*" in self.columns):
             raise ValueError(f"keys: expected one for each of the {len(self.columns)} columns, without *")
 
@@ -167,7 +172,8 @@ class Ascii:
         self._more = columns[-1] == "*"
         self._width = len(columns) - self._more
         self._keys = [key.encode(ENCODING) for key in options.keys]
-        self._xyz = itemgetter(*(columns.index(axis) for axis in "xyz"))
+        self.is_scalar = "total_field" in columns
+        self._field = [columns.index(name) for name in (("total_field",) if self.is_scalar else "xyz")]
         self._others = [
             (name, at, COLUMN_READERS[name]) for at, name in enumerate(columns) if name in COLUMN_READERS
         ]
@@ -175,7 +181,7 @@ class Ascii:
         self._separator = options.separator.encode(ENCODING) or None
         self._counts = options.unit == "counts"
         self._scale = options.scale * NT_PER_UNIT.get(options.unit, 1.0)
-        self.nt_per_count = self._scale if self._counts else 0.0
+        self.nt_per_count = self._scale if self._counts else SCALAR_STEP_NT if self.is_scalar else 0.0
         self._seconds = SECONDS[options.time_unit]
         self.range_nt = options.range or inf
         self.sequence_modulo = options.sequence_modulo
@@ -225,7 +231,7 @@ class Ascii:
         cells = self._cells(line[len(self._prefix) :])
         if len(cells) != self._width and not (self._more and len(cells) > self._width):
             raise ValueError
-        x, y, z = map(float, self._xyz(cells))
+        x, y, z = [*(float(cells[index]) for index in self._field), 0.0, 0.0][:3]
         scale = self._scale
         field = (x * scale, y * scale, z * scale)
         largest = abs(field[0]) + abs(field[1]) + abs(field[2])
@@ -236,7 +242,7 @@ class Ascii:
             raise ValueError
         return Reading(
             field,
-            (int(x), int(y), int(z)) if self._counts else None,
+            self._counts_of(x, y, z, field[0]),
             others.get("sequence"),
             others.get("time", nan) * self._seconds,
             temperature=others.get("temperature", nan),
@@ -244,6 +250,14 @@ class Ascii:
             power_cycle=others.get("power_cycle"),
             saturated=saturated(*field, self.range_nt),
         )
+
+    def _counts_of(self, x: float, y: float, z: float, total: float) -> tuple[int, int, int] | None:
+        """Return the counts of a reading; those of a total field (nT) keep more digits than a float32."""
+        if self._counts:
+            return int(x), int(y), int(z)
+        if self.is_scalar and abs(total) < MAX_ASCII_COUNT * SCALAR_STEP_NT:
+            return round(total / SCALAR_STEP_NT), 0, 0
+        return None
 
 
 def strip_checksum(line: bytes, checksum: str) -> bytes:

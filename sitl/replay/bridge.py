@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from magbridge.bridge.drive import drive, set_up
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, Start, port_number
 from magbridge.bridge.links import open_link
 from magbridge.bridge.port import Port
 from magbridge.bridge.serial_port import SerialPort
@@ -34,42 +34,45 @@ BATCH = 8192
 class ScriptedEdge:
     """Reads real ports in the order, and at the times, given by a timetable."""
 
-    def __init__(self, ports: dict[Channel, Port], timetable: int) -> None:
+    def __init__(self, ports: dict[int, Port], timetable: int) -> None:
         self._ports = ports
         self._timetable = timetable
         self._entries = read_entries(self._wait_for_times)
-        self._unread = {channel: bytearray() for channel in ports}
+        self._unread = {number: bytearray() for number in ports}
         self._unsent = bytearray()
 
     def start(self) -> Start:
         """Return the start that the timetable begins with."""
-        _, _, _, data = next(self._entries)
+        *_, data = next(self._entries)
         return msgspec.json.decode(data, type=Start)
 
     def events(self, _deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield the events of the timetable; the bytes come through the ports."""
-        for time_us, channel, size, data in self._entries:
-            yield Event(time_us, channel, data if channel is Channel.STATE else self._read(channel, size))
+        for time_us, channel, sensor_id, size, data in self._entries:
+            if channel is not Channel.STATE:
+                number = port_number(sensor_id) if channel is Channel.SENSOR else Channel.LINK
+                data = self._read(number, size)  # noqa: PLW2901 - the timetable has the bytes of states only
+            yield Event(time_us, channel, data, sensor_id)
         self.flush()
 
     def _wait_for_times(self) -> bytes:
         self.flush()  # in a paced replay, published messages must be seen before the next event
         return os.read(self._timetable, 65536)
 
-    def _read(self, channel: Channel, size: int) -> bytes:
+    def _read(self, number: int, size: int) -> bytes:
         """Return exactly `size` bytes of a port, waiting for them."""
-        unread = self._unread[channel]
+        unread = self._unread[number]
         while len(unread) < size:
-            port = self._ports[channel]
+            port = self._ports[number]
             if select.select(port.fds(), [], [], 10.0)[0]:
                 unread += port.read()
         data = bytes(unread[:size])
         del unread[:size]
         return data
 
-    def send(self, channel: Channel, data: bytes) -> None:
-        """Send to the autopilot. Commands to the sensor are dropped: the logged one has already had them."""
-        if channel is Channel.SENSOR:
+    def send(self, number: int, data: bytes) -> None:
+        """Send to the autopilot. Commands to a sensor are dropped: the logged one has already had them."""
+        if number != Channel.LINK:
             return
         self._unsent += data
         if len(self._unsent) >= BATCH:
@@ -88,7 +91,7 @@ def main() -> int:
     """Play the bridge on the ports given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("config", type=Path)
-    parser.add_argument("--sensor", required=True)
+    parser.add_argument("--sensor", required=True, nargs="+")
     parser.add_argument("--link", required=True)
     parser.add_argument("--timetable", type=int, required=True)
     parser.add_argument("--log", type=Path)
@@ -97,10 +100,13 @@ def main() -> int:
         config = load(chosen.config)
         if chosen.log and config.log is None:
             config = msgspec.structs.replace(config, log=Log(directory=str(chosen.log)))
-        sensor, link = SerialPort(chosen.sensor, config.sensor.baudrate), open_link(chosen.link, 0)
-        sensor.open()
-        link.open()
-        edge = ScriptedEdge({Channel.SENSOR: sensor, Channel.LINK: link}, chosen.timetable)
+        ports: dict[int, Port] = {}
+        for one, device in zip(config.sensors, chosen.sensor, strict=True):
+            ports[port_number(one.id or 0)] = SerialPort(device, one.baudrate)
+        ports[Channel.LINK] = open_link(chosen.link, 0)
+        for port in ports.values():  # the link last: the stage begins to send when it connects
+            port.open()
+        edge = ScriptedEdge(ports, chosen.timetable)
         pipeline = set_up(config, edge.start())
         log = TlogWriter(chosen.log, header=pipeline.declarations) if chosen.log else None
         drive(pipeline, edge, log, lambda _: None)

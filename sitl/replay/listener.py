@@ -24,7 +24,8 @@ COLUMNS = {
     "field_z": "z",
     "quality": "flags",
 }
-"""Values kept of every MAG_FIELD, by the message's names."""
+"""Values kept of every MAG_FIELD of the main sensor, by the message's names."""
+SENSOR_ID = FIELD.fields["sensor_id"]
 
 
 class Listener:
@@ -57,7 +58,7 @@ class Listener:
         """Receive bytes in any pieces."""
         for message in self._codec.parse(data):
             self._counts[message.id] += 1
-            if message.id == FIELD.id:
+            if message.id == FIELD.id and not SENSOR_ID.get(message.payload):
                 self._values.extend(field.get(message.payload) for field in self._fields)
             elif message.id == TEXT.id:
                 self.texts.append(message["text"])

@@ -108,12 +108,12 @@ class Recorded:
         frame_log = FrameLogReader()
         time_us = self.start.time_us
         inputs = (record for record in self._records() if not self._went_out(record) and _is_event(record))
-        for (time_us, channel), group in groupby(inputs, lambda record: (record.time_us, record.channel)):
+        for (time_us, channel, sensor_id), group in groupby(inputs, _event_key):
             if channel == Channel.STATE:
                 for record in group:
                     yield Event(time_us, Channel.STATE, record.frame)
             elif channel == Channel.SENSOR:
-                yield Event(time_us, Channel.SENSOR, _sensor_bytes(group))
+                yield Event(time_us, Channel.SENSOR, _sensor_bytes(group), sensor_id)
             elif data := b"".join(frame_log.data(record.frame) for record in group):
                 yield Event(time_us, Channel.LINK, data)
         # timers that fired after the last input
@@ -126,6 +126,12 @@ class Recorded:
         self.published += record.frame
         self.messages += 1
         return True
+
+
+def _event_key(record: Record) -> tuple[int, int, int]:
+    """Return time (µs), channel and sensor id of the event that a record belongs to."""
+    sensor_id = record.message["sensor_id"] if record.channel == Channel.SENSOR else 0
+    return record.time_us, record.channel, sensor_id
 
 
 def _is_event(record: Record) -> bool:

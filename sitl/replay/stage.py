@@ -22,6 +22,7 @@ from pathlib import Path
 import msgspec
 
 from magbridge.bridge.events import Event, Start
+from magbridge.config import load
 from magbridge.errors import MagbridgeError, PortError, WrongUse
 from magbridge.records import Channel
 from sitl.replay.timetable import Entry, pace
@@ -51,18 +52,23 @@ class Stage:
 
     def __init__(self, config: Path, listener: Callable[[bytes], None], log: Path | None = None) -> None:
         self._listener = listener
-        self._buffers = {Channel.STATE: bytearray(), Channel.LINK: bytearray(), Channel.SENSOR: bytearray()}
+        self._times_due, self._link_due = bytearray(), bytearray()
+        self._sensors_due: dict[int, bytearray] = {one.id or 0: bytearray() for one in load(config).sensors}
         with ExitStack() as opened, socket.create_server(("127.0.0.1", 0)) as server:
-            self._master, slave = pty.openpty()
-            opened.callback(os.close, self._master)
-            opened.callback(os.close, slave)
-            os.set_blocking(self._master, False)
-            # bytes written before the bridge opens it must not be edited as a terminal would
-            tty.setraw(slave)
+            self._masters: dict[int, int] = {}
+            devices = []
+            for sensor_id in self._sensors_due:
+                self._masters[sensor_id], slave = pty.openpty()
+                opened.callback(os.close, self._masters[sensor_id])
+                opened.callback(os.close, slave)
+                os.set_blocking(self._masters[sensor_id], False)
+                # bytes written before the bridge opens it must not be edited as a terminal would
+                tty.setraw(slave)
+                devices.append(os.ttyname(slave))
             times_out, times = os.pipe()
             command = [
                 sys.executable, "-m", "sitl.replay.bridge", str(config),
-                "--sensor", os.ttyname(slave),
+                "--sensor", *devices,
                 "--link", f"tcp:127.0.0.1:{server.getsockname()[1]}",
                 "--timetable", str(times_out),
                 *(("--log", str(log)) if log else ()),
@@ -139,9 +145,9 @@ class Stage:
             self._opened.close()
 
     def _send(self, start: Start, events: Iterable[Event], speed: float) -> None:
-        times = self._buffers[Channel.STATE]
+        times = self._times_due
         begin = msgspec.json.encode(start)
-        times += Entry.pack(start.time_us | Channel.STATE, len(begin)) + begin
+        times += Entry.pack(start.time_us | Channel.STATE, len(begin), 0) + begin
         pending = 0
         for wait, event in pace(events, speed):
             if wait > 0.0:
@@ -149,8 +155,11 @@ class Stage:
                 pending = 0
                 time.sleep(wait)
             size = len(event.data)
-            times += Entry.pack(event.time_us | event.channel, size)
-            self._buffers[event.channel] += event.data
+            times += Entry.pack(event.time_us | event.channel, size, event.sensor_id)
+            if event.channel is Channel.SENSOR:
+                self._sensors_due[event.sensor_id] += event.data
+            else:
+                (times if event.channel is Channel.STATE else self._link_due).extend(event.data)
             pending += size
             if pending >= BATCH:
                 self._flush()
@@ -160,16 +169,28 @@ class Stage:
     def _flush(self) -> None:
         """Write the due bytes: the timetable first, by which the bridge reads more than a pty holds.
 
-        The sensor's bytes come last, so that the bridge never waits for the link's while the pty is full.
+        The sensors' bytes come last, so that the bridge never waits for the link's while a pty is full.
         """
-        times, link, sensor = self._buffers.values()
+        times, link = self._times_due, self._link_due
         try:
             while times:
                 del times[: self._times.write(times)]
             self._link.sendall(link)
             link.clear()
-            while sensor:
-                self._wait(self._master, select.POLLOUT)
-                del sensor[: os.write(self._master, sensor)]
+            while any(self._sensors_due.values()):
+                self._write_sensors()
         except (BrokenPipeError, ConnectionResetError) as error:
             raise self._failure() from error
+
+    def _write_sensors(self) -> None:
+        """Write what the ptys take now: the bridge reads them in the order of the timetable."""
+        waiting = select.poll()
+        waiting.register(self._times, 0)  # it breaks when the bridge, its only reader, ends
+        masters = {self._masters[one]: due for one, due in self._sensors_due.items() if due}
+        for master in masters:
+            waiting.register(master, select.POLLOUT)
+        ready = [fd for fd, _ in waiting.poll() if fd in masters]
+        if not ready:
+            raise self._failure()
+        for fd in ready:
+            del masters[fd][: os.write(fd, masters[fd])]

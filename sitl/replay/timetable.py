@@ -17,12 +17,13 @@ from magbridge.records import Channel
 
 __all__ = ["Entry", "pace", "read_entries"]
 
-Entry = struct.Struct("<QI")
-"""Stamp (µs, channel in the low two bits) and number of bytes; a ``STATE`` entry is followed by its bytes."""
+Entry = struct.Struct("<QIB")
+"""Stamp (µs, channel in the low two bits), number of bytes, sensor id; a ``STATE`` entry is followed by its
+bytes."""
 
 
-def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int, bytes]]:
-    """Yield a timetable's entries: time in µs, channel, number of bytes, and the bytes of a ``STATE`` entry.
+def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int, int, bytes]]:
+    """Yield the entries: time in µs, channel, sensor id, number of bytes, and bytes of a ``STATE`` entry.
 
     `read` returns the next bytes of the timetable, and none at its end.
     """
@@ -31,7 +32,7 @@ def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int,
     while True:
         position = 0
         while len(buffer) - position >= Entry.size:
-            stamp, size = Entry.unpack_from(buffer, position)
+            stamp, size, sensor_id = Entry.unpack_from(buffer, position)
             channel = channels[stamp & 3]
             inline = size if channel is Channel.STATE else 0
             if len(buffer) - position < Entry.size + inline:
@@ -39,7 +40,7 @@ def read_entries(read: Callable[[], bytes]) -> Iterator[tuple[int, Channel, int,
             position += Entry.size
             data = bytes(buffer[position : position + inline])
             position += inline
-            yield stamp & ~3, channel, size, data
+            yield stamp & ~3, channel, sensor_id, size, data
         del buffer[:position]
         chunk = read()
         if not chunk:

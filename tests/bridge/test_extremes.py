@@ -14,6 +14,7 @@ from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.position import Position
 from magbridge.calibration.model import Parameter
+from magbridge.correction import Correction
 from magbridge.mavlink import Codec, Message
 from magbridge.one_time import OneTime
 from magbridge.parts import OptionalParts
@@ -30,7 +31,7 @@ def test_extreme_values_raise_nothing(seed: int, tmp_path: Path) -> None:
     for event in events(4000, seed):
         feed(bridge, files, event)
     files.close()
-    assert bridge.samples > 500
+    assert bridge.streams[0].samples > 500
     assert bridge.navigation is not None
     assert bridge.navigation.navigator.estimate.begun
 
@@ -97,8 +98,10 @@ def test_a_part_that_raises_is_switched_off_and_the_sample_is_published(
     def fail(*_: object, **__: object) -> float:
         raise ZeroDivisionError("made for this test")
 
-    health = bridge._correction.health
-    assert health is not None
+    correction = bridge.streams[0].correction
+    assert isinstance(correction, Correction)
+    assert correction.health is not None
+    health = correction.health
     monkeypatch.setattr(health, "check", fail)
     for second in (1, 2, 3):
         assert [message.name for message in sent(bridge, second)].count("MAG_FIELD") == 1

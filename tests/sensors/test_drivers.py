@@ -159,7 +159,7 @@ def test_the_table_keeps_its_word(name: str) -> None:
         ("hmr2300", {"speed": 21}, "sensor.options.speed: unknown key"),
         ("twinleaf", {"columns": ["x"]}, "sensor.options.columns: expected `array` of length 3"),
         ("twinleaf", {"unit": "ell"}, "sensor.options: unit: expected one of"),
-        ("ascii", {"columns": ["x", "y"]}, "sensor.options: columns: x, y and z must be among them"),
+        ("ascii", {"columns": ["x", "y"]}, "sensor.options: columns: expected x, y and z, or total_field"),
         ("ascii", {"columns": ["x", "y", "z", "q"]}, "sensor.options: columns: 'q' is none of x y z"),
         ("ascii", {"columns": ["x", "y", "z", "z"]}, "sensor.options: columns: 'z' stands there twice"),
         ("ascii", {"scale": float("inf")}, "sensor.options: scale: expected a finite number, got inf"),

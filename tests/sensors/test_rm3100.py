@@ -145,4 +145,4 @@ def test_a_wrong_bus_is_named(tmp_path: Path, port: str, name: str, text: str) -
     source = f'[sensor]\ndriver = "{name}"\nport = "{port}"\n[link]\nurl = "udpout:127.0.0.1:1"\n'
     path.write_text(source, encoding="utf-8")
     with pytest.raises(ConfigError, match=text):
-        sensor_port(load(path))
+        sensor_port(load(path).sensor, path)

@@ -1,0 +1,273 @@
+"""One sensor of the bridge: its driver, its line, its correction and its publisher."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from glob import has_magic
+from math import nan
+
+import msgspec
+
+from magbridge.bridge.needs import check, check_channels
+from magbridge.bridge.sensor_line import SensorLine
+from magbridge.calibration.file import load
+from magbridge.calibration.model import Calibration
+from magbridge.calibration.scalar import ScalarSensor
+from magbridge.columns import COLUMNS
+from magbridge.config import Align, Config, Sensor
+from magbridge.correction import Correction
+from magbridge.errors import ConfigError
+from magbridge.learning import Learner
+from magbridge.link.component import Component
+from magbridge.link.publish import Publisher
+from magbridge.mavlink.enums import MAG_PORT_STATE
+from magbridge.records import Reading, Vector
+from magbridge.scalar_correction import CorrectedReading, ScalarCorrection
+from magbridge.sensors import Driver, is_scalar, open_driver
+from magbridge.sensors.clock import DeviceClock, Stamp
+
+__all__ = ["SensorStream", "open_correction", "open_drivers", "other_calibrations"]
+
+RATE_SAMPLES = 64
+"""Samples over which the sample rate is computed."""
+
+
+def open_drivers(config: Config) -> list[Driver]:
+    """Return the driver of each sensor; ConfigError: one does not exist, or sensor 0 is not a vector."""
+    drivers = [open_driver(one.driver, one.options, config.path, one.key) for one in config.sensors]
+    vectors = [one for one, driver in zip(config.sensors, drivers, strict=True) if not is_scalar(driver)]
+    if vectors and is_scalar(drivers[0]):
+        expected = f"expected 0 for a vector sensor, such as {vectors[0].label}: sensor 0 is the main sensor"
+        raise ConfigError(config.path, f"{config.sensor.key}.id", expected)
+    if is_scalar(drivers[0]) and config.learning is not None:
+        raise ConfigError(config.path, "learning", "expected a vector sensor: a scalar cannot be learned")
+    if is_scalar(drivers[0]) and config.calibration is not None:
+        text = "expected none: the compensation of a scalar needs a vector sensor as sensor 0"
+        raise ConfigError(config.path, "calibration", text)
+    for one in config.more_sensors:
+        if one.name in COLUMNS or f"{one.name}_x" in COLUMNS:
+            text = f"expected another name: logs have columns of {one.name!r} already"
+            raise ConfigError(config.path, one.key, text)
+    for one, driver in zip(config.sensors, drivers, strict=True):
+        if one.sigma is not None and not is_scalar(driver):
+            raise ConfigError(config.path, f"{one.key}.sigma", "expected only for a scalar sensor")
+    return drivers
+
+
+def other_calibrations(config: Config) -> dict[int, Calibration]:
+    """Return the calibrations of the sensors after the first, by sensor id.
+
+    FormatError, CalibrationError: a file is not a calibration.
+    """
+    named = {one.id or 0: one.calibration for one in config.more_sensors}
+    return {number: load(config.resolve(name)) for number, name in named.items() if name is not None}
+
+
+def scalar_entry(
+    sensor: Sensor, config: Config, own: Calibration | None, main: Calibration | None
+) -> ScalarSensor | None:
+    """Return the compensation of a scalar sensor; None if no calibration has one.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        Its name is the column of the compensation.
+    config : Config
+        For its path and its telemetry.
+    own, main : Calibration or None
+        That of the sensor itself, and that of sensor 0.
+
+    Raises
+    ------
+    ConfigError
+        `own` has no entry for the sensor, or a channel is not in ``[telemetry]``.
+    """
+    entries = (own or main).sensors if own is not None or main is not None else ()  # type: ignore[union-attr]
+    entry = next((one for one in entries if one.column == sensor.name), None)
+    if entry is None and own is not None:
+        if len(entries) != 1:
+            columns = ", ".join(one.column for one in entries) or "none"
+            text = f"expected a scalar sensor called {sensor.name!r}, got {columns}"
+            raise ConfigError(config.path, f"{sensor.key}.calibration", text)
+        entry = entries[0]
+    if entry is not None:
+        check_channels({channel.name: channel.unit for channel in entry.channels}, config)
+    return entry
+
+
+class SensorStream:
+    """One sensor.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    driver : Driver
+    correction : Correction or ScalarCorrection
+    component : Component
+        The MAVLink side.
+    start_us : int
+        µs, when the bridge started.
+    publisher : Publisher
+        Sends its samples.
+
+    Attributes
+    ----------
+    sensor_id : int
+    line : SensorLine
+        Holds the commands that are to be sent to the sensor.
+    samples, lost : int
+        Readings received, and those missing by the instrument's own numbering.
+    quality : int
+        The flags that were announced last.
+    """
+
+    def __init__(
+        self,
+        sensor: Sensor,
+        driver: Driver,
+        correction: Correction | ScalarCorrection,
+        component: Component,
+        start_us: int,
+        publisher: Publisher,
+    ) -> None:
+        self.sensor, self.driver, self.correction, self.publisher = sensor, driver, correction, publisher
+        self.sensor_id = sensor.id or 0
+        self.clock = DeviceClock.of(driver)
+        self.line = SensorLine(
+            sensor.label, driver.start, round(sensor.timeout * 1e6), component.announcer, component.timers,
+            start_us, searching=has_magic(sensor.port), sensor_id=self.sensor_id,
+        )  # fmt: skip
+        self._component = component
+        self.samples = self.lost = self.quality = 0
+        self._times: deque[int] = deque(maxlen=RATE_SAMPLES)
+
+    def receive(self, data: bytes, time_us: int) -> list[tuple[Reading, Stamp]]:
+        """Parse bytes; return the readings that they complete, each with its time."""
+        readings = self.driver.feed(data)
+        if not readings:
+            self.line.on_unparsed(data, time_us)
+            return []
+        self.line.on_reading(time_us)
+        return list(zip(readings, self.clock.stamp(readings, time_us), strict=True))
+
+    def correct(
+        self,
+        reading: Reading,
+        stamp: Stamp,
+        main_field: float,
+        where: tuple[float, float] | None,
+        depth: float,
+    ) -> list[CorrectedReading]:
+        """Correct a reading; return the samples that are complete now.
+
+        Parameters
+        ----------
+        reading, stamp
+            As :meth:`receive` returns them.
+        main_field : float
+            nT, the main field's total; NaN where unknown.
+        where : tuple of 2 float or None
+            deg, latitude and longitude; None where not known.
+        depth : float
+            m; NaN where not known.
+        """
+        self.samples += 1
+        self.lost += stamp.missing
+        self._times.append(stamp.time_us)
+        self.line.read(reading.field, stamp.time_us)
+        correction, time_us = self.correction, stamp.time_us
+        restarted, missing = stamp.restarted, stamp.missing
+        if isinstance(correction, Correction):
+            sample, corrected = correction.reading(
+                reading, time_us, restarted=restarted, missing=missing, main_field=main_field, where=where,
+                depth=depth,
+            )  # fmt: skip
+            return [CorrectedReading(sample, corrected, main_field, correction.stated_sigma)]
+        correction.reading(
+            reading, time_us, restarted=restarted, missing=missing, main_field=main_field, where=where
+        )
+        return self.complete()
+
+    def complete(self) -> list[CorrectedReading]:
+        """Return the samples of a scalar that waited for others and are complete now."""
+        if not isinstance(self.correction, ScalarCorrection):
+            return []
+        return self.correction.samples(self._component.codec.now_us)
+
+    def use_vector(self, time_us: int, field: Vector) -> None:
+        """Use the corrected vector (nT) of sensor 0 at `time_us` (µs) to compensate a scalar."""
+        if isinstance(self.correction, ScalarCorrection):
+            self.correction.vector(time_us, field)
+
+    def tune(self, settings: Align, ages: Mapping[str, float]) -> None:
+        """Apply the settings of the alignment, and the ages (s) from which telemetry is stale."""
+        self.correction.aligner.tune(own_settings(self.sensor, self.driver, settings), ages)
+
+    @property
+    def sample_rate(self) -> float:
+        """Rate of the last readings, Hz; NaN while the sensor is silent."""
+        times = self._times
+        span_us = times[-1] - times[0] if times and self.line.state == MAG_PORT_STATE.OK else 0
+        return (len(times) - 1) * 1e6 / span_us if span_us > 0 else nan
+
+    def report(self) -> None:
+        """Send MAG_SENSOR."""
+        component = self._component
+        component.outbox.send(
+            "MAG_SENSOR",
+            time_usec=component.codec.utc_us,
+            calibration_id=self.publisher.calibration_id,
+            samples=self.samples & 0xFFFFFFFF,
+            samples_lost=self.lost & 0xFFFFFFFF,
+            bytes_skipped=self.driver.bytes_skipped & 0xFFFFFFFF,
+            frames_bad=self.driver.frames_bad & 0xFFFFFFFF,
+            sample_rate=self.sample_rate,
+            clock_drift=-self.clock.drift_ppm,
+            sensor_id=self.sensor_id,
+            state=self.line.state,
+            name=self.sensor.label,
+        )
+
+
+def own_settings(sensor: Sensor, driver: Driver, settings: Align) -> Align:
+    """Return the settings of the alignment with the filter delay of one sensor."""
+    if sensor.filter_delay is None and not is_scalar(driver):
+        return settings
+    return msgspec.structs.replace(settings, filter_delay=sensor.filter_delay or 0.0)
+
+
+def open_correction(
+    sensor: Sensor,
+    driver: Driver,
+    config: Config,
+    own: Calibration | None,
+    main: Calibration | None,
+    learner: Learner | None = None,
+) -> tuple[Correction | ScalarCorrection, Calibration | None]:
+    """Return the correction of a sensor, and the calibration that it uses.
+
+    Parameters
+    ----------
+    sensor, driver, config
+        The sensor, its driver, and the configuration.
+    own, main : Calibration or None
+        That of the sensor itself, and that of sensor 0.
+    learner : Learner, optional
+        Of sensor 0.
+
+    Raises
+    ------
+    ConfigError
+        The link does not provide what the calibration needs.
+    """
+    settings = own_settings(sensor, driver, config.align)
+    if is_scalar(driver):
+        entry = scalar_entry(sensor, config, own, main) if config.sensor != sensor else None
+        used = None if entry is None else own or main
+        return ScalarCorrection(entry, settings, sensor.sigma), used
+    if own is not None:
+        check(own, config)
+        if not own.sensor.may_be(sensor.driver):
+            return Correction(None, settings, learner), None
+    return Correction(own, settings, learner), own

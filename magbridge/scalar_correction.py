@@ -1,0 +1,227 @@
+"""Compensate the readings of a scalar magnetometer live, with the vector sensor's samples of the same time.
+
+The compensation (:mod:`magbridge.calibration.scalar`) needs the direction of the field and its rate of change
+at the time of the reading, and how fast the reading itself changes. So a reading waits for the next one, and
+for a vector sample that is not older than that. The vector is interpolated to the readings' times; all
+derivatives are then central differences, as offline.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from math import inf, isfinite, nan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from magbridge.align import Aligner, Sample
+from magbridge.arrays import FloatArray
+from magbridge.calibration.model import Noise
+from magbridge.calibration.scalar import (
+    CYCLE_LEVEL_SIGMA_NT,
+    ScalarSensor,
+    ScalarSeries,
+    correct_scalar,
+)
+from magbridge.config import Align
+from magbridge.health import HealthMonitor, Messages
+from magbridge.parts import OptionalParts
+from magbridge.records import Corrected, Quality, Reading, Vector
+from magbridge.track import Input
+
+__all__ = ["CorrectedReading", "ScalarCorrection"]
+
+MAX_AGE_S = 30.0
+"""s after which telemetry is stale, unless the configuration sets another age."""
+MAX_WAIT_US = 3_000_000
+"""µs that a reading waits for the next one and for the vector; then it is published without a field."""
+STORED_VECTORS = 4096
+"""Vector samples that are kept: three seconds at 1,000 Hz."""
+NO_VECTOR = (nan, nan, nan)
+
+
+class PendingReading(NamedTuple):
+    """A reading that waits for its compensation."""
+
+    sample: Sample
+    main_field: float
+    """nT, the main field's total; NaN where unknown."""
+    where: tuple[float, float] | None
+    """Position of the vehicle: latitude and longitude, deg; None where unknown."""
+
+
+class CorrectedReading(NamedTuple):
+    """A corrected reading of any sensor."""
+
+    sample: Sample
+    corrected: Corrected
+    main_field: float
+    """nT, the main field's total; NaN where unknown."""
+    stated_sigma: float
+    """nT, 1-sigma of the total field without what the plausibility checks added."""
+
+
+class ScalarCorrection:
+    """Corrects reading after reading of a scalar magnetometer.
+
+    Parameters
+    ----------
+    sensor : ScalarSensor or None
+        The compensation; without it, a reading is published as it is.
+    settings : Align
+        With the filter delay of this sensor.
+    sigma : float or None
+        nT, 1-sigma of a reading that needs no compensation. Without `sensor` and `sigma`, samples are flagged
+        ``uncalibrated``.
+
+    Attributes
+    ----------
+    aligner : Aligner
+        Of the readings and of the compensation's channels.
+    notices : list of str
+        Messages about flagged samples since the caller last emptied the list, each once.
+    """
+
+    def __init__(self, sensor: ScalarSensor | None, settings: Align, sigma: float | None = None) -> None:
+        self._sensor = sensor
+        channels = sensor.channels if sensor is not None else ()
+        inputs = tuple(Input(one.name, one.low, one.high, MAX_AGE_S, is_mass=False) for one in channels)
+        self.aligner = Aligner(inputs, settings)
+        self._messages = Messages()
+        self.notices = self._messages.lines
+        self.parts = OptionalParts(self.notices.append)
+        self._sigma = CYCLE_LEVEL_SIGMA_NT if sigma is None else sigma
+        self._flags = int(Quality.UNCALIBRATED) if sensor is None and sigma is None else 0
+        white = sensor.noise.white if sensor is not None else 0.0
+        self._health = None if self._flags else HealthMonitor(Noise(white), self._messages)
+        self._vectors: deque[tuple[int, Vector]] = deque(maxlen=STORED_VECTORS)
+        self._pending: deque[PendingReading] = deque()
+        self._before: Sample | None = None
+
+    def tune(self, settings: Align, ages: dict[str, float]) -> None:
+        """Replace the settings of the alignment; the filter delay stays that of this sensor."""
+        self.aligner.tune(settings, ages)
+
+    def telemetry(self, name: str, value: float, time_us: int, *, guessed: bool = False) -> None:
+        """Process a telemetry value; arguments as :meth:`magbridge.align.Aligner.telemetry`."""
+        self.aligner.telemetry(name, time_us, value, guessed=guessed)
+
+    def vector(self, time_us: int, field: Vector) -> None:
+        """Record the corrected vector (nT) of the vector sensor's sample at `time_us` (µs)."""
+        if self._sensor is not None and isfinite(field[0] + field[1] + field[2]):
+            if self._vectors and time_us <= self._vectors[-1][0]:
+                self._vectors.clear()  # a clock was set back
+            self._vectors.append((time_us, field))
+
+    def reading(
+        self,
+        reading: Reading,
+        time_us: int,
+        *,
+        restarted: bool = False,
+        missing: int = 0,
+        main_field: float = nan,
+        where: tuple[float, float] | None = None,
+    ) -> None:
+        """Record one reading; parameters as for :meth:`magbridge.correction.Correction.reading`."""
+        sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
+        self._pending.append(PendingReading(sample, main_field, where))
+
+    def samples(self, now_us: int) -> list[CorrectedReading]:
+        """Return the samples that are complete at `now_us` (µs)."""
+        pending = self._pending
+        if self._sensor is None:
+            ready = list(pending)
+            pending.clear()
+            results = [(one.sample.field[0], self._sigma) for one in ready]
+            flags = [0] * len(ready)
+        else:
+            count = self._complete(now_us)
+            ready = [pending.popleft() for _ in range(count)]
+            results, flags = self._compensate([one.sample for one in ready])
+        return [
+            self._checked(one, total, sigma, flag)
+            for one, (total, sigma), flag in zip(ready, results, flags, strict=True)
+        ]
+
+    def _complete(self, now_us: int) -> int:
+        """Return how many of the first pending readings need not wait any longer."""
+        vector_us = self._vectors[-1][0] if self._vectors else 0
+        count = 0
+        for k, one in enumerate(self._pending):
+            has_next = k + 1 < len(self._pending) and self._pending[k + 1].sample.time_us <= vector_us
+            if not has_next and now_us - one.sample.time_us < MAX_WAIT_US:
+                break
+            count = k + 1
+        return count
+
+    def _compensate(self, samples: list[Sample]) -> tuple[list[tuple[float, float]], list[int]]:
+        """Return total field and sigma (nT), and the flags, of readings in a row."""
+        if not samples:
+            return [], []
+        sensor = self._sensor
+        assert sensor is not None
+        after = [self._pending[0].sample] if self._pending else []
+        before = [self._before] if self._before is not None else []
+        self._before = samples[-1]
+        while len(self._vectors) > 2 and self._vectors[1][0] < samples[0].time_us - MAX_WAIT_US:
+            self._vectors.popleft()
+        row = [*before, *samples, *after]
+        stale = int(Quality.STALE_TELEMETRY)
+        if len(row) < 2:
+            return [(nan, inf)] * len(samples), [stale] * len(samples)
+        cycles = [one.reading.power_cycle for one in row]
+        series = ScalarSeries(
+            np.array([one.time_us for one in row]) * 1e-6,
+            np.array([one.field[0] for one in row]),
+            self._vectors_at([one.time_us for one in row]),
+            np.full(len(row), nan),
+            np.array([one.values for one in row]).reshape(len(row), len(sensor.channels)),
+            np.array([nan if cycle is None else cycle for cycle in cycles], float),
+        )
+        found = correct_scalar(sensor, series)
+        part = slice(len(before), len(before) + len(samples))
+        flags = np.where(found.extrapolated, int(Quality.EXTRAPOLATED), 0) | np.where(found.missing, stale, 0)
+        both = zip(found.field[part].tolist(), found.sigma[part].tolist(), strict=True)
+        return list(both), flags[part].tolist()
+
+    def _vectors_at(self, times_us: list[int]) -> FloatArray:
+        """Return the vector (n, 3), nT, at times in µs; NaN where it is not known."""
+        if len(self._vectors) < 2:
+            return np.full((len(times_us), 3), nan)
+        times = np.array([time_us for time_us, _ in self._vectors], float)
+        field = np.array([vector for _, vector in self._vectors])
+        wanted = np.array(times_us, float)
+        columns = [np.interp(wanted, times, axis, left=nan, right=nan) for axis in field.T]
+        far = np.abs(times[np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)] - wanted) > MAX_WAIT_US
+        return np.where(far[:, None], nan, np.stack(columns, axis=1))
+
+    def _checked(self, one: PendingReading, total: float, sigma: float, flags: int) -> CorrectedReading:
+        """Return a sample with the flags and the variance that alignment and plausibility checks add."""
+        sample = one.sample
+        quality = sample.quality | flags | self._flags
+        variance = sigma * sigma + sample.sigma * sample.sigma
+        stated_sigma = sqrt(variance)
+        if self._health is not None and isfinite(total):
+            arguments = (self._health, one, (total, sigma), quality)
+            added, more = self.parts.call("plausibility check", (0.0, 0), self._check, *arguments)
+            variance, quality = variance + added, quality | more
+        corrected = Corrected(total, sqrt(variance), NO_VECTOR, NO_VECTOR, quality)
+        return CorrectedReading(sample, corrected, one.main_field, stated_sigma)
+
+    def _check(
+        self, health: HealthMonitor, one: PendingReading, total: tuple[float, float], quality: int
+    ) -> tuple[float, int]:
+        """Return the variance (nT²) and the flags of the plausibility checks."""
+        sample, F = one.sample, one.sample.field[0]
+        if one.where is not None:
+            health.set_position(sample.time_us, *one.where)
+        no_masses: Callable[[], tuple[float, ...]] = tuple
+        reference = one.main_field, self.aligner.settings.reference_sigma
+        # one channel in place of three: its direction never changes, and it repeats only as a whole
+        variance = health.check(
+            sample.time_us, (F, F, F), (total[0], 0.0, 0.0), total, quality, reference,
+            sample.reading.temperature, sample.age, no_masses,
+        )  # fmt: skip
+        return variance, health.flags

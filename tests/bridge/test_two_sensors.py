@@ -1,0 +1,278 @@
+"""Two sensors on one bridge: ids, messages, the comparison of both, and the compensation of a scalar."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from devices import open_line
+
+from magbridge.bridge import states
+from magbridge.bridge.check import findings
+from magbridge.bridge.drive import set_up
+from magbridge.bridge.events import Event, Start, port_number
+from magbridge.calibration.file import save
+from magbridge.calibration.model import Boresight, Calibration, Noise, Reference, Sensor
+from magbridge.calibration.scalar import (
+    PLATFORM_TERMS,
+    ScalarNoise,
+    ScalarSensor,
+    ScalarSeries,
+    correct_scalar,
+)
+from magbridge.calibration.terms import Polynomial
+from magbridge.config import load
+from magbridge.logs import read
+from magbridge.mavlink import Codec, Message
+from magbridge.records import Channel, Quality
+from sitl.replay.own_log import Recorded
+from sitl.replay.stage import Stage
+
+START = 1_780_000_000_000_000
+FIELD_NT = 50_000.0
+PATIENCE_S = 60.0
+"""s that the bridge has to start and to publish."""
+CONFIG = """\
+[sensor.flux]
+driver = "ascii"
+port = "/dev/null"
+calibration = "flux.json"
+[sensor.flux.options]
+columns = ["x", "y", "z", "time"]
+[sensor.{name}]
+driver = "ascii"
+port = "/dev/null"
+{settings}
+[sensor.{name}.options]
+columns = {columns}
+[link]
+url = "udpout:127.0.0.1:14550"
+[publish]
+MAG_FIELD = 0
+[align]
+reference_sigma = 30.0
+[log]
+directory = "logs"
+"""
+
+
+def scalar() -> ScalarSensor:
+    """Return a compensation with a permanent, an induced and an eddy-current part."""
+    size = PLATFORM_TERMS + 1
+    coefficients = np.zeros(size)
+    coefficients[:3] = 30.0, -20.0, 10.0
+    coefficients[3:6] = 5.0, -3.0, 2.0
+    coefficients[9] = 4.0
+    return ScalarSensor(
+        kind="scalar",
+        column="tail",
+        directions_from="mag",
+        reference_field=FIELD_NT,
+        channels=(),
+        coefficients=tuple(coefficients.tolist()),
+        covariance=tuple(map(tuple, (np.eye(size) * 0.01).tolist())),
+        prior_sigma=(30.0,) * size,
+        noise=ScalarNoise(0.05, 0.1),
+        fitted_from=START * 1e-6,
+        fitted_until=START * 1e-6,
+    )
+
+
+def calibration(*sensors: ScalarSensor) -> Calibration:
+    """Return a calibration that changes nothing."""
+    return Calibration(
+        parameters=(),
+        terms=(Polynomial(exponents=((),)),),
+        coefficients=np.zeros(9),
+        covariance=np.eye(9),
+        noise=Noise(1.0),
+        reference=Reference(FIELD_NT),
+        sensor=Sensor("ascii"),
+        boresight=Boresight((0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6))),
+        method="made for a test",
+        sensors=sensors,
+    )
+
+
+class Bench:
+    """A bridge with two sensors, and the messages that it sent."""
+
+    def __init__(self, folder: Path, name: str, columns: str, settings: str, *sensors: ScalarSensor) -> None:
+        save(calibration(*sensors), folder / "flux.json")
+        save(calibration(), folder / "other.json")
+        self.config = folder / "bridge.toml"
+        self.config.write_text(CONFIG.format(name=name, columns=columns, settings=settings), encoding="utf-8")
+        self.bridge = set_up(load(self.config), Start(START))
+        self.messages: list[Message] = []
+        self._ear = Codec(0, 0)
+        for sensor_id in (0, 1):
+            self.feed(0.0, Channel.STATE, states.opened(port_number(sensor_id)))
+
+    def feed(self, seconds: float, channel: Channel, data: bytes, sensor_id: int = 0) -> None:
+        """Feed one event at a time after the start, s."""
+        event = Event(START + round(seconds * 1e6) // 4 * 4, channel, data, sensor_id)
+        for _, frame in self.bridge.feed(event):
+            self.messages += self._ear.parse(frame)
+
+    def vector(self, seconds: float, x: float, y: float, z: float, sensor_id: int = 0) -> None:
+        """Send a line of a vector sensor."""
+        line = b"%.3f %.3f %.3f %.6f\n" % (x, y, z, seconds)
+        self.feed(seconds, Channel.SENSOR, line, sensor_id)
+
+    def field(self, sensor_id: int) -> list[Message]:
+        """Return the MAG_FIELDs of a sensor."""
+        fields = [one for one in self.messages if one.name == "MAG_FIELD"]
+        return [one for one in fields if one["sensor_id"] == sensor_id]
+
+    def texts(self) -> str:
+        """Return all STATUSTEXTs."""
+        return "\n".join(text for _, text in self.bridge.component.announcer.texts)
+
+
+VECTOR = '["x", "y", "z", "time"]', 'calibration = "other.json"'
+
+
+def attitude(seconds: np.ndarray) -> np.ndarray:
+    """Return the field (n, 3), nT, in the axes of a vehicle that turns."""
+    yaw, tilt = 0.3 * seconds, 0.3 * np.sin(0.5 * seconds)
+    axes = np.stack([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.sin(tilt)], axis=1)
+    return FIELD_NT * axes
+
+
+def test_each_sensor_has_its_id_its_messages_and_its_state(tmp_path: Path) -> None:
+    bench = Bench(tmp_path, "tail", *VECTOR)
+    for k in range(40):
+        bench.vector(0.5 * k, 20_000.0 + k, 0.0, 40_000.0)
+        bench.vector(0.5 * k + 0.1, 0.0, 20_000.0, 40_000.0 + k, sensor_id=1)
+    assert len(bench.field(0)) == len(bench.field(1)) == 39  # the first line may have been half a line
+    assert bench.field(1)[0]["y"] == pytest.approx(20_000.0)
+    states_sent = [one for one in bench.messages if one.name == "MAG_SENSOR"]
+    assert {(one["sensor_id"], one["name"], one["state"]) for one in states_sent[-2:]} == {
+        (0, "flux", 1),
+        (1, "tail", 1),
+    }
+    assert states_sent[-1]["sample_rate"] == pytest.approx(2.0, rel=0.01)
+    assert "tail speaks" in bench.texts()
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_a_sensor_that_jumps_is_named_and_its_sigma_grows(tmp_path: Path, wrong: int) -> None:
+    bench = Bench(tmp_path, "tail", *VECTOR)
+    random = np.random.default_rng(1)
+    for k in range(1200):
+        seconds = 0.1 * k
+        for sensor_id in (0, 1):
+            offset = 300.0 if sensor_id == wrong and k >= 600 else 0.0
+            x, y, z = attitude(np.array([seconds]))[0] * (1 + offset / FIELD_NT) + random.normal(size=3)
+            bench.vector(seconds + 0.02 * sensor_id, x, y, z, sensor_id)
+    names = ["flux", "tail"]
+    assert f"{names[wrong]} is wrong: " in bench.texts()
+    last = [bench.field(0)[-1], bench.field(1)[-1]]
+    assert last[wrong]["flags"] & Quality.IMPLAUSIBLE
+    assert last[wrong]["total_field_sigma"] == pytest.approx(300.0, rel=0.1)
+    assert not last[1 - wrong]["flags"] & Quality.IMPLAUSIBLE
+    assert last[1 - wrong]["total_field_sigma"] < 5.0
+    good = [one for one in bench.field(1 - wrong) if one["total_field_sigma"] > 5.0]
+    assert len(good) < 60
+
+
+def test_a_scalar_is_compensated_by_the_vector_of_its_time(tmp_path: Path) -> None:
+    sensor = scalar()
+    bench = Bench(tmp_path, "tail", '["total_field", "time"]', "", sensor)
+    vector_times, scalar_times = np.arange(0.0, 60.0, 0.05), np.arange(0.51, 59.0, 0.1)
+    vectors = attitude(scalar_times)
+    known = ScalarSeries(
+        START * 1e-6 + scalar_times, np.full(len(scalar_times), FIELD_NT), vectors,
+        np.full(len(scalar_times), np.nan), np.zeros((len(scalar_times), 0)),
+        np.full(len(scalar_times), np.nan),
+    )  # fmt: skip
+    disturbance = FIELD_NT - correct_scalar(sensor, known).field
+    assert np.ptp(disturbance) > 50.0
+    readings = FIELD_NT + disturbance
+    events = sorted(
+        [(t, 0, v) for t, v in zip(vector_times, attitude(vector_times), strict=True)]
+        + [(t, 1, s) for t, s in zip(scalar_times, readings, strict=True)],
+        key=lambda event: event[0],
+    )
+    for seconds, sensor_id, value in events:
+        if sensor_id == 0:
+            bench.vector(seconds, *value)
+        else:
+            bench.feed(seconds, Channel.SENSOR, b"%.4f %.6f\n" % (value, seconds), 1)
+    fields = bench.field(1)[2:]
+    assert len(fields) > 570
+    error = np.array([one["total_field"] for one in fields]) - FIELD_NT
+    assert np.abs(error).max() < 0.1
+    assert all(one["flags"] == 0 and 0.05 < one["total_field_sigma"] < 2.0 for one in fields)
+    assert all(np.isnan(one["x"]) for one in fields)
+    assert max(one["latency"] for one in fields) < 0.25
+
+
+def test_a_scalar_alone_needs_no_calibration(tmp_path: Path) -> None:
+    path = tmp_path / "bridge.toml"
+    text = (
+        '[sensor]\ndriver = "ascii"\nport = "/dev/null"\nsigma = 0.5\n'
+        '[sensor.options]\ncolumns = ["total_field"]\n[link]\nurl = "udpout:127.0.0.1:14550"\n'
+    )
+    path.write_text(text, encoding="utf-8")
+    assert [fault for fault in findings(path) if fault.fatal] == []
+    bridge = set_up(load(path), Start(START))
+    ear, messages = Codec(0, 0), []
+    for k in range(20):
+        event = Event(START + k * 1_000_000, Channel.SENSOR, b"%.4f\n" % (50_000.1234 + 0.1 * (k % 3)))
+        messages += [one for _, frame in bridge.feed(event) for one in ear.parse(frame)]
+    fields = [one for one in messages if one.name == "MAG_FIELD"]
+    assert fields[-1]["total_field"] == pytest.approx(50_000.2234, abs=1e-6)
+    assert fields[-1]["total_field_sigma"] == pytest.approx(0.5)
+    assert fields[-1]["flags"] == 0
+
+
+def test_the_log_of_two_lines_and_a_socket_replays_to_the_same_bytes(tmp_path: Path) -> None:
+    save(calibration(), tmp_path / "flux.json")
+    save(calibration(), tmp_path / "other.json")
+    (tmp_path / "dev").mkdir()
+    lines = [open_line(tmp_path / "dev" / name)[0] for name in ("flux", "tail")]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.setblocking(False)
+        settings = "sigma = 0.2"
+        text = CONFIG.format(name="tail", columns='["total_field"]', settings=settings)
+        for name in ("flux", "tail"):
+            text = text.replace("/dev/null", str(tmp_path / "dev" / name), 1)
+        text = text.replace("14550", str(autopilot.getsockname()[1]))
+        config = tmp_path / "bridge.toml"
+        config.write_text(text, encoding="utf-8")
+        command = [sys.executable, "-m", "magbridge", "run", "--config", str(config)]
+        bridge = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        ear, fields = Codec(0, 0), list[Message]()
+        begun, sent = time.monotonic(), 0
+        while len({one["sensor_id"] for one in fields}) < 2 or len(fields) < 40:
+            assert time.monotonic() - begun < PATIENCE_S
+            os.write(lines[0], b"20000.0 0.0 %d.0 %.3f\n" % (40_000 + sent % 3, time.monotonic()))
+            os.write(lines[1], b"%.4f\n" % (44_721.3596 + 0.1 * (sent % 3)))
+            sent += 1
+            time.sleep(0.02)
+            with suppress(BlockingIOError):
+                while data := autopilot.recv(65536):
+                    fields += [one for one in ear.parse(data) if one.name == "MAG_FIELD"]
+        bridge.terminate()
+        assert bridge.wait(10) == 0
+    (log,) = (tmp_path / "logs").glob("*.tlog")
+    recorded, published = Recorded([log]), bytearray()
+    Stage(config, published.extend).play(recorded.start, recorded.events())
+    assert bytes(published) == bytes(recorded.published)
+    replayed = [one for one in Codec(0, 0).parse(bytes(published)) if one.name == "MAG_FIELD"]
+    assert {one["sensor_id"] for one in replayed} == {0, 1}
+    rows = read([log])
+    known = rows["tail"].dropna("time").to_numpy()
+    assert len(known) > 10
+    assert 44_721.3 < known.min() <= known.max() < 44_721.6
+    assert "tail_time" not in rows
+    assert float(rows["mag_z"].max()) == 40_002.0
