@@ -2,7 +2,6 @@
 
     python3 tools/dev.py bench                      everything: some minutes
     python3 tools/dev.py bench processor start      some of it
-    python3 tools/dev.py bench --json               for machines, with details
     python3 tools/dev.py bench --table FILE.md      also as a table in Markdown, with date, commit and load
 
 Repetitions of the program and of its floor alternate and medians are printed, so that a busy machine slows
@@ -12,7 +11,6 @@ with them, and the floor's own tail shows how far they can be trusted.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import subprocess
@@ -35,8 +33,6 @@ __all__ = ["BENCHMARKS"]
 BENCHMARKS: dict[str, tuple[str, int]] = {
     "processor": ("benchmarks.processor:processor", 15),
     "latency": ("benchmarks.latency:latency", 5),
-    "files": ("benchmarks.files:files", 2),
-    "replay": ("benchmarks.replay:replay", 5),
     "start": ("benchmarks.start:start", 5),
     "learning": ("benchmarks.learning:learning", 5),
     "commands": ("benchmarks.commands:commands", 7),
@@ -110,7 +106,6 @@ def markdown(results: list[dict[str, Any]]) -> str:
 def main() -> int:
     parser = command_line(__doc__)
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--table", type=Path, help="Markdown file to write the table to")
     parser.add_argument("--factor", type=float, default=1.0, help="multiplies the number of repetitions")
     chosen = parser.parse_args()
@@ -122,20 +117,7 @@ def main() -> int:
         results.append(measure(name, chosen.factor))
     if chosen.table:
         chosen.table.write_text(markdown(results), encoding="utf-8")
-    if chosen.json:
-        results = [
-            {
-                **result,
-                "rows": [
-                    {**row._asdict(), "detail": dict(row.detail), "holds": row.holds}
-                    for row in result["rows"]
-                ],
-            }
-            for result in results
-        ]
-        print(json.dumps(results, indent=1))
-    else:
-        Console(width=None if sys.stdout.isatty() else 160).print(show(results))
+    Console(width=None if sys.stdout.isatty() else 160).print(show(results))
     return int(any(row.holds is False for result in results for row in result["rows"]))
 
 

@@ -1,125 +1,167 @@
-"""Damaged inputs for every parser and reader: a result, or one of our own errors; anything else is kept.
-
-Seeds are what our own writers write. Each is damaged at random (bits, bytes, numbers, pieces moved, doubled,
-cut off), and read as a user's file or line would be. A seed damages in one way; a run goes on where
-the last of its folder stopped. With atheris (pip install atheris) ``--guided`` lets coverage choose.
+"""Damage inputs of every parser and reader at random; each must give a result or one of our own errors.
 
     python tools/fuzz.py mavlink digitizer -n 1000000 -o fuzz
     python tools/fuzz.py --kind file --seconds 600 -o fuzz
-    python tools/fuzz.py csv --guided -n 100000 -o fuzz
-    python tools/fuzz.py --report -o fuzz
+
+The seeds are inputs of our own writers and of the emulators. Bits, bytes and numbers of them are changed, and
+pieces are moved, doubled or cut off. Input k of a seed is the same in every run. Inputs that fail are kept in
+the output folder with their traceback.
 """
 
 from __future__ import annotations
 
-import atexit
-import contextlib
 import hashlib
-import json
 import random
+import struct
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fuzz_seeds import SEEDS
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "harness"))
+
+import grids
+import numpy as np
+import xarray as xr
+from flash import Log
 from rich.console import Console
+from segments import segment
 from studies import command_line, table
+from ulogs import ulog_of
 
+from magbridge import config, logs
+from magbridge.calibration.file import decode_calibration, encode_calibration
+from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import MagbridgeError
+from magbridge.field import read
+from magbridge.field.grid import AnomalyGrid
+from magbridge.mavlink import BAD_DATA, Codec
+from magbridge.mavlink.tlog import LogReader
+from magbridge.records import Reading
+from magbridge.sensors import open_driver
+from sitl.fluxgate import open_encoder
 
-LONGEST = 10.0
-"""s of processor time that any input may take: these are far smaller than 10 MB."""
-SAVE_EVERY = 1000
+MAX_SECONDS = 10.0
+"""Processor time that an input may take, s; all inputs are far smaller than 10 MB."""
 NUMBERS = [0, 1, 2, 3, 4, 7, 8, 127, 128, 254, 255]
 WORDS = [
-    b"nan",
-    b"inf",
-    b"-1",
-    b"1e400",
-    b"-9999",
-    b"0",
-    b",",
-    b"\n",
-    b"\0",
-    b'"',
-    b"\xff\xfe",
-    b"\xef\xbb\xbf",
-]
+    b"nan", b"inf", b"-1", b"1e400", b"-9999", b"0", b",", b"\n", b"\0", b'"', b"\xff\xfe", b"\xef\xbb\xbf",
+]  # fmt: skip
+CONFIG = """
+[sensor]
+driver = "ascii"
+port = "loop://"
+[sensor.options]
+columns = ["x", "y", "z"]
+[link]
+url = "udpout:192.0.2.1:14550"
+system = 1
+[telemetry.battpos]
+message = "NAMED_VALUE_FLOAT"
+match = {name = "battpos"}
+field = "value"
+[publish]
+MAG_FIELD = 0
+[log]
+directory = "logs"
+"""
 
 Read = Callable[[bytes], object]
 
 
 class Target(NamedTuple):
-    """A parser: ``kind`` "bytes" or "file", and what opens the function that is fed, given a folder."""
+    """A parser: its kind, how it reads, and its seeds, both given a folder to write to."""
 
     kind: str
     open: Callable[[Path], Read]
+    seeds: Callable[[Path], list[bytes]]
+
+
+# ---- targets of bytes --------------------------------------------------------------------------------------
 
 
 def _driver(name: str, **options: Any) -> Target:
-    def opened(_: Path) -> Read:
-        from magbridge.sensors import open_driver
-
-        def read(data: bytes) -> object:
-            driver = open_driver(name, options)
-            half = len(data) // 2
-            return [driver.feed(data[:half]), driver.feed(data[half:])]
-
-        return read
-
-    return Target("bytes", opened)
-
-
-def _mavlink(_: Path) -> Read:
-    from magbridge.mavlink import BAD_DATA, Codec
+    """Return the target of a sensor driver; its bytes come in two chunks."""
 
     def read(data: bytes) -> object:
-        """Parse in two chunks; every byte must be in a message, counted as skipped, or pending."""
-        codec = Codec(1, 191)
+        driver = open_driver(name, options)
         half = len(data) // 2
-        messages = [*codec.parse(data[:half]), *codec.parse(data[half:])]
-        skipped = sum(len(one.frame) for one in messages if one.id == BAD_DATA)
-        if b"".join(one.frame for one in messages) + codec.pending != data:
-            raise AssertionError("messages and pending bytes are not the bytes received")
-        if skipped != codec.bytes_skipped or codec.frames != sum(one.id != BAD_DATA for one in messages):
-            raise AssertionError("messages or skipped bytes are not counted")
-        return [one.fields for one in messages if one.known]
+        return [driver.feed(data[:half]), driver.feed(data[half:])]
 
-    return read
+    def seeds(_: Path) -> list[bytes]:
+        encoder = open_encoder(name, options, rate=10.0)
+        answers = b"".join(encoder.feed(command) for command in open_driver(name, options).start())
+        readings = [Reading((2e4 + k, -3e3 * k, 4.5e4), device_time=0.1 * k) for k in range(5)]
+        return [answers + b"".join(encoder.encode(reading) for reading in readings), b"", b"\0" * 64]
 
-
-def _frame_log(_: Path) -> Read:
-    from magbridge.mavlink.tlog import LogReader
-
-    return lambda data: [(record, record.message) for record in LogReader(BytesIO(data))]
+    return Target("bytes", lambda _: read, seeds)
 
 
-def _calibration(_: Path) -> Read:
-    from magbridge.calibration.file import decode_calibration
+def _mavlink(data: bytes) -> object:
+    """Parse in two chunks; every byte must be in a message, counted as skipped, or pending."""
+    codec = Codec(1, 191)
+    half = len(data) // 2
+    messages = [*codec.parse(data[:half]), *codec.parse(data[half:])]
+    skipped = sum(len(one.frame) for one in messages if one.id == BAD_DATA)
+    if b"".join(one.frame for one in messages) + codec.pending != data:
+        raise AssertionError("messages and pending bytes are not the bytes received")
+    if skipped != codec.bytes_skipped or codec.frames != sum(one.id != BAD_DATA for one in messages):
+        raise AssertionError("messages or skipped bytes are not counted")
+    return [one.fields for one in messages if one.known]
 
-    return decode_calibration
+
+def _frames(_: Path) -> list[bytes]:
+    codec = Codec(1, 1)
+    frames = [
+        codec.pack("HEARTBEAT", type=12),
+        codec.pack("ATTITUDE", time_boot_ms=1000, roll=0.1, yaw=2.0),
+        codec.pack("NAMED_VALUE_FLOAT", name="battpos", value=0.3),
+        codec.pack("PARAM_SET", param_id="MB_OFFSET", param_value=1.0),
+        codec.pack("MAG_FIELD", time_usec=5, total_field=50_000.0),
+    ]
+    return [b"".join(frames), *frames]
 
 
-def _file(name: str, reader: str) -> Target:
-    """Return a target that writes the bytes to a file called `name` and reads it as a log, a grid or so."""
+def _frame_log(folder: Path) -> list[bytes]:
+    return [
+        b"".join(struct.pack(">Q", 1_700_000_000_000_000 + k) + f for k, f in enumerate(_frames(folder)[1:]))
+    ]
+
+
+def _calibration(_: Path) -> list[bytes]:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(27, 27))
+    made = Calibration(
+        parameters=(Parameter("battpos", "in", -0.4, 0.5, 0.05, 0.45),),
+        terms=(Polynomial(exponents=full_order(1, 2)),),
+        effects=(),
+        coefficients=rng.normal(size=27) * 100.0,
+        covariance=root @ root.T,
+        noise=Noise(1.0, 0.0, 0.3, 4.0),
+        reference=Reference(51_000.0, "IGRF"),
+        sensor=Sensor("digitizer", 3),
+        boresight=None,
+        runs=(Run("1", 225, 1.1, (0.3,)),),
+        method="auto",
+        inputs={"a.csv": "00"},
+        software="magbridge 0.1.0",
+    )
+    return [encode_calibration(made)]
+
+
+# ---- targets of files --------------------------------------------------------------------------------------
+
+
+def _file(name: str, function: Callable[[Path], object], *writers: Callable[[Path], object]) -> Target:
+    """Return a target that writes the bytes to a file and reads it; `writers` write the seeds to a path."""
 
     def opened(folder: Path) -> Read:
-        from magbridge import config, logs
-        from magbridge.field import read
-
         path = folder / name
-        how: Any = {
-            "log": logs.read,
-            "grid": read.read_grid,
-            "polygon": read.read_polygon,
-            "config": config.load,
-        }
-        function = how[reader]
 
         def run(data: bytes) -> object:
             path.write_bytes(data)
@@ -127,7 +169,53 @@ def _file(name: str, reader: str) -> Target:
 
         return run
 
-    return Target("file", opened)
+    def seeds(folder: Path) -> list[bytes]:
+        path, made = folder / f"seed{Path(name).suffix}", []
+        for write in writers:
+            write(path)
+            made.append(path.read_bytes())
+        return made
+
+    return Target("file", opened, seeds)
+
+
+def _log() -> xr.Dataset:
+    t = 1.7e9 + 4.0 * np.arange(60)
+    columns = {
+        name: ("time", 2e4 + 100.0 * np.sin(t / 50.0 + k))
+        for k, name in enumerate(("mag_x", "mag_y", "mag_z"))
+    }
+    more = {
+        "roll": 5.0 * np.sin(t / 30.0),
+        "latitude": 54.0 + (t - t[0]) * 1e-6,
+        "longitude": 10.0 + 0.0 * t,
+        "battpos": np.where(t % 40 < 20, 0.1, 0.4),
+    }
+    return xr.Dataset(
+        {**columns, **{k: ("time", v) for k, v in more.items()}}, {"time": t}, {"source": "fuzz"}
+    )
+
+
+def _write_ardupilot(path: Path) -> None:
+    log = Log()
+    for k in range(20):
+        log.mag(100_000 * k, 0, (100 + k, 20, -300))
+    path.write_bytes(log.data)
+
+
+def _write_px4(path: Path) -> None:
+    topics = {"sensor_mag": ("uint64_t timestamp;float x;float y;float z;", "<Q3f")}
+    rows = [("sensor_mag", 0, (1000 * k, 0.2, 0.01 * k, -0.4)) for k in range(20)]
+    path.write_bytes(ulog_of(topics, {}, rows))
+
+
+def _write_slocum(path: Path) -> None:
+    t = 4.0 * np.arange(20)
+    segment(path, {"m_present_time": 1.7e9 + t, "m_roll": 0.03 * t, "m_battpos": 0.3 + 0.0 * t})
+
+
+def _write_log(path: Path) -> None:
+    logs.write(_log(), path)
 
 
 TARGETS: dict[str, Target] = {
@@ -139,29 +227,42 @@ TARGETS: dict[str, Target] = {
     "nmea": _driver(
         "ascii", prefix="$PMAG,", separator=",", columns=["time", "x", "y", "z"], checksum="nmea"
     ),
-    "mavlink": Target("bytes", _mavlink),
-    "frame_log": Target("bytes", _frame_log),
-    "calibration": Target("bytes", _calibration),
-    "config": _file("bridge.toml", "config"),
-    "polygon": _file("mask.csv", "polygon"),
-    "csv": _file("log.csv", "log"),
-    "tlog": _file("log.tlog", "log"),
-    "netcdf": _file("log.nc", "log"),
-    "parquet": _file("log.parquet", "log"),
-    "ardupilot": _file("log.BIN", "log"),
-    "px4": _file("log.ulg", "log"),
-    "slocum": _file("log.dbd", "log"),
-    "table": _file("grid.csv", "grid"),
-    "esri": _file("grid.asc", "grid"),
-    "surfer": _file("grid.grd", "grid"),
-    "geosoft": _file("grid.grd", "grid"),
-    "geotiff": _file("grid.tif", "grid"),
-    "grid-netcdf": _file("grid.nc", "grid"),
-}
+    "mavlink": Target("bytes", lambda _: _mavlink, _frames),
+    "frame_log": Target(
+        "bytes", lambda _: lambda data: [(one, one.message) for one in LogReader(BytesIO(data))], _frame_log
+    ),
+    "calibration": Target("bytes", lambda _: decode_calibration, _calibration),
+    "config": _file("bridge.toml", config.load, lambda path: path.write_text(CONFIG)),
+    "polygon": _file(
+        "mask.csv",
+        read.read_polygon,
+        lambda path: path.write_text("longitude,latitude\n10.1,54.1\n10.4,54.1\n10.2,54.3\n"),
+    ),
+    "csv": _file("log.csv", logs.read, _write_log),
+    "tlog": _file("log.tlog", logs.read, _write_log),
+    "netcdf": _file("log.nc", logs.read, _write_log),
+    "parquet": _file("log.parquet", logs.read, _write_log),
+    "ardupilot": _file("log.BIN", logs.read, _write_ardupilot),
+    "px4": _file("log.ulg", logs.read, _write_px4),
+    "slocum": _file("log.dbd", logs.read, _write_slocum),
+    "table": _file("grid.csv", read.read_grid, grids.table),
+    "esri": _file("grid.asc", read.read_grid, grids.esri),
+    "surfer": _file("grid.grd", read.read_grid, grids.surfer_text, grids.surfer_6, grids.surfer_7),
+    "geosoft": _file(
+        "grid.grd", read.read_grid, grids.geosoft, lambda path: grids.geosoft(path, compressed=True)
+    ),
+    "geotiff": _file("grid.tif", read.read_grid, grids.geotiff),
+    "grid-netcdf": _file(
+        "grid.nc", read.read_grid, AnomalyGrid(grids.LON, grids.LAT, grids.MAP, 1.0, 300.0).save
+    ),
+}  # fmt: skip
 
 
-def damaged(seeds: list[bytes], rng: random.Random) -> bytes:
-    """Return one of the seeds with one to eight damages."""
+# ---- fuzzing -----------------------------------------------------------------------------------------------
+
+
+def damaged(seeds: Sequence[bytes], rng: random.Random) -> bytes:
+    """Return one of the seeds with one to eight changes."""
     data = bytearray(rng.choice(seeds))
     for _ in range(rng.choice((1, 1, 2, 3, 8))):
         at = rng.randrange(len(data) + 1)
@@ -189,148 +290,74 @@ def damaged(seeds: list[bytes], rng: random.Random) -> bytes:
     return bytes(data)
 
 
-class Session:
-    """One target's folder: how many inputs were tried with what outcome, and the findings."""
+class Counts:
+    """Outcomes of the inputs of one target; inputs that fail are kept in its folder."""
 
-    def __init__(self, name: str, folder: Path, seed: int) -> None:
-        self.name, self.folder = name, folder / name
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._state = self.folder / "state.json"
-        begun = {
-            "seed": seed,
-            "tried": 0,
-            "read": 0,
-            "refused": 0,
-            "found": 0,
-            "seconds": 0.0,
-            "slowest": 0.0,
-        }
-        self.state: dict[str, Any] = json.loads(self._state.read_text()) if self._state.exists() else begun
-        self._began = time.monotonic() - self.state["seconds"]
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.tried = self.read = self.refused = self.found = 0
+        self.slowest = 0.0
 
     def run(self, read: Read, data: bytes) -> None:
-        """Feed one input, count its outcome, keep it if that is neither a result nor one of our errors."""
-        began = time.process_time()
-        problem = ""
+        """Feed one input and count its outcome."""
+        began, problem = time.process_time(), ""
         try:
             read(data)
-            self.state["read"] += 1
+            self.read += 1
         except MagbridgeError as error:
-            self.state["refused"] += 1
-            if "\n" in str(error) or "cannot be read, damaged?" in str(error):  # it was not foreseen
+            self.refused += 1
+            if "\n" in str(error) or "cannot be read, damaged?" in str(error):  # the reader did not expect it
                 problem = f"{error}\n" + "\n".join(getattr(error, "__notes__", []))
-        except Exception:  # noqa: BLE001 - that is what we look for
+        except Exception:  # noqa: BLE001 - any other exception is a fault
             problem = traceback.format_exc()
         took = time.process_time() - began
-        self.state["slowest"] = max(self.state["slowest"], took)
-        if took > LONGEST:
+        self.slowest = max(self.slowest, took)
+        self.tried += 1
+        if took > MAX_SECONDS:
             problem = problem or f"took {took:.1f} s\n"
-        self.state["tried"] += 1
         if problem:
             self._keep(data, problem)
-        if self.state["tried"] % SAVE_EVERY == 0:
-            self.save()
 
     def _keep(self, data: bytes, problem: str) -> None:
-        """Keep an input whose problem, told by its last lines, is new."""
+        """Keep an input whose problem, by the last lines of its traceback, is new."""
         lines = [line for line in problem.splitlines() if line.strip().startswith(("File", "took"))]
-        kind = hashlib.sha1(
-            "".join(lines[-2:] or [problem[:80]]).encode(), usedforsecurity=False
-        ).hexdigest()[:10]
+        text = "".join(lines[-2:] or [problem[:80]])
+        kind = hashlib.sha1(text.encode(), usedforsecurity=False).hexdigest()[:10]
         if not (self.folder / f"{kind}.txt").exists():
-            self.state["found"] += 1
+            self.found += 1
+            self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / kind).write_bytes(data)
             (self.folder / f"{kind}.txt").write_text(problem)
 
-    def save(self) -> None:
-        """Write the counts."""
-        self.state["seconds"] = round(time.monotonic() - self._began, 1)
-        temporary = self._state.with_suffix(".partial")
-        temporary.write_text(json.dumps(self.state, indent=1))
-        temporary.replace(self._state)
 
-
-def blind(session: Session, read: Read, seeds: list[bytes], count: int, seconds: float) -> None:
-    """Damage the seeds at random; input k of a seed is the same in every run."""
-    until = time.monotonic() + seconds
-    for k in range(session.state["tried"], session.state["tried"] + count):
-        session.run(read, damaged(seeds, random.Random(f"{session.state['seed']} {k}")))
-        if time.monotonic() > until:
-            break
-    session.save()
-
-
-def guided(session: Session, name: str, folder: Path, count: int) -> None:
-    """Use coverage by atheris; useful inputs stays in the target's folder ``corpus``."""
-    import atheris  # type: ignore[import-not-found,import-untyped,unused-ignore]  # optional, for this alone
-
-    # imports here are watched: also that which the first reading imports
-    with atheris.instrument_imports(include=["magbridge"]), contextlib.suppress(MagbridgeError):
-        read = TARGETS[name].open(folder)
-        read(b"")
-    corpus = session.folder / "corpus"
-    corpus.mkdir(exist_ok=True)
-    for k, seed in enumerate(SEEDS[name](folder)):
-        (corpus / f"seed{k}").write_bytes(seed)
-    options = [f"-runs={count}", f"-seed={session.state['seed'] + 1}", "-max_len=100000", "-verbosity=0"]
-
-    def one(data: bytes) -> None:
-        session.run(read, data)
-
-    atheris.Setup([sys.argv[0], *options, str(corpus)], one)
-    atexit.register(session.save)
-    atheris.Fuzz()
-
-
-def report(folder: Path) -> None:
-    """Print the counts of a folder's targets."""
-    shown = table(
-        "Fuzzing", "target", "tried", "read", "refused", "found", "a second", "slowest, s", left=("target",)
-    )
-    total = 0
-    for path in sorted(folder.glob("*/state.json")):
-        state = json.loads(path.read_text())
-        total += state["tried"]
-        rate = state["tried"] / max(state["seconds"], 0.1)
-        counts = [f"{state[key]:,}" for key in ("tried", "read", "refused", "found")]
-        shown.add_row(path.parent.name, *counts, f"{rate:,.0f}", f"{state['slowest']:.2f}")
-    shown.add_row("all", f"{total:,}")
-    Console().print(shown)
-
-
-@contextlib.contextmanager
-def _folder() -> Iterator[Path]:
-    memory = Path("/dev/shm")
-    with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as made:
-        yield Path(made)
-
-
-def main() -> None:
-    """Fuzz the targets one after the other."""
+def main() -> int:
+    """Fuzz the targets one after the other; print the outcomes."""
     parser = command_line(__doc__)
-    parser.add_argument("targets", nargs="*", help=f"which: {' '.join(TARGETS)}; default all")
+    parser.add_argument("targets", nargs="*", help=f"of {' '.join(TARGETS)}; default all")
     parser.add_argument("--kind", choices=["bytes", "file"], help="all targets of a kind")
     parser.add_argument("-n", type=int, default=10_000, help="inputs for each")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="for each, at most")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("-o", type=Path, default=Path("fuzz"), help="folder of states and findings")
-    parser.add_argument("--guided", action="store_true", help="by coverage (atheris); one target")
-    parser.add_argument("--report", action="store_true", help="print the inputs tried, and stop")
+    parser.add_argument("-o", type=Path, default=Path("fuzz"), help="folder of the inputs that fail")
     chosen = parser.parse_args()
-    if chosen.report:
-        report(chosen.o)
-        return
-    names = chosen.targets or [n for n, t in TARGETS.items() if chosen.kind in (None, t.kind)]
-    for name in names:
-        with _folder() as folder:
-            session = Session(name, chosen.o, chosen.seed)
-            if chosen.guided:
-                guided(session, name, folder, chosen.n)
-            else:
-                read, seeds = TARGETS[name].open(folder), SEEDS[name](folder)
-                blind(session, read, seeds, chosen.n, chosen.seconds)
-    report(chosen.o)
+    shown = table("Fuzzing", "target", "tried", "read", "refused", "faults", "slowest, s", left=("target",))
+    faults = 0
+    for name in chosen.targets or [n for n, t in TARGETS.items() if chosen.kind in (None, t.kind)]:
+        memory = Path("/dev/shm")
+        with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as made:
+            counts, folder = Counts(chosen.o / name), Path(made)
+            read, seeds = TARGETS[name].open(folder), TARGETS[name].seeds(folder)
+            until = time.monotonic() + chosen.seconds
+            for k in range(chosen.n):
+                counts.run(read, damaged(seeds, random.Random(f"{chosen.seed} {k}")))
+                if time.monotonic() > until:
+                    break
+        faults += counts.found
+        numbers = (f"{count:,}" for count in (counts.tried, counts.read, counts.refused, counts.found))
+        shown.add_row(name, *numbers, f"{counts.slowest:.2f}")
+    Console().print(shown)
+    return int(faults > 0)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

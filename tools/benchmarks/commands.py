@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from statistics import median
 
@@ -44,18 +43,15 @@ def commands(folder: Path, repetitions: int) -> list[Row]:
         for _ in range(repetitions + 1):  # the first fills the caches
             times.append(_spent(command))
             bare.append(_spent([sys.executable, "-c", floor]))
-        wall, used = (median(each) for each in zip(*times[1:], strict=True))
         rows.append(
-            Row(what, used, "s", median(one[1] for one in bare[1:]), floor, most=most,
-                detail={"wall_s": wall, "best_wall_s": min(times[1:])[0]})
+            Row(what, median(times[1:]), "s", median(bare[1:]), floor, most=most)
         )  # fmt: skip
     return rows
 
 
-def _spent(command: list[str]) -> tuple[float, float]:
-    """Return wall clock and processor time, s, that a command takes from its start to its end."""
-    begun = time.perf_counter()
+def _spent(command: list[str]) -> float:
+    """Return the processor time, s, of a command from its start to its end."""
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, _, used = os.wait4(process.pid, 0)
     process.returncode = 0
-    return time.perf_counter() - begun, used.ru_utime + used.ru_stime
+    return used.ru_utime + used.ru_stime

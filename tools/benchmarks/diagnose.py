@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from benchmarks.measure import in_own_process
-from benchmarks.row import Row
+from benchmarks.row import Row, in_own_process
 
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
@@ -53,14 +52,12 @@ def diagnosing(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (o
         _diagnosed(folder, hours, size)
         for hours, size in ((NIGHT, 0.0), (NIGHT, NIGHTLY), (MONTH, 0.0), (MONTH, MONTHLY))
     )
-    fields = ("seconds", "processor seconds", "samples", "verdict", "causes", "MB")
-    detail = {name: [run[k] for run in (night, found, month, loud)] for k, name in enumerate(fields)}
     slope = float(np.log(month[1] / night[1]) / np.log(month[2] / night[2]))
     share = f"{month[2] / night[2]:.0f} times 12 h"
     return [
         Row(f"diagnose, 12 h at 0.25 Hz ({night[2]:,} samples), every cause, plain", night[0], "s",
             most=20.0),
-        Row("the same with an effect hidden in it", found[0], "s", most=20.0, detail=detail),
+        Row("the same with an effect hidden in it", found[0], "s", most=20.0),
         Row(f"diagnose, 30 days ({month[2]:,} samples), every cause, plain", month[0], "s",
             night[0] * month[2] / night[2], share, most=240.0),
         Row("the same with an effect hidden in it", loud[0], "s", found[0] * loud[2] / found[2], share,

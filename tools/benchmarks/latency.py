@@ -16,7 +16,7 @@ import sys
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -125,18 +125,15 @@ def _rows(hertz: int, bridge: list[Sent], echo: list[Sent]) -> list[Row]:
     def quantile(runs: list[Sent], q: float) -> float:
         return median([float(np.nanpercentile(run.latency, q)) for run in runs])
 
-    detail = {
-        "best": [min(float(np.nanpercentile(run.latency, q)) for run in bridge) for q in (50.0, 99.0)],
-        "samples": sum(len(run.latency) for run in bridge),
-    }
+    count = sum(len(run.latency) for run in bridge)
     rows = [
         Row(f"latency at {hertz:,} Hz, {name}", quantile(bridge, q), "ms", quantile(echo, q), "echo",
-            most=most, detail=detail)
+            most=most)
         for name, q, most in (("p50", 50.0, 0.5), ("p99", 99.0, 2.0))
     ]  # fmt: skip
     lost = sum(int(np.isnan(run.latency).sum()) for run in bridge)
     samples = hertz * SECONDS
-    rows.append(Row(f"lost at {hertz:,} Hz, of {detail['samples']:,}", lost, "samples", most=0))
+    rows.append(Row(f"lost at {hertz:,} Hz, of {count:,}", lost, "samples", most=0))
     cpu = [median([run.cpu for run in runs]) / samples * 1e6 for runs in (bridge, echo)]
     rows.append(Row(f"processor time at {hertz:,} Hz, kernel and log included", cpu[0], "us", cpu[1], "echo"))
     rows.append(Row(f"resident after {hertz:,} Hz", bridge[-1].resident, "MB", most=90.0))
@@ -148,12 +145,8 @@ def play(
     feed: Feed,
     hertz: int,
     sequences: Callable[[bytes], list[int]],
-    station: Callable[[bytes], bytes] = lambda _: b"",
 ) -> Sent:
-    """Send readings and telemetry for a while; match the answers by sequence number.
-
-    A `station` receives every datagram, and its answer is sent.
-    """
+    """Send readings and telemetry for a while; match the datagrams by sequence number."""
     clock, send, recv = time.perf_counter, running.link.sendto, running.link.recv
     received: list[tuple[float, bytes]] = []
     written: dict[int, float] = {}
@@ -161,12 +154,8 @@ def play(
 
     def listen(until: float) -> None:
         while (now := clock()) < until:
-            try:
+            with suppress(BlockingIOError):
                 received.append((now, recv(65536)))
-            except BlockingIOError:
-                continue
-            if request := station(received[-1][1]):
-                send(request, running.peer)
 
     cpu = processor_time(running.process.pid)
     begun = clock() + 0.01

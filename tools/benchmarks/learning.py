@@ -1,4 +1,4 @@
-"""What learning in flight adds: processor time a sample at 100 Hz, time to the first heartbeat, memory."""
+"""Measure the processor time that in-flight calibration adds to a sample at 100 Hz."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from functools import partial
 from pathlib import Path
 from statistics import median
 
-from benchmarks.latency import bridge_command, resident, started
-from benchmarks.measure import processor_time
 from benchmarks.processor import Edge
-from benchmarks.row import Row
+from benchmarks.row import Row, processor_time
 from benchmarks.workload import BEGIN_US, Feed, write_config
 
 from magbridge.bridge.drive import set_up
@@ -25,16 +23,10 @@ HERTZ = 100
 SECONDS = 20
 """Simulated, in one repetition."""
 LEARNING = "[learning]\nenabled = true\n"
-LIVE = 6.0
-"""s of a running bridge before its memory is read: some samples are learned from."""
 
 
 def learning(folder: Path, repetitions: int) -> list[Row]:
     """Measure a bridge that learns and one that does not."""
-    return [*_processor(folder, repetitions), *_running(folder, repetitions)]
-
-
-def _processor(folder: Path, repetitions: int) -> list[Row]:
     pipelines = {}
     for more in ("", LEARNING):
         path = write_config(folder, more=more)
@@ -51,14 +43,11 @@ def _processor(folder: Path, repetitions: int) -> list[Row]:
             if repetition:  # the first one warms up
                 times[more].append(1e6 * seconds / (SECONDS * HERTZ))
     gc.unfreeze()
-    learner = pipelines[LEARNING].learning
-    assert learner is not None
     added = [a - b for a, b in zip(times[LEARNING], times[""], strict=True)]
     return [
         Row("learning, processor time more a sample", median(added), "us", median(times[""]),
-            "without learning", ratio=median(added), most=60.0,
-            detail={"learned_from": learner.learner.samples}),
-        Row("the longest event of a second", median(longest), "ms", detail={"most": max(longest)}),
+            "without learning", ratio=median(added), most=60.0),
+        Row("the longest event of a second", median(longest), "ms"),
     ]  # fmt: skip
 
 
@@ -74,27 +63,3 @@ def _drive(pipeline: Pipeline, edge: Edge, longest: list[float]) -> None:
             if second:
                 longest.append(worst)
             worst, second = 0.0, event.time_us // 1_000_000
-
-
-def _running(folder: Path, repetitions: int) -> list[Row]:
-    first: dict[str, list[float]] = {"": [], LEARNING: []}
-    memory: dict[str, list[float]] = {"": [], LEARNING: []}
-    for _ in range(repetitions):
-        for more in ("", LEARNING):
-            with started(bridge_command(folder, more)) as live:
-                first[more].append(live.seconds)
-                feed = Feed()
-                for _ in range(round(LIVE * HERTZ)):
-                    live.link.sendto(feed.message(time.time_ns() // 1000), live.peer)
-                    live.write(feed.reading(HERTZ))
-                    time.sleep(1.0 / HERTZ)
-                memory[more].append(resident(live.process.pid)["VmRSS"])
-    extra = median([a - b for a, b in zip(memory[LEARNING], memory[""], strict=True)])
-    ratio = median([a / b for a, b in zip(first[LEARNING], first[""], strict=True)])
-    without = "without learning"
-    return [
-        Row("learning, to the first heartbeat", median(first[LEARNING]), "s", median(first[""]), without,
-            ratio=ratio),
-        Row("learning, resident", median(memory[LEARNING]), "MB", median(memory[""]), without, ratio=extra,
-            most=15.0),
-    ]  # fmt: skip

@@ -13,9 +13,8 @@ from functools import partial
 from pathlib import Path
 from statistics import median
 
-from benchmarks.measure import processor_time
 from benchmarks.peer import Peer
-from benchmarks.row import Row
+from benchmarks.row import Row, processor_time
 from benchmarks.workload import BEGIN_US, Feed, write_config
 
 from magbridge.bridge.drive import drive, set_up
@@ -59,13 +58,12 @@ def processor(folder: Path, repetitions: int) -> list[Row]:
 
 def _measure(folder: Path, repetitions: int, *, moving: bool) -> list[Row]:
     state = "masses in motion" if moving else "masses at rest"
-    times, messages = _times(folder, repetitions, moving=moving)
+    times = _times(folder, repetitions, moving=moving)
     link = [d + e for d, e in zip(times["decode"], times["encode"], strict=True)]
     floors = {
         "pymavlink, link": link,
         "pymavlink, link and log": [a + b for a, b in zip(link, times["encode_log"], strict=True)],
     }
-    detail = {f"{name}_us": median(times[name]) for name in ("decode", "encode", "encode_log")}
     return [
         Row(
             f"processor time a sample, {state}",
@@ -75,17 +73,16 @@ def _measure(folder: Path, repetitions: int, *, moving: bool) -> list[Row]:
             name,
             median([b / f for b, f in zip(times["bridge"], floor, strict=True)]),
             most=BUDGET,
-            detail=detail | {"messages_out": messages},
         )
         for name, floor in floors.items()
     ]
 
 
-def _times(folder: Path, repetitions: int, *, moving: bool) -> tuple[dict[str, list[float]], float]:
-    """Return the µs that a sample takes in each repetition, by kind of work; and the messages it sends."""
+def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[float]]:
+    """Return the processor time of a sample in each repetition, µs, by kind of work."""
     pipeline = set_up(load(write_config(folder)), Start(BEGIN_US))
     feed, peer, log = Feed(moving=moving), Peer(), TlogWriter(folder / "logs")
-    samples, messages = SECONDS * HERTZ, 0
+    samples = SECONDS * HERTZ
     times: dict[str, list[float]] = {"bridge": [], "decode": [], "encode": [], "encode_log": []}
 
     def live(edge: Edge) -> None:
@@ -105,9 +102,8 @@ def _times(folder: Path, repetitions: int, *, moving: bool) -> tuple[dict[str, l
         kept = [peer.sensor_bytes(event.data) for event in events if event.channel is Channel.SENSOR]
         floors = (partial(peer.decode, received), partial(peer.encode, sent), partial(peer.encode, kept))
         if repetition:  # the first one warms up
-            messages += len(sent)
             for name, seconds in zip(times, (bridge, *map(processor_time, floors)), strict=True):
                 times[name].append(1e6 * seconds / samples)
     log.close()
     gc.unfreeze()
-    return times, messages / (samples * repetitions)
+    return times

@@ -1,12 +1,16 @@
-"""One line of the table."""
+"""A line of the benchmarks' table, and how times are measured."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = ["Row"]
+__all__ = ["Row", "in_own_process", "processor_time"]
 
 
 class Row(NamedTuple):
@@ -24,8 +28,6 @@ class Row(NamedTuple):
         repetitions of value divided by floor.
     most, least : float or None
         The target: upper or lower limit.
-    detail : mapping
-        For ``--json``.
     """
 
     what: str
@@ -36,7 +38,6 @@ class Row(NamedTuple):
     ratio: float | None = None
     most: float | None = None
     least: float | None = None
-    detail: Mapping[str, Any] = MappingProxyType({})
 
     @property
     def holds(self) -> bool | None:
@@ -45,3 +46,18 @@ class Row(NamedTuple):
         if self.most is not None:
             return judged <= self.most
         return judged >= self.least if self.least is not None else None
+
+
+def in_own_process(script: str, *arguments: object) -> Any:
+    """Run a script with arguments in another process; return its output, which is JSON, or None."""
+    command = [sys.executable, "-c", script, *map(str, arguments)]
+    place = Path(__file__).parents[1]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout or "null")
+
+
+def processor_time(work: Callable[[], object]) -> float:
+    """Return the processor time, in s, that `work` takes in all threads."""
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
