@@ -1,4 +1,4 @@
-"""What several rooms' tests share."""
+"""Fixtures of the whole test suite."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-# threads only wait for each other on matrices this narrow, above all beside those of a second worker
+# on matrices this narrow threads only wait for each other, and for those of a second worker
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
@@ -66,7 +66,7 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def cases() -> Path:
-    """Folder of inputs on which the program once failed, kept beside the measured data."""
+    """Folder of inputs on which the program once failed, next to the measured data."""
     folder = Path(__file__).parents[2] / "shared" / "cases"
     if not folder.is_dir():
         pytest.skip("no failing inputs in ../shared/cases")

@@ -1,4 +1,4 @@
-"""bridge.toml: what is accepted, and the one line that says what is not."""
+"""bridge.toml: accepted settings, and the one-line message for every other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Alignment and calibration together: what is not known exactly goes into the sigma."""
+"""Alignment and calibration together: the sigma includes every uncertainty."""
 
 from __future__ import annotations
 

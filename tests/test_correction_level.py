@@ -1,4 +1,4 @@
-"""The part of a corrected sigma that all samples share stands beside it."""
+"""The common part of a corrected sigma has a column of its own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from magbridge.rows import correct_rows
 
 
 def test_level_sigma_is_what_the_level_moves() -> None:
-    """A common gain of 0.2 %: the level is 0.2 % of each field; without a level there is no column."""
+    """A common gain of 0.2 % gives a level of 0.2 % of each field; without a level the column is missing."""
     gain = 0.002 * 50_000.0
     w = np.array([gain] * 3 + [0.0] * 6)
     plain = replace(identity(), covariance=np.outer(w, w), method="survey")

@@ -14,7 +14,7 @@ from magbridge import errors
 ROOMS = [Path(str(package.__file__)).parent for package in (magbridge, sitl)]
 ERRORS = {name for name, thing in vars(errors).items() if isinstance(thing, type)}
 SHAPE = re.compile(r"\((\.\.\.|[\w+ ]+),[\w+*., ()-]*\)|\bshape\b|[Aa]rguments as")
-"""``(n,)``, ``(n, 3)``, ``(..., 9 m)``, or a reference to where it is said."""
+"""``(n,)``, ``(n, 3)``, ``(..., 9 m)``, or a reference to the place that states it."""
 
 
 def functions(scope: ast.Module | ast.ClassDef) -> list[ast.FunctionDef]:
@@ -38,7 +38,7 @@ def offered(tree: ast.Module) -> list[str]:
 
 @cache
 def public() -> dict[str, ast.FunctionDef]:
-    """Functions in ``__all__``, and methods of the classes there, but for those that override another."""
+    """Functions in ``__all__``, and methods of the classes there that override no other method."""
     classes = {n.name: n for tree in trees().values() for n in tree.body if isinstance(n, ast.ClassDef)}
 
     def above(one: ast.ClassDef) -> set[str]:

@@ -1,4 +1,4 @@
-"""Each fault of the sensor, the telemetry and the computer, in a survey's bytes: what is wrong is flagged."""
+"""Each fault of sensor, telemetry and computer in the bytes of a survey: wrong samples have a flag."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UNSEEN = HUMS | {
     "offset of x +100 nT with a motion",
     "drift of z, 20 nT/h",
 }
-"""On a steady course it is a constant, or a slope, as rock is."""
+"""On a steady course the fault is a constant or a slope, like the crustal field."""
 
 
 @pytest.fixture(scope="module")

@@ -16,15 +16,15 @@ from magbridge.files import atomic_path, new_folder
 WRITER = """
 import sys, time
 from magbridge.files import atomic_path, new_folder
-with atomic_path(sys.argv[1]) as beside:
-    beside.write_text("half")
-    print(beside.name, flush=True)
+with atomic_path(sys.argv[1]) as partial:
+    partial.write_text("half")
+    print(partial.name, flush=True)
     time.sleep(60)
 """
 
 
 def writing(target: Path) -> tuple[subprocess.Popen[str], Path]:
-    """Start a process that is in the middle of writing `target`; return it and what it writes to."""
+    """Start a process that writes `target`; return it and the name of its temporary file."""
     process = subprocess.Popen([sys.executable, "-c", WRITER, str(target)], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     with process.stdout as output:

@@ -1,4 +1,4 @@
-"""A command that is told to end, or whose reader has gone: one line at most, nothing half-written."""
+"""A command that receives a signal, or whose reader has ended: one line at most, no partial file."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def test_from_a_log_to_corrected_samples(tmp_path: Path, lacking: list[str]) -> 
     at_rest = corrected["quality"].to_numpy() == int(corrected["quality"].min())
     error = corrected["total_field"].to_numpy() - truth
     assert at_rest.mean() > 0.9
-    level = found.calibration.reference.level_sigma  # which the IGRF alone does not tell, and which is said
+    level = found.calibration.reference.level_sigma  # unknown to the IGRF, and reported
     assert (level > 100.0) == bool(lacking)
     if lacking:
         assert abs(error[at_rest].mean()) < level

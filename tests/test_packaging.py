@@ -1,4 +1,4 @@
-"""What is shipped beside the package: the service, the adapter's rule, the container and BlueOS extension."""
+"""The service, the adapter's udev rule, the container and the BlueOS extension."""
 
 from __future__ import annotations
 

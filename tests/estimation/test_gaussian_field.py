@@ -1,4 +1,4 @@
-"""The Gaussian field in place, and the samples' sums about it: exact beside dense algebra and Laplace."""
+"""The Gaussian field and its normal equations, compared with dense algebra and Laplace's equation."""
 
 from __future__ import annotations
 

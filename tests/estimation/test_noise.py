@@ -89,7 +89,7 @@ def test_every_number_that_was_fitted_counts() -> None:
 
 
 def test_what_a_fit_has_absorbed_of_slow_noise_is_given_back() -> None:
-    """Residuals of a straight line in each of many short runs, beside what was drawn."""
+    """Return the residuals of a straight line in many short runs, and the noise that was drawn."""
     e, runs = drawn(0.9), np.arange(N) // 40
     X = np.column_stack([np.ones(40), np.linspace(-1.0, 1.0, 40)])
     H = X @ np.linalg.inv(X.T @ X) @ X.T

@@ -1,4 +1,4 @@
-"""The solver: the minimum that an independent optimiser finds, and what it says when it has not found it."""
+"""The solver finds the minimum of an independent optimiser, and reports when it does not converge."""
 
 from __future__ import annotations
 

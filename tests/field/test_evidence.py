@@ -69,7 +69,7 @@ def test_a_column_is_what_its_name_says(tmp_path: Path, header: str, values: tup
 
 
 def test_without_names_only_the_range_tells(tmp_path: Path) -> None:
-    """A number beyond 90 is no latitude; two that could be make one line."""
+    """A number beyond 90 cannot be a latitude; two candidates give one message."""
     path = tmp_path / "a.xyz"
     for values in ((Y, X + 100.0, MAP), (X + 100.0, Y, MAP)):
         columns(path, "", *values)

@@ -1,4 +1,4 @@
-"""The anomaly map: what a spline must do, beside scipy's own and beside finite differences."""
+"""The spline of an anomaly map, compared with scipy's and with finite differences."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_descending_axis_is_the_same_map(grid: AnomalyGrid, places: Places, fl
 
 @pytest.mark.parametrize("start", [179.8, -180.2, 359.9])
 def test_longitude_goes_round(grid: AnomalyGrid, places: Places, start: float) -> None:
-    """The same hills, laid over the antimeridian or Greenwich, whichever way the axis counts there."""
+    """A map has equal values over the antimeridian and over Greenwich, for both ranges of longitude."""
     axis = LON - 10.0 + start
     for stored in (axis, (axis + 180) % 360 - 180, axis % 360):
         moved = AnomalyGrid(stored, LAT, grid.anomaly)

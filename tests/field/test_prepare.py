@@ -46,7 +46,7 @@ def test_continuation_keeps_a_constant_and_the_holes() -> None:
 
 @pytest.mark.parametrize("depth", [0.0, 60.0, 150.0])
 def test_below_a_map_the_error_is_told(depth: float) -> None:
-    """Half of what the height takes off comes back at least, and what does not is foretold within a third."""
+    """Continuation restores half of the lost amplitude, and sigma predicts the remainder within a third."""
     low = AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0)
     there = continued(low, depth)
     middle = slice(15, -15), slice(20, -20)
@@ -120,7 +120,7 @@ def test_surveys_that_disagree_are_not_exact() -> None:
 
 
 def test_it_is_told_how_far_surveys_are_apart() -> None:
-    """Two by their difference, three by that of any two; apart in space, they are not apart in nT."""
+    """Two maps are compared by their difference, three by each pair; distance in space does not count."""
 
     def merged(*surveys: AnomalyGrid) -> str:
         return prepare(surveys)[1][-1].title
@@ -161,7 +161,7 @@ def test_nothing_is_smoothed_unless_asked_for() -> None:
 
 
 def test_smoothing_is_by_wavelength_and_what_goes_becomes_sigma() -> None:
-    """Of a wave as long as asked for half stays, of one twice as long 84 %; sigma is the RMS of what went."""
+    """Half of a wave of the cutoff length stays, 84 % of one twice as long; sigma is the RMS loss."""
     per_latitude, _ = metres_per_degree(49.5)
     north = (LAT - LAT[0]) * per_latitude
     middle = slice(20, -20), slice(20, -20)

@@ -48,7 +48,7 @@ def test_total_and_vector_come_from_one_evaluation_of_the_main_field(monkeypatch
 
 
 def test_a_map_flown_above_is_continued_to_the_depth() -> None:
-    """A glider's dives over rough rock: most of the difference between aircraft's map and truth is height."""
+    """Under dives, most of the difference between an aircraft's map and the true field is the altitude."""
     twin, rng = Twin.draw(load("demo"), 5), np.random.default_rng(5)
     flown = twin.anomaly_map()
     unknown = AnomalyGrid(flown.longitude, flown.latitude, flown.anomaly)

@@ -1,4 +1,4 @@
-"""What the tests of faults check and tell alike."""
+"""Checks that all tests of faults have in common."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def soon(limit: float) -> float:
 
 
 def replays(rig: Rig) -> None:
-    """Stop the bridge; its log, replayed, publishes the same bytes, and holds what was heard, in order."""
+    """Stop the bridge; its replayed log publishes the same bytes, and has the received frames in order."""
     assert rig.stop() == 0
     recorded, published = rig.replay()
     assert recorded.damages == 0

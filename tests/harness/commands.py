@@ -1,4 +1,4 @@
-"""A command as a user types it: what it prints, and the one line with which it refuses."""
+"""A command as a user types it: its output, or the one line of its error message."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Command:
         self._capsys = capsys
 
     def __call__(self, *arguments: object, code: int = 0) -> Output:
-        """Run a command that must end with `code`; return what it printed."""
+        """Run a command that must end with `code`; return its output."""
         assert main([str(argument) for argument in arguments]) == code
         return Output(*self._capsys.readouterr())
 

@@ -1,4 +1,4 @@
-"""A PostgreSQL server of one's own, without a port, where the system has one installed."""
+"""A private PostgreSQL server without a port, where the system has one installed."""
 
 from __future__ import annotations
 

@@ -68,10 +68,10 @@ class Fluxgate:
         """Pull it out, `after` so many bytes of a frame."""
         self.write(self._frame()[:after])
         deadline = time.monotonic() + 5.0
-        # a pty hands on in its own time, and FIONREAD does not see what it holds
+        # a pty forwards with a delay, and FIONREAD does not count its buffer
         time.sleep(0.05 if after else 0.0)
         while after and array("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))[0]:
-            assert time.monotonic() < deadline, "nobody reads the line"
+            assert time.monotonic() < deadline, "no process reads the line"
             time.sleep(TURN)
         self._name.unlink()
         os.close(self._slave)
@@ -79,7 +79,7 @@ class Fluxgate:
         self._master = -1
 
     def write(self, data: bytes) -> None:
-        """Put bytes on the line; nobody may be there to read them."""
+        """Put bytes on the line; a reader may be missing."""
         if self._master >= 0:
             with suppress(BlockingIOError):
                 os.write(self._master, data)
@@ -112,7 +112,7 @@ class SerialEnd:
         os.write(self._master, data)
 
     def recvfrom(self, size: int) -> tuple[bytes, None]:
-        """Take bytes from the line."""
+        """Read bytes from the line."""
         return os.read(self._master, size), None
 
     def close(self) -> None:
@@ -128,9 +128,9 @@ class Autopilot:
     def __init__(self, url: str, codec: Codec) -> None:
         self.codec = codec
         self.position: Callable[[float], float] = lambda _: 0.5
-        """Of the battery at a time (s, monotonic)."""
+        """Position of the battery at a time (s, monotonic)."""
         self.answers = True
-        """Whether it answers TIMESYNC."""
+        """True if it answers TIMESYNC."""
         self.reported: list[float] = []
         """When it sent telemetry (s, monotonic)."""
         self._retell: Callable[[bytes], list[bytes]] = lambda frame: [frame]
@@ -145,7 +145,7 @@ class Autopilot:
 
     @contextmanager
     def retelling(self, retell: Callable[[bytes], list[bytes]]) -> Iterator[None]:
-        """Let the link make of each telemetry frame what `retell` makes of it."""
+        """Replace each telemetry frame on the link by the frames that `retell` returns."""
         plain, self._retell = self._retell, retell
         try:
             yield
@@ -185,7 +185,7 @@ class Autopilot:
         self._line = self._listener = None
 
     def reboot(self) -> None:
-        """Begin its clock anew."""
+        """Restart its clock."""
         self._booted, self._boot_ms = time.monotonic(), 0
 
     @property
@@ -220,7 +220,7 @@ class Autopilot:
         )
 
     def turn(self) -> Iterator[Message]:
-        """Say what is due; yield what has come."""
+        """Send the due messages; yield the received ones."""
         now = time.monotonic()
         if self._listener is not None and self._line is None:
             with suppress(BlockingIOError):

@@ -11,7 +11,7 @@ __all__ = ["full_disk"]
 
 @contextmanager
 def full_disk(room: int) -> Iterator[None]:
-    """Let no file grow beyond `room` bytes."""
+    """Limit the size of every file to `room` bytes."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:

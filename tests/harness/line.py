@@ -38,7 +38,7 @@ class Line:
         return [message for message in messages if message.get_type() == name]
 
     def to(self, seconds: float) -> list[Any]:
-        """Let time pass until `seconds` after the start; return what the station heard."""
+        """Advance the time to `seconds` after the start; return the messages to the station."""
         self.now = START + round(seconds * SECOND)
         self.component.advance(self.now)
         return self.receive()
@@ -53,12 +53,12 @@ class Line:
         return received
 
     def send_message(self, name: str, /, *args: Any, **fields: Any) -> list[Any]:
-        """Send a message of the station; return what it hears back."""
+        """Send a message of the station; return the messages back to it."""
         message = getattr(self.peer, f"MAVLink_{name.lower()}_message")(*args, **fields)
         return self.give(message.pack(self.station))
 
     def fly(self, name: str, **fields: Any) -> list[Any]:
-        """Send a message of the autopilot; return what the station hears."""
+        """Send a message of the autopilot; return the messages to the station."""
         return self.give(self.autopilot.pack(name, **fields))
 
     def give(self, data: bytes) -> list[Any]:

@@ -1,4 +1,4 @@
-"""A vehicle over hills of the field: what a bridge and an autopilot are tried on in closed loop."""
+"""A vehicle over hills of the field, for tests of bridge and autopilot in closed loop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOST, BACK, LAST = 60.0, 840.0, 900.0
 AIRCRAFT = Options(
     start_sigma=50.0, current_sigma=4.0, current_time=3600.0, bias_sigma=2.0, map_sigma=2.0, interval=5.0
 )
-"""Of a plane: a wind of 4 m/s."""
+"""Options for a plane, with a wind of 4 m/s."""
 OPTIONS = Options(start_sigma=200.0, current_sigma=0.1, bias_sigma=1.0, map_sigma=0.5, interval=4.0)
 
 
@@ -42,7 +42,7 @@ def hills(seed: int = 4) -> AnomalyGrid:
 
 @cache
 def passage(seed: int = 1, current: float = 0.1) -> Passage:
-    """Return two legs at 1.5 m/s through a current that nobody measures (m/s, north)."""
+    """Return two legs at 1.5 m/s through an unmeasured current (m/s, north)."""
     rng = np.random.default_rng(seed)
     time = START + np.arange(0.0, LAST + 1.0)
     heading = np.where(time - START < 0.5 * LAST, np.radians(50.0), np.radians(-40.0))

@@ -34,9 +34,9 @@ FIELD, T0 = 5e4, 1.7e9
 
 
 def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
-    """A survey at 4 s without gaps, of a field along `directions` (n, 3) beside a mass at p (n,).
+    """A survey at 4 s without gaps, of a field along `directions` (n, 3) near a mass at p (n,).
 
-    `more` stands in the place of what it names; dives are of fifty samples.
+    `more` replaces fields by name; a dive has fifty samples.
     """
     n = len(p)
     plain = {
@@ -75,13 +75,13 @@ def regressors_of(survey: Survey, calibration: Calibration, effect: Effect) -> F
 
 
 def right(rows: int) -> Problem:
-    """A vehicle that is right but for noise, and turns to anywhere."""
+    """Return a calibrated vehicle with noise that turns to random attitudes."""
     directions = np.random.default_rng(4).normal(size=(rows, 3))
     return pose(surveyed(directions, np.linspace(-1.0, 1.0, rows)), calibrated(np.zeros(9), 1e-6))
 
 
 def thinned(survey: Survey, here: NDArray[np.bool_]) -> Survey:
-    """Return what is left of a survey of even steps where samples are lost."""
+    """Return the remaining rows of an evenly sampled survey with lost samples."""
     each = ("time", "field", "reference", "dive", "fitted", "learned")
     rows = {name: getattr(survey, name)[here] for name in each}
     channels = {name: c._replace(values=c.values[here]) for name, c in survey.channels.items()}

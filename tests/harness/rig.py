@@ -1,7 +1,7 @@
 """A bridge on the bench: the real ``magbridge run`` as a process, between a fluxgate and an autopilot.
 
-The fluxgate speaks into a pty, the autopilot on a UDP or TCP socket or a pty of its own. Both are played
-by whoever calls :meth:`Rig.until`: nothing happens in the background, so a test says in plain order what
+The fluxgate sends into a pty, the autopilot on a UDP or TCP socket or a pty of its own. Both are played
+by the caller of :meth:`Rig.until`: nothing happens in the background, so a test states in order what
 goes wrong when.
 """
 
@@ -175,7 +175,7 @@ class Rig:
 
     @property
     def mark(self) -> int:
-        """Here, in the stream of what is heard."""
+        """The present position in the stream of received messages."""
         return len(self.received)
 
     def since(self, begun: float, end: float | None = None) -> float:
@@ -197,7 +197,7 @@ class Rig:
         return self.since(begun)
 
     def run(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the time."""
         begun = time.monotonic()
         self.until(lambda: self.since(begun) >= seconds, seconds + 5)
 
@@ -294,7 +294,7 @@ class Rig:
         return sorted((self.folder / "logs").glob("*.tlog"))
 
     def replay(self, files: list[Path] | None = None) -> tuple[Recorded, bytes]:
-        """Replay the log through another bridge: what was recorded, and what is published now."""
+        """Replay the log through another bridge; return the recorded and the new output."""
         recorded, published = Recorded(files or self.logs), bytearray()
         Stage(self.config, published.extend).play(recorded.start, recorded.events())
         return recorded, bytes(published)

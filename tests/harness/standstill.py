@@ -1,4 +1,4 @@
-"""Whether this machine stood still, its processors taken away: no test must blame a bridge for that."""
+"""Detect that this machine had no processor time for a while, so that no test counts it as a fault."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ Station = tuple[str, tuple[str, int]]
 
 
 def free(kind: socket.SocketKind) -> int:
-    """Return a port that nobody has."""
+    """Return a free port."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

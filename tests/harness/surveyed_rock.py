@@ -1,4 +1,4 @@
-"""A survey over rock of 40 nT, read by a vehicle with iron of its own, and what a fit makes of it."""
+"""A survey over a crustal field of 40 nT by a vehicle with iron, and its fit."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOISE = 1.0
 def flown(
     *, legs: int = 16, straight: bool = False, zigzag: bool = False, seed: int = 3, noise: float = NOISE
 ) -> tuple[Observations, FloatArray]:
-    """Fly dives and climbs criss-cross over rock of 40 nT; return what was read, and the true total field."""
+    """Fly dives criss-cross over a crustal field of 40 nT; return the readings and the true total field."""
     rng = np.random.default_rng(seed)
     each, dt, speed = 110, 4.0, 0.9
     n = legs * each

@@ -35,7 +35,7 @@ CURRENT = 10.0 * (K // 30 % 2)
 
 
 def sensor(*, mass: bool = False, motors: bool = False) -> FloatArray:
-    """Return what the fluxgate reads, (n, 3) nT: field, hard iron, what moves it, 5 nT of noise."""
+    """Return the fluxgate's readings (n, 3), nT: field, hard iron, moving parts, 5 nT of noise."""
     noise = np.random.default_rng(3).normal(0.0, 5.0, (N, 3))
     field = BODY.inv().apply(NED) + np.array([900.0, -1400.0, 600.0]) + noise
     if mass:

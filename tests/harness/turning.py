@@ -22,7 +22,7 @@ __all__ = ["bridge", "events", "named", "received"]
 PLACE = (49.52, -57.87)
 SAMPLES = 700
 COUNT = 1.0 / 64.0
-"""nT."""
+"""Resolution of a reading, nT."""
 SHIFT = np.array([14.0, -11.0, 13.0])
 LEARNING = "[learning]\nenabled = true\n"
 

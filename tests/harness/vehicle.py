@@ -31,20 +31,20 @@ class Bench:
         self.now_us = START_US
 
     def to(self, seconds: float) -> list[Message]:
-        """Let time pass; return what was sent, and keep what was said."""
+        """Advance the time; return the sent messages, and keep the texts."""
         self.now_us = START_US + round(seconds * 1e6) // 4 * 4
         self.component.advance(self.now_us)
         return self._drain()
 
     def receive(self, name: str, component: int = 1, **fields: Any) -> list[Message]:
-        """Hear a message now; return what was sent."""
+        """Receive a message now; return the sent messages."""
         frame = self._autopilot[component].pack(name, **fields)
         for message in self.component.receive(frame, self.now_us):
             self.navigation.receive(message, self.now_us)
         return self._drain()
 
     def fix(self, sigma: float = 5.0) -> list[Message]:
-        """Offer a position; return what was sent."""
+        """Offer a position; return the sent messages."""
         at = Reckoned(self.now_us, *PLACE, sigma**2, 0.0, sigma**2)
         if self.navigation.fixing.send(at, 0):
             self.navigation.motion.fixes_sent()

@@ -1,4 +1,4 @@
-"""Worlds to learn in: a glider that turns, dives and moves its mass over smooth rock."""
+"""Worlds for in-flight calibration: a glider that turns, dives and moves its mass over a smooth field."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def calibration(sigma: float = 1.0) -> Calibration:
 
 
 class World:
-    """A glider that yaws to and fro, pitches up and down and moves its mass, over smooth rock."""
+    """A glider that yaws, pitches and moves its mass over a smooth crustal field."""
 
     def __init__(self, truth: Calibration, samples: int, seed: int = 1, *, straight: bool = False) -> None:
         rng = np.random.default_rng(seed)
@@ -72,7 +72,7 @@ def learn(
     settled: np.ndarray | None = None,
     seen: Callable[[int], None] | None = None,
 ) -> list[int]:
-    """Give the learner a world's samples, and call `seen` after each; return where it doubted.
+    """Give the learner a world's samples, and call `seen` after each; return where it had an alarm.
 
     `settled` (n, 3) is what each sample's field turns out to have been, once the next has come.
     """
@@ -109,7 +109,7 @@ def error_of(learned: Calibration, world: World) -> float:
 
 
 def grid_of(scale: float, shift: float = 0.0, level: float = 0.0) -> AnomalyGrid:
-    """Return a map of the world's rock, running north; `scale`, `shift` (m), `level` (nT) make it wrong."""
+    """Return a map of the crustal field along north, with errors of `scale`, `shift` (m) and `level` (nT)."""
     metres = np.arange(-3_000.0, 5_000.0, 100.0)
     rock = scale * 60.0 * np.sin((metres + shift) / 900.0) + level
     latitude = 49.0 + metres / 111_000.0

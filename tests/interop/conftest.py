@@ -24,7 +24,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def python() -> Path:
-    """The interpreter that has MAVProxy and MAVSDK; their commands lie beside it."""
+    """Return the interpreter that has MAVProxy and MAVSDK; their commands are in its folder."""
     found = PEERS / "python" / "bin" / "python"
     if not found.exists():
         pytest.skip(f"MAVProxy and MAVSDK are {MISSING}")

@@ -1,4 +1,4 @@
-"""A ground station on MAVSDK; tells what it finds as lines of JSON. Arguments: URL of the link, our XML."""
+"""A ground station on MAVSDK that prints its results as JSON lines. Arguments: URL of the link, our XML."""
 
 from __future__ import annotations
 

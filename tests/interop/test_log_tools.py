@@ -66,7 +66,7 @@ def test_mavparms(log: Path) -> None:
 
 
 def test_mavlink_connection_with_our_dialect(log: Path, peer: ModuleType) -> None:
-    """As a program of one's own would read it: pymavlink and the module that mavgen makes from our XML."""
+    """Read it as a user's program does: pymavlink and the module that mavgen generates from our XML."""
     reader = mavutil.mavlink_connection(str(log))
     reader.mav = peer.MAVLink(reader)
     reader.mav.robust_parsing = True

@@ -1,4 +1,4 @@
-"""Files and parameters by programs that nobody here wrote, also through one that forwards, and old peers."""
+"""Files and parameters by third-party programs, also through a router, and by old peers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def indices(values: list[Message]) -> set[int]:
 
 
 class Ear:
-    """A station on a socket: says frames, and keeps what it hears."""
+    """A station on a socket that sends frames and keeps the received ones."""
 
     def __init__(self, system: int) -> None:
         self.codec, self.ear = Codec(system, 190), Codec(0, 0)

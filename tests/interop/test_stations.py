@@ -1,4 +1,4 @@
-"""Ground stations that nobody here wrote find the bridge, tune it, and read what it publishes."""
+"""Third-party ground stations find the bridge, set its parameters, and read its messages."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def test_an_operator_opens_the_page(here: Path) -> None:
     words = [word.replace("0.0.0.0:14550", f"127.0.0.1:{ports[0]}") for word in shown[1:]]
     page = subprocess.Popen(
         [sys.executable, "-m", "magbridge", *words, "--port", str(ports[1])],
-        env={name: value for name, value in os.environ.items() if "PYTEST" not in name},  # NiceGUI heeds it
+        env={name: value for name, value in os.environ.items() if "PYTEST" not in name},  # NiceGUI reads it
         stderr=subprocess.PIPE,
         text=True,
     )

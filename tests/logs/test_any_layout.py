@@ -60,7 +60,7 @@ STAMPS: dict[str, Stamps] = {
 ASKED = "can be both", "in a unit that the file does not tell"
 SINCE_A_START = {"boot, ms"}
 UNITS = {" [nT]": 1.0, " (uT)": 1e-3, " [mG]": 1e-2, " (G)": 1e-5, "": 1e-3, " ": 1e-9}
-"""What stands behind the axes' names, and nT by which their numbers are multiplied: nothing is no unit."""
+"""Unit after the names of the axes, and its factor to nT; an empty text is not a unit."""
 NAMES = "mag_{}", "Mag{}", "B{}", "imu.magnetic_field.{}", "RAW_IMU.{}mag"
 
 

@@ -98,7 +98,7 @@ def test_bin_without_gps_counts_from_the_boot(tmp_path: Path) -> None:
 
 def test_damaged_bin_is_read_to_its_end(tmp_path: Path) -> None:
     data = bytearray(bin_log())
-    at = data.index(b"\xa3\x95d", len(data) // 2)  # there is no checksum: what is hit inside stays a record
+    at = data.index(b"\xa3\x95d", len(data) // 2)  # without a checksum a damaged record stays a record
     data[at : at + 40] = b"garbage " * 5
     path = tmp_path / "log.bin"
     path.write_bytes(bytes(data[:-4]))

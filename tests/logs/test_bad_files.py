@@ -1,4 +1,4 @@
-"""Each bad file is one line that says which file, which row, which column, and what was expected."""
+"""Each bad file gives one line with file, row, column and the expected content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ArduPilot's records: every field beside pymavlink's reading, and damage that costs only itself."""
+"""ArduPilot's records: every field equals pymavlink's, and damage costs only the damaged records."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_junk_between_records_costs_no_record(at: int, junk: bytes, tmp_path: Pa
 
 
 def test_a_record_that_was_cut_short_is_not_read(tmp_path: Path) -> None:
-    """Its last fields would be the bytes of the next record: numbers that nobody measured."""
+    """Its last fields would be bytes of the next record, which are not measurements."""
     log, path = Log(), tmp_path / "log.bin"
     for k in range(20):
         log.mag(k * 100_000, 0, (k, 20, -300))

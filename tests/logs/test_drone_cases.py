@@ -1,4 +1,4 @@
-"""Logs of drones that once were read wrong without a word, or refused for a little, and what is right."""
+"""Logs of drones that were once read wrong without a message or refused for a small fault."""
 
 from __future__ import annotations
 
@@ -243,10 +243,10 @@ CASES = {
 @pytest.mark.real
 @pytest.mark.parametrize("name", CASES)
 def test_a_case(name: str, real_data: Path) -> None:
-    """The collection's own files, where they are beside the measured data."""
+    """The files of the collection, if they are next to the measured data."""
     path = real_data.parent / "cases" / "logs" / name
     if not path.exists():
-        pytest.skip(f"no {name} beside the measured data")
+        pytest.skip(f"no {name} next to the measured data")
     rows, start, counts = CASES[name]
     back = logs.read(path)
     assert back.sizes["time"] == rows

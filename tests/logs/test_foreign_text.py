@@ -165,7 +165,7 @@ def test_the_axes_are_in_nanotesla(kind: str, tmp_path: Path) -> None:
 
 
 def test_a_field_of_another_length_in_our_own_file_is_as_it_is(tmp_path: Path) -> None:
-    """In a shielded room; a foreign file says nothing of its units, ours are nanotesla."""
+    """In a shielded room; a third-party file has no unit, ours are in nanotesla."""
     shielded = read(tmp_path, "time,mag_x [nT],mag_y [nT],mag_z [nT]\n1.6e9,20.5,-10.25,45\n")
     logs.write(shielded, tmp_path / "again.csv")
     assert float(logs.read(tmp_path / "again.csv")["mag_z"][0]) == 45.0

@@ -1,4 +1,4 @@
-"""What is written comes back, whole or in pieces, from every format that can be written."""
+"""Every format that can be written is read back, whole or in pieces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is bad in a log is dropped, counted and named, and the rest is read as if it had not been there."""
+"""Bad rows of a log are dropped, counted and named, and the rest is read as without them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T0 = 1.7e9
 
 
 def counted(time: np.ndarray, rows: int = 1000) -> tuple[list[float], dict[str, int], list[str]]:
-    """Check a log with these times; return those that are left, what was counted, and what was named."""
+    """Check a log with these times; return the remaining times, the counts and the messages."""
     whole = deployment("log.csv", time, {"mag_x": np.arange(float(len(time)))})
     pieces = [
         (whole.isel(time=slice(k, k + rows)), range(k + 1, k + 1 + rows)) for k in range(0, len(time), rows)
@@ -90,7 +90,7 @@ def test_no_longer_series_of_times_could_be_kept(time: list[int]) -> None:
 
 
 def made(folder: Path, n: int, bad: tuple[int, ...]) -> list[Path]:
-    """Write a deployment of `n` files, some of which are no logs."""
+    """Write a deployment of `n` files, some of which are not logs."""
     paths = [folder / f"{k:03}.csv" for k in range(n)]
     for k, path in enumerate(paths):
         rows = deployment("made", T0 + 10.0 * k + np.arange(10.0), {"mag_x": np.full(10, float(k))})
@@ -122,7 +122,7 @@ def test_no_good_file_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
-    """Its end is no text: rows that were given out before are kept, and the file is counted and named."""
+    """Its end is not text: the rows before it are kept, and the file is counted and named."""
     paths = made(tmp_path, 3, ())
     long = deployment("made", T0 + 10.0 + np.arange(0.0, 10.0, 0.001), {"mag_x": np.ones(10_000)})
     logs.write(long, paths[1])

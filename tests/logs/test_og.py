@@ -1,4 +1,4 @@
-"""OceanGliders OG1.0: what the format demands is there, and what is missing is one line."""
+"""OceanGliders OG1.0: all required content is written, and missing input gives one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every column beside another reader's: xarray, pyulog, pymavlink, on made files and on measured data."""
+"""Every column equals that of another reader: xarray, pyulog, pymavlink, on made and on measured files."""
 
 from __future__ import annotations
 

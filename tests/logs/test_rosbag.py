@@ -1,4 +1,4 @@
-"""Bags of robots: written by rosbags, read back in this project's frames, and beside rosbags' own reading."""
+"""Bags of robots: written by rosbags, read in this project's frames, and compared with rosbags' reader."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_an_odometry_of_its_own_frame_is_no_position(tmp_path: Path) -> None:
 
 
 def _robot(write_message: Any, types: Any, header: Any, k: int, _: str) -> None:
-    """Say all that a robot with mavros does: a fix that is lost at times, a battery, servos, sensors."""
+    """Write the topics of a robot with mavros: position fixes with gaps, battery, servos and sensors."""
     status = types["sensor_msgs/msg/NavSatStatus"](status=-1 if k % 4 == 3 else 0, service=1)
     write_message(
         "/mavros/global_position/global", "sensor_msgs/msg/NavSatFix", k, header=header(k, ""), status=status,

@@ -40,7 +40,7 @@ def dive(path: Path, **changed: tuple[str, np.ndarray]) -> xr.Dataset:
 
 
 def test_a_dive_across_the_date_line(tmp_path: Path) -> None:
-    """Its positions stand at the times of its CTD, and what lies between two of them is beside them."""
+    """Its positions are at the times of its CTD, and rows between two of them are interpolated."""
     read = dive(tmp_path / "p1670001.nc")
     east = np.array([-3, -2, -1, 0, 1, 2, 3]) * 0.01
     np.testing.assert_allclose((read["longitude"] + 360.0) % 360.0, 180.0 + east, atol=1e-9)
@@ -92,7 +92,7 @@ def test_the_second_compass_may_be_in_use(tmp_path: Path) -> None:
 
 
 def test_counts_of_unknown_size_are_as_long_as_the_field(tmp_path: Path) -> None:
-    """The unit is estimated, whatever the iron, and it is said."""
+    """The unit is estimated for any iron, and it is reported."""
     rng = np.random.default_rng(3)
     direction = rng.normal(size=(7, 3))
     counts = 731.0 * direction / np.linalg.norm(direction, axis=1)[:, None] + [90.0, -300.0, 40.0]

@@ -19,7 +19,7 @@ START = 1_700_000_000.0
 
 
 def vehicle(path: Path, *, shift_s: float = 0.0, **more: Any) -> Path:
-    """Write 200 s of a vehicle's telemetry, a row every 4 s but for a gap of 60 s."""
+    """Write 200 s of a vehicle's telemetry, a row every 4 s, with a gap of 60 s."""
     time = START + np.r_[0:80:4.0, 140:201:4.0]
     columns = {
         "heading": (350.0 + (time - START)) % 360.0,

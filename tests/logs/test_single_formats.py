@@ -1,4 +1,4 @@
-"""What is particular to one format: its own shape, its limits, and files that other programs write."""
+"""Properties of single formats: their layout, their limits, and files of other programs."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def test_every_column_is_dbdreaders(tmp_path: Path) -> None:
     ):  # fmt: skip
         when, what = other.get(theirs)
         np.testing.assert_array_equal(np.interp(back["time"], when, what * factor), back[ours])
-    assert back.sizes["time"] == 49  # dbdreader leaves the first cycle out, which repeats what was before
+    assert back.sizes["time"] == 49  # dbdreader leaves the first cycle out: it repeats earlier values
 
 
 def test_what_a_science_computer_starts_with_was_not_measured(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Logs of live links: what a row holds of what was said around it."""
+"""Logs of live links: the telemetry that each row gets."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_without_a_magnetometer_attitude_makes_the_rows(tmp_path: Path) -> None:
 
 
 def test_a_bridges_own_log(tmp_path: Path) -> None:
-    """Its own reports are no telemetry, the correction stands in the row of its reading."""
+    """Reports of the bridge are not telemetry; a correction is in the row of its reading."""
     log, ours = Log(), (1, 191)
     log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
     for k in range(3):
@@ -183,7 +183,7 @@ def test_of_two_components_a_bridges_log_is_read_as_it_was_corrected(
 
 @pytest.mark.parametrize("step", [-3600 * S, 3600 * S, 50 * 31_557_600 * S])
 def test_a_clock_that_is_set_costs_no_rows_and_dates_those_before(tmp_path: Path, step: int) -> None:
-    """The records' stamps go on; what is published is dated by the clock as it is set."""
+    """The stamps of the records continue; published messages are dated by the clock as it is set."""
     log, ours = Log(), (1, 191)
     log.write_message(0, "MAG_BRIDGE_START", by=ours, channel=Channel.STATE)
     for k in range(6):

@@ -1,4 +1,4 @@
-"""A station's log read at once, beside the reading message by message; and what is whose."""
+"""A station's log read as columns equals the reading message by message; the senders are separated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text files as other programs write them: separators, times, headings, units; and what is declared."""
+"""Text files of other programs: separators, times, headings, units, and declared columns."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ def test_a_file_without_headings_says_what_to_declare(
 
 
 def test_a_blackbox_as_csv(tmp_path: Path) -> None:
-    """What blackbox_decode writes: an index in brackets is no unit."""
+    """In a file of blackbox_decode an index in brackets is not a unit."""
     header = "loopIteration,time (us),magADC[0],magADC[1],magADC[2],amperageLatest (A),motor[0]\n"
     rows = "".join(
         f"{k},{1_000_000 + 2000 * k}, {200 + k}, -100, 350, {0.1 * k}, {1100 + k}\n" for k in range(9)

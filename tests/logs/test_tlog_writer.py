@@ -142,7 +142,7 @@ print(full[0])
 
 @pytest.mark.parametrize("removed", ["file", "folder"])
 def test_a_log_that_is_removed_is_missed(tmp_path: Path, removed: str) -> None:
-    """It can still be written to, as any file that is open; whoever looks for it later finds nothing."""
+    """It can still be written to, as any open file; later its name does not exist."""
 
     def write(time_us: int) -> tuple[int, int, str]:
         before = log.records + log.lost
@@ -187,7 +187,7 @@ def test_a_file_after_a_loss_begins_with_the_beginning_and_one_in_turn_does_not(
 def test_stalled_disk_drops_and_counts_and_never_blocks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file is a pipe that nobody empties: its writes block like those to a disk that hangs."""
+    """The file is a pipe without a reader: its writes block like those to a disk that hangs."""
     inlet, outlet = os.pipe()
     monkeypatch.setattr(tlog, "QUEUE", 3_000)
     monkeypatch.setattr(os, "open", lambda *_: outlet)

@@ -21,7 +21,7 @@ def stream(count: int, system: int = 1) -> list[bytes]:
 
 
 def foreign(payload: bytes, number: int = 59_999) -> bytes:
-    """Frame of a message that nobody here knows; its checksum cannot be checked."""
+    """Return the frame of an unknown message; its checksum cannot be checked."""
     return bytes((0xFD, len(payload), 0, 0, 9, 1, 1, *number.to_bytes(3, "little"))) + payload + b"\x12\x34"
 
 
@@ -119,7 +119,7 @@ def test_wrong_names_and_values_are_refused() -> None:
 
 
 def test_garbage_is_cheap_even_byte_by_byte() -> None:
-    """A parser that starts anew at every byte would need minutes."""
+    """A parser that restarts at every byte would need minutes."""
     for garbage in (b"\xfd" * 20_000, b"\xfe\xff" * 10_000, random.Random(1).randbytes(20_000)):
         codec = Codec(1, 191)
         bytewise = (garbage[i : i + 1] for i in range(len(garbage)))

@@ -11,7 +11,7 @@ GENUINE = [
     Codec(1, 1).pack("ATTITUDE", time_boot_ms=1, roll=0.1, yawspeed=1.0),
     Codec(1, 1).pack("HEARTBEAT", type=12, autopilot=3),
     Codec(1, 1).pack("MAG_LINK_BYTES", length=3, data=b"abc"),
-    b"\xfd\x03\x00\x00\x09\x01\x01\x5f\xea\x00abc\x12\x34",  # a message that nobody here knows
+    b"\xfd\x03\x00\x00\x09\x01\x01\x5f\xea\x00abc\x12\x34",  # an unknown message
 ]
 CHUNKS = st.lists(
     st.lists(

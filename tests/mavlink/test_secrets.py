@@ -28,7 +28,7 @@ def logged(codec: Codec, *chunks: bytes) -> list[bytes]:
 
 
 def holds(frames: list[bytes]) -> bool:
-    """Whether any eight bytes of the key stand in them."""
+    """Return True if the bytes contain any eight bytes of the key."""
     data = b"".join(frames)
     return any(KEY[i : i + 8] in data for i in range(len(KEY) - 8))
 
@@ -42,7 +42,7 @@ def test_a_message_with_a_secret(name: str, signing: Signing | None) -> None:
     (message,) = listener.parse(frame)
     assert (message.id, message.payload, message.system) == (REFUSED, b"", 255)
     assert not holds([message.frame])
-    # what is kept is a frame, and gives the same again
+    # the kept bytes are a frame, and removing secrets again changes nothing
     assert Codec(1, 191).parse(message.frame)[0].frame == message.frame
     assert len(message.frame) == len(frame)
 
@@ -50,7 +50,7 @@ def test_a_message_with_a_secret(name: str, signing: Signing | None) -> None:
 @given(st.integers(0, len(SETUP)), st.integers(0, len(SETUP) - 1), st.booleans())
 def test_however_it_is_cut_or_damaged(cut: int, bad: int, noise: bool) -> None:
     damaged = SETUP[:bad] + bytes((SETUP[bad] ^ 0xFF,)) + SETUP[bad + 1 :]
-    header = bad < 10  # a header that is damaged no longer says what follows
+    header = bad < 10  # a damaged header does not identify the message
     for data in [SETUP] if header else [SETUP, damaged]:
         chunks = (b"\xfd noise" * noise + data[:cut], data[cut:] + BEAT * 3, BEAT)
         frames = logged(Codec(1, 191), *chunks)

@@ -107,7 +107,7 @@ def test_key_file(tmp_path: Path) -> None:
 
 
 def test_signatures_follow_the_host_s_clock(peer: ModuleType) -> None:
-    """A computer without a clock of its own wakes up in 1970, until it hears the time."""
+    """A computer without a real-time clock starts in 1970, until it receives the time."""
     ours, theirs = codec(now=5_000_000), station(peer)
     (refused,) = theirs.parse_buffer(text(codec(now=5_000_000)))
     assert refused.get_type() == "BAD_DATA"
@@ -122,13 +122,13 @@ MINUTE, HOUR, YEAR = 60_000_000, 3_600_000_000, 31_557_600_000_000
 
 
 def accepts(listener: Codec, speaker: Codec, now: int, ahead: int = 0) -> bool:
-    """Say whether a frame that the speaker sends now, its clock `ahead` (µs), is accepted."""
+    """Return True if a frame that the sender sends now, its clock `ahead` (µs), is accepted."""
     listener.now_us, speaker.now_us = now, now + ahead
     return bool(listener.parse(text(speaker))[0].known)
 
 
 def restarted(one: Codec, *, clean: bool) -> Codec:
-    """The same listener after a restart."""
+    """Return the receiver after a restart."""
     old = signing(one)
     last = old.last if clean else old.reserved(one.utc_us, 2 * MINUTE // 10)
     new = Codec(one.system, one.component, Signing(KEY, last, old.streams, (1, 1)))
@@ -157,7 +157,7 @@ def test_a_clock_that_was_wrong_refuses_nothing_once_it_is_right(step: int, ours
     for k in range(1, 6):
         now = NOW + k * 1_000_000 + (step if ours else 0)
         received.append(accepts(bridge, autopilot, now, -step if ours else max(step, 0)))
-    autopilot = codec(component=1)  # its own stamps begin anew with the right clock
+    autopilot = codec(component=1)  # its stamps restart with the right clock
     after = [accepts(restarted(bridge, clean=True), autopilot, NOW + k * 1_000_000) for k in range(7, 12)]
     assert all(received)
     assert all(after)
@@ -169,7 +169,7 @@ def test_a_liar_with_the_key_harms_only_its_own_stream() -> None:
     lie = text(liar)
     assert all(accepts(bridge, autopilot, NOW + k * 1_000_000) for k in range(1, 5))
     assert bridge.parse(lie)[0].known
-    assert not bridge.parse(lie)[0].known  # nobody can send it again
+    assert not bridge.parse(lie)[0].known  # it cannot be replayed
     assert signing(bridge).last == 0
     newcomer = codec(component=42)
     assert accepts(bridge, newcomer, NOW + 6_000_000)

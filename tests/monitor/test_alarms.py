@@ -1,4 +1,4 @@
-"""When an alarm begins, ends, begins anew, and what acknowledging it does."""
+"""Begin, end and repetition of an alarm, and its acknowledgement."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def test_an_alarm_stands_until_it_is_acknowledged_and_returns_when_it_begins_ane
     assert (one.since, one.last, one.count, one.active, alarms.unseen) == (1.0, 2.0, 1, True, 1)
     alarms.update({}, 3.0)
     (one,) = alarms
-    assert (one.active, alarms.unseen) == (False, 1)  # it was there, and nobody has seen it
+    assert (one.active, alarms.unseen) == (False, 1)  # it was active, and not yet acknowledged
     alarms.acknowledge("gap")
     assert alarms.unseen == 0
     alarms.update({"gap": "Samples are missing"}, 5.0)
@@ -35,7 +35,7 @@ def test_alarms_are_bounded_and_newest_first() -> None:
 
 
 def test_what_alarms_of_what_is_heard() -> None:
-    """A mass that moves alarms nobody; a stale parameter, a lost sensor, an error and silence do."""
+    """A moving mass raises no alarm; a stale parameter, a lost sensor, an error and silence do."""
     fleet, bridge = Fleet(), Codec(1, 191)
 
     def feed(now: float, name: str, **fields: object) -> None:

@@ -1,4 +1,4 @@
-"""The page in a real browser: what a reader sees, does with the keyboard, and hears from a screen reader."""
+"""The page in a real browser: its view, its keyboard control, and its text for a screen reader."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_a_reader_zooms_with_keys_and_finds_the_day_again_after_a_reload(browser
     page.keyboard.press("+")
     zoom = page.evaluate(f"{CHART}.getOption().dataZoom[0]")
     assert (zoom["start"], zoom["end"]) == pytest.approx((25, 75))
-    page.wait_for_timeout(1500)  # what is drawn meanwhile leaves the reader's span alone
+    page.wait_for_timeout(1500)  # new samples do not change the selected time span
     assert page.evaluate(f"{CHART}.getOption().dataZoom[0].start") == pytest.approx(25)
     page.keyboard.press("0")
     assert page.evaluate(f"{CHART}.getOption().dataZoom[0].end") == 100

@@ -1,4 +1,4 @@
-"""The panel of learning in a browser, of a real bridge over a real socket: what it shows, and its buttons."""
+"""The panel of in-flight calibration in a browser, of a real bridge over a real socket, and its buttons."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def press(button: Locator, answer: Locator) -> None:
 
 
 def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], clock: Path) -> None:
-    """Since when, how large, its causes and both predictions; each button does in the bridge what it says."""
+    """Onset, amplitude, causes and both predictions are shown; each button acts on the bridge."""
     rig, field = flying
     with (
         served(clock, url=rig.url.replace("udpin", "udpout")) as (address, _),
@@ -103,7 +103,7 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         panel = page.get_by_role("region", name="Learning in flight")
         panel.get_by_text("learned", exact=True).wait_for()  # the state
         to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
-        # nothing more is learned, so that a doubt stands
+        # learning stops, so that the alarm stays
         rig.autopilot.send_message("PARAM_SET", param_id="MB_LEARN_FREEZE", param_value=1.0, **to)
         panel.get_by_text("frozen", exact=True).wait_for()
         field.level = 60.0

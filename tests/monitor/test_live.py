@@ -1,4 +1,4 @@
-"""The live demonstration: a glider's bridge, on a pty and a socket, as its page hears it."""
+"""The live demonstration: a glider's bridge, on a pty and a socket, as its page receives it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ live = pytest.importorskip("sitl.live", reason="the analysis extra is not instal
 
 
 def test_a_glider_is_flown_into_the_page(tmp_path: Path) -> None:
-    """Its field comes corrected, its masses and its track beside it, and its parameters can be read."""
+    """Corrected field, masses and track arrive, and the parameters can be read."""
     texts: list[str] = []
     with live.flying(tmp_path, 1, texts.append) as link:
         port, fleet, codec = open_link(link, 0, "test", "LINK"), Fleet(), Codec(255, 190)

@@ -84,7 +84,7 @@ def test_a_clock_set_back_hides_no_silence(page: Station, clock: Path) -> None:
 
 
 def test_a_bridge_that_signs_is_asked_in_signed_messages(clock: Path, tmp_path: Path) -> None:
-    """And only what is signed with the same key is believed."""
+    """Only messages that are signed with the same key are accepted."""
     key = bytes(range(32))
     (tmp_path / "key").write_bytes(key)
     bridge = Codec(1, 191, Signing(key))
@@ -119,5 +119,5 @@ def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, command: Comm
     monkeypatch.setitem(sys.modules, "nicegui", None)
     monkeypatch.delitem(sys.modules, "magbridge.monitor.serve", raising=False)
     line = command.refuses("monitor", code=2)
-    # as it was installed: nobody publishes a package that would be found by its name
+    # as installed: no public package is found by its name
     assert line == f"nicegui is not installed: pip install '{Path(__file__).parents[2]}[monitor]'"

@@ -38,7 +38,7 @@ class Air:
 
     @property
     def state(self) -> State:
-        """Of the bridge that speaks."""
+        """The state of the bridge that sends."""
         return self.fleet.states.get((self.bridge.system, self.bridge.component), State())
 
     def feed(self, now: float, name: str, /, **fields: object) -> None:
@@ -119,7 +119,7 @@ def test_figures_of_a_field_that_stopped_are_not_the_present_ones(air: Air) -> N
 
 
 def test_a_restart_loses_nothing(air: Air) -> None:
-    """The sequence numbers begin anew; what was lost before and is lost after counts."""
+    """The sequence numbers restart; losses before and after are counted."""
     for k in range(100):
         air.field(NOW + k * 0.1)
     air.bridge.sequence += 3
@@ -168,11 +168,11 @@ def test_the_position_by_the_field(air: Air) -> None:
 def test_what_a_newer_bridge_says_is_shown_as_far_as_it_is_known(air: Air) -> None:
     air.feed(NOW, "MAG_STATUS", sensor_state=200, log_state=201)
     air.feed(NOW, "MAG_NAVIGATION", state=202)
-    air.feed(NOW, "STATUSTEXT", chunk_seq=1, text="the end of what was not heard")
+    air.feed(NOW, "STATUSTEXT", chunk_seq=1, text="the end of a lost text")
     assert health(air.state, NOW)["Sensor"] == ("state 200", False)
     assert health(air.state, NOW)["Log"] == ("state 201", False)
     assert whereabouts(air.state, NOW)["State"][0] == "state 202"
-    assert [texts.text for texts in air.state.texts] == ["the end of what was not heard"]
+    assert [texts.text for texts in air.state.texts] == ["the end of a lost text"]
 
 
 def test_each_vehicle_has_a_state_of_its_own(air: Air) -> None:
@@ -388,7 +388,7 @@ def test_another_run_s_parameters_are_fetched_anew(air: Air) -> None:
 
 
 def test_what_is_learned_is_shown_in_words(air: Air) -> None:
-    """Both predictions, the doubt with its causes, whatever a stranger sends as its time."""
+    """Both predictions and the alarm with its causes are kept for any time that the sender states."""
     air.field(NOW)
     assert learnt(air.state)["Not explained"] == ("nothing", True)
     doubt = {"alarm_since": 1_780_000_000_000_000, "alarm_amplitude": 12.4, "causes": 1 | 4}
@@ -409,7 +409,7 @@ def test_what_is_learned_is_shown_in_words(air: Air) -> None:
 
 
 def test_an_order_that_goes_back_to_zero_was_taken(air: Air) -> None:
-    """MB_LEARN_CMD answers 0: what was asked is done."""
+    """MB_LEARN_CMD returns to 0 when the command is done."""
     air.field(NOW)
     air.feed(NOW, "PARAM_VALUE", param_id="MB_LEARN_CMD", param_value=0.0, param_count=1)
     air.state.set("MB_LEARN_CMD", 2.0)

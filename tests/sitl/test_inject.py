@@ -1,4 +1,4 @@
-"""What the injector hides is what it says: the physics of each effect, not the detector's idea of it."""
+"""The physics of each injected effect, independent of the detector's model of it."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ DRAWN = {
 }  # fmt: skip
 """Norm (nT) of what each does to the log of :func:`flight`, as first drawn.
 
-A case of the blind study is the same in every study: whoever changes an effect's physics or the order of its
-draws on purpose replaces its number, and the cases of earlier studies are then others. The tolerance is that
-of the printed digits; another draw changes the first of them.
+A case of the blind study is equal in every study. A change of an effect's physics or of the order of its
+draws requires a new number here, and makes the cases of earlier studies different. The tolerance is that of
+the printed digits; another draw changes the first of them.
 """
 Flight = tuple[Twin, Track, np.ndarray]
 
@@ -67,7 +67,7 @@ def seen(flight: Flight, *hidden: Hidden) -> xr.Dataset:
 
 
 def effect(flight: Flight, clean: xr.Dataset, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:
-    """What it does to the channels (n, 3), and the log."""
+    """Return the change of the channels (n, 3), and the log."""
     ds = seen(flight, Hidden(name, times * SIZE.get(name, 5.0), 11))
     return channels(ds) - channels(clean), ds
 
@@ -162,7 +162,7 @@ def test_skew_reads_each_channel_in_its_own_time(flight: Flight) -> None:
         later = disturb(twin, (), track, when + truth[axis], 3)
         np.testing.assert_allclose(ds[f"mag_{axis}"], later[f"mag_{axis}"], atol=1e-3)
     assert sorted(truth.values()) == [0.0, size, 2 * size]
-    assert not {"mag_time_x", "mag_time_z"} & set(ds.data_vars)  # nobody says so
+    assert not {"mag_time_x", "mag_time_z"} & set(ds.data_vars)  # not in the log
 
 
 def test_a_ring_couples_across_axes_only(flight: Flight, clean: xr.Dataset) -> None:

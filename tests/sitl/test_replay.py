@@ -81,7 +81,7 @@ def config(folder: Path, driver: str = "digitizer", options: str = "") -> Path:
 def test_every_instrument_s_protocol_arrives_whole(
     survey: Path, tmp_path: Path, driver: str, options: str, step: float
 ) -> None:
-    """What a ground station hears of the raw field is what was measured, to the instrument's own step."""
+    """A ground station receives the measured raw field, to the resolution of the instrument."""
     result = replay([survey], config(tmp_path, driver, options))
     assert result["samples"] == result["rows"] == 150
     part = result["parts"][0]
@@ -114,7 +114,7 @@ def test_a_log_of_a_replay_is_replayed_bit_for_bit(
 def test_a_log_that_breaks_off_is_the_same_as_far_as_it_goes_and_no_further(
     recorded: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """Cut between a reading and what was published of it, after that, and within the next record."""
+    """Cut between a reading and its messages, after them, and within the next record."""
     path, log = recorded
     whole, cut = log.read_bytes(), tmp_path / "cut.tlog"
     with log.open("rb") as file:
@@ -146,7 +146,7 @@ def test_another_configuration_is_told_apart(recorded: tuple[Path, Path], tmp_pa
 
 @pytest.mark.parametrize("motion", ["glide", "position"])
 def test_a_replay_finds_its_way_by_the_field(flown: xr.Dataset, tmp_path: Path, motion: str) -> None:
-    """However a log tells motion, the bridge hears it: its filter knows where it begins, and is not lost."""
+    """The bridge receives the motion in every form of telemetry: its filter has a start, and is not lost."""
     Twin.draw(load("demo"), 3).anomaly_map().save(tmp_path / "grid.nc")
     save(
         replace(identity(), covariance=1e-4 * np.eye(9), noise=Noise(1.0), method="nominal"),
@@ -256,7 +256,7 @@ def lines(count: int) -> Event:
 
 
 def test_more_than_a_pty_holds_is_read_at_once(tmp_path: Path) -> None:
-    """A bridge that was stopped for a while finds so much in its line, and so does a replay of its log."""
+    """A bridge that was stopped for a while has a backlog in its line, as a replay of its log has."""
     received = Listener()
     stage = Stage(config(tmp_path, "ascii", 'columns = ["x", "y", "z"]'), received.receive)
     stage.play(Start(1_700_000_000_000_000), [lines(4000)])
@@ -277,7 +277,7 @@ def test_a_bridge_that_dies_holds_nobody_up(tmp_path: Path) -> None:
 
 
 def test_a_value_that_its_message_cannot_hold_ends_the_replay(survey: Path, tmp_path: Path) -> None:
-    """The bridge hears that nothing more comes, and ends, too."""
+    """The bridge detects the end of the input, and ends, too."""
     path = config(tmp_path)
     table = '[telemetry.battpos]\nmessage = "SERVO_OUTPUT_RAW"\nfield = "servo1_raw"\nscale = 1e-9\n'
     path.write_text(path.read_text() + table)
@@ -315,7 +315,7 @@ def test_a_log_of_few_samples_is_no_silent_sensor(flown: xr.Dataset, tmp_path: P
 def test_measured_counts_and_moving_masses_go_through(real_data: Path) -> None:
     """Seaglider 167: the dive that was left out of the fit is right to about one count (100 nT).
 
-    Its sigma knows besides that the IGRF, which it is compared with here, says nothing of the rock's level.
+    Its sigma includes the mean crustal field, which the IGRF does not have.
     """
     result = replay(sorted((real_data / "seaglider_sg167").glob("*.nc")))
     last = result["parts"][-1]

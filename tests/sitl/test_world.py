@@ -1,4 +1,4 @@
-"""The simulated Earth field, rock and water."""
+"""The simulated Earth field, crustal field and water."""
 
 from __future__ import annotations
 
