@@ -22,6 +22,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("magbridge: interrupted", file=sys.stderr)
         return 130
+    except OSError as error:  # a part of the program cannot be loaded: no file handle is left, a damaged disk
+        print(f"magbridge: {error.strerror or error} (magbridge itself cannot be loaded)", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

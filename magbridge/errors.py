@@ -53,10 +53,14 @@ class WrongUse(MagbridgeError):
 
 
 class ConfigError(WrongUse, ValueError):
-    """A key of a configuration or scenario file: ``file: key: expected ...``."""
+    """A key of a configuration or scenario file: ``file: key: expected ...``.
+
+    Without a key, the file itself cannot be read, which ends a command as any other such file does.
+    """
 
     def __init__(self, file: str | Path, key: str, expected: str) -> None:
         self.file, self.key, self.expected = Path(file), key, expected
+        self.exit_code = 2 if key else 1
         super().__init__(f"{file}: {key}: {expected}" if key else f"{file}: {expected}")
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from magbridge.errors import FormatError, MagbridgeError, WriteError
 
-__all__ = ["atomic_path", "digest", "existing", "new_folder", "systems_reason"]
+__all__ = ["atomic_path", "contents", "digest", "existing", "new_folder", "systems_reason"]
 
 PROBE_BYTES = 1 << 20
 """Bytes written to learn why a write failed: more than a library writes at a time."""
@@ -67,6 +67,15 @@ def existing(path: Path) -> Path:
         what = "not a pipe or a device" if path.exists() else "there is none"
         raise FormatError(path, f"expected a file, {what}")
     return path
+
+
+def contents(path: str | os.PathLike[str]) -> bytes:
+    """Return the bytes of a file; FormatError: there is none, or the system does not let it be read."""
+    file = Path(path)
+    try:
+        return existing(file).read_bytes()
+    except OSError as error:
+        raise FormatError(file, f"cannot be read: {error.strerror or error}") from error
 
 
 def digest(path: Path) -> str:

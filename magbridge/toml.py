@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 import msgspec
 from msgspec import inspect
 
-from magbridge.errors import ConfigError
+from magbridge.errors import ConfigError, FormatError
+from magbridge.files import contents, existing
 from magbridge.wording import suggestion
 
 __all__ = ["Table", "check_entries", "convert", "load_toml"]
@@ -33,16 +34,18 @@ def load_toml(path: str | Path) -> dict[str, Any]:
     """Read a TOML file; raise :class:`ConfigError` where it is missing or not TOML."""
     too_deep = f"expected keys, arrays and tables at most {MAX_DEPTH} deep"
     try:
-        if Path(path).stat().st_size > MAX_SIZE:
+        if existing(Path(path)).stat().st_size > MAX_SIZE:
             raise ConfigError(path, "", f"expected a TOML file of at most {MAX_SIZE // 10**6} MB")
-        text = Path(path).read_text(encoding="utf-8-sig")
+        text = contents(path).decode("utf-8-sig")
+        if not text.strip():
+            raise ConfigError(path, "", "expected a TOML file, the file is empty")
         if any(line.count(".") > MAX_DEPTH and NESTED.match(line.lstrip(" [")) for line in text.splitlines()):
             raise ConfigError(path, "", too_deep)
         return tomllib.loads(text)
     except RecursionError:
         raise ConfigError(path, "", too_deep) from None
-    except OSError as error:
-        raise ConfigError(path, "", error.strerror or str(error)) from error
+    except FormatError as error:
+        raise ConfigError(path, "", error.expected) from error
     except UnicodeDecodeError as error:
         raise ConfigError(path, "", "expected text in UTF-8") from error
     except tomllib.TOMLDecodeError as error:

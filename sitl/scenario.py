@@ -116,7 +116,7 @@ def load(path: str | Path) -> Scenario:
     if path.suffix == "":
         known = {one.stem: one for one in sorted(SCENARIOS.glob("*.toml"))}
         if str(path) not in known:
-            raise ConfigError(path, "", f"scenario: {one_of(str(path), known)}; or a file (.toml)")
+            raise ConfigError(path, "scenario", f"{one_of(str(path), known)}; or a file (.toml)")
         path = known[str(path)]
     table = load_toml(path)
     vehicle = table.get("vehicle")

@@ -28,7 +28,7 @@ from magbridge.calibration.model import (
 from magbridge.calibration.scalar import PLATFORM_TERMS, ScalarSensor
 from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
 from magbridge.errors import CalibrationError, FormatError
-from magbridge.files import atomic_path
+from magbridge.files import atomic_path, contents
 
 __all__ = ["CALIBRATION_FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
@@ -154,11 +154,7 @@ def load(path: str | Path) -> Calibration:
     FormatError: it cannot be opened, or as :func:`decode_calibration`. CalibrationError: as
     :func:`decode_calibration`.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as problem:
-        raise FormatError(path, f"cannot be read: {problem.strerror}") from problem
-    return decode_calibration(data, path)
+    return decode_calibration(contents(path), path)
 
 
 def save(calibration: Calibration, path: str | Path) -> None:

@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 the data do not allow it, 2 wrong use. An error is one lin
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -49,21 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
         _heed_signals()
     try:
         app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
-    except CycloptsError as error:
-        return complain(_misuse(error), 2)
-    except MagbridgeError as error:
-        return complain(str(error), error.exit_code)
-    except ImportError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
-        if extra is None:
-            raise
-        return complain(str(MissingExtra(str(error.name), extra)), 2)
     except BrokenPipeError:  # the reader of our output has gone, as `| head` does
         sys.stderr.close()
-    except UnicodeEncodeError as error:  # netCDF and JSON take no name that is not of the locale
-        return complain(f"{error.object}: a name that cannot be written in {error.encoding}: rename it", 1)
-    except (OSError, MemoryError) as error:  # the system refuses a file, a folder or memory
-        return complain(_reason(error), 1)
+    except (CycloptsError, MagbridgeError, ImportError, UnicodeEncodeError, OSError, MemoryError) as error:
+        sentence, code = _explained(error)
+        return complain(sentence, code)
     except _Terminated as end:
         signal.signal(end.number, signal.SIG_DFL)
         signal.raise_signal(end.number)
@@ -71,6 +62,30 @@ def main(arguments: list[str] | None = None) -> int:
         if not isinstance(end.__context__, BrokenPipeError):
             raise
     return 0
+
+
+def _explained(error: Exception) -> tuple[str, int]:
+    """Return the line and the exit code of an error; an ImportError within magbridge is raised again."""
+    sentence, code = _no_handle(error), 1
+    match error:
+        case _ if sentence:
+            pass
+        case CycloptsError():
+            sentence, code = _misuse(error), 2
+        case MagbridgeError():
+            sentence, code = str(error), error.exit_code
+        case ImportError():
+            extra = EXTRAS.get((error.name or "").partition(".")[0])
+            if extra is None:
+                raise error
+            sentence, code = str(MissingExtra(str(error.name), extra)), 2
+        case UnicodeEncodeError():  # netCDF and JSON take no name that is not of the locale
+            sentence = f"{error.object}: a name that cannot be written in {error.encoding}: rename it"
+        case OSError(strerror=str(reason)):  # the system refuses a file, a folder or memory
+            sentence = f"{error.filename}: {reason}" if error.filename else reason
+        case _:
+            sentence = str(error) or "not enough memory"
+    return sentence, code
 
 
 def _open_streams() -> None:
@@ -113,7 +128,20 @@ def _terminated(number: int, _: object) -> None:
     raise _Terminated(number)
 
 
-def _reason(error: OSError | MemoryError) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return str(error) or "not enough memory"
+def _no_handle(error: BaseException) -> str:
+    """Return the message that no file handle is left, if that is the reason of an error; else empty."""
+    reason: BaseException | None = error
+    while reason is not None:
+        if os.strerror(errno.EMFILE) in str(reason) or getattr(reason, "errno", None) == errno.EMFILE:
+            return f"too many open files: the limit of this process is {_file_limit()}; raise it (ulimit -n)"
+        reason = reason.__cause__ or reason.__context__
+    return ""
+
+
+def _file_limit() -> str:
+    """Return how many files the process may open, as a text."""
+    try:
+        from resource import RLIMIT_NOFILE, getrlimit
+    except ImportError:  # Windows
+        return "reached"
+    return str(getrlimit(RLIMIT_NOFILE)[0])

@@ -123,6 +123,8 @@ def simulate(
 
     check_inputs((scenario, *trajectory_from), output)
     check_inputs((scenario, *trajectory_from, output), map_output)
+    if trajectory_from:
+        logs_to_read(trajectory_from)
     chosen = load(scenario)
     if reference is not None:
         telemetry = msgspec.structs.replace(chosen.telemetry, reference=reference)

@@ -16,10 +16,10 @@ from magbridge.cli.common import (
     Json,
     Reading,
     Whole,
-    check_inputs,
     command,
     complain,
     folder_to_write,
+    logs_to_read,
     print_result,
 )
 from magbridge.errors import DataError, WrongUse
@@ -119,7 +119,9 @@ def run(*, config: Path, check: bool = False, live: bool = False) -> None:
 def _check(config: Path, *, live: bool) -> None:
     """Print all that would go wrong, and with `live` what arrives; WrongUse: the bridge would not start."""
     from magbridge.bridge.check import findings
+    from magbridge.toml import load_toml
 
+    load_toml(config)  # a file that cannot be read is an error of its own
     found = findings(config)
     errors = sum(one.fatal for one in found)
     if live and not errors:
@@ -180,11 +182,13 @@ def replay(
     reading
         How to read logs that are not a bridge's own.
     """
+    logs_to_read(files, None, config)
+
     from sitl.replay.run import replay as played
     from sitl.replay.summary import summary
 
     with new_folder(log) if log else nullcontext():
-        result = played(check_inputs(files), config, speed_of(speed), log, reading.options)
+        result = played(files, config, speed_of(speed), log, reading.options)
     print_result(result, summary(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
         raise DataError("the replay did not publish what the log holds")

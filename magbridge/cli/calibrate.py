@@ -140,6 +140,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     """
     given: dict[str, Any] = dict(locals())
     masses = Path(vehicle) if vehicle and not fleet else None
+    _refuse_together(parameter, method, masses, fleet)
     logs_to_read(files, output, masses, grid, base)
     check_inputs((*files, output), plot)
     if reading.compass == ALL_COMPASSES:
@@ -158,7 +159,6 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 
-    _refuse_together(parameter, method, masses, fleet)
     beside = _scalar_options(scalar, reference, lag, lever)
     named_channels = tuple(name for name in parameter if name != AUTO)
     start = fleet_start(fleet, vehicle, refit, files) if fleet else None

@@ -15,7 +15,7 @@ import msgspec
 from cyclopts import App, Parameter, Token
 
 from magbridge import __version__
-from magbridge.errors import WrongUse
+from magbridge.errors import FormatError, WrongUse
 from magbridge.files import existing
 from magbridge.logs import Options, suffixes
 from magbridge.logs.registry import is_bag
@@ -184,11 +184,16 @@ def check_inputs(
 def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: Path | None) -> None:
     """Check, before anything heavy is imported, that logs are there and are not written over.
 
-    WrongUse: as :func:`check_inputs`. FormatError: one is not there.
+    `others` are other files to read; one of them may be a folder, as a grid is.
+
+    WrongUse: as :func:`check_inputs`. FormatError: one is not there, or a log is empty.
     """
     for path in check_inputs(files, output, *others):
-        if not is_bag(path):
-            existing(path)
+        if not is_bag(path) and not existing(path).stat().st_size:
+            raise FormatError(path, "expected a log, the file is empty")
+    for other in others:
+        if other is not None and not other.is_dir():
+            existing(other)
 
 
 def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:

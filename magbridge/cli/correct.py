@@ -97,7 +97,7 @@ def correct(
         A PNG, PDF or SVG to draw: the corrected field with its 2-sigma band, and the flagged samples.
     """
     source = _source(calibration, config, learn=learn)
-    logs_to_read(files, output, source)
+    logs_to_read(files, output, source, reading.columns)
     check_inputs((*files, output), plot)
 
     from magbridge.logs import Writer, read_chunks

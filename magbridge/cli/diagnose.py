@@ -64,7 +64,7 @@ def diagnose(
     grid
         An anomaly grid to add to the IGRF, where a log has no reference_field.
     """
-    logs_to_read(files, output / "calibration.json", calibration)
+    logs_to_read(files, output / "calibration.json", calibration, grid)
 
     from magbridge.calibration.file import load
     from magbridge.diagnose.report.findings import findings

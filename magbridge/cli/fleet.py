@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter, validators
 
-from magbridge.cli.common import Day, Json, Output, Whole, app, complain, print_result
+from magbridge.cli.common import Day, Json, Output, Whole, app, complain, logs_to_read, print_result
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
 from magbridge.wording import counted
@@ -71,7 +71,9 @@ def add(
         raise WrongUse("expected a fleet.toml or logs, or --vehicle with its --parameter")
     described, made, logs = _sorted(files)
     if (logs or made) and not (vehicle and deployment):
-        raise WrongUse("logs: say --vehicle and --deployment, or put them into a fleet.toml")
+        raise WrongUse("logs: give --vehicle and --deployment, or put them into a fleet.toml")
+    if logs:
+        logs_to_read(tuple(logs))
     plans = {file: read_fleet(file) for file in described}
     calibrations = _calibrations(made, date)
     there = open_catalogue(catalogue, create=True)

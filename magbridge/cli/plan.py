@@ -7,7 +7,17 @@ from typing import Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import AS_THEY_SAY, Heading, Json, Reading, Whole, command, complain, print_result
+from magbridge.cli.common import (
+    AS_THEY_SAY,
+    Heading,
+    Json,
+    Reading,
+    Whole,
+    command,
+    complain,
+    logs_to_read,
+    print_result,
+)
 from magbridge.cli.remarks import note_losses
 from magbridge.errors import WrongUse
 from magbridge.progress import waiting
@@ -52,7 +62,8 @@ def plan(
     from magbridge.logs import read
 
     if calibration is None and survey is None:
-        raise WrongUse("expected --calibration, or --survey HOURS to plan a survey from nothing")
+        raise WrongUse("expected --calibration, or --survey HOURS to plan a survey without one")
+    logs_to_read((mission,), None, calibration)
     with waiting("reading"):
         deployment = with_true_heading(read(mission, options=reading.options), heading_reference)
     note_losses(deployment.attrs)

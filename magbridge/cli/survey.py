@@ -17,10 +17,10 @@ from magbridge.cli.common import (
     Plot,
     Reading,
     Whole,
-    check_inputs,
     command,
     complain,
     file_to_write,
+    logs_to_read,
     print_result,
 )
 from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, warnings_of
@@ -106,7 +106,7 @@ def survey(
     from magbridge.survey.run import survey as make
     from magbridge.survey.write import write_crossovers, write_tracks
 
-    check_inputs(logs, output, base, predict, *calibration)
+    logs_to_read(logs, output, base, predict, *calibration)
     if predict is None and output.suffix.lower() != ".nc":
         raise WrongUse(f"{output}: a map's name must end in .nc")
     if calibration and save:

@@ -23,6 +23,7 @@ from magbridge.field.grid import HOLE, AnomalyGrid
 from magbridge.field.grid_formats import ascii_grid, folder, geotiff, grd, libraries
 from magbridge.field.grid_netcdf import Parts, netcdf
 from magbridge.field.grid_table import table
+from magbridge.files import contents, existing
 from magbridge.guard import guarded
 
 __all__ = ["READERS", "read_grid", "read_polygon", "without_fill"]
@@ -74,10 +75,8 @@ def read_grid(path: str | Path) -> AnomalyGrid:
     it may. A library reads the file in a process of its own (:mod:`magbridge.guard`).
     """
     path = Path(path)
-    if not path.exists():
-        raise FormatError(path, "no such file")
-    if not (path.is_file() or path.is_dir()):  # opening a pipe would wait for a writer
-        raise FormatError(path, "expected a file, not a pipe or a device")
+    if not path.is_dir():
+        existing(path)  # opening a pipe would wait for a writer
     reader = folder if path.is_dir() else READERS.get(path.suffix.lower())
     if reader is None:
         raise FormatError(path, f"expected a grid: one of {' '.join(READERS)} or a folder")
@@ -146,9 +145,7 @@ def read_polygon(path: str | Path) -> RealArray:
     FormatError: it cannot be read or is not a polygon.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise FormatError(path, f"cannot be read: {error.strerror or error}") from error
+        lines = contents(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise FormatError(path, "expected text in UTF-8") from None
     corners = []

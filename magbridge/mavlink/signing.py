@@ -22,7 +22,8 @@ from collections.abc import Iterable
 from hashlib import sha256
 from pathlib import Path
 
-from magbridge.errors import ConfigError
+from magbridge.errors import FormatError
+from magbridge.files import contents
 from magbridge.mavlink.dialect import MAVLinkSigning
 from magbridge.mavlink.framing import is_signed
 
@@ -59,14 +60,11 @@ def timestamp(t_us: int) -> int:
 def load_key(path: str | Path) -> bytes:
     """Read a signing key: a file of 32 bytes.
 
-    ConfigError: the file cannot be read or has another length.
+    FormatError: the file cannot be read or has another length.
     """
-    try:
-        key = Path(path).read_bytes()
-    except OSError as error:
-        raise ConfigError(path, "", error.strerror or str(error)) from error
+    key = contents(path)
     if len(key) != 32:
-        raise ConfigError(path, "", f"a signing key has 32 bytes, not {len(key)}")
+        raise FormatError(path, f"expected a signing key of 32 bytes, not {len(key)}")
     return key
 
 

@@ -164,7 +164,7 @@ def test_init_says_what_is_left_to_fill_in(command: Command) -> None:
     [
         ("init --driver none", "expected one of ascii, digitizer, hmr2300, rm3100, twinleaf"),
         ("init --option x", "expected NAME=VALUE"),
-        ("init --calibration none.json", "none.json: cannot be read"),
+        ("init --calibration none.json", "none.json: expected a file, there is none"),
         ("drivers none", "expected one of ascii"),
         ("run --check --config none.toml", "none.toml: No such file"),
     ],

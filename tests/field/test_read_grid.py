@@ -175,7 +175,7 @@ def scattered(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "write", "message"),
     [
-        ("none.nc", None, "no such file"),
+        ("none.nc", None, "expected a file, there is none"),
         ("a.nc", os.mkfifo, "expected a file, not a pipe or a device"),
         ("a.png", lambda p: p.write_bytes(b"x"), "expected a grid: one of .nc"),
         ("a.nc", lambda p: p.write_bytes(b"not netCDF"), "expected a netCDF grid"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from magbridge.errors import ConfigError
+from magbridge.errors import FormatError
 from magbridge.mavlink import REFUSED, Codec, Signing, load_key, readable_by_all
 from magbridge.mavlink.signing import timestamp
 
@@ -97,10 +97,10 @@ def test_same_events_same_bytes() -> None:
 
 def test_key_file(tmp_path: Path) -> None:
     path = tmp_path / "key.bin"
-    with pytest.raises(ConfigError, match="No such file"):
+    with pytest.raises(FormatError, match="there is none"):
         load_key(path)
     path.write_bytes(b"short")
-    with pytest.raises(ConfigError, match="32 bytes, not 5"):
+    with pytest.raises(FormatError, match="32 bytes, not 5"):
         load_key(path)
     path.write_bytes(KEY)
     assert load_key(path) == KEY

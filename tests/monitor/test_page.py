@@ -110,7 +110,7 @@ def test_bad_input_is_one_line(command: Command) -> None:
             (["/dev/nowhere"], 1, "/dev/nowhere: "),
             (["udpin:127.0.0.1:0", "--port", port], 1, f"127.0.0.1:{port}: Address already in use"),
             (["--port", "99999"], 2, "99999"),
-            (["--signing-key", "/nowhere"], 2, "/nowhere: No such file or directory"),
+            (["--signing-key", "/nowhere"], 1, "/nowhere: expected a file, there is none"),
         ):
             assert expected in command.refuses("monitor", *arguments, code=code)
 
