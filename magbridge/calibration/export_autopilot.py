@@ -25,7 +25,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.columns import NT_PER_UNIT, usual
 
-__all__ = ["Compass", "ardupilot", "compass_of", "px4"]
+__all__ = ["Compass", "ardupilot", "compass_of", "matrix_and_offset", "px4"]
 
 AUTOPILOT_AXES = "X", "Y", "Z"
 OFF = (0, 1), (0, 2), (1, 2)
@@ -55,18 +55,18 @@ def compass_of(calibration: Calibration) -> Compass:
     currents = [k for k, one in enumerate(calibration.parameters) if usual(one.unit) == "A"][:1]
     middle = np.array([0.5 * (one.low + one.high) for one in calibration.parameters])
     middle[currents] = 0.0
-    matrix, offset = _at(calibration, middle)
+    matrix, offset = matrix_and_offset(calibration, middle)
     current = None
     if currents:
         step = np.zeros(len(middle))
         step[currents] = 1.0
-        current = _at(calibration, middle + step)[1] - offset
+        current = matrix_and_offset(calibration, middle + step)[1] - offset
     lost = []
     corners = product(*((one.low, one.high) for one in calibration.parameters))
     field = kernel.field * np.eye(3)
     worst = 0.0
     for corner in corners:
-        there, shift = _at(calibration, np.array(corner))
+        there, shift = matrix_and_offset(calibration, np.array(corner))
         held = offset + (current * corner[currents[0]] if current is not None else 0.0)
         worst = max(worst, float(np.linalg.norm(shift - held) + np.linalg.norm((there - matrix) @ field, 2)))
     if worst > 1.0:
@@ -81,7 +81,7 @@ def compass_of(calibration: Calibration) -> Compass:
     return Compass(matrix, offset, current, tuple(lost))
 
 
-def _at(calibration: Calibration, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def matrix_and_offset(calibration: Calibration, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return A (3, 3) and T (3,), nT, at the parameters' values."""
     kernel = calibration.kernel
     phi = np.array(kernel.monomials(values.tolist(), 1.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter, validators
 
@@ -11,8 +11,15 @@ from magbridge.cli.common import Folder, Whole, command, complain, file_to_write
 from magbridge.cli.remarks import warnings_of
 from magbridge.errors import DataError, WrongUse
 
+if TYPE_CHECKING:
+    from magbridge.calibration.model import Calibration
 
-@command("export cal.json --c DIR | --ardupilot F.param | --px4 F.params")
+
+NT_PER_COUNT = 100.0
+"""nT in a count of most of a Seaglider's compasses."""
+
+
+@command("export cal.json --c DIR | --ardupilot F.param | --px4 F.params | --seaglider F.cal | --table F.csv")
 def export(
     calibration: Path,
     /,
@@ -21,6 +28,11 @@ def export(
     ardupilot: Annotated[Path | None, Parameter(validator=file_to_write(".param", ".parm"))] = None,
     px4: Annotated[Path | None, Parameter(validator=file_to_write(".params"))] = None,
     number: Annotated[Whole, Parameter(validator=validators.Number(gte=0, lte=3))] = 0,
+    seaglider: Annotated[Path | None, Parameter(validator=file_to_write(".cal"))] = None,
+    nt_per_count: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=1e5))] = NT_PER_COUNT,
+    table: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
+    parameter: str = "",
+    dip: Annotated[float, Parameter(validator=validators.Number(gt=-90, lt=90))] = 60.0,
 ) -> None:
     """Write a calibration for other programs, and say what they cannot hold of it.
 
@@ -36,12 +48,25 @@ def export(
         A parameter file of QGroundControl: the same for PX4.
     number
         Which of the autopilot's compasses, from 0.
+    seaglider
+        The compass coefficients (tcm2mat.cal) of a Seaglider: one offset and one matrix, with the boresight.
+    nt_per_count
+        For --seaglider: nT in a count of its compass, 100 for most, 56 for type 4.
+    table
+        A table (.csv) of offset and matrix at positions of one mass, for loggers that can hold one.
+    parameter
+        For --table: the mass; by default the first parameter.
+    dip
+        For --seaglider: the inclination of the Earth's field in deg, on which the heading error depends.
     """
-    if c is None and ardupilot is None and px4 is None:
-        raise WrongUse("expected --c DIR, --ardupilot F.param or --px4 F.params")
+    if not any((c, ardupilot, px4, seaglider, table)):
+        raise WrongUse(
+            "expected --c DIR, --ardupilot F.param, --px4 F.params, --seaglider F.cal or --table F.csv"
+        )
 
     from magbridge.calibration import export_autopilot
     from magbridge.calibration.export_c import c_header, c_source
+    from magbridge.calibration.export_seaglider import position_table
     from magbridge.calibration.file import load
     from magbridge.errors import CalibrationError
     from magbridge.files import atomic_path, new_folder
@@ -50,12 +75,17 @@ def export(
     for doubt in warnings_of(known, calibration):
         complain(doubt)
     texts: dict[Path, str] = {}
-    if c is not None:
-        try:
+    try:
+        if c is not None:
             header, source = c_header(known), c_source(known)
             texts |= {c / "magbridge_calibration.h": header, c / "magbridge_calibration.c": source}
-        except CalibrationError as error:
-            raise DataError(f"{calibration}: {error}") from error
+        if seaglider is not None:
+            texts[seaglider] = _seaglider(calibration, known, nt_per_count, dip)
+        if table is not None:
+            first = known.parameters[0].name if known.parameters else ""
+            texts[table] = position_table(known, parameter or first)
+    except CalibrationError as error:
+        raise DataError(f"{calibration}: {error}") from error
     if ardupilot is not None or px4 is not None:
         compass = export_autopilot.compass_of(known)
         for lost in compass.lost:
@@ -70,3 +100,21 @@ def export(
         with new_folder(file.parent), atomic_path(file) as path:
             path.write_text(text, encoding="utf-8")
         print(f"{file}: written")
+
+
+def _seaglider(file: Path, known: Calibration, nt_per_count: float, dip: float) -> str:
+    """Return a Seaglider's coefficients; report on stderr what they cannot hold, and its cost in degrees."""
+    from magbridge.calibration.export_seaglider import heading_cost, seaglider
+
+    text = seaglider(known, nt_per_count)
+    for cost in heading_cost(known, dip):
+        names = ", ".join(one.name for one in known.parameters)
+        what = f"{cost.name} alone" if cost.name else f"the field of {names}"
+        complain(
+            f"{file}: the file cannot hold {what}: heading error {cost.rms:.2f} deg RMS, up to "
+            f"{cost.largest:.2f} deg, at the ends of the range (dip {dip:g} deg)"
+        )
+    for effect in known.effects:
+        complain(f"{file}: the file cannot hold the effect {effect.kind} of {' '.join(effect.channels())}")
+    complain(f"{file}: the file cannot hold uncertainties and flags")
+    return text

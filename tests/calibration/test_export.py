@@ -15,9 +15,12 @@ import pytest
 from magbridge.calibration.correct import correct
 from magbridge.calibration.export_autopilot import ardupilot, compass_of, px4
 from magbridge.calibration.export_c import c_header, c_source
+from magbridge.calibration.export_seaglider import heading_cost, position_table, seaglider
 from magbridge.calibration.file import load, save
+from magbridge.calibration.heading import heading, level_vector
 from magbridge.calibration.model import Boresight, Calibration, Parameter, identity
 from magbridge.calibration.terms import Polynomial
+from magbridge.cli import main
 
 GCC = shutil.which("gcc") or shutil.which("cc")
 
@@ -152,3 +155,60 @@ def test_what_an_autopilot_cannot_hold_is_said(tmp_path: Path) -> None:
     lost = " ".join(compass_of(load(tmp_path / "cal.json")).lost)
     assert "the field of battpos, ballast: up to " in lost
     assert "the boresight, a turn of 6.1 deg" in lost
+
+
+def seaglider_heading(text: str, counts: np.ndarray, roll: np.ndarray, pitch: np.ndarray) -> np.ndarray:
+    """Return headings (n,), deg, as a basestation computes them from counts, roll and pitch (rad)."""
+    hard, soft = (np.array(line.split('"')[1].split(), float) for line in text.splitlines())
+    m = counts * [1.0, -1.0, -1.0] - hard
+    p = m @ soft.reshape(3, 3).T
+    x = p[:, 0] * np.cos(pitch) - p[:, 1] * np.sin(pitch) * np.sin(roll)
+    x -= p[:, 2] * np.sin(pitch) * np.cos(roll)
+    return np.degrees(np.arctan2(p[:, 1] * np.cos(roll) - p[:, 2] * np.sin(roll), x)) % 360.0
+
+
+def test_a_seaglider_s_file_gives_our_heading_at_the_middle_of_the_ranges() -> None:
+    calibration = made(Parameter("pitchCtl", "cm", -8.0, 2.0, -3.0, 5.0))
+    random = np.random.default_rng(2)
+    field = random.normal(0.0, 30_000.0, (50, 3))
+    roll, pitch = random.uniform(-0.5, 0.5, (2, 50))
+    vector = correct(calibration, field, np.full((50, 1), -3.0), np.arange(50.0)).vector
+    expected = heading(vector, roll, pitch).magnetic
+    found = seaglider_heading(seaglider(calibration, 56.0), field / 56.0, roll, pitch)
+    difference = (found - expected + 180.0) % 360.0 - 180.0
+    horizontal = np.linalg.norm(level_vector(vector, roll, pitch)[:, :2], axis=1)
+    assert np.abs(difference * horizontal).max() < np.degrees(10.0), "hard has one decimal: 2.8 nT, rounded"
+
+
+def test_what_a_seaglider_s_file_cannot_hold_costs_degrees() -> None:
+    """An offset of 500 nT in y at either end, beside a horizontal field of 25,000 nT: 1.15 deg at most."""
+    one = Parameter("pitchCtl", "cm", -8.0, 2.0, -3.0, 5.0)
+    calibration = made(one, order=1)
+    coefficients = np.zeros(18)
+    coefficients[9 + 7] = 500.0
+    calibration = replace(
+        calibration, coefficients=coefficients, boresight=Boresight((0.0, 0.0, 0.0), ((0.0,) * 3,) * 3)
+    )
+    (cost,) = heading_cost(calibration, dip_deg=60.0)
+    assert cost.largest == pytest.approx(np.degrees(500.0 / 25_000.0), rel=0.03)
+    assert cost.rms == pytest.approx(cost.largest / np.sqrt(2.0), rel=0.03)
+    header, *rows = position_table(calibration, "pitchCtl").splitlines()
+    assert header.startswith("pitchCtl [cm],offset_x [nT],offset_y [nT]")
+    offsets = np.array([row.split(",")[:3] for row in rows], float)
+    np.testing.assert_allclose(offsets[:, 2], 500.0 * (offsets[:, 0] + 3.0) / 5.0, atol=1e-6)
+
+
+def test_the_seaglider_export_reports_what_is_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = Parameter("pitchCtl", "cm", -8.0, 2.0, -3.0, 5.0)
+    cal, file, table = (tmp_path / name for name in ("cal.json", "tcm2mat.cal", "table.csv"))
+    save(made(one), cal)
+    assert main(["export", str(cal), "--seaglider", str(file), "--table", str(table)]) == 0
+    lines = capsys.readouterr().err
+    assert "cannot hold the field of pitchCtl: heading error" in lines
+    assert "deg RMS" in lines
+    assert len(table.read_text().splitlines()) == 12
+    save(made(one, turned=False), cal)
+    assert main(["export", str(cal), "--seaglider", str(file)]) == 1
+    assert "no boresight" in capsys.readouterr().err
