@@ -97,7 +97,7 @@ def shifted(log: xr.Dataset, offset: FloatArray) -> xr.Dataset:
 def signal_to_noise(problem: Problem, null: Joint, change: FloatArray) -> float:
     """Return the whitened norm of a change of the residual (n,), nT, beyond the calibration's freedom."""
     noise = null.noise
-    A = noise.filter(problem.calibration_jacobian)
+    A = noise.filter(problem.calibration_rows(slice(None)))
     y = noise.whiten(change)
     P = A.T @ A + np.diag(null.prior[: A.shape[1]])
     b = A.T @ y

@@ -16,8 +16,7 @@ from magbridge.diagnose.problem import Problem
 
 __all__ = [
     "AXES", "Candidate", "Columns", "GridPoint", "Group", "Interpolated", "Mixture", "effect_columns",
-    "of_effect", "of_reference", "parts", "per", "places", "side_by_side", "since", "size_of", "slices",
-    "times", "together",
+    "of_effect", "of_reference", "parts", "per", "places", "since", "size_of", "slices", "times", "together",
 ]  # fmt: skip
 
 Columns = Callable[[slice], FloatArray]
@@ -110,12 +109,6 @@ def together(columns: Sequence[Columns]) -> Mixture:
         for X, M in blocks:
             found.setdefault(X, np.zeros((len(M), sum(sizes))))[:, own] += M
     return Mixture(tuple(found.items()))
-
-
-def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
-    """(m, k) blocks of columns side by side, stored column by column."""
-    out = np.empty((sum(block.shape[1] for block in blocks), len(blocks[0])))
-    return np.concatenate([block.T for block in blocks], out=out).T
 
 
 @dataclass(frozen=True)

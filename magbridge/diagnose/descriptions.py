@@ -22,9 +22,9 @@ from magbridge.calibration.memory_effects import ClockEffect, PlayEffect, play
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.columns import Candidate, Columns, effect_columns, size_of
-from magbridge.diagnose.joint import Joint, pieces
+from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.packets import packets, passage
-from magbridge.diagnose.problem import Problem, rates
+from magbridge.diagnose.problem import Problem, pieces, rates
 
 __all__ = [
     "Description", "bends", "crossing", "delayed", "descriptions", "lower_end", "near_surface", "repeated",

@@ -50,13 +50,12 @@ from magbridge.diagnose.columns import (
     Group,
     parts,
     places,
-    side_by_side,
     slices,
     together,
 )
 from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statistic, normal, volume_of
 from magbridge.diagnose.noise import Noise
-from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.problem import Problem, side_by_side
 
 __all__ = [
     "CONFOUNDED", "FALSE_ALARM_RATE", "IDEAL", "MOST_REMAINING", "ODDS", "REMNANT", "SMOOTH", "Best",
@@ -144,22 +143,28 @@ class Information:
 
 
 def information(
-    problem: Problem, noise: Noise, base: Joint, columns: Sequence[Columns], unshared: int = 0
+    problem: Problem,
+    noise: Noise,
+    base: Joint,
+    columns: Sequence[Columns],
+    unshared: int = 0,
+    stride: int = 1,
 ) -> Information:
     """Sum up the information of columns at `base` under `noise`, only the calibration projected out.
 
     The first `unshared` of them share no parts with any other, and their products with each other are not
-    computed.
+    computed. With a `stride`, only every so many pieces of the log count.
     """
-    q, shared = problem.calibration_jacobian.shape[1], together(columns).parts
+    q, shared = len(problem.centre), together(columns).parts
     alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:unshared]), q)
     others = slice(alone[-1].stop if alone else q, None)
     asked = [(slice(q), slice(None)), *zip(alone, alone, strict=True), (others, slice(q, None))]
     G, b = normal(
-        lambda rows: side_by_side([problem.calibration_jacobian[rows], *(X(rows) for X, _ in shared)]),
+        lambda rows: side_by_side([problem.calibration_rows(rows), *(X(rows) for X, _ in shared)]),
         noise.response(base.residual),
         noise,
         asked if unshared else ALL_PRODUCTS,
+        stride,
     )
     pull = base.prior[:q] * (problem.centre - base.z)
     K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])

@@ -380,7 +380,7 @@ def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Pr
     rebuilt = replace(problem, residual=e, jacobian=g, reference_jacobian=reference_jacobian)
     # The residual at the calibration as given, extrapolated linearly from this point. Errors of the
     # reference, slow noise and the axes' delays are in both, because `extended` corrects none of them
-    rebuilt.residual[:] += rebuilt.calibration_jacobian[:, problem.known] @ fit.z[problem.known]
+    rebuilt.residual[:] += rebuilt.coefficient_jacobian @ fit.z[problem.known]
     for piece, place in zip(pieces, slices(pieces), strict=True):
         if not piece.effects:
             columns.append(piece.columns)

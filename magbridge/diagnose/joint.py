@@ -45,21 +45,19 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray, IntArray
-from magbridge.diagnose.columns import Columns, places, side_by_side, size_of, times
+from magbridge.diagnose.columns import Columns, places, size_of, times
 from magbridge.diagnose.noise import Noise, fit_noise
-from magbridge.diagnose.problem import DELAYS, Problem
+from magbridge.diagnose.problem import DELAYS, Problem, pieces, side_by_side
 from magbridge.estimation.residual import robust_scale
 
 __all__ = [
     "ALL_PRODUCTS", "CONFIDENCE_LEVEL", "FLAT_PRECISION", "LONG", "PRIOR_SIZES", "RIDGE", "Design", "HeldOut",
     "Improvement", "Joint", "Ridge", "Statistic", "fit_joint", "held_out", "in_threads", "normal", "paired",
-    "pieces", "precomputed", "volume_of",
+    "precomputed", "volume_of",
 ]  # fmt: skip
 
 S = TypeVar("S")
 T = TypeVar("T")
-WHITENED_ROWS = 2048
-"""Rows that are whitened at a time, few enough for the processor's cache."""
 MAX_STORED_NUMBERS = 12_500_000
 """Most numbers of columns that are kept in memory: 100 MB."""
 ALL_PRODUCTS = ((slice(None), slice(None)),)
@@ -97,11 +95,6 @@ def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
     return [made.__getitem__ for made in in_threads(n, whole, columns)]
 
 
-def pieces(n: int) -> list[slice]:
-    """Return the pieces in which n rows are processed."""
-    return [slice(start, min(start + WHITENED_ROWS, n)) for start in range(0, n, WHITENED_ROWS)]
-
-
 class Design:
     """The columns of a hypothesis, the calibration's and the effects'.
 
@@ -113,36 +106,40 @@ class Design:
     """
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
-        self.calibration_jacobian, self.columns = problem.calibration_jacobian, columns
-        self.pieces = pieces(len(problem))
-        sizes = [size_of(column) for column in columns]
-        self.at, self.effects = places(sizes, self.calibration_jacobian.shape[1]), sum(sizes)
+        self.problem, self.columns, self.pieces = problem, columns, pieces(len(problem))
+        sizes, self.q = [size_of(column) for column in columns], len(problem.centre)
+        self.at, self.effects = places(sizes, self.q), sum(sizes)
 
     def rows(self, rows: slice) -> FloatArray:
         """(m, q + k) rows of all columns."""
-        return side_by_side([self.calibration_jacobian[rows], *(column(rows) for column in self.columns)])
+        return side_by_side([self.problem.calibration_rows(rows), *(column(rows) for column in self.columns)])
 
     def times(self, c: FloatArray) -> FloatArray:
         """(n,) ``X c``, the product of all columns and coefficients c (q + k,)."""
         asked = [(own, column) for own, column in zip(self.at, self.columns, strict=True) if c[own].any()]
 
         def piece(rows: slice) -> FloatArray:
-            out = np.asarray(self.calibration_jacobian[rows] @ c[: self.calibration_jacobian.shape[1]])
+            out = np.asarray(self.problem.calibration_rows(rows) @ c[: self.q])
             for own, column in asked:
                 out += times(column, rows, c[own])
             return out
 
-        return np.concatenate(in_threads(len(self.calibration_jacobian), piece, self.pieces))
+        return np.concatenate(in_threads(len(self.problem), piece, self.pieces))
 
 
 def normal(
-    X: Columns, y: FloatArray, noise: Noise | None = None, asked: Sequence[tuple[slice, slice]] = ALL_PRODUCTS
+    X: Columns,
+    y: FloatArray,
+    noise: Noise | None = None,
+    asked: Sequence[tuple[slice, slice]] = ALL_PRODUCTS,
+    stride: int = 1,
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``X^T X`` (k, k) and ``X^T y`` (k,), X whitened if a noise is given.
 
     They are summed up in pieces that fit the processor's cache. Long logs are shared out among threads,
     always in the same way, so any machine returns the same numbers. Of ``X^T X`` only the blocks that are
-    `asked` for are computed, and their transposes; the others are zero.
+    `asked` for are computed, and their transposes; the others are zero. With a `stride`, only every so many
+    pieces of the log count.
     """
     k = size_of(X)
 
@@ -155,7 +152,7 @@ def normal(
             b += A.T @ y[rows]
         return P, b
 
-    every = pieces(len(y))
+    every = pieces(len(y))[::stride]
     each = -(-len(every) // THREADS) if len(y) > LONG else len(every)
     shares = in_threads(len(y), share, [every[n : n + each] for n in range(0, len(every), each)])
     P = np.asarray(sum(P for P, _ in shares))
@@ -317,7 +314,7 @@ def fit_joint(
         At most.
     """
     X = Design(problem, precomputed(len(problem), columns))
-    q, k = X.calibration_jacobian.shape[1], X.effects
+    q, k = X.q, X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]
     if problem.waves.size:

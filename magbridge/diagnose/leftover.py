@@ -22,10 +22,10 @@ from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.columns import Candidate, Columns, places, times
 from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, information
-from magbridge.diagnose.joint import Design, Joint, Ridge, Statistic, in_threads, pieces, precomputed
+from magbridge.diagnose.joint import Design, Joint, Ridge, Statistic, in_threads, precomputed
 from magbridge.diagnose.noise import Noise, fit_noise
 from magbridge.diagnose.observed import Memory, memory
-from magbridge.diagnose.problem import Problem
+from magbridge.diagnose.problem import Problem, pieces
 from magbridge.diagnose.search import Outliers
 from magbridge.estimation.residual import rms, robust_scale
 

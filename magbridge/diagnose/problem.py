@@ -41,7 +41,7 @@ itself they would correlate with its noise, and scales could grow against offset
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, wraps
 from typing import TypeVar
@@ -53,6 +53,7 @@ from scipy.interpolate import CubicSpline
 from magbridge.arrays import FloatArray
 from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.correct import regressors
+from magbridge.calibration.effects import powers
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect, Polynomial, Series
 from magbridge.diagnose.survey import Survey
@@ -62,8 +63,8 @@ from magbridge.estimation.residual import Samples, jacobian, residuals, robust_s
 
 __all__ = [
     "AXIS_DELAY_SIGMA_S", "DELAYS", "DERIVATIVE_ROWS", "FALL", "MAX_MISSING_SAMPLES", "Problem",
-    "derivatives", "floor", "interpolation_error", "isotropic", "linearised", "once", "pose", "rates",
-    "samples_of", "with_slow_noise",
+    "derivatives", "floor", "interpolation_error", "isotropic", "linearised", "once", "pieces", "pose",
+    "rates", "samples_of", "side_by_side", "with_slow_noise",
 ]  # fmt: skip
 
 EACH, LAST = 16, 64
@@ -71,6 +72,8 @@ EACH, LAST = 16, 64
 MAX_MISSING_SAMPLES = 3
 """Largest number of samples missing in a row within a leg: the rate next to such a gap still has 98 % of the
 true one's power."""
+WHITENED_ROWS = 2048
+"""Rows that are whitened at a time, few enough for the processor's cache."""
 DERIVATIVE_ROWS = 8192
 """Rows at a time: the memory is bounded, whatever the log."""
 BROADEST = 1e-3
@@ -96,12 +99,13 @@ def waves() -> FloatArray:
     return np.append(np.repeat(np.arange(1.0, EACH + 1.0), 3), np.arange(EACH + 1.0, LAST + 1.0))
 
 
-def slow_columns(slopes: FloatArray) -> FloatArray:
-    """(n, k) what a nanotesla of each coefficient adds to a residual of `slopes` (n, 3) by the reading."""
-    n, count = len(slopes), 3 * EACH
-    wave = np.cos(np.pi * (np.arange(n)[:, None] + 0.5) / n * waves())
-    along = np.linalg.norm(slopes, axis=1)[:, None]
-    return np.concatenate([wave[:, :count] * np.tile(slopes, EACH), wave[:, count:] * along], axis=1)
+def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
+    """(m, k) what a nanotesla of each coefficient adds to some rows of a residual of `slopes` (n, 3)."""
+    n, part = len(slopes), slopes.T[:, rows]
+    phase = np.pi * (np.arange(n)[rows] + 0.5) / n
+    wave = np.stack(powers(np.exp(1j * phase), LAST)).real  # cos(k phase), by one product each
+    each = (wave[:EACH, None] * part).reshape(3 * EACH, -1)
+    return np.concatenate([each, wave[EACH:] * np.linalg.norm(part, axis=0)]).T
 
 
 def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
@@ -147,6 +151,17 @@ def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
     out = np.zeros_like(H)
     out[:, at] = rate[:, at] - (H[:, at] - H[:, at - 1]) / (survey.time[at] - survey.time[at - 1])
     return out
+
+
+def pieces(n: int) -> list[slice]:
+    """Return the pieces in which n rows are processed."""
+    return [slice(start, min(start + WHITENED_ROWS, n)) for start in range(0, n, WHITENED_ROWS)]
+
+
+def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
+    """(m, k) blocks of columns side by side, stored column by column."""
+    out = np.empty((sum(block.shape[1] for block in blocks), len(blocks[0])))
+    return np.concatenate([block.T for block in blocks], out=out).T
 
 
 def derivatives(calibration: Calibration, samples: Samples, g: FloatArray, L: FloatArray) -> FloatArray:
@@ -313,7 +328,8 @@ class Problem:
         """(n,) what slow noise of z (q,) adds to the residual."""
         if not self.waves.size:
             return np.zeros(len(self))
-        return np.asarray(self.calibration_jacobian[:, self.slow] @ z[self.slow])
+        slopes = self.jacobian[:, 6:]
+        return np.concatenate([slow_columns(slopes, rows) @ z[self.slow] for rows in pieces(len(self))])
 
     def series(self, effect: Effect, rows: slice = slice(None)) -> Series:
         """Return rows of the log as the array form of an effect takes them."""
@@ -322,23 +338,29 @@ class Problem:
         return Series(self.survey.time[rows], self.reading[rows], values, self.calibration.kernel)
 
     @cached_property
-    def calibration_jacobian(self) -> FloatArray:
-        """(n, q) ``-de/dz``; the delays' are :attr:`delay_jacobian`, slow noise is in nT."""
+    def coefficient_jacobian(self) -> FloatArray:
+        """(n, k) ``-de/dz`` of the calibration's own coefficients, :attr:`known` of z."""
         samples, _ = samples_of(self.survey, self.calibration)
-        found = derivatives(self.calibration, samples, self.jacobian, -self.directions)
-        found[:, DELAYS] = self.delay_jacobian
+        return derivatives(self.calibration, samples, self.jacobian, -self.directions[:, self.known])
+
+    def calibration_rows(self, rows: slice) -> FloatArray:
+        """(m, q) rows of ``-de/dz``: the calibration's coefficients, slow noise (nT), the axes' delays.
+
+        Slow noise is computed where it is needed: for a month its columns would fill 500 MB.
+        """
+        blocks = [self.coefficient_jacobian[rows]]
         if self.waves.size:
-            found[:, self.slow] = slow_columns(self.jacobian[:, 6:])
-        return found
+            blocks.append(slow_columns(self.jacobian[:, 6:], rows))
+        return side_by_side([*blocks, self.delay_jacobian[rows]])
 
     def let_go(self) -> None:
-        """Release :attr:`calibration_jacobian` (300 MB for a month); it is computed again when needed."""
-        self.__dict__.pop("calibration_jacobian", None)
+        """Release :attr:`coefficient_jacobian` (100 MB for a month); it is computed again when needed."""
+        self.__dict__.pop("coefficient_jacobian", None)
 
     @property
     def stated(self) -> FloatArray:
         """(n,) nT², variance that the calibration states: of the noise, and of its coefficients."""
-        noise, J = self.calibration.noise, self.calibration_jacobian[:, self.known]
+        noise, J = self.calibration.noise, self.coefficient_jacobian
         return np.asarray(noise.sensor**2 + noise.reference**2 + np.einsum("ij,ij->i", J, J))
 
     def straight(self, z: FloatArray) -> FloatArray:

@@ -39,6 +39,8 @@ from magbridge.diagnose.problem import Problem
 
 __all__ = ["State", "refined", "sharpen"]
 
+MAX_SCREENED_SAMPLES = 65_536
+"""Samples of a long log, in pieces spread evenly over it, by which a round chooses what it fits to all."""
 JOINTLY_FITTED_CAUSES = 9
 """Causes that are fitted jointly in a round."""
 COLUMNS, STAGES = 144, 2
@@ -133,11 +135,13 @@ class State:
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Fit the best causes given `model`, each on its own, and list them, the likeliest first."""
-        as_fitted = self.conditional_on(model, base).fitted(base)
+        stride = max(len(self.problem) // MAX_SCREENED_SAMPLES, 1)
+        screened = self._under(base.noise, model, base, stride) if stride > 1 else None
+        as_fitted = (screened or self.conditional_on(model, base)).fitted(base)
         if not self.look_elsewhere:
             self.look_elsewhere = look_elsewhere_factors(as_fitted, self.candidates, self.at)
         under: dict[Group, list[Best]] = {}
-        for info in (as_fitted, self._cleared(model, base, as_fitted)):
+        for info in (as_fitted, self._cleared(model, base, as_fitted, stride)):
             for group, best in self.best(info).items():
                 under.setdefault(group, []).append(best)
         listed = sorted(under.values(), key=lambda won: -max(best.score.evidence for best in won))
@@ -155,7 +159,7 @@ class State:
         assert info is not None
         return info
 
-    def _cleared(self, model: list[Candidate], base: Joint, info: Information) -> Information:
+    def _cleared(self, model: list[Candidate], base: Joint, info: Information, stride: int) -> Information:
         """Information under the noise that remains when the best candidate of every cause is fitted."""
         top: dict[str, Best] = {}
         for (cause, _), best in self.best(info).items():
@@ -178,11 +182,12 @@ class State:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
             certain = certainty(everything.residual, everything.noise, middle)
             self.certain = dict(zip(self.groups, certain, strict=True))
-        return self._under(everything.noise, model, base).fitted(base)
+        return self._under(everything.noise, model, base, stride).fitted(base)
 
-    def _under(self, noise: Noise, model: Sequence[Candidate], base: Joint) -> Information:
-        """Information of all candidates and of `model` under a noise."""
-        return information(self.problem, noise, base, [*self.columns, *(c.columns for c in model)])
+    def _under(self, noise: Noise, model: Sequence[Candidate], base: Joint, stride: int = 1) -> Information:
+        """Information of all candidates and of `model` under a noise, in every `stride`-th piece."""
+        columns = [*self.columns, *(candidate.columns for candidate in model)]
+        return information(self.problem, noise, base, columns, stride=stride)
 
     def _joint(self, model: list[Candidate], base: Joint, won: list[Best]) -> Hypothesis:
         """Fit one cause jointly at the grid points that won under either noise."""

@@ -9,9 +9,10 @@ from scipy.sparse import csr_array
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose import joint as design
-from magbridge.diagnose.columns import Columns, Interpolated, Mixture, parts, side_by_side, times, together
+from magbridge.diagnose.columns import Columns, Interpolated, Mixture, parts, times, together
 from magbridge.diagnose.evidence import information
 from magbridge.diagnose.joint import fit_joint
+from magbridge.diagnose.problem import side_by_side
 
 ROWS = slice(3, 20)
 

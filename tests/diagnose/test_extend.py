@@ -143,10 +143,10 @@ def test_a_rate_that_is_noise_live_is_left_out() -> None:
 
 
 def test_what_was_let_go_is_made_again(problem: Problem) -> None:
-    before = problem.calibration_jacobian
+    before = problem.coefficient_jacobian
     problem.let_go()
-    assert problem.calibration_jacobian is not before
-    np.testing.assert_array_equal(problem.calibration_jacobian, before)
+    assert problem.coefficient_jacobian is not before
+    np.testing.assert_array_equal(problem.coefficient_jacobian, before)
 
 
 def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:

@@ -40,7 +40,7 @@ def test_the_score_is_the_density_of_each_dive_given_the_others(problem: Problem
     )
     posed = replace(problem, residual=problem.residual + 2.0 * shape[:, 0])
     c = np.append(fit.z, fit.coefficients)
-    A = fit.noise.filter(np.hstack([posed.calibration_jacobian, 3.0 * shape]))
+    A = fit.noise.filter(np.hstack([posed.calibration_rows(slice(None)), 3.0 * shape]))
     y = fit.noise.response(posed.residual)
     white = fit.noise.response(fit.residual)
     assert np.abs(A.T @ white - fit.prior * (c - np.append(posed.centre, 0.0))).max() < 0.05 * np.abs(A).max()
@@ -67,7 +67,7 @@ def test_what_is_there_wins_on_the_dives_left_out_and_what_is_not_does_not(probl
 
 def test_what_the_calibration_would_have_to_become_counts_against_it(problem: Problem) -> None:
     """A constant that a calibration absorbs is foretold by every other dive, but not by the calibration."""
-    absorbed = problem.calibration_jacobian[:, 14]  # what these dives show best
+    absorbed = problem.coefficient_jacobian[:, 14]  # what these dives show best
     posed = replace(problem, residual=problem.residual - 8.0 * absorbed)
     columns = [lambda rows: 8.0 * absorbed[rows, None]]
     scores = [held_out(posed, some, fit_joint(posed, some, 1)).score for some in (columns, [])]

@@ -41,7 +41,7 @@ def test_the_covariance_is_that_of_a_fit_in_which_the_lag_is_free(problem: Probl
     slope = CELL * fit.coefficients[0] * t / LAG**2 * np.exp(-t / LAG)
 
     def every(rows: slice) -> np.ndarray:
-        return np.column_stack([problem.calibration_jacobian[rows], one.columns(rows), slope[rows]])
+        return np.column_stack([problem.calibration_rows(rows), one.columns(rows), slope[rows]])
 
     P = normal(every, fit.noise.response(fit.residual), fit.noise)[0] + np.diag(np.append(fit.prior, 1.0))
     expected = np.linalg.inv(P)[:-1, :-1]
