@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.observations import Observations
     from magbridge.calibration.model import Calibration
     from magbridge.correction import Correction
-    from magbridge.diagnose.diagnosis import Diagnosis
+    from magbridge.diagnose.assessment import DiagnosisResult
     from magbridge.field.grid import AnomalyGrid
     from magbridge.navigate.options import Options
     from magbridge.survey.run import Result
@@ -73,7 +73,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     return corrected.assign_coords(time=deployment["time"])
 
 
-def diagnose(deployments: Sequence[xr.Dataset], calibration: Calibration, **options: Any) -> Diagnosis:
+def diagnose(deployments: Sequence[xr.Dataset], calibration: Calibration, **options: Any) -> DiagnosisResult:
     """Find what the model gets wrong in these logs; :func:`magbridge.diagnose.run.diagnose`."""
     from magbridge.diagnose import run  # noqa: PLC0415 - scipy only where it is used
 

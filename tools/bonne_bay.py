@@ -75,7 +75,7 @@ def run_diagnosis(seed: int, reference: str) -> list[Row]:
     twin = Twin.draw(load("bonne_bay").replace(telemetry=telemetry), seed)
     parts = measure_trials(twin, at_depth=reference == "map at its depth")
     calibration = fit(observations(parts["trial 1"], MASSES), "auto").calibration
-    found = diagnose([parts["survey"]], calibration, training_logs=[parts["trial 1"]])
+    found = diagnose([parts["survey"]], calibration, training_logs=[parts["trial 1"]]).diagnosis
     survey = parts["survey"]
     before, after = (
         rms(corrected(survey, known).total - true_field(survey)) for known in (calibration, found.calibration)

@@ -158,14 +158,13 @@ def case(vehicle: str, effect: str, seed: int, snr: float, data: str) -> list[Ro
     if hidden is None:
         return []
     changed, row["snr"] = hidden
-    found = diagnose([changed.isel(time=slice(0, half))], calibration)
+    found, use = diagnose([changed.isel(time=slice(0, half))], calibration)
     first = [one.candidate.cause for one in found.findings]
     every = {candidate.cause for one in found.findings for candidate in one.possible}
     every |= {one.candidate.cause for one in found.unexplained.within} if found.unexplained else set()
     later = load_survey([changed.isel(time=slice(half, None))], found.calibration)
     given, written = (corrected(later, one) for one in (calibration, found.calibration))
     before, after = (rms(one.total - later.reference) for one in (given, written))
-    use = found.assessment
     return [
         row | {
             "found": float(bool(first) or found.unexplained is not None), "named": ", ".join(first) or "none",

@@ -308,7 +308,7 @@ def check_by_tolles_lawson(found: Diagnosis) -> tuple[float, float, float]:
 def calibrate_and_diagnose(vehicle: Vehicle) -> tuple[Fit, Diagnosis]:
     """Return the fit of a vehicle's first logs, and the diagnosis of its others."""
     fitted = fit(observations(joined(vehicle.known), vehicle.parameters))
-    return fitted, diagnose([joined(vehicle.asked)], fitted.calibration)
+    return fitted, diagnose([joined(vehicle.asked)], fitted.calibration).diagnosis
 
 
 def show_diagnoses(data: Path, console: Console) -> None:

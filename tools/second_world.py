@@ -240,7 +240,8 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
     seen = effect if effect.ndim == 1 else np.sum(effect * unit, axis=1)
     effect = effect * snr / (np.std(seen) * np.sqrt(len(seen)))
     H = glider.reads(survey) + noise(len(seen)) + (effect if effect.ndim == 2 else 0.0)
-    return reported(name, diagnose([dataset(survey, H, effect if effect.ndim == 1 else 0.0)], calibration))
+    log = dataset(survey, H, effect if effect.ndim == 1 else 0.0)
+    return reported(name, diagnose([log], calibration).diagnosis)
 
 
 def reported(name: str, found: Diagnosis) -> dict[str, Any]:

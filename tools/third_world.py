@@ -226,7 +226,7 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
         effect = (OWN | FOREIGN)[name](vehicle, survey, rng)
         unit = survey.body / np.linalg.norm(survey.body, axis=1)[:, None]
         H = H + effect * snr / loudness(np.sum(effect * unit, axis=1))
-    return reported(name, diagnose([dataset(survey, H)], calibration))
+    return reported(name, diagnose([dataset(survey, H)], calibration).diagnosis)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.alternatives import CompetingHypothesis
-from magbridge.diagnose.assessment import Assessment, assess
 from magbridge.diagnose.causes import CAUSES, Cause
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.evidence import ODDS, Hypothesis, Isolability
@@ -128,11 +127,6 @@ class Diagnosis:
     """True if the findings hardly improve on a refit of the calibration's own coefficients."""
     causes: Mapping[str, Cause] = field(default_factory=lambda: CAUSES)
     """The table of causes that were asked about."""
-
-    @cached_property
-    def assessment(self) -> Assessment:
-        """Assessment: numbers and verdicts that the report shows in addition to the findings."""
-        return assess(self, self.causes)
 
     @property
     def counts(self) -> BoolArray:

@@ -220,21 +220,6 @@ class Returns(NamedTuple):
         """Return True if the log distinguishes place from time."""
         return self.separable >= SEPARABLE
 
-    @property
-    def text(self) -> str:
-        """Description of the track as a sentence."""
-        both = "an error of the map and a slow change with time (a daily variation)"
-        if not self.share:
-            return f"The track never returns to a place: {both} cannot be distinguished."
-        again = (
-            f"The track passes {100.0 * self.share:.0f} % of its places again, up to "
-            f"{self.longest / 3600.0:.1f} h later"
-        )
-        if self.distinguishable:
-            return f"{again}: {both} can be distinguished."
-        like = f"imitates {100.0 * (1.0 - self.separable):.0f} % of the other's power"
-        return f"{again}, but at times at which one {like}: {both} cannot be distinguished."
-
 
 def returns(survey: Survey) -> Returns | None:
     """Return where and when the track of a survey returns; None for a log without positions."""

@@ -15,6 +15,7 @@ from magbridge.calibration.file import encode_calibration
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.alternatives import CompetingHypothesis
+from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.time_dependent import interference_tone
 from magbridge.diagnose.columns import Candidate, Columns, Group, since, slices
@@ -180,7 +181,7 @@ def diagnose(
     causes: Mapping[str, Cause] | None = None,
     progress: Callable[[str], object] = str,
     remarks: Sequence[str] = (),
-) -> Diagnosis:
+) -> DiagnosisResult:
     """Find what the forward model gets wrong in these deployments.
 
     Parameters
@@ -212,18 +213,20 @@ def diagnose(
     # one thread: for matrices this narrow more only wait, and sums keep one order on any machine
     with threadpool_limits(1, "blas"):
         diagnosis = _examine(datasets, calibration, training_logs, grid, causes, progress)
-    if out_dir is not None:
-        # matplotlib only where a report is wanted
-        from magbridge.diagnose.report.page import write  # noqa: PLC0415
+    if out_dir is None:
+        return assess(diagnosis)
+    # matplotlib only where a report is wanted
+    from magbridge.diagnose.report.page import write  # noqa: PLC0415
 
-        progress("checking the written calibration")
-        if diagnosis.calibration is not calibration:
-            worse = check_written(encode_calibration(diagnosis.calibration), calibration, datasets, grid)
-            if worse and not any(candidate.about != "vehicle" for candidate in diagnosis.named):
-                diagnosis = _refused(diagnosis, worse)
-        progress("writing the report")
-        write(diagnosis, out_dir, causes, remarks)
-    return diagnosis
+    progress("checking the written calibration")
+    if diagnosis.calibration is not calibration:
+        worse = check_written(encode_calibration(diagnosis.calibration), calibration, datasets, grid)
+        if worse and not any(candidate.about != "vehicle" for candidate in diagnosis.named):
+            diagnosis = _refused(diagnosis, worse)
+    progress("writing the report")
+    result = assess(diagnosis)
+    write(result, out_dir, remarks)
+    return result
 
 
 def _examine(

@@ -175,7 +175,7 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) ->
 
 def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> Iterator[Row]:
     """Yield a row for each cause found, or one that says that there is none."""
-    found = diagnose([log], calibration, training_logs=[log])
+    found = diagnose([log], calibration, training_logs=[log]).diagnosis
     nothing: Row = {**job.mark, "verdict": found.verdict}
     if not found.findings:
         yield {**nothing, "cause": "", "channel": "", "signal_to_noise": None}

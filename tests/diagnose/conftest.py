@@ -42,7 +42,8 @@ def clear() -> Diagnosis:
     hours, deployment.HOURS = deployment.HOURS, 2.0
     deployment.vehicle.cache_clear()
     here = deployment.Background.of(deployment.vehicle(0), 24, "white")
-    found = diagnose([here.log(here.hide("current_field", 60.0, 24).ds)], here.deployment.calibration)
+    log = here.log(here.hide("current_field", 60.0, 24).ds)
+    found = diagnose([log], here.deployment.calibration).diagnosis
     deployment.HOURS = hours
     deployment.vehicle.cache_clear()
     return found

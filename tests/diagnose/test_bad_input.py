@@ -18,7 +18,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration, Sensor
-from magbridge.diagnose.diagnosis import Diagnosis
+from magbridge.diagnose.assessment import DiagnosisResult
 from magbridge.diagnose.report import page
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.survey import load_survey
@@ -43,21 +43,23 @@ def some(ds: xr.Dataset, count: int) -> xr.DataArray:
 @pytest.fixture(scope="module")
 def found(
     plain: tuple[xr.Dataset, Calibration], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Diagnosis, Path]:
+) -> tuple[DiagnosisResult, Path]:
     """A diagnosis, and the folder it was written to."""
     folder = tmp_path_factory.mktemp("found")
     return diagnose([plain[0]], plain[1], folder, remarks=["a<b>.csv: fitted to this log"]), folder
 
 
-def test_the_demonstrations_survey_is_plain(found: tuple[Diagnosis, Path]) -> None:
+def test_the_demonstrations_survey_is_plain(found: tuple[DiagnosisResult, Path]) -> None:
     """And report and findings say what their reader must know of the log."""
-    assert found[0].verdict == "nothing_found"
+    assert found[0].diagnosis.verdict == "nothing_found"
     remarks = json.loads((found[1] / "findings.json").read_text())["remarks"]
     assert remarks == ["a<b>.csv: fitted to this log"]
     assert "a&lt;b&gt;.csv: fitted to this log.</p>" in (found[1] / "report.html").read_text()
 
 
-def test_where_one_file_cannot_be_written_none_is(found: tuple[Diagnosis, Path], tmp_path: Path) -> None:
+def test_where_one_file_cannot_be_written_none_is(
+    found: tuple[DiagnosisResult, Path], tmp_path: Path
+) -> None:
     (tmp_path / "report.html").mkdir()
     (tmp_path / "findings.json").write_text("of an earlier diagnosis")
     with pytest.raises(WriteError, match=r"report\.html: cannot be written: Is a directory"):
@@ -66,7 +68,9 @@ def test_where_one_file_cannot_be_written_none_is(found: tuple[Diagnosis, Path],
     assert (tmp_path / "findings.json").read_text() == "of an earlier diagnosis"
 
 
-def test_a_full_disk_names_the_file_that_has_no_room(found: tuple[Diagnosis, Path], tmp_path: Path) -> None:
+def test_a_full_disk_names_the_file_that_has_no_room(
+    found: tuple[DiagnosisResult, Path], tmp_path: Path
+) -> None:
     sizes = {path.name: path.stat().st_size for path in found[1].iterdir()}
     largest = sizes.pop("report.html")
     enough = max(sizes.values())
@@ -82,7 +86,7 @@ def test_a_full_disk_names_the_file_that_has_no_room(found: tuple[Diagnosis, Pat
 
 def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Calibration]) -> None:
     wild = plain[0].assign(mag_x=plain[0]["mag_x"].where(some(plain[0], 10), 1e300))
-    assert diagnose([wild], plain[1]).verdict == "nothing_found"
+    assert diagnose([wild], plain[1]).diagnosis.verdict == "nothing_found"
 
 
 def test_how_old_a_parameter_was_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
@@ -150,13 +154,13 @@ def test_a_log_given_twice_is_refused(plain: tuple[xr.Dataset, Calibration]) -> 
 
 
 def test_a_hundred_samples_are_few_but_enough(plain: tuple[xr.Dataset, Calibration]) -> None:
-    assert diagnose([plain[0].isel(time=slice(0, 100))], plain[1]).verdict == "nothing_found"
+    assert diagnose([plain[0].isel(time=slice(0, 100))], plain[1]).diagnosis.verdict == "nothing_found"
 
 
 def test_telemetry_that_stands_still_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     ds = plain[0]
     still = ds.assign({name: 0.0 * ds[name] + ds[name].mean() for name in ("sensor_temperature", "depth")})
-    found = diagnose([still], plain[1])
+    found = diagnose([still], plain[1]).diagnosis
     assert {"temperature_offset", "pressure_offset"} <= set(found.isolability.untestable)
 
 
@@ -172,7 +176,7 @@ def test_attitude_and_position_may_be_lacking_in_some_rows_or_all(
     assert np.isfinite(survey.attitude).all()
     assert survey.place is None
     assert load_survey([ds.assign(roll=np.nan * ds["roll"])], calibration).attitude is None
-    assert diagnose([ds.assign(late | never)], calibration).verdict == "nothing_found"
+    assert diagnose([ds.assign(late | never)], calibration).diagnosis.verdict == "nothing_found"
 
 
 def test_a_track_across_the_date_line_is_one_track(plain: tuple[xr.Dataset, Calibration]) -> None:

@@ -118,7 +118,7 @@ def written(
     """The folder of a diagnosis and the channel that it names."""
     ds, calibration = warm
     out = tmp_path_factory.mktemp("diagnosis")
-    return out, diagnose([ds], calibration, out / "out").findings[0].candidate.channel
+    return out, diagnose([ds], calibration, out / "out").diagnosis.findings[0].candidate.channel
 
 
 def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Path, str]) -> None:
@@ -156,7 +156,7 @@ def test_a_maps_error_is_told_by_its_size(short: None) -> None:
     """A hundred functions of the place say nothing to anyone; their RMS does."""
     here = deployment.Background.of(deployment.vehicle(0), 24, "white")
     hidden = here.hide("map_error", 40.0, 24)
-    diagnosis = diagnose([here.log(hidden.ds)], here.deployment.calibration)
+    diagnosis = diagnose([here.log(hidden.ds)], here.deployment.calibration).diagnosis
     (named,) = [one for one in diagnosis.findings if one.candidate.cause == "map_error"]
     numbers = parameters(named, len(diagnosis.problem))
     assert set(numbers) == {"rms"}
@@ -170,13 +170,17 @@ def test_a_channels_name_does_not_decide(
 ) -> None:
     ds, calibration = warm
     renamed = ds.rename({written[1]: "zz"})
-    found = diagnose([renamed], calibration)
+    found = diagnose([renamed], calibration).diagnosis
     assert found.findings[0].candidate.channel == "zz"
-    assert "do not use it" in useful(replace(found, improvement=Improvement(1.0, 1.0, 1.0, (0.9, 1.1))))
-    assert "It leaves" not in useful(found)
+    idle = useful(replace(found, improvement=Improvement(1.0, 1.0, 1.0, (0.9, 1.1))))
+    used = useful(found)
+    assert idle is not None
+    assert used is not None
+    assert "do not use it" in idle.text
+    assert "It leaves" not in used.text
     first = found.findings[0]
     sun = replace(first.candidate, cause="diurnal_variation", channel=None, effects=())
     both = (first, replace(first, hypothesis=replace(first.hypothesis, candidate=sun)))
-    assert useful(replace(found, findings=both)).endswith(
-        "It leaves diurnal variation in the field, which the RMS above has removed."
-    )
+    partly = useful(replace(found, findings=both))
+    assert partly is not None
+    assert partly.text.endswith("It leaves diurnal variation in the field, which the RMS above has removed.")

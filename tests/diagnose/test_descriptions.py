@@ -62,7 +62,7 @@ def test_a_plain_survey_is_plain(seed: int) -> None:
     learned = unfiltered(
         observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
     )
-    assert diagnose([parts["survey"]], fit(learned, "auto").calibration).verdict == "nothing_found"
+    assert diagnose([parts["survey"]], fit(learned, "auto").calibration).diagnosis.verdict == "nothing_found"
 
 
 def test_a_converter_whose_steps_differ_is_described() -> None:

@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from posed import candidate
+from reported import page_of
 
 from magbridge.diagnose.alternatives import CompetingHypothesis
+from magbridge.diagnose.assessment import assess
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.report.findings import FINDINGS_FORMAT, findings_json
-from magbridge.diagnose.report.page import report_html
 from magbridge.diagnose.search import Outliers
-from magbridge.diagnose.words import number
+from magbridge.diagnose.texts import number
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "findings.schema.json").read_text(encoding="utf-8"))
 
@@ -46,13 +47,13 @@ def test_the_schema_is_one() -> None:
 
 @pytest.mark.parametrize("name", ["named", "contested", "nothing", "rest", "wrong"])
 def test_findings_are_as_the_schema_says(clear: Diagnosis, name: str) -> None:
-    facts = json.loads(findings_json(variants(clear)[name], CAUSES, ["a remark"]))
+    facts = json.loads(findings_json(assess(variants(clear)[name]), ["a remark"]))
     errors = [error.message for error in Draft202012Validator(SCHEMA).iter_errors(facts)]
     assert errors == []
 
 
 def test_what_is_not_in_the_schema_is_refused(clear: Diagnosis) -> None:
-    facts: dict[str, Any] = json.loads(findings_json(clear, CAUSES))
+    facts: dict[str, Any] = json.loads(findings_json(assess(clear)))
     for wrong in (facts | {"more": 1}, facts | {"verdict": "fine"}, facts | {"format": FINDINGS_FORMAT + 1}):
         assert not Draft202012Validator(SCHEMA).is_valid(wrong)
 
@@ -61,8 +62,8 @@ def test_what_is_not_in_the_schema_is_refused(clear: Diagnosis) -> None:
 def test_the_report_says_what_the_assessment_holds(clear: Diagnosis, name: str) -> None:
     """Answer, and each reason and note, word by word; the answer stands before the first section."""
     diagnosis = variants(clear)[name]
-    facts = json.loads(findings_json(diagnosis, CAUSES))["assessment"]
-    page = unescape(report_html(diagnosis, CAUSES)).replace("\N{NO-BREAK SPACE}", " ")
+    facts = json.loads(findings_json(assess(diagnosis)))["assessment"]
+    page = unescape(page_of(diagnosis)).replace("\N{NO-BREAK SPACE}", " ")
     first = page.partition("<h2")[0]
     assert facts["summary"] in first
     for note in (*facts["reasons_for"], *facts["reasons_against"]):
@@ -76,7 +77,7 @@ def test_the_report_says_what_the_assessment_holds(clear: Diagnosis, name: str) 
 
 
 def test_what_is_seen_stands_apart_from_what_it_may_be(clear: Diagnosis) -> None:
-    (one,) = json.loads(findings_json(clear, CAUSES))["findings"]
+    (one,) = json.loads(findings_json(assess(clear)))["findings"]
     assert one["cause"] == "current_field"
     assert one["follows"]["channel"] == one["channel"]
     assert one["follows"]["amplitude_nT"] > 1.0
@@ -84,7 +85,7 @@ def test_what_is_seen_stands_apart_from_what_it_may_be(clear: Diagnosis) -> None
 
 def test_no_sentence_says_that_nothing_is_left(clear: Diagnosis) -> None:
     """It says how much is left, how long that remembers unless it is white, and what a refit would do."""
-    page, last = report_html(clear, CAUSES), clear.assessment.residual
+    page, last = page_of(clear), assess(clear).assessment.residual
     assert "Nothing else" not in page
     assert re.search(r"The remaining [\d.]+\xa0nT RMS look like noise", page)
     assert ("remembers" in page) == last.lasts

@@ -95,7 +95,7 @@ def rotor(hidden: str) -> xr.Dataset:
 def test_on_a_multirotors_log_what_is_seen_stands_apart_from_what_it_may_be(hidden: str) -> None:
     known = replace(calibrated(np.zeros(9)), parameters=(), terms=(Polynomial(exponents=((),)),))
     found = diagnose([rotor(hidden)], known)
-    facts = findings(found, CAUSES)
+    facts = findings(found)
     named = {(one["cause"], one["channel"]) for one in facts["findings"]}
     every = named | {(o["cause"], o["channel"]) for one in facts["findings"] for o in one["alternatives"]}
     assert not [one for one in every if one[0].startswith(("temperature", "pressure"))]

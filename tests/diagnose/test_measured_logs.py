@@ -9,7 +9,6 @@ import pytest
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from magbridge.logs import read
@@ -28,7 +27,7 @@ def test_thrusters_leave_the_field_of_an_rov_elsewhere(real_data: Path) -> None:
     half = len(motors[0]) // 2
     before, after = ds.isel(time=slice(0, half)), ds.isel(time=slice(half, None))
     result = diagnose([after], fit(observations(before, []), "auto").calibration)
-    found = findings(result, CAUSES)
+    found = findings(result)
     step = next(one for one in found["findings"] if one["cause"] == "offset_step")["parameters"]
     assert 0.0 <= step["onset"]["value"] - ds.time.values[turning[-1]] < 5.0
     # the vertical channel, half a minute before the thrusters turn and after; a swaying hull adds 0.6 uT
@@ -44,6 +43,6 @@ def test_a_seaglider_is_better_where_it_was_not_seen(real_data: Path) -> None:
     """A coarse compass with rock below it: a map's error is among the names, and dives left out improve."""
     dives = sorted((real_data / "seaglider_sg167").glob("*.nc"))
     known = fit(observations(read(dives[:3]), ["pitchCtl", "vbdCC"])).calibration
-    result = diagnose([read(dives[3:])], known)
+    result = diagnose([read(dives[3:])], known).diagnosis
     assert "map_error" in {one.hypothesis.candidate.cause for one in result.findings}
     assert result.total.shown

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
+from reported import section
 from scipy.signal import lfilter
 
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.noise import fit_noise
-from magbridge.diagnose.report.page import remaining
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.search import Outliers, outliers
 from magbridge.diagnose.survey import MAX_LAG, Past
@@ -112,7 +111,7 @@ def test_a_diagnosis_names_isolated_samples_only(demo: Demo, shape: np.ndarray, 
         off[row - 1 : row + 2] = 3.0 * shape
     for name in ("mag_x", "mag_y", "mag_z"):
         survey[name] = survey[name] * (1.0 + off / survey["reference_field"].to_numpy())
-    reported = diagnose([survey], calibration)
+    reported = diagnose([survey], calibration).diagnosis
     assert not reported.findings
     assert (reported.wrong is not None) is isolated
     assert (reported.unexplained is None) is isolated
@@ -128,11 +127,11 @@ def test_a_relay_gets_no_name(demo: Demo, beside_runs: bool) -> None:
     relay = np.searchsorted(at, np.arange(n)) % 2
     for name, size in (("mag_x", 9.0), ("mag_y", -6.0), ("mag_z", 12.0)):
         survey[name] = survey[name] + size * relay
-    reported = diagnose([survey], calibration, training_logs=demo[2:] if beside_runs else ())
+    reported = diagnose([survey], calibration, training_logs=demo[2:] if beside_runs else ()).diagnosis
     assert (reported.findings, reported.wrong) == ((), None)
     assert reported.unexplained is not None
     assert reported.unexplained.kind == "switching"
     found = reported.problem.survey.time[list(reported.unexplained.shifts)]
     true = survey["time"].to_numpy().astype(float)[at]
     assert sum(np.abs(found - one).min() < 40.0 for one in true) >= 10
-    assert f"The level shifts at {found.size} places, " in "".join(remaining(reported, CAUSES))
+    assert f"The level shifts at {found.size} places, " in section(reported, "What is left")

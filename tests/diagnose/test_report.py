@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +12,7 @@ from posed import candidate, right
 
 from magbridge.cli.diagnose import causes_of, summary
 from magbridge.diagnose.alternatives import CompetingHypothesis
-from magbridge.diagnose.assessment import IMPLAUSIBLE_MULTIPLE, Note, level, not_separated, times_usual
+from magbridge.diagnose.assessment import IMPLAUSIBLE_MULTIPLE, level, not_separated, times_usual
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.diagnosis import Finding, small, verdict_of
 from magbridge.diagnose.evidence import Hypothesis
@@ -21,9 +20,9 @@ from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.problem import Problem, isotropic
 from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.page import _folded, _outliers, improved, nameless
+from magbridge.diagnose.report.page import physics
 from magbridge.diagnose.survey import Channel, _channels
-from magbridge.diagnose.words import chance, measured, number, physics, row, sizes
+from magbridge.diagnose.texts import chance, measured, number, sizes
 
 
 @pytest.mark.parametrize("cause", CAUSES)
@@ -49,13 +48,6 @@ def test_a_causes_physics_is_a_sentence(cause: str) -> None:
 )
 def test_a_number_is_written_to_two_digits_of_its_sigma(value: float, sigma: float, text: str) -> None:
     assert f"{measured(value, sigma)} ± {measured(sigma, sigma)}" == text
-
-
-def test_when_something_began_is_a_date() -> None:
-    cells = '<td class="n">2026-06-01 11:50:41</td><td class="n"></td><td>UTC</td>'
-    assert row("onset (2)", 1780314641.5, None, "s") == f"<tr><td>onset (2)</td>{cells}</tr>"
-    assert '<td class="n">± 0.50</td><td>nT/A</td>' in row("x", 12.0, 0.5, "nT/A")
-    assert '<td class="n">12</td>' in row("count", 12, None, "")
 
 
 @pytest.mark.parametrize(
@@ -170,23 +162,6 @@ def test_a_constant_of_the_reference_is_one_at_any_attitude() -> None:
     np.testing.assert_allclose(finding.field(problem), 0.5 * bias.width[0])
 
 
-def test_a_gain_that_does_not_show_is_said_to_be_none() -> None:
-    """As on a log of a compass in steps of 100 nT: a name, and 588 nT that became 587."""
-    none, much = (
-        Improvement(588.1, 587.3, 0.999, (0.863, 1.021)),
-        Improvement(117.0, 75.8, 0.65, (0.48, 0.83)),
-    )
-    assert improved(none, "").startswith(
-        "On the log that the calibration was fitted to, the error of the corrected field, 588 nT RMS, became"
-    )
-    assert improved(none, "eighths of the log") == (
-        "On eighths of the log left out of the fit, the error of the corrected field, 588 nT RMS, became 587 "
-        "nT (ratio 1.00, 95 % interval 0.86 to 1.02: no improvement is shown)."
-    )
-    assert improved(much, "dives").endswith("(ratio 0.65, 95 % interval 0.48 to 0.83).")
-    assert (none.shown, much.shown) == (False, True)
-
-
 def test_names_that_gain_nothing_explain_only_in_part() -> None:
     """As where a survey is diagnosed with the calibration that was fitted to it."""
     candidate = CAUSES["reference_bias"].candidates(right(100))[0]
@@ -210,21 +185,6 @@ def test_where_the_calibrations_own_numbers_do_as_well_nothing_needs_explaining(
         False,
     ]
     assert not small(problem, noise + 20.0 * (np.arange(1000) > 500), None)
-
-
-def test_a_long_table_of_terms_is_folded_to_a_line() -> None:
-    terms = {f"x{k}": {"value": float(k), "sigma": 1.0} for k in range(15)}
-    assert _folded("table", terms).startswith("<details><summary>15 terms, 12 of them beyond 2 sigma<")
-    assert _folded("table", dict(list(terms.items())[:9])) == "table"
-
-
-def test_the_times_of_wrong_samples_are_all_or_the_first() -> None:
-    few, many = (_outliers(np.linspace(1780300800.0, 1780300799.0 + n, n)) for n in (2, 13))
-    assert "2 isolated samples are wrong, at 08:00:00, 08:00:01 UTC." in few
-    assert "13 isolated samples are wrong, the first 12 at 08:00:00, " in many
-    assert "1 isolated sample is wrong, at 08:00:00 UTC. No RMS before or after counts them." in _outliers(
-        np.array([1780300800.0])
-    )
 
 
 @pytest.mark.parametrize("unit", ["", "1"])
@@ -261,23 +221,6 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
     assert level(problem, [bias], problem.calibration) is None
 
 
-def test_names_that_something_unexplained_keeps_are_told() -> None:
-    """With what would tell the likeliest of them; what fits no cause has no names."""
-    drift, current = (
-        CompetingHypothesis(candidate(cause, np.ones(1), channel=channel), behind)
-        for cause, channel, behind in (("offset_drift", None, 0.0), ("current_field", "motor<1>", 1.0))
-    )
-    rest = Leftover("drift", 9.0, 1e-9, 12.0, None, None, within=(drift, current))
-    output = nameless(rest, CAUSES)
-    assert "It resembles: offset drift, current field (motor&lt;1&gt;)." in output
-    assert CAUSES["offset_drift"].disambiguation in output
-    assert nameless(rest._replace(within=()), CAUSES) == "It fits no known cause, so it has no name."
-
-
-def _text(notes: Iterable[Note]) -> str:
-    return "".join(note.text for note in notes)
-
-
 def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     """That a second thermometer does as well is no doubt of the name."""
     own, twin, other = (
@@ -288,7 +231,7 @@ def test_a_rival_on_another_channel_is_no_other_cause() -> None:
     )  # fmt: skip
     cause = CAUSES["temperature_offset"]
     alone, channels, causes = (
-        _text(not_separated(own, cause, [CompetingHypothesis(one, 1.0) for one in competing]))
+        not_separated(own, cause, [CompetingHypothesis(one, 1.0) for one in competing]).text
         for competing in ([], [twin], [twin, other])
     )
     assert "water would do nearly as well" in channels

@@ -8,21 +8,23 @@ from dataclasses import replace
 
 import numpy as np
 from posed import candidate
+from reported import page_of, section
 
 from magbridge.diagnose.alternatives import CompetingHypothesis
-from magbridge.diagnose.assessment import OWN_LOG_TEXT, Assessment
+from magbridge.diagnose.assessment import Assessment, assess
 from magbridge.diagnose.causes import CAUSES
+from magbridge.diagnose.columns import GridPoint
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.report.figures import ends, rolling
-from magbridge.diagnose.report.page import remaining, report_html, visible
+from magbridge.diagnose.report.findings import parameters
 from magbridge.diagnose.search import Outliers
-from magbridge.diagnose.words import number
+from magbridge.diagnose.texts import measured, number, write_text
 
 
 def answer(diagnosis: Diagnosis) -> Assessment:
-    return diagnosis.assessment
+    return assess(diagnosis).assessment
 
 
 def reasons(found: Assessment) -> list[str]:
@@ -66,7 +68,7 @@ def test_what_makes_no_difference_needs_no_extension(clear: Diagnosis) -> None:
     """And a calibration whose own data do not support it sets the condition."""
     small = replace(clear, negligible=True)
     assert answer(small).reason == "not_needed"
-    assert "Nothing needs explaining: the causes found make" in report_html(small, CAUSES).partition("<h2")[0]
+    assert "Nothing needs explaining: the causes found make" in page_of(small).partition("<h2")[0]
     given = replace(clear.problem.calibration, warnings=("all headings lie within 20 degrees",))
     found = answer(replace(clear, problem=replace(clear.problem, calibration=given)))
     assert found.fit_for_use == "conditional"
@@ -101,7 +103,7 @@ def test_each_other_objection_is_reported(clear: Diagnosis) -> None:
     doubtful = {
         "shows no improvement on held-out parts": with_(clear, improvement=IDLE),
         "10 times the usual size": with_(clear, coefficients=large),
-        OWN_LOG_TEXT: replace(clear, problem=own),
+        write_text("own_log"): replace(clear, problem=own),
         "S/N 9.0 is left that has no name": replace(clear, unexplained=rest),
     }
     for text, diagnosis in doubtful.items():
@@ -127,27 +129,27 @@ def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
     report = clear.isolability
     gone = replace(report.visible[0], sizes={"x": (np.inf, "nT")})
     blind = replace(clear, isolability=replace(report, visible=(gone, *report.visible[1:])))
-    count = [sum("<tr><td>" in part for part in part.split("</tr>")) for part in visible(blind)]
-    assert max(count) == len(report.visible) - 1
-    assert any("Not to be found at any plausible size" in part for part in visible(blind))
-    assert not any("Not to be found at any plausible size" in part for part in visible(clear))
+    part, whole = (section(one, "What this log could have shown") for one in (blind, clear))
+    assert part.count("<tr><td>") == len(report.visible) - 1
+    assert "Not to be found at any plausible size" in part
+    assert "Not to be found at any plausible size" not in whole
 
 
 def test_predicted_and_remaining_residual_stand_beside_each_other(clear: Diagnosis) -> None:
-    output = "".join(remaining(clear, CAUSES))
+    output = section(clear, "What is left")
     assert output.count("<tr><td>") == 5
     assert "times worse than fitted ones" not in output
     worse = replace(clear, total=clear.total.__class__(5.0, 3.0, 0.6, (0.5, 0.7)))
-    assert "times worse than fitted ones" in "".join(remaining(worse, CAUSES))
+    assert "times worse than fitted ones" in section(worse, "What is left")
 
 
 def test_what_has_no_name_is_described_on_the_first_screen(clear: Diagnosis) -> None:
     rest = Leftover("tone", 9.0, 1e-9, 12.0, 33.0, "amps<b>")
-    page = report_html(replace(clear, findings=(), unexplained=rest, verdict="unexplained"), CAUSES)
+    page = page_of(replace(clear, findings=(), unexplained=rest, verdict="unexplained"))
     first, below = page.split("<h2", 1)
     assert "<b>A tone</b> of period 33 s is left (signal-to-noise ratio 9.0; best described by" in first
     assert "amps&lt;b&gt;" in first
-    residual = clear.assessment.residual
+    residual = answer(clear).residual
     last = number(residual.correlation_time, 2)
     lasts = f", which last {last} s" * residual.lasts
     assert f"in all {number(residual.rms)}\N{NO-BREAK SPACE}nT RMS{lasts})" in first
@@ -158,14 +160,14 @@ def test_wrong_samples_alone_promise_no_gain(clear: Diagnosis) -> None:
     """They are left out of every RMS, and nothing is added that could gain."""
     wrong = Outliers(np.array([3, 90]), 40.0, 1e-6, 1.0, lasting=False)
     alone = replace(clear, findings=(), wrong=wrong, verdict="explained")
-    page = report_html(alone, CAUSES)
+    page = page_of(alone)
     assert "(2 wrong samples). Without them, " in page
     assert "became" not in page
 
 
 def test_the_page_is_whole(clear: Diagnosis) -> None:
     """Every figure has a caption, and no line ends between a number and its unit."""
-    page = report_html(clear, CAUSES)
+    page = page_of(clear)
     assert page.count("<figure>") == page.count("<figcaption>") == page.count('alt="')
     assert page.index('class="box doubt"') < page.index("<h2")
     assert not re.search(r"\d (nT|%)", re.sub(r"base64,[^\"]*|<style>.*?</style>", "", page, flags=re.DOTALL))
@@ -173,14 +175,14 @@ def test_the_page_is_whole(clear: Diagnosis) -> None:
 
 def test_the_answer_is_read_in_a_minute(clear: Diagnosis) -> None:
     """Unfolded, the page is a screen: at most 250 words and one figure."""
-    first = report_html(clear, CAUSES).partition("<details")[0].partition("<body>")[2]
+    first = page_of(clear).partition("<details")[0].partition("<body>")[2]
     assert first.count("<figure>") == 1
     assert len(re.sub(r"<[^>]*>", " ", first).split()) <= 250
 
 
 def test_the_page_is_small_enough_to_send(clear: Diagnosis) -> None:
     """Even with eight causes: each picture has a palette (colour type 3 in a PNG's header)."""
-    page = report_html(replace(clear, findings=clear.findings * 8), CAUSES)
+    page = page_of(replace(clear, findings=clear.findings * 8))
     pictures = [b64decode(text) for text in re.findall(r'base64,([^"]*)', page)]
     assert {picture[25] for picture in pictures} == {3}
     assert len(page) < 800_000
@@ -200,3 +202,68 @@ def test_wild_samples_do_not_set_the_scale() -> None:
     low, high = ends(np.append(np.linspace(-1.0, 1.0, 1000), 1e6), low=0.0, high=0.0)
     assert -1.01 < low < -0.98
     assert 0.98 < high < 1.01
+
+
+def test_terms_have_a_sigma_and_an_onset_is_a_date(clear: Diagnosis) -> None:
+    first = clear.findings[0]
+    point = GridPoint({"onset": (1780314641.5, "s")})
+    named = replace(first.hypothesis, candidate=replace(first.candidate, point=point))
+    output = section(with_(clear, hypothesis=named), "Each cause")
+    assert '<tr><td>onset</td><td class="n">2026-06-01 11:50:41</td><td class="n"></td><td>UTC</td>' in output
+    x = parameters(first, len(clear.problem))["x"]
+    assert f'<td class="n">± {measured(x["sigma"], x["sigma"])}</td><td>nT/A</td>' in output
+
+
+def test_a_long_table_of_terms_is_folded_to_a_line(clear: Diagnosis) -> None:
+    first, flat = clear.findings[0], np.ones((len(clear.problem), 15))
+    many = replace(
+        first.candidate, names=tuple(f"x{k}" for k in range(15)), units=("nT",) * 15, width=np.ones(15),
+        columns=flat.__getitem__,
+    )  # fmt: skip
+    b = np.where(np.arange(15) < 12, 3.0, 0.1)
+    named = replace(first.hypothesis, candidate=many)
+    long = replace(first, hypothesis=named, coefficients=b, covariance=np.eye(15))
+    output = section(replace(clear, findings=(long,)), "Each cause")
+    assert "<summary>15 terms, 12 of them beyond 2 sigma<" in output
+    assert "<summary>3 terms" not in section(clear, "Each cause")
+
+
+def test_the_times_of_wrong_samples_are_all_or_the_first(clear: Diagnosis) -> None:
+    time = 1780300800.0 + np.arange(float(len(clear.problem.survey)))
+    problem = replace(clear.problem, survey=replace(clear.problem.survey, time=time))
+
+    def output(count: int) -> str:
+        wrong = Outliers(np.arange(count), 40.0, 1e-6, 1.0, lasting=False)
+        return section(replace(clear, problem=problem, wrong=wrong), "Each cause")
+
+    assert "1 isolated sample is wrong, at 08:00:00 UTC. No RMS before or after counts them." in output(1)
+    assert "2 isolated samples are wrong, at 08:00:00, 08:00:01 UTC." in output(2)
+    assert "13 isolated samples are wrong, the first 12 at 08:00:00, " in output(13)
+
+
+def test_a_gain_that_does_not_show_is_reported_as_none(clear: Diagnosis) -> None:
+    """As on a log of a compass in steps of 100 nT: a name, and 588 nT that became 587."""
+    none = Improvement(588.1, 587.3, 0.999, (0.863, 1.021))
+    page = page_of(replace(clear, improvement=none)).replace("\N{NO-BREAK SPACE}", " ")
+    assert (
+        f"On {clear.problem.survey.parts} left out of the fit, the error of the corrected field, 588 nT RMS, "
+        "became 587 nT (ratio 1.00, 95 % interval 0.86 to 1.02: no improvement is shown)." in page
+    )
+    fitted = np.ones(len(clear.problem), bool)
+    own = replace(clear.problem, survey=replace(clear.problem.survey, fitted=fitted))
+    first = page_of(replace(clear, problem=own))
+    assert "On the log that the calibration was fitted to, the error of the corrected field, " in first
+
+
+def test_names_that_something_unexplained_keeps_are_listed(clear: Diagnosis) -> None:
+    """With the manoeuvre that distinguishes the likeliest of them; what fits no cause has no names."""
+    drift, current = (
+        CompetingHypothesis(candidate(cause, np.ones(1), channel=channel), behind)
+        for cause, channel, behind in (("offset_drift", None, 0.0), ("current_field", "motor<1>", 1.0))
+    )
+    rest = Leftover("drift", 9.0, 1e-9, 12.0, None, None, within=(drift, current))
+    output = section(replace(clear, unexplained=rest), "What is left")
+    assert "It resembles: offset drift, current field (motor<1>)." in output
+    assert CAUSES["offset_drift"].disambiguation in output
+    alone = section(replace(clear, unexplained=rest._replace(within=())), "What is left")
+    assert "It fits no known cause, so it has no name." in alone

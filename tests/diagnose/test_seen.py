@@ -9,6 +9,7 @@ import pytest
 import xarray as xr
 from msgspec import structs
 from posed import calibrated, surveyed, walk
+from reported import section
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import lagged
@@ -17,11 +18,9 @@ from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.cli.diagnose import causes_of
-from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.observed import memory, seen
 from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.report.findings import findings
-from magbridge.diagnose.report.page import described
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.survey import Channel
 from sitl import load, simulate
@@ -126,10 +125,11 @@ def test_a_residual_far_from_white_is_never_nothing() -> None:
     How large it is, how long it lasts, and that nothing logged goes with it, are said.
     """
     survey, loud, slow = _slow_log()
-    found = diagnose([survey], loud)
+    result = diagnose([survey], loud)
+    found = result.diagnosis
     assert found.verdict == "unexplained"
     assert found.findings == ()
-    facts = findings(found, CAUSES)
+    facts = findings(result)
     rest, residual = facts["unexplained"], facts["assessment"]["residual"]
     assert rest["kind"] == "drift"
     assert residual["rms_nT"] == pytest.approx(np.std(slow), rel=0.1)
@@ -141,5 +141,5 @@ def test_a_residual_far_from_white_is_never_nothing() -> None:
     assert f"{residual['rms_nT']:.1f} nT RMS, lasts {rest['correlation_time_s']:.3g} s" in output
     assert 0.5 * residual["rms_nT"] < rest["rms_nT"] <= residual["rms_nT"]
     assert found.unexplained is not None
-    page = described(found.unexplained, found.assessment.residual)
+    page = section(found, "What is left")
     assert f"in all {residual['rms_nT']:.1f} nT RMS, which last" in page

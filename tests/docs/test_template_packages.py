@@ -145,10 +145,11 @@ def test_the_cause_is_put_forward_found_and_explained(
     survey = parts["survey"]
     heater = (np.arange(survey.sizes["time"]) // 90 % 2).astype(float)
     hot = survey.assign(mag_z=survey["mag_z"] + 40.0 * heater, heater=("time", heater))
-    found = diagnose([hot], calibration)
+    result = diagnose([hot], calibration)
+    found = result.diagnosis
     assert set(found.causes) == {*CAUSES, "heater_field"}
     assert "heater_field" in {one.cause for one in found.possible}
-    facts = findings(found, found.causes)
+    facts = findings(result)
     assert facts["findings"][0]["follows"]["channel"] == "heater"
     assert facts["findings"][0]["follows"]["axis"] == "z"
 

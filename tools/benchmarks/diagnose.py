@@ -39,7 +39,7 @@ from magbridge.diagnose.run import diagnose
 folder = Path(sys.argv[1])
 survey, calibration = read(folder / "survey.nc"), load(folder / "calibration.json")
 begun, used = time.monotonic(), time.process_time()
-found = diagnose([survey], calibration)
+found = diagnose([survey], calibration).diagnosis
 causes = [h.candidate.cause for h in found.findings]
 print(json.dumps([time.monotonic() - begun, time.process_time() - used, len(found.problem), found.verdict,
                   causes, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1.024e-3]))

@@ -175,8 +175,8 @@ def case(entry: Row) -> Row:
     whole = hidden[0].ds if len(hidden) == 1 else background.measure(*(one.hidden for one in hidden))
     ds = background.log(whole)
     table = {name: cause for name, cause in CAUSES.items() if name != without}
-    result = diagnose([ds], deployment.calibration, training_logs=deployment.learned, causes=table)
-    found = findings(result, table)
+    judged = diagnose([ds], deployment.calibration, training_logs=deployment.learned, causes=table)
+    result, found = judged.diagnosis, findings(judged)
     row = entry | {
         "sizes": [one.hidden.size for one in hidden],
         "verdict": found["verdict"],

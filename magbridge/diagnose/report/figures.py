@@ -15,7 +15,7 @@ from scipy.signal import periodogram
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose.diagnosis import Diagnosis
-from magbridge.diagnose.words import label
+from magbridge.diagnose.texts import label
 from magbridge.pictures import literal
 
 __all__ = ["CHANNELS", "channels", "ends", "measured", "rolling", "spectrum", "terms", "track"]

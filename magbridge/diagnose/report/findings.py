@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -10,12 +10,12 @@ import numpy as np
 
 from magbridge.arrays import plain
 from magbridge.diagnose.alternatives import CompetingHypothesis
-from magbridge.diagnose.assessment import Assessment, Note, telemetry_delay
-from magbridge.diagnose.causes import Cause
+from magbridge.diagnose.assessment import Assessment, DiagnosisResult, separation, telemetry_delay
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.diagnosis import Diagnosis, Finding
 from magbridge.diagnose.joint import CONFIDENCE_LEVEL, Improvement, normal
 from magbridge.diagnose.observed import Seen
+from magbridge.diagnose.texts import Diagnostic
 
 __all__ = ["FINDINGS_FORMAT", "findings", "findings_json", "parameters"]
 
@@ -23,61 +23,46 @@ FINDINGS_FORMAT = 3
 """Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""
 
 
-def findings(
-    diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str] = ()
-) -> dict[str, Any]:
+def findings(result: DiagnosisResult, remarks: Sequence[str] = ()) -> dict[str, Any]:
     """Return what ``findings.json`` holds, as plain Python; a reader must know `remarks` of the logs."""
-    listed = [_finding(diagnosis, finding, causes) for finding in diagnosis.findings]
+    diagnosis, assessment = result
+    listed = [_finding(diagnosis, finding) for finding in diagnosis.findings]
     if diagnosis.wrong is not None:
         listed.append(_wrong(diagnosis))
-    rest = diagnosis.unexplained
-    return {
+    facts = {
         "format": FINDINGS_FORMAT,
         "verdict": diagnosis.verdict,
-        "rms_before_nT": _round(diagnosis.improvement.before),
-        "rms_after_nT": _round(diagnosis.improvement.after),
+        "rms_before_nT": diagnosis.improvement.before,
+        "rms_after_nT": diagnosis.improvement.after,
         "improvement": _corrected(diagnosis),
         "findings": listed,
-        "unexplained": None
-        if rest is None
-        else {
-            "kind": rest.kind,
-            "signal_to_noise": _round(rest.signal_to_noise),
-            "period_s": None if rest.period_s is None else _round(rest.period_s),
-            "best_channel": rest.best_channel or diagnosis.assessment.follows.channel,
-            "follows": follows(diagnosis.assessment.follows),
-            "correlation_time_s": _round(diagnosis.assessment.residual.correlation_time),
-            "rms_nT": None if rest.size is None else _round(rest.size),
-            "alternatives": alternatives(rest.within),
-        },
-        "assessment": assessment(diagnosis.assessment),
+        "unexplained": _unexplained(diagnosis, assessment),
+        "assessment": _assessment(assessment),
         "remarks": list(remarks),
     }
+    rounded: dict[str, Any] = _round(facts)
+    return rounded
 
 
-def findings_json(diagnosis: Diagnosis, causes: Mapping[str, Cause], remarks: Sequence[str] = ()) -> bytes:
+def findings_json(result: DiagnosisResult, remarks: Sequence[str] = ()) -> bytes:
     """Return ``findings.json``."""
-    return (
-        msgspec.json.format(
-            msgspec.json.encode(findings(diagnosis, causes, remarks), enc_hook=plain), indent=2
-        )
-        + b"\n"
-    )
+    content = msgspec.json.encode(findings(result, remarks), enc_hook=plain)
+    return msgspec.json.format(content, indent=2) + b"\n"
 
 
-def _finding(diagnosis: Diagnosis, finding: Finding, causes: Mapping[str, Cause]) -> dict[str, Any]:
+def _finding(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any]:
     candidate, competing = finding.candidate, finding.competing
     return {
         "cause": candidate.cause,
         "channel": candidate.channel,
-        "follows": follows(finding.follows(diagnosis.problem, diagnosis.fit)),
-        "signal_to_noise": _round(finding.signal_to_noise),
-        "p_value": _round(finding.hypothesis.p_value),
-        "alternatives": alternatives(competing),
-        "disambiguation": causes[candidate.cause].disambiguation if competing else None,
+        "follows": _follows(finding.follows(diagnosis.problem, diagnosis.fit)),
+        "signal_to_noise": finding.signal_to_noise,
+        "p_value": finding.hypothesis.p_value,
+        "alternatives": _alternatives(competing),
+        "disambiguation": diagnosis.causes[candidate.cause].disambiguation if competing else None,
         "parameters": parameters(finding, len(diagnosis.problem)),
         "configuration": _configuration(diagnosis, finding),
-        "improvement": _improvement(finding.improvement, diagnosis),
+        "improvement": _improvement(finding.improvement, diagnosis.problem.survey.parts),
     }
 
 
@@ -86,11 +71,11 @@ def _configuration(diagnosis: Diagnosis, finding: Finding) -> dict[str, Any] | N
     late = telemetry_delay(diagnosis, finding)
     if late is None or late.delay_s <= 0.0 or late.after_nt >= late.before_nt:
         return None
-    delay = {"delay": _round(late.delay_s)}
-    return {"telemetry": {parameter.name: delay for parameter in diagnosis.problem.calibration.parameters}}
+    masses = diagnosis.problem.calibration.parameters
+    return {"telemetry": {parameter.name: {"delay": late.delay_s} for parameter in masses}}
 
 
-def alternatives(competing: tuple[CompetingHypothesis, ...]) -> list[dict[str, Any]]:
+def _alternatives(competing: Sequence[CompetingHypothesis]) -> list[dict[str, Any]]:
     """List the others within 20:1, the likeliest first."""
     return [{"cause": one.candidate.cause, "channel": one.candidate.channel} for one in competing]
 
@@ -116,15 +101,11 @@ def parameters(finding: Finding, samples: int) -> dict[str, dict[str, Any]]:
         for label, some in ({name: members} | listed).items():
             sigma = float(np.sqrt(covariance[np.ix_(some, some)].sum()))
             found[label] = {
-                "value": _round(float(value[some].sum())),
-                "sigma": _round(sigma),
-                "unit": candidate.units[members[0]],
-            }
-    shape = {
-        name: {"value": float(v), "sigma": None, "unit": unit}
-        for name, (v, unit) in candidate.point.shape.items()
-    }
-    return found | shape
+                "value": float(value[some].sum()), "sigma": sigma, "unit": candidate.units[members[0]],
+            }  # fmt: skip
+    for name, (shape, unit) in candidate.point.shape.items():
+        found[name] = {"value": shape, "sigma": None, "unit": unit}
+    return found
 
 
 def _rms(finding: Finding, samples: int) -> dict[str, Any]:
@@ -136,8 +117,7 @@ def _rms(finding: Finding, samples: int) -> dict[str, Any]:
     M = normal(finding.candidate.columns, np.zeros(samples))[0] / samples
     f = float(np.sqrt(b @ M @ b))
     slope = M @ b / max(f, 1e-12)
-    sigma = float(np.sqrt(slope @ finding.covariance @ slope))
-    return {"value": _round(f), "sigma": _round(sigma), "unit": "nT"}
+    return {"value": f, "sigma": float(np.sqrt(slope @ finding.covariance @ slope)), "unit": "nT"}
 
 
 def _adds_up(candidate: Candidate) -> bool:
@@ -146,9 +126,24 @@ def _adds_up(candidate: Candidate) -> bool:
     return len(channels) == 1 and not candidate.point.shape.keys().isdisjoint(("lag", "onset"))
 
 
-def assessment(found: Assessment) -> dict[str, Any]:
-    """Return the parts of the report in addition to the findings, rounded."""
-    delays, budget, residual, track = found.delays, found.budget, found.residual, found.returns
+def _unexplained(diagnosis: Diagnosis, assessment: Assessment) -> dict[str, Any] | None:
+    """Return what is left without a name."""
+    rest = diagnosis.unexplained
+    return rest and {
+        "kind": rest.kind,
+        "signal_to_noise": rest.signal_to_noise,
+        "period_s": rest.period_s,
+        "best_channel": rest.best_channel or assessment.follows.channel,
+        "follows": _follows(assessment.follows),
+        "correlation_time_s": assessment.residual.correlation_time,
+        "rms_nT": rest.size,
+        "alternatives": _alternatives(rest.within),
+    }
+
+
+def _assessment(found: Assessment) -> dict[str, Any]:
+    """Return the parts of the report in addition to the findings."""
+    delays, residual, track, shift = found.delays, found.residual, found.returns, found.reference_shift
     return {
         "fit_for_use": found.fit_for_use,
         "reason": found.reason,
@@ -158,89 +153,81 @@ def assessment(found: Assessment) -> dict[str, Any]:
         "reasons_against": _notes(found.reasons_against),
         "manoeuvres": list(found.manoeuvres),
         "warnings": [_notes(some) for some in found.notes],
-        "reference_shift": found.reference_shift and {
-            "shift_nT": _round(found.reference_shift.shift), "sigma_nT": _round(found.reference_shift.sigma),
-        },
+        "reference_shift": shift and {"shift_nT": shift.shift, "sigma_nT": shift.sigma},
         "channel_delays": delays and {
-            "y_s": _round(delays.later[0]), "z_s": _round(delays.later[1]),
-            "y_sigma_s": _round(delays.sigma[0]), "z_sigma_s": _round(delays.sigma[1]),
-            "rms_nT": _round(delays.rms),
+            "y_s": delays.later[0], "z_s": delays.later[1], "y_sigma_s": delays.sigma[0],
+            "z_sigma_s": delays.sigma[1], "rms_nT": delays.rms,
         },
-        "rms_nT": {name: None if x is None else _round(x) for name, x in budget._asdict().items()},
+        "rms_nT": found.budget._asdict(),
         "residual": {
-            "rms_nT": _round(residual.rms), "white_nT": _round(residual.white),
-            "correlation_time_s": _round(residual.correlation_time), "slow_fraction": _round(residual.slow),
-            "follows": follows(found.follows),
+            "rms_nT": residual.rms, "white_nT": residual.white, "slow_fraction": residual.slow,
+            "correlation_time_s": residual.correlation_time, "follows": _follows(found.follows),
         },
         "spatial_temporal": track and {
-            "distinguishable": track.distinguishable, "least_fraction": _round(track.separable),
-            "returning_fraction": _round(track.share), "longest_s": _round(track.longest), "text": track.text,
+            "distinguishable": track.distinguishable, "least_fraction": track.separable,
+            "returning_fraction": track.share, "longest_s": track.longest, "text": separation(track).text,
         },
     }  # fmt: skip
 
 
-def _notes(some: Sequence[Note]) -> list[dict[str, Any]]:
-    numbers = [{name: _round(x) for name, x in note.numbers.items()} for note in some]
-    return [
-        {"code": note.code, "text": note.text, "numbers": given}
-        for note, given in zip(some, numbers, strict=True)
-    ]
+def _notes(some: Sequence[Diagnostic]) -> list[dict[str, Any]]:
+    return [{"code": note.code, "text": note.text, "numbers": note.numbers} for note in some]
 
 
-def follows(what: Seen) -> dict[str, Any]:
+def _follows(what: Seen) -> dict[str, Any]:
     """Return the observed correlate, without its interpretation."""
     return {
-        "channel": what.channel,
-        "lag_s": what.lag,
-        "axis": what.axis,
-        "amplitude_nT": _round(what.size),
-        "fraction": _round(what.share),
-    }
+        "channel": what.channel, "lag_s": what.lag, "axis": what.axis, "amplitude_nT": what.size,
+        "fraction": what.share,
+    }  # fmt: skip
 
 
 def _wrong(diagnosis: Diagnosis) -> dict[str, Any]:
     wrong = diagnosis.wrong
     assert wrong is not None
-    size = np.abs(diagnosis.residual[wrong.rows])
+    size = float(np.median(np.abs(diagnosis.residual[wrong.rows])))
+    nothing = dict.fromkeys(("channel", "follows", "disambiguation", "configuration", "improvement"))
     return {
         "cause": "outliers",
-        "channel": None,
-        "follows": None,
-        "signal_to_noise": _round(float(np.sqrt(wrong.ratio))),
-        "p_value": _round(wrong.p_value),
+        "signal_to_noise": float(np.sqrt(wrong.ratio)),
+        "p_value": wrong.p_value,
         "alternatives": [],
-        "disambiguation": None,
         "parameters": {
             "count": {"value": int(wrong.rows.size), "sigma": None, "unit": "1"},
-            "median_amplitude": {"value": _round(float(np.median(size))), "sigma": None, "unit": "nT"},
+            "median_amplitude": {"value": size, "sigma": None, "unit": "nT"},
         },
-        "configuration": None,
-        "improvement": None,
+        **nothing,
     }
 
 
-def _improvement(improvement: Improvement, diagnosis: Diagnosis) -> dict[str, Any]:
+def _improvement(improvement: Improvement, parts: str) -> dict[str, Any]:
     return {
-        "rms_ratio": _round(improvement.ratio),
-        "interval": [_round(improvement.interval[0]), _round(improvement.interval[1])],
-        "level": CONFIDENCE_LEVEL,
-        "held_out": diagnosis.problem.survey.parts,
-    }
+        "rms_ratio": improvement.ratio, "interval": list(improvement.interval), "level": CONFIDENCE_LEVEL,
+        "held_out": parts,
+    }  # fmt: skip
 
 
 def _corrected(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the improvement of the corrected field, compared with a refit of the calibration alone."""
-    found, over = diagnosis.improvement, diagnosis.over_refit
-    day = diagnosis.other_day
-    return _improvement(found, diagnosis) | {
-        "before_nT": _round(found.before),
-        "after_nT": _round(found.after),
-        "refit_nT": _round(over.before),
-        "ratio_to_refit": _round(over.ratio),
-        "interval_to_refit": [_round(over.interval[0]), _round(over.interval[1])],
-        "other_day": None if day is None else _improvement(day, diagnosis) | {"held_out": "days"},
+    found, over, day = diagnosis.improvement, diagnosis.over_refit, diagnosis.other_day
+    return _improvement(found, diagnosis.problem.survey.parts) | {
+        "before_nT": found.before,
+        "after_nT": found.after,
+        "refit_nT": over.before,
+        "ratio_to_refit": over.ratio,
+        "interval_to_refit": list(over.interval),
+        "other_day": day and _improvement(day, "days"),
     }
 
 
-def _round(value: float) -> float:
-    return float(f"{value:.5g}")
+def _round(value: Any) -> Any:
+    """Return plain data with its numbers rounded to five digits; values without a sigma keep theirs.
+
+    An onset, in seconds since 1970, is such a value.
+    """
+    if isinstance(value, dict):
+        exact = value.get("sigma", 0.0) is None
+        return value if exact else {name: _round(x) for name, x in value.items()}
+    if isinstance(value, list):
+        return [_round(x) for x in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
