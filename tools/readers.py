@@ -47,7 +47,7 @@ def by_pymavlink(paths: list[Path]) -> None:
     """Read the kinds of messages that magbridge reads."""
     from pymavlink import mavutil  # noqa: PLC0415
 
-    from magbridge.logs.ardupilot_fields import WANTED  # noqa: PLC0415
+    from magbridge.logs.ardupilot import WANTED  # noqa: PLC0415
     from magbridge.logs.telemetry_fields import MAVLINK_FIELDS  # noqa: PLC0415
 
     for path in paths:
@@ -73,7 +73,7 @@ def by_rosbags(paths: list[Path]) -> None:
     """Read and decode the types of messages that magbridge reads."""
     from rosbags.highlevel import AnyReader  # noqa: PLC0415
 
-    from magbridge.logs.ros_messages import MESSAGE_KINDS  # noqa: PLC0415
+    from magbridge.logs.rosbag import MESSAGE_KINDS  # noqa: PLC0415
 
     for path in paths:
         with AnyReader([path]) as bag:

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import xarray as xr
 
 from magbridge.arrays import FloatArray
+from magbridge.logs.checks import in_order
 from magbridge.logs.compasses import LogCompass, choose, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sliced, uncounted
-from magbridge.logs.order import in_order
 from magbridge.logs.resample import latest
 
 __all__ = ["BootRun", "Fields", "Magnetometer", "Series", "pieces", "values_of"]

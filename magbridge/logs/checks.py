@@ -3,26 +3,27 @@
 One damaged record costs only itself. The longest increasing series of times is kept: a clock
 that was set back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time
 become one. A value beyond what nature has is unknown (NaN). A file of which half is wrong is in other units,
-or in another order, and is refused.
+or in another order, and is refused. Each kind of fault is counted, and the first of each column is named.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 from magbridge.columns import CHANNEL_TIMES, usual
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import merged, with_losses
-from magbridge.logs.faults import Faults
-from magbridge.logs.order import in_order
 
-__all__ = ["checked", "increasing"]
+__all__ = ["MEDIAN_ROWS", "Faults", "boots", "checked", "in_order", "increasing"]
 
 Piece = tuple[xr.Dataset, Sequence[int]]
 """Rows of a deployment, and their numbers in the file."""
@@ -224,3 +225,137 @@ def _rows_to_keep(time: FloatArray, after: float) -> IndexArray:
         groups = [group for group in np.split(index, apart) if len(group) >= MIN_GROUP_ROWS]
         index = np.concatenate(groups) if groups else index
     return index
+
+
+MAX_WRONG_FRACTION = 0.5
+"""Share of the rows, or of a column's values, that are wrong in a file that is refused."""
+
+
+class Faults:
+    """The faults of a file so far.
+
+    Attributes
+    ----------
+    rows : int
+        Rows seen, also the wrong ones.
+    """
+
+    def __init__(self, file: str | Path, *, strict: bool) -> None:
+        self._file, self._strict = file, strict
+        self.rows = 0
+        # by column; "" and time: rows, the others: values
+        self._wrong: Counter[str] = Counter()
+        self._known: Counter[str] = Counter()
+        self._first: dict[str, FormatError] = {}
+        # since they were last asked for
+        self._counts: Counter[str] = Counter()
+        self._lines: list[str] = []
+
+    def note(
+        self, column: str, count: int, row: int, expected: str, counter: str = "", *, wrong: bool = True
+    ) -> None:
+        """Count the faults in a column, also in `counter`; `row` and `expected` are of the first.
+
+        Unknown values are not `wrong`, and may be most of a column. FormatError: `strict`.
+        """
+        error = FormatError(self._file, expected, row=row, column=column or None)
+        if self._strict:
+            raise error
+        self._wrong[column] += count * wrong
+        if counter:
+            self._counts[counter] += count
+        if column not in self._first:
+            self._first[column] = error
+            self._lines.append(str(error))
+
+    def remark(self, line: str) -> None:
+        """Add a line to those that name the losses."""
+        self._lines.append(line)
+
+    def count(self, column: str, known: int) -> None:
+        """Count the values that a column has."""
+        self._known[column] += known
+
+    def lost(self, **counts: int) -> None:
+        """Count losses, by the counters of a deployment."""
+        self._counts.update(counts)
+
+    def since_last(self) -> tuple[Counter[str], list[str]]:
+        """Return the losses since the last call: how much, and the lines that name it."""
+        last = self._counts, self._lines
+        self._counts, self._lines = Counter(), []
+        return last
+
+    def finish(self) -> None:
+        """FormatError: half of the rows, or of a column's values, are wrong."""
+        for column, error in self._first.items():
+            if self._wrong[column] >= MAX_WRONG_FRACTION * (self._known[column] or self.rows):
+                raise error
+
+
+MIN_SET_BACK_S = 1.0
+"""s by which times are set back where a vehicle was switched on again: records of one moment, which tasks of
+their own write, differ by less."""
+MEDIAN_ROWS = 5
+"""Times before and after, whose median is compared: fewer than half of them may be damaged."""
+
+
+def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
+    """Return which rows to keep so that time increases and the fewest are left out.
+
+    A single time that is ahead costs its own row, and not all that follow; so does one set back.
+
+    Parameters
+    ----------
+    time : (n,) array of float
+        s, in the order of the file; NaN is never kept.
+    strictly : bool
+        Of several rows with one time, only the first is kept.
+
+    Returns
+    -------
+    (n,) array of bool
+
+    Notes
+    -----
+    The longest increasing subsequence, by patience sorting from the end, so that of equals the first is kept:
+    C. Schensted (1961), Canad. J. Math. 13, 179.
+    """
+    known = np.isfinite(time)
+    steps = np.diff(time[known])
+    if (steps > 0 if strictly else steps >= 0).all():
+        return known
+    rows, place = np.flatnonzero(known)[::-1], bisect_left if strictly else bisect_right
+    starts: list[float] = []  # starts[k]: minus the greatest first time of an increasing sequence of k + 1,
+    first: list[int] = []  # and its row
+    after: list[int] = [-1] * len(time)
+    for row, one in zip(rows.tolist(), (-time[rows]).tolist(), strict=True):
+        k = place(starts, one)
+        if k == len(starts):
+            starts.append(one)
+            first.append(row)
+        else:
+            starts[k], first[k] = one, row
+        after[row] = first[k - 1] if k else -1
+    keep = np.zeros(len(time), dtype=bool)
+    row = first[-1] if first else -1
+    while row >= 0:
+        keep[row] = True
+        row = after[row]
+    return keep
+
+
+def boots(time: FloatArray) -> IndexArray:
+    """Return the rows at which the clock started again, the first row included.
+
+    Parameters
+    ----------
+    time : (n,) array of float
+        s since the boot, in the order of the file.
+    """
+    found = [0]
+    for k in (1 + np.flatnonzero(np.diff(time) < -MIN_SET_BACK_S)).tolist():
+        before, after = time[max(found[-1], k - MEDIAN_ROWS) : k], time[k : k + MEDIAN_ROWS]
+        if np.median(after) < np.median(before) - MIN_SET_BACK_S:
+            found.append(k)
+    return np.array(found, dtype=np.intp)

@@ -16,9 +16,8 @@ import numpy as np
 import pandas as pd
 
 from magbridge.arrays import FloatArray
-from magbridge.logs.gps_time import GPS_EPOCH, WEEK, leap_seconds
-from magbridge.logs.order import MEDIAN_ROWS, boots
-from magbridge.logs.stamps import DAY, HOURS, SECONDS_SUFFIX, epoch, patterns
+from magbridge.logs.checks import MEDIAN_ROWS, boots
+from magbridge.logs.stamps import DAY, GPS_EPOCH, HOURS, SECONDS_SUFFIX, WEEK, epoch, leap_seconds, patterns
 
 __all__ = ["SECONDS_OF_DAY", "CountState", "TimeFormat", "clock_of", "date_order", "seconds"]
 

@@ -1,4 +1,4 @@
-"""ArduPilot's binary log as columns, read by numpy from the log's own format (``FMT``) records.
+"""ArduPilot's log as columns: binary by numpy, or as text, from the log's own format (``FMT``) records.
 
 A record is the bytes A3 95, the number of its kind, and that kind's fields, as an ``FMT`` record of the
 log describes them: there is neither a length nor a checksum. So a record is believed where it joins another:
@@ -8,6 +8,9 @@ short, and is damage too: its last fields are the next record's bytes.
 
 Only the kinds that are asked for are decoded. Which records there are is found in a few passes over all bytes
 at once; Python steps only from one place to the next where the chain does not go on with the next header.
+
+The text form (``.log``, as Mission Planner and ``mavlogdump.py`` write it) has a record in each line. Its
+values are already in the unit of the field. Lines without a record are counted.
 
 References
 ----------
@@ -27,7 +30,7 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray, IndexArray
 
-__all__ = ["OWN_SCALE", "Flash", "Records", "number_of", "read_binary"]
+__all__ = ["OWN_SCALE", "Flash", "Records", "read_binary", "read_text"]
 
 Bytes = NDArray[np.uint8]
 
@@ -229,3 +232,50 @@ def number_of(text: str) -> float:
         return float(text)
     except ValueError:
         return float("nan")
+
+
+TEXT_TYPES = frozenset("nNZaM")
+
+
+def read_text(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
+    """Return the records of the `wanted` kinds, and of each the wanted fields."""
+    described: dict[str, tuple[str, tuple[str, ...]]] = {}
+    lines: dict[str, list[list[str]]] = {}
+    at: dict[str, list[int]] = {}
+    skipped = 0
+    with path.open(encoding="latin-1", newline="\n") as file:
+        for k, line in enumerate(file):
+            parts = [part.strip() for part in line.split(",")]
+            if parts[0] == "FMT" and len(parts) > 5:
+                described[parts[3]] = parts[4], tuple(parts[5:])
+            elif parts[0] not in described:
+                skipped += parts != [""]
+            elif parts[0] in wanted:
+                if len(parts) - 1 == len(described[parts[0]][1]):
+                    lines.setdefault(parts[0], []).append(parts[1:])
+                    at.setdefault(parts[0], []).append(k)
+                else:
+                    skipped += 1
+    records: dict[str, Records] = {}
+    kept: dict[tuple[str, str], str] = {}
+    for name, rows in lines.items():
+        letters, columns = described[name]
+
+        kept |= {(name, one): letter for one, letter in zip(columns, letters, strict=False)}
+        records[name] = _records(at[name], rows, letters, columns, wanted[name])
+    return Flash(records, kept, skipped)
+
+
+def _records(
+    at: list[int], rows: list[list[str]], letters: str, columns: tuple[str, ...], wanted: Collection[str]
+) -> Records:
+    fields, texts = {}, {}
+    for name, letter, values in zip(columns, letters, zip(*rows, strict=True), strict=False):
+        if name in wanted and letter in TEXT_TYPES:
+            texts[name] = list(values)
+        elif name in wanted:
+            try:
+                fields[name] = np.array(values, dtype=np.float64)
+            except ValueError:  # one of them is damaged
+                fields[name] = np.array([number_of(value) for value in values])
+    return Records(np.array(at, dtype=np.intp), fields, texts)

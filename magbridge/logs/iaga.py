@@ -20,7 +20,7 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import deployment, sliced, with_losses
-from magbridge.logs.packed import opened
+from magbridge.logs.registry import opened
 
 __all__ = ["chunks"]
 

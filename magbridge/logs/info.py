@@ -13,7 +13,7 @@ from magbridge.columns import AGE, CHANNELS, COLUMNS, NT_PER_UNIT, counts_from_b
 from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
-from magbridge.logs.magnetic import READING_RANGE_NT
+from magbridge.logs.naming import READING_RANGE_NT
 
 __all__ = ["INFO_GAP_INTERVALS", "USES", "info", "lacking", "movers", "telemetry"]
 

@@ -20,10 +20,8 @@ from pathlib import Path
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import SETTINGS
 from magbridge.logs.headings import CELL_NUMBER, is_unit
-from magbridge.logs.magnetic import units_of_angles
-from magbridge.logs.makers import declared_by_maker
-from magbridge.logs.mapping import ColumnMapping
-from magbridge.logs.naming import name_columns
+from magbridge.logs.mapping import ColumnMapping, declared_by_maker
+from magbridge.logs.naming import name_columns, units_of_angles
 from magbridge.logs.validity import Validity, validity_of
 from magbridge.wording import counted
 

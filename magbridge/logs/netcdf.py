@@ -28,7 +28,7 @@ from magbridge.files import systems_reason
 from magbridge.logs import seaglider, trajectory
 from magbridge.logs.cf import EPOCH
 from magbridge.logs.deployment import sliced
-from magbridge.logs.unknown import known
+from magbridge.logs.validity import known
 from magbridge.records import Quality
 from magbridge.version import __version__
 

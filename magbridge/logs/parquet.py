@@ -20,7 +20,7 @@ from magbridge.logs.clocks import TimeFormat, clock_of, seconds
 from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, plain_attrs
 from magbridge.logs.layout import LAYOUT_LINES, Layout
 from magbridge.logs.naming import name_columns, on_side
-from magbridge.logs.unknown import known
+from magbridge.logs.validity import known
 
 try:
     import pyarrow as pa

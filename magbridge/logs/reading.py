@@ -20,8 +20,7 @@ from magbridge.errors import FormatError
 from magbridge.files import existing
 from magbridge.guard import Guarded, Job, guarded
 from magbridge.logs.options import Options
-from magbridge.logs.packed import DECOMPRESSION_ERRORS
-from magbridge.logs.registry import LEADS, Format, format_of, is_bag
+from magbridge.logs.registry import DECOMPRESSION_ERRORS, LEADS, Format, format_of, is_bag
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -1,8 +1,9 @@
 """The table of formats: which module reads and writes what, and how a file is recognised.
 
 A file is what its first bytes say; its suffix counts only where they say nothing (CSV, or a log that begins
-with damage). A package adds a format with an entry point in the group ``magbridge.formats``: the suffix
-without its dot, and the module (``examples/format`` is such a package).
+with damage). Text files may be compressed by gzip, bzip2 or xz. A package adds a format with an entry point
+in the group ``magbridge.formats``: the suffix without its dot, and the module (``examples/format`` is such a
+package).
 
 A format's module has ``chunks(path, rows)``, or ``chunks(path, rows, options)`` where
 :class:`~magbridge.logs.options.Options` make a difference to it. It yields deployments of at most `rows` rows
@@ -14,21 +15,27 @@ attributes, also ``metadata``, bytes that are written next to it.
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import lzma
 import re
+import zlib
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 from magbridge.errors import FormatError, PluginError
-from magbridge.logs.packed import DECOMPRESSION_ERRORS, is_packed, opened
 from magbridge.plugins import blamed, load, plugins
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-__all__ = ["FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "metadata_path", "suffixes"]
+__all__ = [
+    "DECOMPRESSION_ERRORS", "FLIGHT", "FORMATS", "LEADS", "Format", "format_of", "is_bag", "metadata_path",
+    "opened", "suffixes",
+]  # fmt: skip
 
 FLIGHT = {".ebd": ".dbd", ".nbd": ".mbd", ".tbd": ".sbd", ".ecd": ".dcd", ".ncd": ".mcd", ".tcd": ".scd"}
 """Suffix of a Slocum's science file to that of its flight file: where both are there, both are read."""
@@ -108,7 +115,7 @@ FORMATS: dict[str, Format] = {
         "magbridge.logs.seaexplorer", (), rb"Timestamp;NavState;|PLD_REALTIMECLOCK;", packed=True
     ),
     "iaga2002": Format("magbridge.logs.iaga", (), rb" ?Format +IAGA-2002", packed=True),
-    "seaglider": Format("magbridge.logs.seaglider_text", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
+    "seaglider": Format("magbridge.logs.seaglider", (".eng",), rb"%?version: [\d.]+\s+%?glider:"),
     "text": Format(
         "magbridge.logs.text",
         (".txt", ".tsv", ".dat", ".asc", ".xyz", ".m77t", ".jsonl", ".ndjson"),
@@ -204,3 +211,24 @@ def _recognised(start: bytes) -> Format | None:
 def metadata_path(path: Path) -> Path:
     """Return where the metadata of a table stand: W3C, *Model for Tabular Data and Metadata*, section 5.3."""
     return path.with_name(f"{path.name}-metadata.json")
+
+
+PACKERS: dict[bytes, Any] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\0": lzma.open}
+"""First bytes -> how it is unpacked."""
+DECOMPRESSION_ERRORS = EOFError, zlib.error, lzma.LZMAError
+"""Errors of damaged ones, in addition to OSError."""
+
+
+def is_packed(path: Path) -> bool:
+    """Whether a file is compressed, by its first bytes."""
+    with path.open("rb") as file:
+        return file.read(6).startswith(tuple(PACKERS))
+
+
+def opened(path: Path) -> IO[bytes]:
+    """Open a file to read its bytes, unpacked."""
+    with path.open("rb") as file:
+        start = file.read(6)
+    unpack = next((unpack for mark, unpack in PACKERS.items() if start.startswith(mark)), Path.open)
+    opened_file: IO[bytes] = unpack(path, "rb")
+    return opened_file

@@ -29,7 +29,7 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, named_losses, sliced, with_losses
 from magbridge.logs.headings import aliases
-from magbridge.logs.packed import opened
+from magbridge.logs.registry import opened
 from magbridge.logs.resample import CIRCLES, degrees, linear
 from magbridge.logs.stamps import epoch
 

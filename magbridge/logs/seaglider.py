@@ -1,8 +1,10 @@
 """A Seaglider's dive: raw compass counts, attitude and the moving masses.
 
-From the netCDF of a basestation, or from the ``.eng`` and ``.log`` that a glider sends
-(:mod:`magbridge.logs.seaglider_text`). Conventions, and how they were found (regression of the raw counts on
-the IGRF rotated by the logged attitude, dives of SG167, SG171, SG180, SG236, SG249, SG272 and SG686):
+From the netCDF of a basestation, or from the ``.eng`` (samples) and ``.log`` (settings, manoeuvres, fixes)
+that a glider sends. Either name, or both, give the same deployment; without its ``.log`` a dive has neither
+masses nor position, and between the fixes before and after the dive the position goes straight. Conventions,
+and how they were found (regression of the raw counts on the IGRF rotated by the logged attitude, dives of
+SG167, SG171, SG180, SG236, SG249, SG272 and SG686):
 
 - ``mag_x/y/z`` are x forward, y starboard, z down, as ours: the 3x3 matrix of that regression is the identity
   to 5 % with few elements off the diagonal above 0.05;
@@ -21,8 +23,10 @@ it, all others 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +39,10 @@ from magbridge.errors import FormatError
 from magbridge.field.igrf import total_field
 from magbridge.field.reference import sphere_radius
 from magbridge.logs.cf import floats
-from magbridge.logs.deployment import deployment, with_losses
-from magbridge.logs.resample import CIRCLES, linear
+from magbridge.logs.deployment import deployment, sliced, with_losses
+from magbridge.logs.resample import CIRCLES, degrees, linear
 
-__all__ = ["COMPASS_NT_PER_COUNT", "DIMENSION", "Dive", "dive", "read_netcdf"]
+__all__ = ["DIMENSION", "chunks", "dive", "read_netcdf"]
 
 DIMENSION = "sg_data_point"
 COMPASS_NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
@@ -237,3 +241,90 @@ def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
     if name not in file.variables or file[name].shape != (size,) or file[name].dtype == str:
         return None
     return floats(file[name]) if file[name].dtype.kind in "iuf" else None
+
+
+HEADER_LINE = re.compile(r"%?(\w+):\s*(.*)")
+GPS_LINE = re.compile(r"\$GPS\d?,(\d{6}),(\d{6}),(-?\d+\.\d+),(-?\d+\.\d+)")
+
+
+def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
+    """Yield the dive in pieces of at most `rows` rows.
+
+    FormatError: no samples, or no magnetometer among them.
+    """
+    samples, log = path.with_suffix(".eng"), path.with_suffix(".log")
+    if not samples.is_file():
+        raise FormatError(path, f"expected {samples.name}, the samples of this dive, in the same folder")
+    known = _samples(samples)
+    if log.is_file():
+        _add_log(known, log)
+    yield from sliced(dive(path, known), rows)
+
+
+def _samples(path: Path) -> Dive:
+    """Return what the ``.eng`` holds."""
+    header, rows = _split(path)
+    names = re.split(r"[,\s]+", header.get("columns", "").replace(".", "_").strip())
+    start = _start(path, header)
+    width = len(names)
+    whole = [fields for fields in (line.split() for line in rows) if len(fields) == width]
+    try:
+        table = np.array(whole, float).reshape(-1, width).T
+    except ValueError as error:
+        raise FormatError(path, f"expected numbers: {error}") from None
+    sampled = dict(zip(names, table, strict=True))
+    if "elaps_t" not in sampled or not table.shape[1]:
+        raise FormatError(path, "expected rows with elaps_t, as of a Seaglider's samples")
+    if "depth" in sampled:
+        sampled["depth"] = sampled["depth"] * 0.01  # cm
+    return Dive(start + sampled["elaps_t"], sampled, max_gap=np.inf)
+
+
+def _add_log(known: Dive, path: Path) -> None:
+    """Add what the ``.log`` holds: parameters, manoeuvres (s from the start of the dive), fixes."""
+    header, rows = _split(path)
+    start = _start(path, header)
+    names: list[str] = []
+    manoeuvres: list[list[float]] = []
+    fixes: list[tuple[float, float, float]] = []
+    for line in rows:
+        name, *values = line.strip().lstrip("$").split(",")
+        if name == "GCHEAD":
+            names = values
+        elif name == "GC" and len(values) == len(names):
+            manoeuvres.append([_number(value) for value in values])
+        elif found := GPS_LINE.match(line):
+            when = datetime.strptime(found[1] + found[2], "%d%m%y%H%M%S").replace(tzinfo=UTC).timestamp()
+            fixes.append((when, *degrees([found[3], found[4]])))
+        elif len(values) in (1, 2):  # a canonical log also has the default
+            known.settings[name] = _number(values[0])
+    known.manoeuvres = dict(zip(names, np.array(manoeuvres, float).reshape(-1, len(names)).T, strict=True))
+    for name in {"st_secs", "end_secs"} & known.manoeuvres.keys():
+        known.manoeuvres[name] += start
+    if fixes:
+        when, latitude, longitude = np.array(sorted(fixes)).T
+        known.elsewhere = {"latitude": (when, latitude), "longitude": (when, longitude)}
+
+
+def _split(path: Path) -> tuple[dict[str, str], list[str]]:
+    """Return the header of a file, and the lines after it."""
+    lines = path.read_text(encoding="ascii", errors="replace").splitlines()
+    ends = next((k for k, line in enumerate(lines) if line.lstrip("%").startswith("data:")), len(lines))
+    header = {found[1]: found[2] for line in lines[:ends] if (found := HEADER_LINE.match(line))}
+    return header, lines[ends + 1 :]
+
+
+def _start(path: Path, header: dict[str, str]) -> float:
+    """Return the s since 1970 of ``start: 02 03 126 19 35 52``, month day year-1900 hour minute second."""
+    try:
+        month, day, year, hour, minute, second = (int(part) for part in header["start"].split())
+        return datetime(1900 + year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+    except (KeyError, ValueError):
+        raise FormatError(path, "expected its start, as of a Seaglider's dive", column="start") from None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float("nan")

@@ -2,7 +2,7 @@
 
 A pattern is one of :meth:`datetime.strptime`, or ends in `` s``, for the seconds of the day. A second's
 fraction is not part of it: behind the seconds, after a point, a comma or a colon, it is read whatever the
-pattern.
+pattern. GPS time has no leap seconds: it is ahead of UTC by :func:`leap_seconds`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import pandas as pd
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["DAY", "HOURS", "SECONDS_SUFFIX", "epoch", "patterns"]
+__all__ = ["DAY", "GPS_EPOCH", "HOURS", "SECONDS_SUFFIX", "WEEK", "epoch", "leap_seconds", "patterns"]
 
 DAY = 86_400.0
 HOURS = ("%H:%M:%S", "%H:%M", "%I:%M:%S %p", "%I:%M %p", "%H%M%S")
@@ -99,3 +99,32 @@ def epoch(texts: pd.Series, pattern: str, zone: str | None = None) -> FloatArray
     whole = counts.astype("datetime64[s]")  # separately, so that no digit is lost
     times = whole.astype(np.int64) + ((counts - whole).astype(np.int64) * 1e-6 + seconds)
     return np.asarray(np.where(np.isnat(counts), np.nan, times), np.float64)
+
+
+GPS_EPOCH = 315_964_800.0
+"""s since 1970 of 1980-01-06, where GPS weeks begin."""
+WEEK = 604_800.0
+"""Length of a GPS week, s."""
+LEAPS = (
+    (1_483_228_800, 18),
+    (1_435_708_800, 17),
+    (1_341_100_800, 16),
+    (1_230_768_000, 15),
+    (1_136_073_600, 14),
+    (0, 13),
+)
+"""From when on (s since 1970) GPS time is ahead of UTC by how many s; IERS Bulletin C 52, from 1999 on."""
+
+
+def leap_seconds(gps: FloatArray) -> FloatArray:
+    """Return by how many s GPS time is ahead of UTC, (n,).
+
+    Parameters
+    ----------
+    gps : (n,) array
+        GPS time, in s since 1970.
+    """
+    leap = np.zeros(len(gps))
+    for since, ahead in reversed(LEAPS):
+        leap[gps - ahead >= since] = ahead
+    return leap

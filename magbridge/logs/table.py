@@ -14,12 +14,12 @@ import pandas as pd
 from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import absent
 from magbridge.errors import FormatError
+from magbridge.logs.checks import Faults
 from magbridge.logs.clocks import CountState, TimeFormat, clock_of, date_order, seconds
-from magbridge.logs.faults import Faults
 from magbridge.logs.layout import BLANKS, LAYOUT_LINES, Layout, cells
 from magbridge.logs.naming import HEMISPHERES, on_side
 from magbridge.logs.stamps import DAY
-from magbridge.logs.unknown import EXPECTED_VALUE, unknown
+from magbridge.logs.validity import EXPECTED_VALUE, unknown
 from magbridge.records import Quality
 from magbridge.wording import counted
 

@@ -36,8 +36,7 @@ from magbridge.logs import captures
 from magbridge.logs.deployment import GUESSED_ATTRIBUTE, HISTORY_ATTRIBUTE, deployment, lasting, with_losses
 from magbridge.logs.layout import LAYOUT_LINES, is_remark, layout_of
 from magbridge.logs.options import Options
-from magbridge.logs.packed import opened
-from magbridge.logs.registry import metadata_path
+from magbridge.logs.registry import metadata_path, opened
 from magbridge.logs.table import TextTable
 from magbridge.records import Quality
 

@@ -1,8 +1,10 @@
-"""Columns that state which values of a text file are valid: ``Valid``, ``MagValid``, ``TEMP_QC``, ``Flag``.
+"""Values of a file that are not valid: by a column that states it, or by a code for "not known".
 
 A column ``Valid`` is 0 in rows that are not valid, ``MagValid`` where the field is not. A column ``X_QC`` has
 the quality flags of column ``X``, of which 3, 4 and 9 are bad or missing. A column ``Flag`` with the values 0
 and 1 marks the rarer of the two.
+
+Programs without NaN write codes such as -999 for "not known"; :func:`unknown` finds them.
 
 References
 ----------
@@ -13,12 +15,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+import xarray as xr
+
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import CHANNELS
+from magbridge.errors import FormatError
+from magbridge.logs.deployment import with_losses
 from magbridge.logs.headings import bare
 
-__all__ = ["Validity", "validity_of"]
+__all__ = ["EXPECTED_VALUE", "Validity", "known", "unknown", "validity_of"]
 
 VALID = re.compile("(is|data|row|sample)?valid(ity)?")
 MAG_VALID = re.compile("(mag|field|tmi)(is)?valid(ity)?")
@@ -80,3 +89,55 @@ def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Val
 def _column(name: str, names: Sequence[str]) -> str:
     """Return the column that a name means, also in other letters; '' where there is none."""
     return next((other for other in names if other and bare(other) == bare(name)), "")
+
+
+EXPECTED_VALUE = "expected a value, or nothing where it is not known, not "
+
+CODES = np.outer([-1.0, 1.0], [
+    9999.0, 99999.0, 999999.0, 9999.9, 99999.9, 99999.99, 999.25, 88888.0, 88888.88, 32767.0, 32768.0,
+    2_147_483_647.0, 69_696_969.0, 999.0, 999.9, 999.99,
+])  # fmt: skip
+"""As they are met, with either sign."""
+ONLY_AMONG_OTHERS = 1_000.0
+"""Smaller codes count only where the column has other values, too."""
+MIN_FILL_VALUE = 1e30
+"""A larger number is one, too, whatever it measures: 1e31, 1e34, 9.97e36."""
+
+
+def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
+    """Return which values of some columns, (n,) each, stand for "not known", without being declared.
+
+    They are huge, or one of :data:`CODES` that lies beyond all others by half their range. A field whose
+    three axes are 0, or the same code, is none, nor is a place at 0, 0: a receiver without a fix writes it.
+    """
+    found = {name: _is_code(values) for name, values in columns.items() if name not in {"time", "quality"}}
+    for together in (CHANNELS, ("latitude", "longitude")):
+        if set(together) <= set(columns):
+            first, *others = (columns[name] for name in together)
+            alike = np.all([first == other for other in others], axis=0)
+            alike &= (first == 0.0) | np.isin(first, CODES)
+            found |= {name: found[name] | alike for name in together}
+    return {name: wrong for name, wrong in found.items() if wrong.any()}
+
+
+def _is_code(values: FloatArray) -> BoolArray:
+    wrong: BoolArray = np.abs(values) > MIN_FILL_VALUE
+    codes = np.isin(values, CODES)
+    others = values[np.isfinite(values) & ~codes & ~wrong]
+    if not len(others):
+        codes &= np.abs(values) >= ONLY_AMONG_OTHERS
+    if codes.any():
+        low, high = (others.min(), others.max()) if len(others) else (0.0, 0.0)
+        wrong |= codes & (np.maximum(low - values, values - high) > max(0.5 * (high - low), 1.0))
+    return wrong
+
+
+def known(path: Path, dataset: xr.Dataset) -> xr.Dataset:
+    """Return a deployment of another program without what stands for "not known": counted, and named."""
+    codes = unknown({str(name): column.to_numpy() for name, column in dataset.data_vars.items()})
+    lines = []
+    for name, wrong in codes.items():
+        values = dataset[name].to_numpy()
+        lines.append(str(FormatError(path, f"{EXPECTED_VALUE}{float(values[wrong][0])!r}", column=name)))
+        dataset = dataset.assign({name: dataset[name].copy(data=np.where(wrong, np.nan, values))})
+    return with_losses(dataset, {"values_dropped": sum(int(wrong.sum()) for wrong in codes.values())}, lines)

@@ -15,8 +15,7 @@ from pymavlink.DFReader import DFReader_binary, DFReader_text
 from magbridge import logs
 from magbridge.logs import Options
 from magbridge.logs.compasses import compasses_in
-from magbridge.logs.dataflash import Flash, read_binary
-from magbridge.logs.dataflash_text import read_text
+from magbridge.logs.dataflash import Flash, read_binary, read_text
 from magbridge.logs.deployment import noted
 
 EVERYTHING = {name: set(fields.split(",")) for name, (_, _, fields) in KINDS.items()}

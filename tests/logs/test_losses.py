@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from magbridge import logs
 from magbridge.errors import FormatError
-from magbridge.logs.checks import checked
+from magbridge.logs.checks import checked, in_order
 from magbridge.logs.deployment import deployment, named_losses, passed_over
-from magbridge.logs.order import in_order
 
 T0 = 1.7e9
 
