@@ -157,7 +157,7 @@ def test_a_disk_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_missing_channels_are_named(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
     path.write_text("time,mag_x,battpos\n1,2,3\n")
-    lacking = "log.csv: column 'mag_y': expected this column; did you mean mag_x.; there are: mag_x battpos; if one"
+    lacking = "log.csv: column 'mag_y': expected this column; did you mean mag_x.; there are: mag_x battpos"
     for read in (logs.read, lambda path, required: list(logs.read_chunks(path, required=required))):
         with pytest.raises(FormatError, match=lacking):
             read(path, required=CHANNELS)
