@@ -30,6 +30,14 @@ The JSON lines of runMag (HamSCI), with counts at a cycle count of 200::
     keys = ["rx", "ry", "rz", "lt"]
     unit = "counts"
     scale = 13.333
+
+A scalar instrument: Marine Magnetics Explorer and SeaSPY2, whose lines begin with
+``*26.150/12:34:56.7 F:050123.456 S:142 D:+001.2m``::
+
+    [sensor.options]
+    prefix = "*"
+    columns = ["total_field"]
+    keys = ["F"]
 """
 
 from __future__ import annotations
@@ -177,6 +185,7 @@ class Ascii:
         self._others = [
             (name, at, COLUMN_READERS[name]) for at, name in enumerate(columns) if name in COLUMN_READERS
         ]
+        self._used = [*self._field, *(index for _, index, _ in self._others)]
         self._prefix = options.prefix.encode(ENCODING)
         self._separator = options.separator.encode(ENCODING) or None
         self._counts = options.unit == "counts"
@@ -226,11 +235,13 @@ class Ascii:
         line = line.rstrip(b"\r")
         if self._options.checksum:
             line = strip_checksum(line, self._options.checksum)
-        if not line.startswith(self._prefix) or b"_" in line:  # Python's numbers may hold underscores
+        if not line.startswith(self._prefix):
             raise ValueError
         cells = self._cells(line[len(self._prefix) :])
         if len(cells) != self._width and not (self._more and len(cells) > self._width):
             raise ValueError
+        if b"_" in line and any(b"_" in cells[index] for index in self._used):
+            raise ValueError  # Python's numbers may hold underscores
         x, y, z = [*(float(cells[index]) for index in self._field), 0.0, 0.0][:3]
         scale = self._scale
         field = (x * scale, y * scale, z * scale)

@@ -12,7 +12,7 @@ import pytest
 
 from magbridge.errors import ConfigError
 from magbridge.records import Reading
-from magbridge.sensors import open_driver
+from magbridge.sensors import is_scalar, open_driver
 
 
 def read(text: str, **options: Any) -> list[Reading]:
@@ -175,3 +175,34 @@ def test_values_are_found_by_their_keys(line: bytes) -> None:
 def test_a_key_for_each_column() -> None:
     with pytest.raises(ConfigError, match="keys: expected one for each of the 4 columns"):
         open_driver("ascii", {**RUNMAG, "keys": ["rx"]})
+
+
+@pytest.mark.parametrize(
+    ("line", "options", "total"),
+    [
+        (
+            "*26.150/12:34:56.7 F:050123.456 S:142 D:+001.2m A:003.4 L:0 120ms_Q:07 !!!!",
+            {"prefix": "*", "keys": ["F"]},
+            50_123.456,
+        ),
+        ("$ 50123.45  142  0012", {"prefix": "$", "columns": ["total_field", "-", "-"]}, 50_123.45),
+        ("$ 49895.131,1249", {"prefix": "$", "separator": ",", "columns": ["total_field", "-"]}, 49_895.131),
+        ("142244.0 48464.53 99", {"columns": ["-", "total_field", "-"]}, 48_464.53),
+        ("04-22-2015 142244  48464.53 99", {"columns": ["-", "-", "total_field", "-"]}, 48_464.53),
+        ('{"Tm": 48.46453}', {"keys": ["Tm"], "unit": "uT"}, 48_464.53),
+    ],
+)
+def test_lines_of_scalar_instruments(line: str, options: dict[str, Any], total: float) -> None:
+    driver = open_driver("ascii", {"columns": ["total_field"]} | options)
+    gps = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
+    (reading,) = driver.feed(gps + line.encode() + b"\r\n")
+    assert reading.field == pytest.approx((total, 0.0, 0.0))
+    assert reading.counts is not None
+    assert reading.counts[0] * driver.nt_per_count == pytest.approx(total, abs=1e-4)
+    assert is_scalar(driver)
+    assert driver.frames_bad == 1
+
+
+def test_underscores_in_a_number_are_refused() -> None:
+    assert read("1_0 2 3\n") == []
+    assert len(read("1 2 3 a_b\n", columns=["x", "y", "z", "-"])) == 1
