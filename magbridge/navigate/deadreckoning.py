@@ -68,13 +68,15 @@ class DeadReckoning:
         m through the water since the start.
     noise : MotionNoise
         Uncertainty of the motion since the start.
+    time : float
+        s, of the last motion; NaN before the first.
     """
 
     def __init__(self) -> None:
         self.latitude = self.longitude = nan
         self.depth, self.travelled = 0.0, 0.0
         self.noise = MotionNoise()
-        self._time = self._reported = nan
+        self.time = self._reported = nan
         self._velocity = self._steady = (0.0, 0.0)
         self._heading = self._pitch = self._speed = nan
         self._dive = (nan, nan)  # time and depth since when the rate of depth is taken
@@ -98,16 +100,16 @@ class DeadReckoning:
 
     def advance(self, time: float) -> None:
         """Move along the last known velocity up to `time` (s)."""
-        elapsed = time - self._time
+        elapsed = time - self.time
         if elapsed <= 0.0:
             return
         if isfinite(elapsed) and elapsed < MAX_TELEMETRY_GAP_S:
             self._move(self._velocity[0] * elapsed, self._velocity[1] * elapsed)
-        self._time = time
+        self.time = time
 
     def ahead(self, time: float) -> tuple[float, float]:
         """Return latitude and longitude at `time`, along the last known velocity, without moving there."""
-        elapsed = time - self._time
+        elapsed = time - self.time
         if not 0.0 < elapsed < MAX_TELEMETRY_GAP_S:
             return self.latitude, self.longitude
         return offset(self.latitude, self.longitude, self._velocity[0] * elapsed, self._velocity[1] * elapsed)

@@ -179,7 +179,7 @@ class Estimate:
             if widest(self.alone) < self._resolution:
                 self._level = float(self.P[4, 4]), block.time_us
             then_us, before, earlier = self._measured
-            seconds = (block.time_us - then_us) * 1e-6
+            seconds = max((block.time_us - then_us) * 1e-6, 0.0)
             self.step = Step(seconds, travelled - before, motion.since(earlier))
             self._measured = block.time_us, travelled, motion
             self._judge(block, seen)
@@ -192,7 +192,12 @@ class Estimate:
         return seen
 
     def predict(self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> None:
-        """Propagate to `time_us`, `travelled` m after the start."""
+        """Propagate to `time_us`, `travelled` m after the start.
+
+        The mean time of samples may precede a fix that came before the last of them: the estimate does not go
+        back, because a covariance can only be propagated forward.
+        """
+        time_us = max(time_us, self.time_us)
         seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self.travelled
         F, Q = transition(self.options, seconds, metres, motion.since(self.motion))
         self.time_us, self.travelled, self.motion = time_us, travelled, motion

@@ -31,6 +31,8 @@ from magbridge.records import Corrected, Quality
 __all__ = ["NO_POSITION_FLAGS", "Navigator"]
 
 NO_POSITION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED)
+MAX_SAMPLE_AGE_S = 10.0
+"""s by which a sample may be older than the dead-reckoned position, which does not go back to its place."""
 FRESH = 3.0
 """Intervals: no position is dead-reckoned from an update older than that."""
 
@@ -45,7 +47,7 @@ class Navigator:
     gnss : GnssMonitor
         Whether the positions of the receiver are used.
     dropped : int
-        Number of samples that were dropped because they came out of time order.
+        Number of samples that were dropped because they came out of time order, or too late.
     utc_offset_us : int
         µs to be added to the samples' times for UNIX time, where the host's clock was set since the start.
     """
@@ -156,15 +158,16 @@ class Navigator:
     def measure(self, time_us: int, total_field: float, sigma: float) -> Record | None:
         """Add a total field and its 1-sigma, nT; return the update that it completes, or None.
 
-        A sample that is NaN, not later than the previous one, or before any position is ignored.
+        A sample is ignored if it is NaN, not later than the previous one, older than the dead-reckoned
+        position by more than :data:`MAX_SAMPLE_AGE_S`, or before any position.
         """
         if self.estimate.state is State.OFF or not isfinite(total_field + sigma):
             return None
-        if time_us <= self._latest_us:
+        where = self._reckoning
+        if time_us <= self._latest_us or time_us * 1e-6 < where.time - MAX_SAMPLE_AGE_S:
             self.dropped += 1
             return None
         self._latest_us = time_us
-        where = self._reckoning
         where.advance(time_us * 1e-6)
         block = self._collector.add(time_us, where, total_field, sigma, self.utc_offset_us)
         return None if block is None else self._update(block)

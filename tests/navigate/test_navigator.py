@@ -106,6 +106,24 @@ def test_samples_that_cannot_be_used(grid: AnomalyGrid, options: Options) -> Non
     assert nav.dropped == 1
 
 
+def test_samples_from_before_a_fix_keep_the_covariance_positive(grid: AnomalyGrid, options: Options) -> None:
+    """A sensor hands over what it has stored, or its clock stands still, while GPS positions come."""
+    nav = _fresh(grid, options)
+    nav.telemetry(START_US, heading=0.0, speed=0.35)
+    for k in range(1, 40):
+        nav.measure(START_US + k * 4_000_000, 52_300.0, 1.0)
+    later_us = START_US + 3_600_000_000
+    nav.gnss_position(later_us, float(grid.latitude.mean()), float(grid.longitude.mean()), 5.0)
+    for k in range(40, 60):
+        assert nav.measure(START_US + k * 4_000_000, 52_300.0, 1.0) is None
+    assert nav.dropped == 20
+    for k in range(20):
+        nav.gnss_position(later_us + k * 4_000_000, nav.reckoned(0)[0], nav.reckoned(0)[1], 5.0)
+        nav.measure(later_us + k * 4_000_000 - 1_000_000, 52_300.0, 1.0)
+        assert np.linalg.eigvalsh(nav.estimate.P)[0] > 0.0
+    assert nav.dropped == 20
+
+
 def test_nothing_before_a_start(grid: AnomalyGrid) -> None:
     nav = Navigator(grid)
     assert nav.estimate.state is State.OFF
