@@ -1,4 +1,4 @@
-"""What the fault tests share: bridges on the bench, and the table of what was measured."""
+"""Fixtures of the fault tests: bridges on the bench, and the table of the results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROWS: list[tuple[str, str, str, str]] = []
 
 @pytest.fixture(scope="module")
 def table() -> Iterator[Callable[[str, str, str, str], None]]:
-    """Take rows of the table of faults; MAGBRIDGE_FAULTS names the file to write it to (with ``-n 0``)."""
+    """Collect rows of the table of faults; MAGBRIDGE_FAULTS names its file (with ``-n 0``)."""
 
     def row(fault: str, meanwhile: str, well: str, lost: str) -> None:
         ROWS.append((fault, meanwhile, well, lost))
@@ -26,7 +26,7 @@ def table() -> Iterator[Callable[[str, str, str, str], None]]:
             "fault",
             "what the bridge publishes meanwhile",
             "recovers after",
-            "what is lost, and where it is counted",
+            "losses, and their counter",
         )
         lines = [header, ("---",) * 4, *ROWS]
         Path(path).write_text("".join(f"| {' | '.join(line)} |\n" for line in lines), encoding="utf-8")

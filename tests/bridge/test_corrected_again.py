@@ -32,7 +32,7 @@ BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
 def test_what_was_set_in_the_course_of_the_log_is_told(
     tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Neither what was refused, nor the rate of a message."""
+    """Neither refused values nor the rate of a message are corrected again."""
     pipeline = small_bridge(tmp_path, Start(START), BATTERY, ["MAG_FIELD"])
     station = Codec(1, 1)
     log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"

@@ -1,4 +1,4 @@
-"""The one clock: what it tells of the host's two."""
+"""The one clock, made of the host's two."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A station reads a log while the bridge measures; the bridge's own log stays what it was."""
+"""A station reads a log while the bridge measures; the bridge's own log is unchanged."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Station:
         self._socket.send(self._codec.pack(name, **fields))
 
     def ask(self, opcode: int, data: bytes = b"", *, session: int = 0, size: int = 0, offset: int = 0) -> int:
-        """Send an FTP request; return where what follows begins in what is heard."""
+        """Send an FTP request; return the position of the next message in the received ones."""
         mark, self._sequence = len(self.received), self._sequence + 1
         header = FTP_HEADER.pack(self._sequence, session, opcode, size or len(data), 0, 0, offset)
         payload = (header + data).ljust(251, b"\0")
@@ -98,7 +98,7 @@ def test_a_log_is_read_while_the_bridge_measures(make_rig: MakeRig, key: bytes |
     after = rig.fresh_status()
     assert after["samples_lost"] == before["samples_lost"]
     assert rig.undue_flags(mark) == ""
-    # nobody else got the file, and what the station got is numbered without a gap
+    # no other peer got the file, and its frames are numbered without a gap
     assert not rig.of("FILE_TRANSFER_PROTOCOL", mark)
     numbers = [one.sequence for one in station.received if one.system == 1]
     assert all((b - a) % 256 == 1 for a, b in itertools.pairwise(numbers))

@@ -1,4 +1,4 @@
-"""When fixes go to the autopilot, and what is told of it."""
+"""When fixes go to the autopilot, and their messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_none_while_gps_is_good_and_none_from_the_moment_it_is_back() -> None:
     assert bench.fix() == []
     bench.to(2)
     bench.receive("GPS_RAW_INT", fix_type=1)
-    assert [one.name for one in bench.fix()] == ["COMMAND_INT"], "lost as soon as it says so"
+    assert [one.name for one in bench.fix()] == ["COMMAND_INT"], "lost as soon as it reports it"
     bench.to(4)
     bench.receive("GPS_RAW_INT", **GOOD)
     assert bench.fix() == []
@@ -140,7 +140,7 @@ def test_an_autopilot_that_does_not_answer_is_told() -> None:
 
 
 def test_what_ardupilot_would_believe_too_much_is_not_sent() -> None:
-    """Its EKF takes no external position for worse than 10 m, and five alike a second for five new ones."""
+    """Its EKF takes no position for worse than 10 m, and five equal ones a second as five new ones."""
     bench = Bench("ODOMETRY")
     bench.receive("HEARTBEAT", autopilot=ARDUPILOT)
     bench.receive("GPS_GLOBAL_ORIGIN", latitude=495_000_000, longitude=-579_000_000)
@@ -205,7 +205,7 @@ def test_a_later_ardupilot_fuses_and_accepts_both_messages(
 
 
 def test_an_autopilot_that_does_not_use_the_fixes_is_reported() -> None:
-    """It answers ACCEPTED, or nothing at all, and flies on 600 m away: within a minute that is said."""
+    """It answers ACCEPTED, or nothing at all, and flies on 600 m away: this is reported within a minute."""
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
     there = {"lat": round(PLACE[0] * 1e7) + 54_000, "lon": round(PLACE[1] * 1e7)}
     for k in range(60):

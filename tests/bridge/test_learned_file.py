@@ -1,4 +1,4 @@
-"""What was learned, as a file: whole or as it was, and no reason not to fly."""
+"""The learned calibration as a file: complete or unchanged, and never a reason not to fly."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def flown(tmp_path: Path) -> Flown:
 
 
 def test_it_is_kept_beside_the_first(flown: Flown) -> None:
-    """A calibration like any other, with where it comes from; only what is new is written."""
+    """An ordinary calibration with its provenance; only changes are written."""
     folder, _, learning = flown
     path = kept_path(load_config(folder / "bridge.toml"))
     assert path == folder / "cal-learned.json"
@@ -58,7 +58,7 @@ def test_it_is_kept_beside_the_first(flown: Flown) -> None:
 
 @pytest.mark.parametrize(("to", "why"), [("", "File too large"), ("nowhere/", "No such file or directory")])
 def test_a_disk_that_does_not_take_it_leaves_the_old_one(flown: Flown, to: str, why: str) -> None:
-    """What was learned is published all the same, and the reason fits into one STATUSTEXT."""
+    """The learned calibration is published anyway, and the reason fits into one STATUSTEXT."""
     folder, pipeline, learning = flown
     path = folder / "cal-learned.json"
     path.write_bytes(before := (folder / "cal.json").read_bytes())
@@ -75,7 +75,7 @@ def test_a_disk_that_does_not_take_it_leaves_the_old_one(flown: Flown, to: str, 
 
 
 def test_killed_while_it_is_written_the_old_one_stays_and_the_first_flies(flown: Flown) -> None:
-    """The next one to be kept clears what was left."""
+    """The next saved file removes the remains."""
     folder, _, learning = flown
     path, first = folder / "cal-learned.json", calibration_id(load(folder / "cal.json"))
     assert keep(learning, path) == ""
@@ -94,7 +94,7 @@ def test_killed_while_it_is_written_the_old_one_stays_and_the_first_flies(flown:
 
 
 def test_one_that_somebody_cut_short_is_not_read(flown: Flown) -> None:
-    """The bridge starts with its first calibration, and writes the learned one anew."""
+    """The bridge starts with its first calibration, and writes the learned one again."""
     folder, _, learning = flown
     path = folder / "cal-learned.json"
     path.write_text('{"format": "magbri', encoding="utf-8")

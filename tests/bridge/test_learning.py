@@ -43,7 +43,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pipeline, li
 def test_what_was_learned_is_announced_and_named_in_every_message(
     flight: tuple[Path, Pipeline, list[tuple[int, bytes]]],
 ) -> None:
-    """The id changes once what is learned is published, in MAG_FIELD and in MAG_STATUS alike."""
+    """The id changes when the learned calibration is published, both in MAG_FIELD and in MAG_STATUS."""
     folder, pipeline, sent = flight
     messages = received(sent)
     first = calibration_id(load(folder / "cal.json"))
@@ -88,7 +88,7 @@ def test_ashore_it_learns_what_it_learned_live(
 
 
 def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
-    """The parameter that does something goes back to 0; what was forgotten is no longer published."""
+    """The command parameter returns to 0; the forgotten calibration is no longer published."""
     pipeline = bridge(tmp_path)
     station = Codec(255, 190)
     to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
@@ -160,7 +160,7 @@ def test_from_nothing_live_and_ashore(tmp_path: Path) -> None:
     assert int(fields[0]["flags"]) & Quality.UNCALIBRATED
     assert fields[0]["total_field_sigma"] > 1000.0
     assert not int(fields[-1]["flags"]) & Quality.UNCALIBRATED
-    assert fields[-1]["total_field_sigma"] < 500.0  # the level, which nobody sees
+    assert fields[-1]["total_field_sigma"] < 500.0  # includes the unobservable level
     assert abs(fields[-1]["total_field"] - 51_900.0) < 2.0 * fields[-1]["total_field_sigma"]
     assert np.std([one["total_field"] for one in fields[-100:]]) < 15.0
     out, log_file = tmp_path / "out.nc", sorted((tmp_path / "logs").iterdir())

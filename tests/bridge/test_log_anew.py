@@ -1,4 +1,4 @@
-"""A log in several files: cut anywhere it replays as one; after a loss its replay says what is missing."""
+"""A log in several files: it replays as one; after a loss its replay reports the missing part."""
 
 from __future__ import annotations
 

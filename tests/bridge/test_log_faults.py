@@ -40,7 +40,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path | None]:
 
 
 def ballast(disk: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Return what fills a disk, and what makes room on it again."""
+    """Return a function that fills a disk, and one that frees space on it."""
     file = disk / "ballast"
 
     def fill() -> None:
@@ -92,10 +92,10 @@ def test_disk_full(make_rig: MakeRig, small_disk: Path | None, table: Row) -> No
     texts = next(line for line in rig.texts(mark) if line.startswith("log: ") and "written" not in line)
     assert texts == ("log: No space left on device" if small_disk is not None else "log: File too large")
     table(
-        "disk full, then room again",
+        "disk full, then space again",
         f'the field goes on without a flag; STATUSTEXT "{texts}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
-        f"the log in between: `log_lost` {lost} records; what was written before can be read to its end",
+        f"the log in between: `log_lost` {lost} records; the earlier part can be read to its end",
     )
 
 
@@ -126,7 +126,7 @@ def test_a_log_that_is_removed(make_rig: MakeRig, table: Row) -> None:
         f'the field goes on without a flag; STATUSTEXT "{texts}", `log_state` failed',
         f"{mended:.1f} s, in a new file",
         f"the deleted log and the records until the new one: `log_lost` {rig.status['log_lost']} records; "
-        "the new one lacks what the bridge knew when it began; its replay says so, and in how many samples "
+        "the new one lacks the earlier state of the bridge; its replay reports this, and in how many samples "
         "the field is the same",
     )
 

@@ -34,7 +34,7 @@ START = 1_780_000_000_000_000
 PLACE = (49.5, -57.9)
 SPEED, HEADING, OFF, DEPTH = 0.5, 60.0, 150.0, 1.0
 ORIGIN, ORIGIN_ALTITUDE = (49.51, -57.93), 12.0
-"""deg and m: of the autopilot's local frame, on a hill beside the water."""
+"""Origin of the autopilot's local frame (deg, deg, m), on a hill near the water."""
 QUATERNION = (0.8487626, 0.0993347, -0.1720527, 0.4900333)
 """Of 60 deg of yaw and -0.4 rad of pitch."""
 SENSOR = {"sensitivity": 5e-5, "reference_voltage": 5.0}
@@ -215,7 +215,7 @@ def test_the_same_events_give_the_same_fixes(sailed: Sailed, folder: Path) -> No
 
 
 def test_odometry_goes_on_between_updates(sailed: Sailed, folder: Path) -> None:
-    """At 5 Hz, its doubt growing; and it ends when the field does."""
+    """At 5 Hz with growing uncertainty; it ends with the field."""
     if sailed.kind != "ODOMETRY":
         pytest.skip("the others go out with each update")
     times = np.array([one["time_usec"] for one in sailed.fixes])

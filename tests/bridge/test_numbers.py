@@ -59,7 +59,7 @@ def test_in_the_telemetry(pipeline: Pipeline, value: float) -> None:
 
 
 def fields(sent: list[tuple[int, bytes]]) -> list[Message]:
-    """Return each MAG_FIELD that was said."""
+    """Return each sent MAG_FIELD."""
     messages = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
     return [one for one in messages if one.name == "MAG_FIELD"]
 
@@ -93,6 +93,6 @@ def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
 
 
 def texts(sent: list[tuple[int, bytes]]) -> list[str]:
-    """Return each text that was said."""
+    """Return each sent text."""
     received = Codec(0, 0).parse(b"".join(frame for _, frame in sent))
     return [one["text"] for one in received if one.name == "STATUSTEXT"]

@@ -1,4 +1,4 @@
-"""A link that anyone can come to: who is answered, and that nobody swallows what another sends."""
+"""A link with any number of peers: which ones get replies, and that none blocks the frames of another."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def beat(component: int = 1, system: int = 1) -> bytes:
 
 
 def header(size: int) -> bytes:
-    """The beginning of an unknown message: whoever waits for the rest of it swallows `size` bytes."""
+    """Return the start of an unknown message: a parser that waits for its end loses `size` bytes."""
     return bytes((0xFD, size, 0, 0, 7, 9, 9, 0xF0, 0xE0, 0))
 
 
@@ -73,7 +73,7 @@ def test_a_header_swallows_nothing_of_another_peer() -> None:
 
 
 def test_frames_come_first_and_a_frame_in_pieces_is_whole() -> None:
-    """So whoever parses what is read needs no more of it to tell a frame from what is none."""
+    """So a parser needs no more bytes to distinguish a frame from other data."""
     both = Peers()
     noise, frame = b"noise" + header(30) + bytes(9), beat()
     for who, data in ((1, frame[:7]), (2, noise), (1, frame[7:]), (2, bytes(5000)), (3, frame)):

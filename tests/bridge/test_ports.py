@@ -99,7 +99,7 @@ def test_a_slow_line_loses_whole_messages() -> None:
 
 
 def sample(codec: Codec, count: int) -> bytes:
-    """Return what is sent with a sample that is taken now."""
+    """Return the messages that are sent with a sample now."""
     us = time.monotonic_ns() // 1000
     return b"".join(
         [
@@ -126,7 +126,9 @@ def test_a_saturated_line_carries_what_is_new() -> None:
     while last < begun + 2.0:
         now = time.monotonic()
         free, last = min(free + (now - last) * baud / 10, 5000.0), now
-        while now > begun + (count - 200) * 0.0025:  # also what was due while the machine was busy
+        while (
+            now > begun + (count - 200) * 0.0025
+        ):  # also the samples that were due while the machine was busy
             port.write(sample(codec, count := count + 1))
         port.flush()
         if free > 100 and select.select([master], [], [], 0)[0]:
@@ -204,7 +206,7 @@ def test_a_backlog_of_a_line_is_read_at_once() -> None:
 
 
 def test_a_serial_line_behind_a_socket() -> None:
-    """Read in pieces as they come; why it does not open is told in few words, without its name again."""
+    """Read in pieces as they come; the reason for a closed port is short, without its name again."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = SerialPort(f"socket://127.0.0.1:{server.getsockname()[1]}", 9600)
         port.open()
@@ -248,7 +250,7 @@ def test_a_server_takes_the_next_client() -> None:
     ("host", "to"), [("[::1]", "[::1]"), ("[::]", "127.0.0.1"), ("localhost", "127.0.0.1")]
 )
 def test_a_link_by_ipv6_and_by_both(kinds: tuple[str, str], host: str, to: str) -> None:
-    """A station that listens to all of IPv6 hears IPv4, too; a name that is both means IPv4."""
+    """A station that listens to all of IPv6 receives IPv4, too; a name that is both means IPv4."""
     here = open_link(f"{kinds[0]}:{host}:0", 0)
     try:
         here.open()

@@ -1,4 +1,4 @@
-"""What speaks on a serial line is recognised by its bytes, through real pseudo-terminals."""
+"""The device on a serial line is recognised by its bytes, through real pseudo-terminals."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def test_an_old_position_or_none_gives_no_field() -> None:
 
 
 def test_the_field_is_that_of_the_day_to_which_the_clock_was_set() -> None:
-    """A computer without a clock of its own wakes up years ago, or in 1970, which is no date."""
+    """A computer without a real-time clock starts years ago, or in 1970, which is not plausible."""
     position = position_at(49.5, -57.9, 0.0)
     assert isnan(position.main_field(START + SECOND, 0))
     for year in (2005, 2026, 2005):

@@ -109,7 +109,7 @@ def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
     back = rig.until_well()
     rig.until_reported("bytes not sent so far", mark, 30.0)
     table(
-        "autopilot's serial line too slow: nobody reads it",
+        "autopilot's serial line too slow: no reader",
         "whole messages are dropped, those first that a newer one replaces; "
         'STATUSTEXT "link: too slow, 1740 bytes not sent so far", again every 10 s',
         f"{back:.2f} s",
@@ -120,7 +120,7 @@ def test_a_serial_line_that_is_too_slow(make_rig: MakeRig, table: Row) -> None:
 
 
 def texts_in(logs: list[Path], text: str) -> bool:
-    """Say whether a bridge has said `text`, as far as its log is on the disk."""
+    """Return True if a bridge has sent `text`, as far as its log is on the disk."""
     return any(text.encode() in path.read_bytes() for path in logs)
 
 

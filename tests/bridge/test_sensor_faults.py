@@ -1,7 +1,7 @@
 """What goes wrong on the sensor's line, one fault after the other, to one bridge that survives all of them.
 
-Every test waits until all is well, does the damage, and says what was published meanwhile, how long it took
-and what was lost. In the end the log of it all is replayed.
+Every test waits for a good state, makes the fault, and checks the published messages, the time and the
+losses. In the end the log is replayed.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -
     table(
         "sensor unplugged, back under another name after a power cycle",
         f"as above; then `offset_suspect` with sigma {sigma:.0f} nT (`turn_on_sigma`) for the rest of the "
-        "run, because its offset may have settled elsewhere",
+        "run, because its offset may have changed",
         seconds(back),
         "the readings in between; their number is unknown, because the sensor's counter started over",
     )

@@ -21,7 +21,7 @@ LINE = b"12340.5 43210.9 -234.5 4.0 %.1f 7\r\n"
 
 
 class Bench:
-    """A bridge, and what it has said."""
+    """A bridge and its messages."""
 
     def __init__(self, folder: Path) -> None:
         self.bridge: Pipeline = small_bridge(
@@ -66,7 +66,7 @@ def test_half_a_line_is_no_sample(bench: Bench) -> None:
 
 
 def test_an_instrument_that_sends_rarely_is_heard_each_time(bench: Bench) -> None:
-    """`sensor.timeout` is 10 s: that it is asked to start anew costs no reading."""
+    """`sensor.timeout` is 10 s: a request to restart costs no reading."""
     for k in range(5):
         bench.receive(15.0 * k, LINE % (15.0 * k))
     assert len(bench.raw) == 4  # the first may have been half a line

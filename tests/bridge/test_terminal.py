@@ -34,7 +34,7 @@ WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such fi
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_terminal_is_told_what_the_link_is(tmp_path: Path, number: signal.Signals) -> None:
-    """Until it is told to end, or the terminal is closed."""
+    """Until it receives a signal, or the terminal is closed."""
     with on_a_terminal(tmp_path) as (process, terminal):
         read_until(terminal, WANTED)
         process.send_signal(number)
@@ -50,7 +50,7 @@ def test_a_calibration_that_its_data_do_not_support_is_told(tmp_path: Path) -> N
 
 
 def test_a_terminal_that_hangs_holds_nobody_up(tmp_path: Path) -> None:
-    """Ctrl-S, or a connection that is gone: the bridge runs, and ends when it is told to."""
+    """Ctrl-S, or a connection that is gone: the bridge runs, and ends at a signal."""
     with on_a_terminal(tmp_path, log='[log]\ndirectory = "."') as (process, terminal):
         read_until(terminal, WANTED[:1])
         os.write(terminal, b"\x13")
@@ -112,7 +112,7 @@ def on_a_terminal(folder: Path, log: str = "") -> Iterator[tuple[subprocess.Pope
 
 
 def read_until(terminal: int, wanted: tuple[str, ...]) -> None:
-    """Read until all of it was said; a busy machine takes seconds to start a bridge."""
+    """Read until the whole text has come; a busy machine takes seconds to start a bridge."""
     seen, deadline = "", time.monotonic() + 60.0
     while not all(words in seen for words in wanted):
         assert time.monotonic() < deadline, seen

@@ -1,4 +1,4 @@
-"""A log that tells neither date nor place is fitted about the mean of its own readings, and says so."""
+"""A log without date and position is fitted about the mean of its own readings, and this is reported."""
 
 from __future__ import annotations
 

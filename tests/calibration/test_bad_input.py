@@ -85,7 +85,7 @@ def test_bad_data(case: str, runs: xr.Dataset, command: Command) -> None:
 
 
 def test_a_log_is_known_by_its_file(runs: xr.Dataset, command: Command) -> None:
-    """Beside what it says of its own source."""
+    """In addition to the statement of its source."""
     write(runs.drop_vars("mag_x"), "bad.nc")
     output = command.refuses("calibrate", "bad.nc", *PARAMETERS, "-o", "cal.json")
     assert output.startswith("bad.nc (simulated: demo): column 'mag_x': expected this column")

@@ -57,7 +57,7 @@ def test_magnetic_headings_that_are_taken_for_true_are_told(pitch: float, turn: 
     warnings = fit(replace(right, attitude=read), "nominal").warnings
     assert [text for text in warnings if text.startswith("the headings look magnetic")]
     assert not [text for text in fit(right, "nominal").warnings if "headings" in text]
-    # a mounting that is turned by about as much as D, of a glider, leaves no mismatch, and nothing is said
+    # a mounting that is turned by about as much as D, of a glider, leaves no mismatch, and no message
     turned = replace(right, field=Rotation.from_euler("z", 10.0, degrees=True).apply(field))
     assert magnetic_headings(identity(), turned) == ""
 

@@ -1,4 +1,4 @@
-"""A compass among motors: what disturbs it is no rock, and a field in place would be fitted to it."""
+"""A compass among motors: its disturbance is not a crustal field, but a spatial field would fit it."""
 
 from __future__ import annotations
 

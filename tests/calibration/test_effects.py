@@ -23,7 +23,7 @@ P = Parameter("p", "in", -1.0, 1.0, 0.0, 1.0)
 
 
 def with_effect(effect: Effect, c: np.ndarray | None = None, of_p: np.ndarray | None = None) -> Calibration:
-    """A calibration whose only term is ``(a, T) = of_p p`` (nT), beside the effect with coefficients c."""
+    """A calibration whose only term is ``(a, T) = of_p p`` (nT), with the effect of coefficients c."""
     coefficients = np.zeros(18 + effect.size)
     if of_p is not None:
         coefficients[9:18] = of_p
@@ -171,7 +171,7 @@ def test_functions_of_time() -> None:
 
 
 def test_the_rate_of_a_steadily_accelerating_field_is_exact() -> None:
-    """From three samples at any distances; a missing sample is bridged, a long gap begins anew."""
+    """From three samples at any interval; a missing one is bridged, a long gap restarts the derivative."""
     t = np.array([0.0, 4.0, 7.0, 12.0, 16.0, 16.5, 90.0, 94.0, 98.0])
     a, b = np.array([300.0, -200.0, 50.0]), np.array([2.0, 1.0, -3.0])
     field = 2e4 + np.outer(t, a) + np.outer(t**2, b)

@@ -15,7 +15,7 @@ FIELD = np.array([21_000.0, 2_000.0, 42_000.0])
 
 
 def drone(crash: int, n: int = 500) -> Observations:
-    """All attitudes, 3 % of soft iron, 200 nT of noise; the last `crash` samples are beside other iron."""
+    """All attitudes, 3 % of soft iron, 200 nT of noise; the last `crash` samples are near other iron."""
     rng, other = np.random.default_rng(1), np.random.default_rng(2)
     body = Rotation.random(n, random_state=1).inv().apply(FIELD)
     body[n - crash :] = body[-1] + other.normal(0.0, 20_000.0, 3) + other.normal(0.0, 2_000.0, (crash, 3))

@@ -1,4 +1,4 @@
-"""cal.json: what is written is read, and what does not hold together is one clear line."""
+"""cal.json: a written file is read back, and an inconsistent one gives one clear line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fits: derivatives, recovery, out of sample near the noise floor, and honest about it."""
+"""Fits: derivatives, recovery, errors out of sample near the noise floor, consistent sigmas."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_the_paper_s_signature(glider: Gliders) -> None:
 
 
 def test_an_order_that_is_too_low_is_told(glider: Gliders) -> None:
-    """Its sigmas are too small, since they do not know what is missing; with the usual order they are not."""
+    """Its sigmas are too small because a term is missing; with the usual order they are not."""
     two = glider(0, 2)
     low, usual = fit(two.runs, "auto", 1), fit(two.runs, "auto", 3)
     assert survey_error(low.calibration, two)[1] > 1.25
@@ -267,7 +267,7 @@ def test_bad_data_is_one_clear_line(glider: Gliders) -> None:
 
 
 def test_a_collapsed_fit_is_refused() -> None:
-    """One circle at one pitch: nothing holds A and T apart, and a free fit runs away."""
+    """One circle at one pitch: A and T are not distinguishable, and a free fit diverges."""
     rng = np.random.default_rng(5)
     heading = rng.uniform(0, 2 * np.pi, 400)
     field = 5e4 * np.column_stack([0.35 * np.cos(heading), 0.35 * np.sin(heading), np.full(400, 0.93)])
@@ -308,7 +308,7 @@ def test_nominal_constraints(glider: Gliders) -> None:
 def test_by_default_the_level_is_known_as_well_as_the_reference(
     glider: Gliders, unmapped: float, map_sigma: float | None, bias: float
 ) -> None:
-    """A true field has no bias, a main-field model lacks the rock, a map has its own sigma."""
+    """A true field has no bias, a main-field model lacks the crustal field, a map has its own sigma."""
     runs = glider(1).runs
     runs = replace(runs, unmapped=np.full(len(runs), unmapped), map_sigma=map_sigma)
     found = fit(runs, "nominal").calibration
@@ -355,7 +355,7 @@ def test_a_slow_part_beside_white_noise_is_whitened_in_any_blocks() -> None:
 
 @pytest.mark.parametrize("interval", [0.5, 4.0])
 def test_the_memory_of_noise_is_a_time_at_any_rate(interval: float) -> None:
-    """A slow part of 8 nT that lasts for 60 s, beside 4 nT white: a fifth of the variance is white."""
+    """A slow part of 8 nT with 60 s of correlation and 4 nT white: a fifth of the variance is white."""
     rng = np.random.default_rng(4)
     n, rho = int(40_000 / interval), np.exp(-interval / 60.0)
     slow = lfilter([np.sqrt(1.0 - rho**2)], [1.0, -rho], rng.normal(0.0, 8.0, n))
@@ -367,7 +367,7 @@ def test_the_memory_of_noise_is_a_time_at_any_rate(interval: float) -> None:
 
 
 def test_what_the_model_lacks_is_in_its_sigmas(glider: Gliders) -> None:
-    """Runs between which something that nobody measured was moved, against the same runs without that."""
+    """Runs between which an unmeasured object was moved, compared with runs without that."""
     one = glider(0)
     assert fit(one.runs).details["left_out_ratio"] == 1.0
     labels, run = np.unique(one.runs.runs, return_inverse=True)

@@ -1,4 +1,4 @@
-"""What runs can and cannot tell, and how a fit says so."""
+"""Terms that runs determine or not, and the message of the fit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from magbridge.calibration.terms import full_order
 
 
 def test_table_1_sees_63_of_90_coefficients(glider: Gliders) -> None:
-    """Ballast at two positions: squares and cubes of it cannot be told apart."""
+    """Ballast at two positions: its squares and cubes are not distinguishable."""
     runs = glider(0, 2).runs
     held = np.array([np.median(runs.parameters[runs.runs == r], axis=0) for r in runs.runs])
     samples = polynomial_samples(replace(runs, parameters=held), full_order(2, 3))

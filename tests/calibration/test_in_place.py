@@ -1,4 +1,4 @@
-"""A survey without calibration runs and without a map: the vehicle's field and the rock, told apart."""
+"""A survey without runs and map separates the vehicle's field from the crustal field."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def survey() -> Survey:
 
 
 def test_field_about_its_mean(survey: Survey) -> None:
-    """The corrected field reaches the noise, rock or not, and its sigma says so, level apart."""
+    """The corrected field reaches the noise, and its sigma without the bias agrees."""
     data, true, found = survey
     assert found.calibration.method == "survey"
     got = correct(found.calibration, data.field, np.empty((len(data), 0)), data.time)
@@ -63,7 +63,7 @@ def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
 
 
 def test_rock_is_not_taken_for_noise(survey: Survey) -> None:
-    """Its size and length are the rock's, its noise the sensor's."""
+    """Amplitude and length are those of the crustal field, the noise is the sensor's."""
     rock = survey[2].details["rock"]
     assert 20.0 < rock["size_nT"] < 100.0
     assert 300.0 < rock["length_m"] < 2000.0
@@ -71,7 +71,7 @@ def test_rock_is_not_taken_for_noise(survey: Survey) -> None:
 
 
 def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) -> None:
-    """Its sigma spans what was found; what is apart from it stays."""
+    """Its sigma includes the found error; independent parts stay."""
     data, _, found = survey
     samples = pose(data, 3, None, None).samples
     doubted, believed = (
@@ -112,7 +112,7 @@ def test_level_stands_in_the_file(survey: Survey) -> None:
 
 
 def test_level_is_less_than_the_sigma_by_the_noise_at_least() -> None:
-    """Whatever it does to the offset: 150 nT across the field lengthen it by 0.2 nT, which is no level."""
+    """For any change of the offset: 150 nT across the field lengthen it by 0.2 nT, not a level."""
     w = np.zeros(9)
     w[:3], w[6] = MAIN_FIELD_SIGMA_NT / np.sqrt(3.0), 150.0
     still = identity()
@@ -124,7 +124,7 @@ def test_level_is_less_than_the_sigma_by_the_noise_at_least() -> None:
 
 
 def test_true_field_is_fitted_as_before() -> None:
-    """Where the true field is known at every sample there is no rock, and no level either."""
+    """With a true field at every sample neither crustal field nor level is estimated."""
     data, true = flown(legs=6)
     known = Observations(field=data.field, reference=true, parameters=data.parameters, time=data.time)
     found = fit(known)
@@ -133,7 +133,7 @@ def test_true_field_is_fitted_as_before() -> None:
 
 
 def test_straight_line_is_not_supported() -> None:
-    """On one straight line rock and heading are one: the pilot is told, and --strict refuses."""
+    """On one straight line field and heading are not distinguishable: a message, and --strict refuses."""
     data, true = flown(legs=8, straight=True)
     found = fit(data)
     assert not found.supported
@@ -145,7 +145,7 @@ def test_straight_line_is_not_supported() -> None:
 def test_a_long_survey_is_searched_with_the_part_about_its_middle(
     survey: Survey, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The rock's size and length are that part's, the calibration and the nodes those of all samples."""
+    """Amplitude and length of the field are those of the part, calibration and nodes those of all."""
     used, few = [], rounds.Rounds._few
 
     def counted(own: rounds.Rounds, field: GaussianField) -> SampleSums:
@@ -227,7 +227,7 @@ def test_a_jump_in_position_is_left_out_and_told() -> None:
 
 
 def test_samples_without_a_position_are_told_apart_from_a_jump() -> None:
-    """A hole in the positions is no jump; a fix that moves the rest of the track is one."""
+    """A gap in the positions does not count as a jump; a fix that moves the rest of the track does."""
     data, true = flown(legs=8)
     assert data.place is not None
     hole, moved = data.place.copy(), data.place.copy()
@@ -254,7 +254,7 @@ def test_two_vehicles_in_one_log_are_not_supported() -> None:
 
 
 def over(data: Observations, length: float) -> Observations:
-    """Return the data with further rock of 30 nT that changes over a `length`, m."""
+    """Return the data with a further crustal field of 30 nT and a `length`, m."""
     rng = np.random.default_rng(0)
     assert data.place is not None
     k, phase = rng.normal(0, 1 / length, (400, 2)), rng.uniform(0, 2 * np.pi, 400)
@@ -263,7 +263,7 @@ def over(data: Observations, length: float) -> Observations:
 
 
 def test_rock_rougher_than_the_tracks_is_not_supported(survey: Survey) -> None:
-    """Rock that changes over 35 m, tracks 90 m apart: one line says so, and the sigma holds."""
+    """A crustal field of 35 m between tracks at 90 m: one message reports it, and the sigma is consistent."""
     smooth, true = flown(legs=2)
     data, every_second = over(smooth, 35.0), np.arange(len(smooth)) % 2 == 0
     true = true * (np.linalg.norm(data.field, axis=1) / np.linalg.norm(smooth.field, axis=1))
@@ -313,7 +313,7 @@ def slowly(data: Observations) -> Observations:
 
 
 def test_a_mass_that_begins_to_move_unseen_is_no_creep_of_the_offset() -> None:
-    """Between two reports a motion may have begun: the samples beside one are neither rock nor drift."""
+    """A motion may begin between two reports: samples near it are neither field nor drift."""
     data, true = flown(legs=14)
     leg, within = np.divmod(np.arange(len(data)), 110)
     moved = np.where(leg % 2, 1.0, -1.0) * np.array([-1.0, -0.2, 0.6, *np.ones(107)])[within]  # ends in 12 s
@@ -329,7 +329,7 @@ def test_a_mass_that_begins_to_move_unseen_is_no_creep_of_the_offset() -> None:
 
 @pytest.mark.parametrize("lag", [0.0, 600.0])
 def test_offset_that_follows_the_temperature_is_found_and_written(lag: float) -> None:
-    """2 nT/degC, and 10 degC between surface and depth: it is in the calibration, and not in the rock."""
+    """2 nT/degC, and 10 degC between surface and depth: it is in the calibration, not in the crust."""
     data, true = flown()
     dive = np.arange(len(data)) % 220 / 110.0
     water = 20.0 - 10.0 * np.minimum(dive, 2.0 - dive)
@@ -363,7 +363,7 @@ def test_temperature_that_moves_nothing_is_left_out(survey: Survey) -> None:
 def test_a_creep_that_shaped_the_rock_for_itself_goes_where_a_search_without_does_better(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """All that is offered is kept at first: as where the rock that was searched with it needs it."""
+    """All offered terms are kept at first, as in a search in which the crustal field needs them."""
 
     def all_of_little_gain(*of: Any, price: float = 0.0) -> tuple[ParameterBlock, ...]:
         return tuple(one for one in of[2] if not (price and one.offered))
@@ -403,7 +403,7 @@ def test_creep_of_the_offset_goes_neither_into_rock_nor_into_the_map() -> None:
 
 
 def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:
-    """By 37 nT in the survey: the rock is found, and another day is off by no more than is said."""
+    """By 37 nT in the survey: the crustal field is found, and the error on another day agrees with sigma."""
     data, true = flown()
     data = slowly(data)
     jump = np.outer(np.arange(len(data)) > 0.6 * len(data), [30.0, -20.0, 10.0])

@@ -1,4 +1,4 @@
-"""What is known before: it can be rescaled, taken out of a fit again, and a fit can start from it."""
+"""Prior knowledge can be rescaled, removed from a fit, and used as its start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hard iron beyond twice the field: accepted where the attitudes tell it from a scale, else refused."""
+"""Hard iron beyond twice the field: accepted if the attitudes separate it from a scale, else refused."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def smoothed(window: int, roll: float = 0.0, pitch: float = 20.0, n: int = 7200)
 
 
 def test_a_smoothed_field_is_as_unsure_as_it_is_wrong_in_attitudes_not_seen() -> None:
-    """What the model lacks is told by groups of like attitude left out: by runs alone sigma is too small."""
+    """Groups of similar attitude that are held out show a missing term; runs alone give too small a sigma."""
     found = fit(smoothed(12))
     assert found.details["left_out_ratio"] > 1.8
     for roll, pitch in ((0.0, 20.0), (25.0, 20.0), (0.0, 55.0)):

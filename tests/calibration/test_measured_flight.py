@@ -41,7 +41,7 @@ def test_the_claimed_sigma_does_not_depend_on_the_rate(line: Observations) -> No
 
 
 def covered(seen: Observations, other: Observations) -> float:
-    """Standardised error where the reference counts as what it is, a main-field model that lacks the rock."""
+    """Return the normalised error with the reference as a main-field model without the crustal field."""
     known = fit(seen, site_bias=145.0).calibration
     corrected = correct(known, other.field, other.parameters, other.time)
     return float(np.sqrt(np.mean(((corrected.total - other.reference) / corrected.sigma) ** 2)))
@@ -51,7 +51,7 @@ def covered(seen: Observations, other: Observations) -> float:
 def test_the_half_that_was_not_seen_bears_out_the_sigma(
     line: Observations, first: bool, limit: float
 ) -> None:
-    """Eddy currents, rock and the day are missing in the model: 30 to 70 nT. Not collapsed, whatever else.
+    """Eddy currents, crustal field and daily variation are missing in the model: 30 to 70 nT. No collapse.
 
     The second half is flown over smoother rock, and knows less of what the first one meets. What a user is
     told covers it, because the rock of the site is in it.

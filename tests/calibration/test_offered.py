@@ -51,7 +51,7 @@ def test_the_current_is_taken_and_what_says_the_same_is_not() -> None:
     assert first.name == "battery_current"
     assert first.left_out < 0.5 * first.without
     assert lines(offers)[0].endswith("with it: taken")
-    # what it promises holds on a flight that it has not seen
+    # the promised error holds on a new flight
     found = fit(observations(log, taken))
     other = observations(flight(2), taken)
     off = correct(found.calibration, other.field, other.parameters, other.time).total - other.reference

@@ -64,7 +64,7 @@ def test_an_extended_or_noiseless_calibration_is_not_planned_with() -> None:
 
 
 def test_a_survey_is_proposed_that_comes_back_to_its_places_on_other_courses(glider: Gliders) -> None:
-    """Criss-cross before lines, lines before a straight track, which says what it leaves open."""
+    """Criss-cross is better than lines, lines than a straight track, which reports the undetermined terms."""
     flown = glider(1, 2).survey
     ahead = 0.35 * (flown.time - flown.time[0])
     survey = replace(flown, place=np.stack([ahead, 0.0 * ahead, 0.0 * ahead], axis=1))

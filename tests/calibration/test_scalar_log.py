@@ -1,4 +1,4 @@
-"""A scalar magnetometer beside the vector: files, commands, and one sensor checked by the other."""
+"""A scalar magnetometer with a vector magnetometer: files, commands, and one sensor checked by the other."""
 
 from __future__ import annotations
 

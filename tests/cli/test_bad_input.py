@@ -80,7 +80,7 @@ def test_a_log_of_another_sensor_is_not_corrected(deployment: Path, command: Com
     [
         "correct log.nc -o x.nc",
         "navigate log.nc -o x.nc",
-        "diagnose log.nc -o doubt",
+        "diagnose log.nc -o found",
         "plan --mission log.nc",
     ],
     ids=lambda arguments: arguments.split()[0],
@@ -153,7 +153,7 @@ def test_a_position_in_another_unit_is_refused(
         ("simulate demo -o x.nc --seed 1.5", 2, "--seed: expected a whole number, not 1.5"),
         ("replay {d} --config none.toml", 1, "none.toml: expected a file, there is none"),
         ("demo --out /dev/null/demo", 2, "/dev/null is a file"),
-        ("diagnose {d} --calibration {d} -o {d}/doubt", 2, "deployment.csv is a file"),
+        ("diagnose {d} --calibration {d} -o {d}/found", 2, "deployment.csv is a file"),
     ],
 )
 def test_bad_input_gets_one_line_and_leaves_nothing(

@@ -31,7 +31,7 @@ from magbridge.progress import waiting
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 
-FEW = 40  # rows, which a diagnosis refuses: what it says before is said all the same
+FEW = 40  # rows, which a diagnosis refuses after its other messages
 
 
 @pytest.mark.parametrize("like", [False, True], ids=["mission", "like a log"])
@@ -65,7 +65,7 @@ def test_convert_there_and_back_keeps_every_number(deployment: Path, command: Co
 
 
 def test_what_was_passed_over_is_told(deployment: Path, command: Command) -> None:
-    """Of a damaged log, and of two that tell of the same times; not again of what was made from them."""
+    """Messages about damaged and overlapping logs come once, not again for derived files."""
     rows = read(deployment).isel(time=slice(0, 200))
     log = Path("log.tlog")
     write(rows, log)

@@ -1,4 +1,4 @@
-"""``magbridge info``, and what is declared of a log on the command line."""
+"""``magbridge info``, and declarations about a log on the command line."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_info_counts_gaps_and_rates() -> None:
 
 
 def test_seconds_too_few_to_be_since_1970_count_from_a_start() -> None:
-    """Under our own name, too: nobody's log is of 1970."""
+    """Also under our own name: a log of 1970 is not plausible."""
     facts = info(made("log", [0.0, 0.5], {"mag_x": [1.0, 2.0]}))
     assert facts["references"]["time_reference"] == "boot"
     assert any("--date says when it was" in hint for hint in facts["hints"])

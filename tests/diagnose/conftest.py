@@ -32,7 +32,7 @@ def problem() -> Problem:
 
 @pytest.fixture(scope="session")
 def listed(problem: Problem) -> list[Description]:
-    """Its descriptions without a name, beside noise alone."""
+    """Return its descriptions without a name, given noise alone."""
     return descriptions(problem, fit_joint(problem, [], 1))
 
 

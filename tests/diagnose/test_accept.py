@@ -62,7 +62,7 @@ def test_a_name_is_asserted_possible_or_ruled_out() -> None:
 
 
 def test_dives_left_out_overrule_a_name_that_fits() -> None:
-    """However likely it was beforehand: what only resembles the truth foretells less than a description."""
+    """For any prior: a name that only resembles the truth predicts less than a description."""
     problem, rng = right(ROWS), np.random.default_rng(10)
     bent = 8.0 * (problem.survey.field / 5e4).prod(axis=1)
     problem = replace(problem, residual=bent + rng.normal(size=ROWS))
@@ -98,7 +98,7 @@ def test_only_what_stands_without_slow_noise_is_searched_for_beside_it(
 
 @pytest.mark.parametrize(("follows", "named"), [(0.0, True), (0.2, True), (1.0, False)])
 def test_a_name_whose_size_follows_something_else_is_not_asserted(follows: float, named: bool) -> None:
-    """A payload's current at S/N 14 or more, its leads drawn apart by a moving mass."""
+    """A payload's current at S/N 14 or more, with leads that a moving mass separates."""
     problem, rng = right(ROWS), np.random.default_rng(10)
     drawn = np.where(np.sin(np.arange(ROWS) / 3.0) > 0.3, 1.0, 0.0)
     place = problem.survey.channels["p"].values
@@ -111,7 +111,7 @@ def test_a_name_whose_size_follows_something_else_is_not_asserted(follows: float
 
 
 def test_the_size_of_a_cause_may_follow_all_but_its_own_channel(problem: Problem) -> None:
-    """What follows a pressure and the pitch at once is held; of the pressure's square the rest is."""
+    """An effect of pressure and pitch together is held; the remainder is the square of the pressure."""
     survey, rows = problem.survey, slice(0, len(problem))
     assert survey.attitude is not None
     squeezed = next(c for c in CAUSES["pressure_offset"].candidates(problem) if c.channel == "depth")

@@ -228,7 +228,7 @@ def test_the_command_line_says_it_in_one_line(
 def test_a_channel_that_repeats_its_reading_is_known_where_it_was_read(
     plain: tuple[xr.Dataset, Calibration],
 ) -> None:
-    """At a time that stands twice there is no slope: so no row was whole."""
+    """A time that occurs twice has no slope, so that no row was complete."""
     ds, calibration = plain
     time = ds["time"].to_numpy()
     sampled = time + 0.02

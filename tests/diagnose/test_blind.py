@@ -83,7 +83,7 @@ def test_samples_that_are_lost_hide_nothing() -> None:
 
 @pytest.mark.parametrize("name", ["current_field", "nonlinearity", "pressure_offset"])
 def test_an_extension_against_a_map_does_no_harm(name: str) -> None:
-    """To the true field, on its own log and another day's: offset anew, the cause come since."""
+    """Compare with the true field on its own log and on another day's with another offset."""
     row = blind("charted", (name,), 40.0, GLIDER, losses="surfacing", reference="map at its depth")
     assert name in {found[0] for found in row["found"]}, row
     assert row["gain"]["after"] < 0.5 * row["gain"]["before"], row
@@ -96,7 +96,7 @@ def test_two_at_once() -> None:
 
 
 def test_what_no_cause_explains_is_called_unexplained() -> None:
-    """A ship: in two hours a relay that nobody logs is a correlated noise, in theory, too."""
+    """Hide a ship: in two hours an unlogged relay cannot be separated from correlated noise."""
     row = blind("foreign", ("ship",), 15.0, number=27)
     assert row["unexplained"].keys() == {
         "kind", "signal_to_noise", "period_s", "best_channel", "alternatives", "correlation_time_s", "rms_nT",
@@ -122,7 +122,7 @@ def written(
 
 
 def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Path, str]) -> None:
-    """The contract's three files; the calibration is an ordinary one, and mends what it says it mends."""
+    """The contract's three files; the calibration is an ordinary one, and corrects the named effect."""
     ds, tmp_path = warm[0], written[0]
     found = json.loads((tmp_path / "out" / "findings.json").read_text())
     assert found["verdict"] == "explained"

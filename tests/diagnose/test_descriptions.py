@@ -1,4 +1,4 @@
-"""What is described without a name, and what is not there at all."""
+"""Descriptions without a name, and the absence of any."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def sizes(effect: Effect) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def agreeing(survey: Survey, calibration: Calibration) -> Survey:
-    """The same, where measured is what was simulated: derivatives are taken there."""
+    """Repeat where the measured field equals the simulated one: derivatives are taken there."""
     channels = survey.values(calibration.channels)
     return replace(survey, reference=correct(calibration, survey.field, channels, survey.time).total)
 
@@ -119,7 +119,7 @@ def test_the_search_uses_the_models_own_derivative(
             residuals(*samples_of(agreeing, with_values(calibration, effect, s * step)))[0]
             for s in (1.0, -1.0)
         )
-        # a coefficient that the calibration has already taken off is missing in the residual
+        # a coefficient that the calibration already contains is missing in the residual
         np.testing.assert_allclose(
             -(above - below) / 2e-3, columns[:, k], rtol=1e-4, atol=1e-5 + 1e-4 * np.abs(columns).max()
         )
@@ -167,7 +167,7 @@ def test_play_remembers_the_side(
 
 
 def test_a_play_of_an_older_file_is_read(survey: Survey, calibration: Calibration) -> None:
-    """Its branches are polynomials: the key ``order`` says so."""
+    """Its branches are polynomials of the degree in the key ``order``."""
     effect = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.1, scale=0.5, order=3)
     phi = regressors_of(survey, calibration, effect)
     straight = PlayEffect(cause="hysteresis", channel="p", width=0.4, centre=0.0, scale=0.5, order=1)

@@ -74,7 +74,7 @@ def test_a_second_regressor_pays_for_its_choice_and_for_the_odds() -> None:
 
 
 def test_a_map_that_is_wrong_makes_no_size_of_the_vehicles_likelier() -> None:
-    """What takes any shape has a prior of its own: beside it a cause is worth what it is alone."""
+    """A free shape has a prior of its own: the evidence of a cause does not depend on it."""
     step, chart = sized("offset_step", 3), sized("map_error", 6, spectra=np.ones((1, 6)))
     look_elsewhere = {"offset_step": 1.0, "map_error": 1.0}
     worth = log_odds(225.0, [step, chart], look_elsewhere, 25.0) - log_odds(

@@ -150,7 +150,7 @@ def test_what_was_let_go_is_made_again(problem: Problem) -> None:
 
 
 def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
-    """A field that bends the magnitude, in the second half alone: linearised anew, it is what it is."""
+    """A field across the magnitude in the second half: linearised again, its value is right."""
     whole = right(300)
     learned, there = np.arange(300) < 150, np.array([900.0, -600.0, 300.0])
     survey = replace(whole.survey, learned=learned, field=whole.survey.field + there * ~learned[:, None])

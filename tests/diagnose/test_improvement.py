@@ -18,7 +18,7 @@ DIVES = 5
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    """Five dives of turning, as calibrated but for 1 nT of noise."""
+    """Return five dives with turns, calibrated, with 1 nT of noise."""
     rng = np.random.default_rng(4)
     n = 40 * DIVES
     steps, dive = np.where(np.arange(n) % 40 > 0, 1, MAX_LAG), np.arange(n) // 40
@@ -28,7 +28,7 @@ def problem() -> Problem:
 
 
 def gaussian(fit: Joint) -> Joint:
-    """The same fit, its noise's tails taken for Gaussian: then the formula is exact."""
+    """Return the fit with Gaussian tails of the noise: then the formula is exact."""
     return replace(fit, noise=replace(fit.noise, nu=1e12))
 
 
@@ -66,7 +66,7 @@ def test_what_is_there_wins_on_the_dives_left_out_and_what_is_not_does_not(probl
 
 
 def test_what_the_calibration_would_have_to_become_counts_against_it(problem: Problem) -> None:
-    """A constant that a calibration absorbs is foretold by every other dive, but not by the calibration."""
+    """Every other dive predicts a constant that a calibration absorbs; the calibration does not."""
     absorbed = problem.coefficient_jacobian[:, 14]  # what these dives show best
     posed = replace(problem, residual=problem.residual - 8.0 * absorbed)
     columns = [lambda rows: 8.0 * absorbed[rows, None]]

@@ -14,7 +14,7 @@ ROWS = 300
 
 
 def test_numbers_of_one_size_that_say_the_same_share_what_they_say() -> None:
-    """Two causes with a common size each, a column double or empty: only their sizes keep them apart."""
+    """Two causes with a common size each, a column double or empty: only their sizes distinguish them."""
     rng = np.random.default_rng(4)
     a, b = np.sin(np.arange(ROWS) / 7.0), np.sign(np.sin(np.arange(ROWS) / 40.0))
     problem = replace(right(ROWS), residual=3.0 * a - 2.0 * b + rng.normal(size=ROWS))

@@ -45,7 +45,7 @@ def test_unit_and_name_give_a_series_its_kind(name: str, unit: str, kinds: tuple
 
 
 def test_no_cause_is_put_forward_for_a_series_whose_kind_contradicts_it() -> None:
-    """And several motors are one candidate, with one common size, beside each by itself."""
+    """Several motors are one candidate with a common size, in addition to each motor."""
     rng = np.random.default_rng(4)
     n = 400
     motors = {name: rng.uniform(size=n) for name in ("throttle", "esc1_current")}

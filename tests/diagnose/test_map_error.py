@@ -54,7 +54,7 @@ def test_what_a_map_as_flown_lacks_grows_with_depth() -> None:
 
 @pytest.mark.parametrize("altitude", [60.0, 100.0, 150.0])
 def test_the_mean_of_what_a_map_lacks_is_known(altitude: float) -> None:
-    """The growth with depth tells it from a constant."""
+    """The growth with depth distinguishes it from a constant."""
     missing = flown(altitude)
     problem = drawn(right(N), missing + 40.0, DOWN)
     chart, _ = map_error(problem)
@@ -75,7 +75,7 @@ def test_what_is_drawn_wrong_is_the_same_at_every_depth() -> None:
 
 
 def test_a_gradient_over_the_whole_region_is_the_maps_error_alone() -> None:
-    """A line there and back tells place from time: no second, slow cause is named beside it."""
+    """A line there and back separates place from time: no second, slow cause is named."""
     rng = np.random.default_rng(5)
     whole = right(N)
     survey = replace(whole.survey, time=whole.survey.time[0] + 16.0 * np.arange(N))

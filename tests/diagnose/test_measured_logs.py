@@ -17,7 +17,7 @@ pytestmark = pytest.mark.real
 
 
 def test_thrusters_leave_the_field_of_an_rov_elsewhere(real_data: Path) -> None:
-    """An ArduSub's eight thrusters rest, turn for a quarter of a minute, and stop: their magnets lie anew.
+    """An ArduSub's eight thrusters rest, turn for 15 s, and stop: their magnets have new positions.
 
     The log's only other event is the turning itself, which no telemetry follows closely enough to name.
     """
@@ -40,7 +40,7 @@ def test_thrusters_leave_the_field_of_an_rov_elsewhere(real_data: Path) -> None:
 
 
 def test_a_seaglider_is_better_where_it_was_not_seen(real_data: Path) -> None:
-    """A coarse compass with rock below it: a map's error is among the names, and dives left out improve."""
+    """A coarse compass over a field: a map's error is among the names, and held-out dives improve."""
     dives = sorted((real_data / "seaglider_sg167").glob("*.nc"))
     known = fit(observations(read(dives[:3]), ["pitchCtl", "vbdCC"])).calibration
     result = diagnose([read(dives[3:])], known).diagnosis

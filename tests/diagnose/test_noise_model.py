@@ -107,7 +107,7 @@ def covariance(ar: np.ndarray, reach: int) -> np.ndarray:
 def test_least_squares_of_the_filtered_is_generalised_least_squares(
     ar: tuple[float, ...], breaks: tuple[int, ...], lost: tuple[int, ...]
 ) -> None:
-    """Against the naive oracle, the full covariance inverted: of separate stretches, and beside gaps."""
+    """Compare with the inverse of the full covariance, for separate stretches and next to gaps."""
     a, p = np.array(ar), len(ar)
     place = np.setdiff1d(np.arange(200), lost)
     n, stretch = len(place), np.searchsorted(breaks, place, "right")

@@ -18,7 +18,7 @@ ROWS, LAG, CELL = 300, 60.0, 40.0
 
 
 def decay(lag: float) -> Candidate:
-    """What decays, of a size and a lag that nobody knows."""
+    """A decay of unknown amplitude and lag."""
     x = np.exp(-np.arange(ROWS) / lag)
     return candidate("made", x, point=GridPoint({"lag": (lag, "s")}, decay, cells=(CELL,)))
 
@@ -65,7 +65,7 @@ def test_parts_of_one_cause_have_each_their_own(problem: Problem) -> None:
 
 
 def step(onset: float) -> Candidate:
-    """What begins, nobody knows when."""
+    """An effect of unknown onset."""
     x = (np.arange(ROWS) >= onset).astype(float)
     return candidate("made", x, point=GridPoint({"onset": (onset, "s")}, step, cells=(4.0,)))
 

@@ -1,4 +1,4 @@
-"""Wrong samples are told from what passes by: beside an isolated one the samples are good."""
+"""Wrong samples are distinguished from a passing source: the samples next to an isolated one are good."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sitl.dataset import segments
 N = 5000
 SPIKE = np.array([0.0, 12.0, 0.0])
 PULSE = np.array([6.0, 12.0, 6.0])
-"""Of a source that passes within a few samples, in units of the innovations."""
+"""Return a source that passes within a few samples, in units of the innovations."""
 
 
 Demo = tuple[Calibration, xr.Dataset, xr.Dataset]
@@ -83,7 +83,7 @@ def test_good_neighbours_are_rarely_doubted(nu: float, rho: float) -> None:
 @pytest.mark.parametrize("order", [2, 13])
 @pytest.mark.parametrize("rho", [0.0, 0.95])
 def test_what_switches_is_no_wrong_sample(rho: float, order: int) -> None:
-    """Noise of a long memory absorbs a relay but for its switching, which was called outliers."""
+    """Noise of a long memory absorbs a relay except its switching, which was reported as outliers."""
     for seed in range(5):
         rng = np.random.default_rng(seed)
         noise = lfilter([1.0], [1.0, -rho], rng.standard_t(50.0, N))
@@ -120,7 +120,7 @@ def test_a_diagnosis_names_isolated_samples_only(demo: Demo, shape: np.ndarray, 
 
 @pytest.mark.parametrize("beside_runs", [False, True])
 def test_a_relay_gets_no_name(demo: Demo, beside_runs: bool) -> None:
-    """Nor does what is left of it where noise of a long memory has absorbed the rest."""
+    """Nor does the remainder where noise of a long memory has absorbed the rest."""
     calibration, survey = demo[0], demo[1].copy()
     n, rng = survey.sizes["time"], np.random.default_rng(5 if beside_runs else 4)
     at = np.sort(rng.integers(0, n, 14))

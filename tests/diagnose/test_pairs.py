@@ -41,7 +41,7 @@ def state() -> State:
 
 
 def test_all_pairs_at_once_are_one_after_the_other(state: State) -> None:
-    """What stands there loses to each pair by what the two say, the second beside the first."""
+    """A single name loses to each pair by the evidence of both, the second given the first."""
     model = [state.candidates[2], state.candidates[4]]
     base = state.fit(model)
     info = state.conditional_on(model, base)

@@ -252,7 +252,7 @@ def test_lags_in_series_follow_conduction_more_closely_than_one() -> None:
 
 
 def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem: Problem) -> None:
-    """A dipole beside the way, anywhere, any direction: the next power leaves far more of it than sources."""
+    """A dipole near the track, anywhere, any direction: the next power leaves far more than sources."""
     rng, t = np.random.default_rng(8), np.linspace(0.0, 1.0, len(problem))
     channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=np.sin(12.0 * t))}
     problem = replace(problem, survey=replace(problem.survey, channels=channels))
@@ -274,7 +274,7 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
 
 
 def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Problem) -> None:
-    """Of a mass whose own field has changed since, all orders together hold what that one misses."""
+    """If the field of a mass has changed, all orders together hold the part that one order misses."""
     own, x = problem.calibration.parameters[0], np.linspace(-1.0, 1.0, len(problem))
     values = own.centre + own.scale * x
     channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=values)}
@@ -294,7 +294,7 @@ def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Proble
 
 
 def test_a_response_bends_by_no_more_than_is_plausible(problem: Problem) -> None:
-    """However likely a larger common size would be: that a reference is 140 nT off is no bend."""
+    """For any common size: a reference error of 140 nT does not count as a bend."""
     bend = CAUSES["nonlinearity"].candidates(problem)[-1]
     for size, sigma in ((20.0, 20.0), (140.0, BENT)):
         coefficients = size / bend.width

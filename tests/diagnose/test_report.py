@@ -204,7 +204,7 @@ def test_a_channel_without_a_unit_shows_none(unit: str) -> None:
 
 
 def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
-    """A constant may belong to either; beside a reference that is surely true it is the vehicle's."""
+    """A constant may belong to either; with a true reference it is the vehicle's."""
     problem = right(100)
     grown = problem.calibration.coefficients + np.repeat([20.0, 0.0], [3, 6])
     louder = replace(problem.calibration, coefficients=grown)
@@ -222,7 +222,7 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
 
 
 def test_a_rival_on_another_channel_is_no_other_cause() -> None:
-    """That a second thermometer does as well is no doubt of the name."""
+    """A second thermometer that fits as well does not weaken the name."""
     own, twin, other = (
         candidate(cause, np.ones(1), channel=channel)
         for cause, channel in (

@@ -1,4 +1,4 @@
-"""The page as a whole: what its first screen decides, what it says is not known, and its figures."""
+"""The whole page: the decision on its first screen, the unknown parts, and its figures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def reasons(found: Assessment) -> list[str]:
 
 
 def with_(diagnosis: Diagnosis, **more: object) -> Diagnosis:
-    """The same diagnosis, with its one finding changed."""
+    """Return the diagnosis with its one finding changed."""
     return replace(diagnosis, findings=(replace(diagnosis.findings[0], **more),))  # type: ignore[arg-type]
 
 

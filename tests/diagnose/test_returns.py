@@ -30,7 +30,7 @@ TRACKS: dict[str, FloatArray] = {
 
 
 def flown(north: FloatArray) -> Returns:
-    """Return what is known of a track along a meridian, m, of four hours."""
+    """Return the known positions of a track of four hours along a meridian, m."""
     survey = replace(
         right(N).survey, time=T0 + 14400.0 * ALONG, place=np.stack([north, 0.0 * north, 0.0 * north], axis=1)
     )

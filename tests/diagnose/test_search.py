@@ -31,7 +31,7 @@ def fault(cause: str, x: NDArray[np.float64], width: float) -> Candidate:
 def test_noise_does_not_swallow_what_two_causes_do_together(
     functions: int, rough: float, warm: float
 ) -> None:
-    """A warming over rough rock: beside either alone, slow noise describes the other as well."""
+    """A warming over a rough crustal field: given one of them, slow noise describes the other."""
     rng = np.random.default_rng(2)
     n = 3000
     t = np.linspace(0.0, 1.0, n)
@@ -85,7 +85,7 @@ def test_what_switches_is_not_searched_for_without_end() -> None:
 
 
 def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
-    """A step at one time is found for one at another, which is found beside it."""
+    """A step is first found at a wrong time; then the true time is found given it."""
     rng = np.random.default_rng(1)
     n = 600
     early, late = (fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in (60, 500))
@@ -144,7 +144,7 @@ def test_what_nature_cannot_do_is_the_vehicles() -> None:
 
 
 def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
-    """At many sites it is, by the rock: a fault of the vehicle that imitates it must not win by that."""
+    """At many sites the crustal field is likely; a fault of the vehicle that imitates it must not win."""
     rng = np.random.default_rng(1)
     problem = right(600)
     noise = rng.normal(size=600)

@@ -1,4 +1,4 @@
-"""What is seen in a signal, apart from what it may be; and a residual that is far from white."""
+"""Properties of a signal, independent of its cause, and a residual that is far from white."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_how_far_from_white_a_residual_is(flown: Problem, rho: float, slow: floa
 
 @pytest.mark.parametrize("axis", ["x", "z", "field"])
 def test_the_axis_of_what_is_slow_is_told_though_it_follows_nothing(axis: str) -> None:
-    """What is slow goes with anything slow by chance: not said. The axis shows as the vehicle turns."""
+    """A slow signal correlates with any slow channel, so this is not reported. Turns show the axis."""
     turned = np.random.default_rng(5).normal(size=(N // 30, 3)).repeat(30, axis=0)
     survey = surveyed(turned, np.sin(np.arange(N) / 30.0))
     hours = Channel(correlated(np.random.default_rng(4).normal(size=(N, 1)), 0.997)[:, 0], "h", ("position",))
@@ -90,7 +90,7 @@ def test_the_axis_of_what_is_slow_is_told_though_it_follows_nothing(axis: str) -
 
 
 def test_a_slow_series_that_explains_all_is_followed(flown: Problem) -> None:
-    """However slow it is: what is left is not."""
+    """For any slow signal the remainder is not slow."""
     warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
     survey = replace(flown.survey, channels={"warmth": Channel(warmth, "degC", ("temperature",))})
     signal = 20.0 * warmth + np.random.default_rng(6).normal(size=N)
@@ -106,7 +106,7 @@ def test_a_cause_does_not_follow_what_only_the_rest_beside_it_does(flown: Proble
 
 
 def _slow_log() -> tuple[xr.Dataset, Calibration, FloatArray]:
-    """A survey beside whose reference something wanders, a calibration that states it, and what does, nT."""
+    """Return a survey with a slow error of the reference, a calibration that states it, and the error, nT."""
     scenario = load("demo")
     parts = segments(simulate(scenario, 2))
     calibration = fit(
@@ -122,7 +122,7 @@ def _slow_log() -> tuple[xr.Dataset, Calibration, FloatArray]:
 def test_a_residual_far_from_white_is_never_nothing() -> None:
     """Noise of a long memory describes anything slow; a calibration that states it makes it no less.
 
-    How large it is, how long it lasts, and that nothing logged goes with it, are said.
+    Its amplitude, its duration and the missing correlation with the log are reported.
     """
     survey, loud, slow = _slow_log()
     result = diagnose([survey], loud)

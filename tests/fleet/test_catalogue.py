@@ -1,4 +1,4 @@
-"""The catalogue: each row once, whoever writes it; newer and damaged ones are refused, in a line each."""
+"""The catalogue: each row once for any number of writers; newer and damaged ones are refused in one line."""
 
 from __future__ import annotations
 

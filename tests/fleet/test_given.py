@@ -1,4 +1,4 @@
-"""A calibration made elsewhere: on record, learnt from as far as its data determined it, and only once."""
+"""A calibration made elsewhere: recorded, and learned from once, as far as its data determined it."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_it_teaches_what_its_data_determined(catalogue: FolderCatalogue, made: t
         catalogue.add(table, rows)
     assert len(catalogue.rows("calibrations")) == 2
     (own,) = lessons(catalogue, "comet")
-    # and what it taught is what its own data say, in the directions that these determine
+    # the fleet learns the information of its data, in the directions that these determine
     off = given.information.vector - given.information.precision @ load(cal).coefficients
     own_off = own.information.vector - own.information.precision @ load(cal).coefficients
     scale = np.sqrt(np.diag(own.information.precision))

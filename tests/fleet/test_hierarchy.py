@@ -1,4 +1,4 @@
-"""The hierarchical model: a dense Gaussian's answer, ever likelier, honest, and what it was drawn from."""
+"""The hierarchical model equals a dense Gaussian, with a rising likelihood and consistent sigmas."""
 
 from __future__ import annotations
 

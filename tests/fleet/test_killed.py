@@ -17,7 +17,7 @@ from fleets import content
 from magbridge.fleet.folder import FolderCatalogue
 
 PATIENCE = 120.0
-"""s, on a busy computer."""
+"""Longest wait on a busy computer, s."""
 
 
 def until(what: Callable[[], bool], *processes: subprocess.Popen[str]) -> None:
@@ -76,7 +76,7 @@ def test_killed_and_run_again_it_is_the_same(done: FolderCatalogue, flown: Path,
     for one in two:  # two people at once
         out, output = one.communicate(timeout=PATIENCE)
         assert (one.returncode, output) == (0, ""), out
-    # but for what the fixture's run did not learn at its end
+    # except the last results, which the fixture's run did not learn
     mine, theirs = content(catalogue), content(done)
     assert len(mine.pop("populations")) == 1
     theirs.pop("populations")

@@ -1,4 +1,4 @@
-"""A catalogue on a server says the same as one in a folder, whoever writes to it at once."""
+"""A catalogue on a server equals one in a folder, with several writers at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Processing: a deployment's rows, what is wrong with a log, killed and begun again, and two workers."""
+"""Processing: a deployment's rows, faults of a log, a killed and repeated run, and two workers."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def test_a_calibration_starts_from_its_fleet(
     found = json.loads(capsys.readouterr().out)["fleet"]
     assert (found["deployments"], found["deployments_of_others"]) == (2, 1)
     assert found["expected_nT"] < 0.5 * found["expected_alone_nT"]
-    # a log that is catalogued has its vehicle there, and is not learnt from twice
+    # a log that is catalogued has its vehicle there, and is not learned from twice
     again = ["calibrate", str(flown / "one/second.nc"), *arguments[2:]]
     assert main(again) == 0
     assert json.loads(capsys.readouterr().out)["fleet"]["deployments"] == 1

@@ -29,7 +29,7 @@ def flight(n: int = 400, seed: int = 1) -> Iterator[tuple[int, FloatArray, Float
 def judge(
     wrong: FloatArray, attitude_error: FloatArray | None = None, field: FloatArray = NED
 ) -> tuple[FloatArray, FloatArray, list[str]]:
-    """Return flags and sigma of each sample, and what was told, of a vector that is `wrong` (3, 3) times."""
+    """Return flags and sigma of each sample and the messages, for a vector multiplied by `wrong` (3, 3)."""
     one, flags, sigma = DirectionCheck(), [], []
     one.expect(*field.tolist())
     rng = np.random.default_rng(2)

@@ -18,7 +18,7 @@ SIGMA, FIELD, PERIOD_US = 1.9, 52_000.0, 4_000_000
 
 
 class Flight:
-    """A vehicle in a field of 52,000 nT over rock, whose sensor has 1 nT of noise."""
+    """A vehicle in a main field of 52,000 nT and a crustal field, with 1 nT of noise."""
 
     def __init__(self, n: int = 1500, seed: int = 1, steps: float = 0.01) -> None:
         rng = np.random.default_rng(seed)
@@ -31,7 +31,7 @@ class Flight:
         self.quality = np.zeros(n, int)
 
     def judge(self, reference: float = FIELD, speed: float = 0.0) -> tuple[IntArray, FloatArray, list[str]]:
-        """Return the flags (n,), the sigma (n,) and what was told; a speed of 0 (m/s) is not known."""
+        """Return the flags (n,), the sigma (n,) and the messages; a speed of 0 (m/s) is not known."""
         judge = HealthMonitor(Noise(1.0))
         flags: list[int] = []
         sigma: list[float] = []
@@ -112,7 +112,7 @@ def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() ->
     flight.raw[515:1000] += along(flight.raw[515:1000], 200.0)
     flags, sigma, _ = flight.judge()
     assert (flags[500:1000] == IMPLAUSIBLE).all()
-    assert (sigma[1000:1400] > 100.0).all()  # what is right again may not be
+    assert (sigma[1000:1400] > 100.0).all()  # a right value may still be wrong
     flight = Flight(n=2500)
     flight.raw[500:1000] += along(flight.raw[500:1000], 200.0)
     flags, sigma, _ = flight.judge()
@@ -144,7 +144,7 @@ def test_a_wrong_mass_is_seen_if_it_moves_with_the_very_second_sample() -> None:
 
 
 def test_a_spike_that_a_mass_s_move_makes_acceptable_is_no_new_level() -> None:
-    """After 40 s of motion the rock may be another by 80 nT; if the next samples are as before, it is not."""
+    """After 40 s of motion the crustal field may differ by 80 nT; equal samples show that it does not."""
     flight = Flight()
     flight.quality[690:700] = MOVING
     flight.raw[700] += along(flight.raw[700:701], 60.0)[0]
@@ -186,7 +186,7 @@ def test_more_noise_than_the_calibration_s_widens_sigma_within_a_hundred_samples
 def test_a_hum_widens_sigma_or_is_flagged_where_rock_is_passed_more_slowly(
     period: float, size: float
 ) -> None:
-    """At 0.35 m/s, rock of 500 m takes 24 minutes; second differences from sample to sample do not see it."""
+    """At 0.35 m/s a crustal field of 500 m takes 24 min; second differences of samples do not show it."""
     flight = Flight(n=3000)
     before = np.linalg.norm(flight.raw, axis=1)
     hum = size * np.sin(2.0 * np.pi * 4.0 * np.arange(2500) / period)
@@ -226,7 +226,7 @@ def test_noise_from_the_start_on_widens_sigma_within_ten_samples(times: float) -
 
 @pytest.mark.parametrize("sigmas", [3.2, -3.2, 4.2])
 def test_a_field_that_is_far_off_from_the_first_on_has_that_as_its_sigma(sigmas: float) -> None:
-    """A gain wrong by 1 % is 500 nT; it is not flagged, since rock may be as much."""
+    """A gain error of 1 % is 500 nT; it is not flagged, since a crustal field may be as large."""
     flight = Flight()
     off = 145.0 * sigmas
     flags, sigma, reported = flight.judge(reference=FIELD - off)

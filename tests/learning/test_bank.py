@@ -19,7 +19,7 @@ PER_DEGREE = np.array([4.0, -3.0, 5.0])
 
 
 def bank_of(known: Calibration) -> tuple[Bank, Model, Nuisance]:
-    """Return one that begins with a calibration, beside the IGRF."""
+    """Return one that begins with a calibration and the IGRF as reference."""
     model, nuisance = Model(known, ()), Nuisance(known.noise, 145.0)
     coefficients, covariance = model.coefficients(known)
     quiet = Estimator(coefficients, covariance, model.offsets, nuisance, 0.01)
@@ -58,7 +58,7 @@ def test_a_warming_is_taken_over_from_the_one_that_follows_the_temperature() -> 
     warm = bank.all[1]
     assert bank.best is warm
     assert warm.coefficients[model.slots("sensor_temperature")] == pytest.approx(PER_DEGREE, abs=1.0)
-    assert not bank.take_over(1000.0)  # what a doubt has found is far better
+    assert not bank.take_over(1000.0)  # the result of an alarm is far better
     assert bank.take_over(20.0)
     assert bank.best is bank.quiet is not warm
     np.testing.assert_array_equal(bank.quiet.coefficients, warm.coefficients)
@@ -72,7 +72,7 @@ def test_a_temperature_that_does_nothing_is_not_believed() -> None:
 
 
 def test_what_a_doubt_has_found_is_believed_if_it_is_far_better() -> None:
-    """Else whoever was believed still is."""
+    """Otherwise the selected one stays."""
     warming = 12.0 * (1.0 - np.exp(-np.arange(400) / 150.0))
     bank, _ = flown(warming, PER_DEGREE)
     nothing = np.zeros(bank.quiet.states), np.zeros((bank.quiet.states, bank.quiet.states))
@@ -83,7 +83,7 @@ def test_what_a_doubt_has_found_is_believed_if_it_is_far_better() -> None:
 
 
 def test_a_calibration_that_follows_the_temperature_is_not_supposed_to() -> None:
-    """Only the drifting one stands beside the quiet one then."""
+    """Then only the drifting one and the quiet one remain."""
     known = calibration()
     assert len(bank_of(known)[0].all) == 3
     effect = ChannelEffect(cause="temperature_offset", channel="sensor_temperature", origin=0.0)
@@ -110,7 +110,7 @@ def test_no_drift_gets_less_certain_than_the_steepest() -> None:
 
 
 def test_a_level_that_nobody_has_seen_is_kept() -> None:
-    """Rock takes up what the coefficients give; but a level that has changed beyond chance is learned."""
+    """The crustal field absorbs small changes; a significant change of the level is learned."""
     bank, _ = flown(np.full(400, 4.0), PER_DEGREE)
     quiet = bank.quiet
     learned, rock = quiet.coefficients.copy(), quiet.rock

@@ -1,4 +1,4 @@
-"""The level that nobody sees: it is kept, and what is published is as unsure of it as it may have changed."""
+"""The unobservable level is kept, and the published sigma includes its possible change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which predicts better: what is learned has to be so by more than a calibration is ever exact."""
+"""The comparison of predictions: a learned calibration must be better by more than a calibration error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_small_advantage_is_none_however_long_it_lasts() -> None:
 
 
 def test_it_is_rolled_back_without_a_margin() -> None:
-    """The first calibration need only predict better beyond chance, and not in a few samples."""
+    """The first calibration need only predict significantly better, and not in a few samples."""
     rng = np.random.default_rng(6)
     nuisance = Nuisance(Noise(1.0), 1e-3)
     judge, still = Judge(nuisance), nuisance.transition(0.0, 0.0)

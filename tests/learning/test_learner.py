@@ -1,4 +1,4 @@
-"""The bridge learns: what it says of a sample is the fit's own equation, and what it makes of many."""
+"""In-flight calibration: the equation of a sample is that of the fit; results of many samples."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_changed_offset_is_learned_and_published() -> None:
 
 
 def test_nothing_is_published_where_nothing_has_changed() -> None:
-    """Nor is anything doubted."""
+    """Nor is there an alarm."""
     known = calibration()
     learner = Learner(known)
     assert learn(learner, World(known, 1500)) == []
@@ -100,7 +100,7 @@ def test_nothing_is_published_where_nothing_has_changed() -> None:
 
 
 def test_rock_is_not_learned_on_a_straight_track() -> None:
-    """The change is within a fraction of what was not known of the offset at this power-on."""
+    """The change is within a fraction of the unknown offset of this power-on."""
     known = calibration()
     learner = Learner(known)
     doubted = learn(learner, World(known, 1500, straight=True))
@@ -113,7 +113,7 @@ def test_rock_is_not_learned_on_a_straight_track() -> None:
 
 
 def test_a_step_is_doubted_named_and_ends_when_learned() -> None:
-    """Sigma grows at once to what is seen, and is small again once it is learned."""
+    """Sigma grows at once to the seen error, and is small again after it is learned."""
     known = calibration()
     learner = Learner(known)
     added = np.zeros((2400, 3))
@@ -133,7 +133,7 @@ def test_a_step_is_doubted_named_and_ends_when_learned() -> None:
 
 
 def test_a_sample_that_waits_is_not_kept_across_a_power_on() -> None:
-    """What was measured before has other offsets: it is as if it had not been."""
+    """Earlier measurements have other offsets and are discarded."""
     known, learners = calibration(), (Learner(calibration()), Learner(calibration()))
     for learner, before in zip(learners, (0.0, 4.0), strict=True):
 
@@ -149,7 +149,7 @@ def test_a_sample_that_waits_is_not_kept_across_a_power_on() -> None:
 
 
 def test_sigma_covers_what_is_not_explained() -> None:
-    """Frozen, nothing is learned, so the doubt stands until someone acknowledges it."""
+    """Frozen, nothing is learned, so the alarm stays until a user acknowledges it."""
     known = calibration()
     learner = Learner(known)
     learner.frozen = True
@@ -179,7 +179,7 @@ def test_flagged_samples_teach_nothing() -> None:
 
 
 def test_forgetting_goes_back_to_the_first() -> None:
-    """And accepting makes what was learned the first."""
+    """Accepting makes the learned calibration the first."""
     known = calibration()
     world, added = World(known, 1000), np.tile([12.0, -9.0, 14.0], (1000, 1))
     learner = Learner(known)
@@ -208,7 +208,7 @@ def test_forgetting_and_accepting_come_before_any_sample_too() -> None:
 
 
 def test_a_worse_calibration_is_rolled_back() -> None:
-    """What was published is taken back when the offset goes back to what it was."""
+    """The published change is withdrawn when the offset returns to its value."""
     known = calibration()
     added = np.zeros((3000, 3))
     added[:700] = [12.0, -9.0, 14.0]
@@ -220,7 +220,7 @@ def test_a_worse_calibration_is_rolled_back() -> None:
 
 
 def test_a_map_tells_the_level_too() -> None:
-    """With the IGRF alone, what is learned may have any level; with a map it has the map's."""
+    """With the IGRF alone, the learned calibration may have any level; with a map it has the map's."""
     known = calibration(30.0)
     world = World(vehicle_off(known), 1500)
     errors = {}
@@ -235,7 +235,7 @@ def test_a_map_tells_the_level_too() -> None:
 
 
 def vehicle_off(known: Calibration) -> Calibration:
-    """Return a calibration that is off by what the known one's sigma lets expect."""
+    """Return a calibration with errors drawn from the known one's sigma."""
     off = 30.0 * np.random.default_rng(8).normal(size=len(known.coefficients))
     return replace(known, coefficients=known.coefficients + off)
 
@@ -253,7 +253,7 @@ def test_a_pumps_current_becomes_a_term() -> None:
 
 
 def test_a_temperature_becomes_a_term() -> None:
-    """Of the coefficients that it has, whatever the offset was learned to be meanwhile."""
+    """The coefficients that it has stay, for any offset that is learned meanwhile."""
     known, n = calibration(), 2400
     temperature = -10.0 + 12.0 / (1.0 + np.exp(-(np.arange(n) - 1200.0) / 150.0))
     per_degree = np.array([4.0, -3.0, 5.0])

@@ -1,4 +1,4 @@
-"""Poisoned references: what is published stays as good as it was, and what is seen is told."""
+"""Wrong references: the published field keeps its accuracy, and the error is reported."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def reported(learner: Learner) -> list[str]:
 
 @pytest.mark.parametrize(("scale", "shift"), [(-1.0, 0.0), (1.0, 1000.0)])
 def test_a_wrong_map_teaches_nothing_wrong(scale: float, shift: float) -> None:
-    """Upside down, or off by a kilometre as a false GPS: what is published stays as good as it was."""
+    """Inverted, or off by a kilometre as a false GPS: the published field keeps its accuracy."""
     known = calibration()
     world = World(known, 1500)
     learner = Learner(known, grid=grid_of(scale, shift), spread=20.0)
@@ -43,7 +43,7 @@ def test_a_map_that_is_wrong_by_no_more_than_rock_is_told() -> None:
 
 
 def test_another_sheet_for_a_while_is_not_learned() -> None:
-    """Its level is 80 nT off: nothing is learned of that, then or after, and the doubt ends by itself."""
+    """Its level is 80 nT off: nothing is learned from it, and the alarm ends by itself."""
     known, n = calibration(), 1900
     right, wrong = grid_of(1.0), grid_of(1.0, level=80.0)
     world, learner = World(known, n), Learner(known, grid=right, spread=20.0)
@@ -59,7 +59,7 @@ def test_another_sheet_for_a_while_is_not_learned() -> None:
 
 
 def test_a_month_without_a_fix_changes_nothing() -> None:
-    """It is reported once, and what was published stays."""
+    """It is reported once, and the published calibration stays."""
     known = calibration()
     learner, world = Learner(known), World(known, 600)
     learn(learner, world)
@@ -130,7 +130,7 @@ def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> Non
             beyond.append(k)
 
     doubted = learn(learner, world, seen=check)
-    assert doubted[0] <= 603  # two outliers are no doubt, and telemetry is waited for
+    assert doubted[0] <= 603  # two outliers raise no alarm, and telemetry is awaited
     assert sum(600 <= k < 900 for k in doubted) >= 295
     assert len(beyond) <= 5
     announced = [text.split(":")[0] for text in reported(learner)]
@@ -144,7 +144,7 @@ def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> Non
 
 
 def test_telemetry_that_is_late_is_told() -> None:
-    """By 8 s: before a motion is reported, two samples are outliers, which fit what is reported later."""
+    """By 8 s: before a motion is reported, two samples are outliers that fit the later report."""
     known, n = calibration(), 400
     world = World(known, n)
     late = np.concatenate([world.mass[:2], world.mass[:-2]])
@@ -161,7 +161,7 @@ def test_telemetry_that_is_late_is_told() -> None:
 
 
 def test_evidence_gathered_while_a_map_was_wrong_is_not_believed_after() -> None:
-    """A doubt that is gone without anything learned leaves no evidence for what was learned meanwhile."""
+    """An alarm that ends without a learned change leaves no evidence for changes learned meanwhile."""
     known = calibration()
     learner, added = Learner(known), np.zeros((300, 3))
     added[250:] = [0.0, 0.0, 30.0]

@@ -1,4 +1,4 @@
-"""How a doubt stands: what is news of it, and when what is behind it is learned."""
+"""The state of an alarm: its reports, and when its cause is learned."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_it_is_learned_sooner_the_fewer_causes_fit() -> None:
     assert not standing(first, alarm(20.1 + SURE, *two)).ripe
     assert standing(first, alarm(20.1 + SURE + LOG_RATIO_PER_CAUSE, *two)).ripe
     assert standing(first, alarm(20.1 + SURE, "offset_drift")).ripe
-    assert standing(first).raised(alarm(22.0, "offset_drift")) == ""  # what it was is told at its end
+    assert standing(first).raised(alarm(22.0, "offset_drift")) == ""  # its cause is reported at its end
 
 
 def test_patience_is_for_each_cause_and_of_telling_samples() -> None:
@@ -70,7 +70,7 @@ def relapsed() -> Standing:
 
 
 def test_what_was_learned_and_is_doubted_again_was_mistaken() -> None:
-    """The doubt is the same, sigma covers all that was seen, and more is asked for the next time."""
+    """The alarm stays the same, sigma includes the seen error, and the next threshold is higher."""
     one = relapsed()
     assert (one.relapses, one.alarm and one.alarm.since) == (1, 0.0)
     assert 28.0 < one.variance**0.5 < 30.0
@@ -81,7 +81,7 @@ def test_what_was_learned_and_is_doubted_again_was_mistaken() -> None:
 
 
 def test_a_relapsed_doubt_ends_when_what_was_learned_has_explained_many_samples() -> None:
-    """Without a word before; an error that is no chance lets it count anew."""
+    """Without a message before; a significant error restarts its count."""
     one = relapsed()
     assert not one.learned()
     assert one.tried
@@ -94,7 +94,7 @@ def test_a_relapsed_doubt_ends_when_what_was_learned_has_explained_many_samples(
 
 
 def test_the_next_doubt_after_a_long_while_is_another() -> None:
-    """What was learned has explained the data; so it was no mistake."""
+    """The learned change has explained the data, so it was not a mistake."""
     one = standing(alarm(20.0, "offset_step"))
     one.learned()
     counted(one, QUIET + 1)

@@ -26,7 +26,7 @@ def vehicle() -> Calibration:
 
 
 def test_a_vehicle_without_a_calibration_gets_one() -> None:
-    """Its error about the mean comes near the noise, and its sigma covers the level that nobody sees."""
+    """Its error about the mean comes near the noise, and its sigma includes the unobservable level."""
     world = World(vehicle(), 2100)
     learner = Learner(class_prior((MASS,), FIELD))
     assert learner.calibration.method == "none"
@@ -42,7 +42,7 @@ def test_a_vehicle_without_a_calibration_gets_one() -> None:
 
 
 def test_no_way_that_is_flown_tells_the_level() -> None:
-    """Some rock is larger than any survey: after twenty kilometres it is as unknown as at first."""
+    """Some crustal fields are larger than a survey: after 20 km they are as unknown as at first."""
     world, learner = World(vehicle(), 5000), Learner(class_prior((MASS,), FIELD))
     learn(learner, world)
     x, y, z = world.field[-1].tolist()
@@ -52,7 +52,7 @@ def test_no_way_that_is_flown_tells_the_level() -> None:
 
 
 def test_nothing_is_published_before_all_samples_were_fitted() -> None:
-    """A filter that is linearised at what is known of the class may predict well, and be far off."""
+    """A filter that is linearised at the prior of the class may predict well with a large error."""
     world, learner = World(vehicle(), 60), Learner(class_prior((MASS,), FIELD))
     published = []
     learn(learner, world, seen=lambda _: published.append(learner.calibration.method))
@@ -69,7 +69,7 @@ def test_a_jump_that_a_young_calibration_made_is_over_with_the_next_fit() -> Non
 
     learn(learner, world, seen=seen)
     values = list(renewed.values())
-    assert values.count(False) >= 4  # nothing, published, and fitted anew at 128, 256 and 512 samples
+    assert values.count(False) >= 4  # nothing, published, and fitted again at 128, 256 and 512 samples
     assert True in values
 
 
@@ -94,7 +94,7 @@ def test_a_class_is_as_unknown_as_physics_lets_it_be() -> None:
 
 
 def test_the_level_that_is_kept_is_as_unsure_as_it_differs_from_what_was_learned() -> None:
-    """What is published keeps its first level; its sigma spans both."""
+    """The published field keeps its first level; its sigma spans both."""
     learner = Learner(class_prior((MASS,), FIELD))
     learn(learner, World(vehicle(), 300))
     publication, best = learner._publication, learner._knowledge.bank.best

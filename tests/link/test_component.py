@@ -192,7 +192,7 @@ def test_whatever_is_said_it_goes_on(chunks: list[bytes]) -> None:
         now = START + i * 300_000
         component.advance(now)
         component.receive(chunk, now)
-        assert len(component.outbox.drain()) < 50  # nothing that is said makes it talk without end
+        assert len(component.outbox.drain()) < 50  # no message makes it send without end
     component.advance(START + 10_000_000)
     rows = component.parameters.table.values()
     assert all(row.low <= component.parameters[row.name] <= row.high * 1.0001 for row in rows)

@@ -1,4 +1,4 @@
-"""MAVLink FTP and the older log transfer, without a link: what is granted, what is refused, and how."""
+"""MAVLink FTP and the older log transfer, without a link: granted and refused requests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SECRETS = ["key.bin", "bridge.toml", "20260101T000000Z_0001.tlog.txt", "x2026010
 
 
 class Station:
-    """Asks, and takes replies apart."""
+    """A client that sends requests and decodes replies."""
 
     def __init__(self, server: FtpServer, who: tuple[int, int] = ME) -> None:
         self._server, self._who, self._sequence = server, who, 0
@@ -316,7 +316,7 @@ def test_metadata_of_every_parameter(link: Line) -> None:
 
 
 def layout(answer: Any) -> tuple[str, int]:
-    """Take apart what pymavlink does not know yet."""
+    """Decode a message that pymavlink does not know yet."""
     (message,) = Codec(0, 0).parse(bytes(answer.get_msgbuf()) if hasattr(answer, "get_msgbuf") else answer)
     assert message.name == "COMPONENT_METADATA"
     return message["uri"], message["file_crc"]

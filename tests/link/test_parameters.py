@@ -80,7 +80,7 @@ def test_out_of_range_is_refused_and_said(link: Line, value: float) -> None:
 
 
 def test_refusals_are_said_once_a_second(link: Line) -> None:
-    """Each is answered with the value; the same one, later, is said again."""
+    """Each request gets the value; a later request gets it again."""
     received = [
         message for value in (0.5, 0.5, 0.25, 0.5, 0.75) for message in write(link, "MB_GAP_FACTOR", value)
     ]
@@ -111,7 +111,7 @@ def test_kept_parameters_come_back(make_link: MakeLine) -> None:
     assert link.component.rates["MAG_RAW"].hertz == 2.0
     texts = link.receive()
     assert any("GONE" in text for text in link.texts(texts))
-    # whoever has changed the configuration meanwhile learns why it has no effect
+    # a user who has changed the configuration learns why it has no effect
     assert "kept from the link, not as configured: MB_R_RAW, MB_GAP_FACTOR" in "".join(link.texts(texts))
 
 

@@ -122,7 +122,7 @@ def test_late_frames_are_not_lost(link: Line) -> None:
 
 
 def test_whose_frames_are_lost_is_told(link: Line) -> None:
-    """Of each component; once while it lasts, and again when it begins anew."""
+    """One report for each component and occurrence, and another when it occurs again."""
     payload, tenths = Codec(1, 25), count((link.now - START) // 100_000 + 1)
 
     def ten_seconds(lost: int) -> list[str]:
@@ -218,7 +218,7 @@ def test_a_clock_that_was_set_is_learned_anew_at_once(now: int) -> None:
         exchange(clock, rng, START + i * 1_000_000, 7_000_000)
     exchange(clock, rng, START + 10_000_000, now)
     assert clock.offset_us(START + 10_000_000) == pytest.approx(now, abs=20_000)
-    exchange(clock, rng, START + 11_000_000, now, slow=300_000.0)  # a slow one is no step
+    exchange(clock, rng, START + 11_000_000, now, slow=300_000.0)  # a slow one does not count as a step
     assert clock.offset_us(START + 11_000_000) == pytest.approx(now, abs=20_000)
 
 

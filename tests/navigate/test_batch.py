@@ -70,7 +70,7 @@ def test_its_picture(result: xr.Dataset, grid: AnomalyGrid, tmp_path: Path) -> N
 
 
 def test_what_is_drawn_is_the_anomaly_on_the_filters_track(result: xr.Dataset) -> None:
-    """What is recorded has the main field where dead reckoning was: five km north, that is 10 nT off."""
+    """The record has the main field of the dead-reckoned position: five km north it differs by 10 nT."""
     moved = result.isel(time=slice(3)).assign(
         north=("time", [0.0, -5_000.0, 0.0]), east=("time", np.zeros(3))
     )
@@ -107,7 +107,7 @@ def test_another_map_altogether_is_recognised(ds: xr.Dataset, options: Options) 
 def test_what_is_known_badly_says_nothing_about_the_map(
     ds: xr.Dataset, grid: AnomalyGrid, options: Options
 ) -> None:
-    """While a mass moves the field is off by hundreds of nT, and says so: its sigma is as large."""
+    """While a mass moves the error is hundreds of nT, and so is the sigma."""
     moving = np.arange(ds.sizes["time"]) % 25 == 0
     off = ds.assign(
         total_field=ds["total_field"] + np.where(moving, 400.0, 0.0),
@@ -211,7 +211,7 @@ def test_magnavs_published_flight(real_data: Path) -> None:
     """100 s at 300 km/h with an inertial track: the example that MagNav.jl navigates.
 
     Its own filter's error on this flight is not stated with the data; asked here is that the field does no
-    harm over so short a time, and that the innovations agree with what was claimed.
+    harm over so short a time, and that the innovations agree with the claimed sigma.
     """
     grid, ds = magnav_flight(real_data / "magnav_example")
     options = Options(start_sigma=10.0, current_sigma=0.5, bias_sigma=5.0, map_sigma=3.0, drift=0.1)

@@ -50,7 +50,7 @@ def test_off_the_map_it_is_dead_reckoning(grid: AnomalyGrid, options: Options) -
 
 @pytest.mark.parametrize("way", [1, -1], ids=["east", "west"])
 def test_across_the_date_line(grid: AnomalyGrid, options: Options, way: int) -> None:
-    """The same as anywhere else, but for the main field."""
+    """The bound equals that of any other place, except for the main field."""
     turn = 180.0 - 57.9
     there = AnomalyGrid(grid.longitude - turn, grid.latitude, grid.anomaly)
     time, latitude, longitude = TRACK[0], TRACK[1][::way], TRACK[2][::way]

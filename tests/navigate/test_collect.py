@@ -1,4 +1,4 @@
-"""What becomes one measurement: no two samples that lie further apart than the map's detail."""
+"""Samples of one measurement: their distance is at most the detail of the map."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`magbridge navigate` as a user has it: a log or a plan, maps of every kind, and what it answers."""
+"""`magbridge navigate` as a user has it: a log or a plan, maps of every kind, and its output."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options:
     log = ds.drop_vars(["total_field", "total_field_sigma", "away_north", "away_east"]).assign(
         {name: ("time", values, unit) for name, values in channels.items()}
     )
-    # GPS at the start: the dead-reckoned position there, which is the truth less what it was off
+    # GPS at the start: the dead-reckoned position, which is the truth less its error
     first = {"gps_latitude": 49.5, "gps_longitude": -57.9}
     for name, value in first.items():
         log[name] = xr.full_like(log["depth"], np.nan)
@@ -136,7 +136,7 @@ def test_without_a_map_the_track_is_bent_to_its_own_survey(command: Command, her
 
 
 def test_a_bound_takes_the_log_s_own_rate(command: Command, here: Path) -> None:
-    """Samples of a log, else those of the calibration, else one in 4 s; or as it is told."""
+    """The interval is that of the log, of the calibration, or 4 s, unless an option states it."""
     slow = read([Path("log.nc")]).isel(time=slice(None, None, 5))
     write(slow.assign(latitude=slow["truth_latitude"], longitude=slow["truth_longitude"]), "slow.nc")
     for words, every in (

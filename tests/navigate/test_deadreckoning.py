@@ -37,7 +37,7 @@ def test_each_kind_of_telemetry_leads_to_the_same_place(rows: list[tuple[float, 
 
 
 def test_a_glider_moves_by_its_sink_rate_and_pitch() -> None:
-    """26 degrees down at 0.17 m/s of depth is 0.35 m/s along; after the turn the climb goes on alike."""
+    """26 degrees down at 0.17 m/s of depth is 0.35 m/s along; after the turn it continues."""
     rows = []
     for t in np.arange(0.0, 1000.0, 4.0):
         down = t < 500

@@ -26,7 +26,7 @@ def test_errors_of_the_map_add_up() -> None:
     assert there.altitude == pytest.approx(-60.0)
     assert known.map_sigma == pytest.approx(hypot(1.5, left.sigma))
     assert min(left.length, 800.0) < known.map_length < max(left.length, 800.0)
-    assert at_depth(drawn, options, depth) == (drawn, options), "an altitude that nobody knows"
+    assert at_depth(drawn, options, depth) == (drawn, options), "an unknown altitude"
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_a_glider_that_dives_under_it_is_found() -> None:
 
 
 def test_what_lies_between_nodes_counts_as_map_error() -> None:
-    """Sources as deep as the nodes are apart: some nT between them, over half their distance."""
+    """Sources at the depth of the node spacing: some nT between the nodes, over half their distance."""
     rng, n = np.random.default_rng(7), 60
     k = 2.0 * np.pi * np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n))
     values = np.fft.ifft2(np.fft.fft2(rng.normal(size=(n, n))) * np.exp(-k)).real
@@ -71,7 +71,7 @@ def test_a_map_whose_level_is_uncertain_leaves_the_bias_open() -> None:
 
 
 def test_what_was_smoothed_away_is_a_map_error_that_lasts_and_a_flight_holds_its_position() -> None:
-    """Rough rock without its waves below 1 km: near the bound, and honest; counted with every measurement
+    """A rough field without its waves below 1 km: near the bound, consistent; counted with every measurement
     instead, a field that has nothing to do with the map explained the flight better, and it was lost.
     """
     raw = synthetic(Map(40, 1000, rough=True), 0)

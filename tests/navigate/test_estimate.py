@@ -69,7 +69,7 @@ def test_a_wide_start_has_many_hypotheses_and_a_narrow_one_has_one(
 def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
     grid: AnomalyGrid, options: Options
 ) -> None:
-    """Over rock five times as rough as the map's, which the map does not explain at any place or level."""
+    """Over a field five times as rough as the map, which the map does not explain at any place or level."""
     elsewhere = synthetic(Map(150, 1500), 9)
     estimate, widths = None, []
     for block, metres in blocks(track_over(elsewhere, options, 5, hours=0.5), grid, options):

@@ -1,4 +1,4 @@
-"""A level that nobody knows is one bias, not noise."""
+"""An unknown level is one bias, not noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The navigator as a user has it: it finds the vehicle, says when it has not, and replays alike."""
+"""The navigator as a user has it: it finds the vehicle or reports that it has not; replays are equal."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: Options, ds: xr.Dat
 
 
 def test_across_the_antimeridian(grid: AnomalyGrid, options: Options) -> None:
-    """The same map and track moved to 180 degrees: the field differs by the main field only."""
+    """Map and track moved to 180 degrees: only the main field differs."""
     moved = AnomalyGrid(grid.longitude - PLACE[1] + 180.0, grid.latitude, grid.anomaly)
     nav = Navigator(moved, replace(options, start_sigma=20.0))
     nav.fix(START_US, PLACE[0], 179.9999)

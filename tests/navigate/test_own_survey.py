@@ -21,7 +21,7 @@ OPTIONS = Options(start_sigma=1.0, current_sigma=0.03, drift=0.05, bias_sigma=1.
 
 
 def flown(*, straight: bool) -> xr.Dataset:
-    """A current of 3 cm/s carries a glider off, over rock of 40 nT and 700 m: back and forth, or ahead."""
+    """A current of 3 cm/s displaces a glider over a field of 40 nT and 700 m: back and forth, or ahead."""
     rng = np.random.default_rng(4)
     time = np.arange(0.0, HOURS * 3600.0, DT)
     leg = (time // 1800.0).astype(int)
@@ -85,7 +85,7 @@ def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning
 
 
 def test_a_drift_that_may_be_longer_than_the_field_is_to_be_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There a track may settle at another repetition of the field, and its spread does not know."""
+    """There a track may converge to another repetition of the field, which its spread does not include."""
     monkeypatch.setattr(own_survey, "PARTICLES", 24)
     track = localise(flown(straight=False), structs.replace(OPTIONS, current_sigma=0.3), start=START)
     assert "check it against a fix" in track.attrs["findings"]

@@ -146,7 +146,7 @@ def test_splitting_and_merging_keep_mean_and_covariance(grid: AnomalyGrid, corre
 def test_the_bank_is_bayes_on_a_wide_start(grid: AnomalyGrid) -> None:
     """Places of the prior, weighted by the likelihood, against the bank: mean, spread and evidence.
 
-    Places need no line through the map: what is left is the bank's own. Bias and map error, which both
+    Places need no line through the map: the remainder is the bank's own. Bias and map error, which both
     measurements share, are integrated out. Two measurements 900 m apart; tolerance 3 % of the posterior's
     spread, and 3 % of the evidence.
     """

@@ -133,7 +133,7 @@ def test_a_stalled_host_changes_nothing() -> None:
 
 
 def test_a_host_that_is_busy_for_a_second_has_not_set_its_clock() -> None:
-    """Nor has the instrument: what comes late for that long was sent in time."""
+    """Nor has the instrument: readings that come late for that long were sent in time."""
     true = np.arange(0.0, 20.0, 0.02)
     made = stamps(
         DeviceClock(), true, arrivals(true, 2e-3) + np.where((true > 5.0) & (true < 6.0), 0.07, 0.0)

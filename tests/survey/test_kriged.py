@@ -1,4 +1,4 @@
-"""Kriging from the nearest samples, over an area that is too large for nodes as fine as its rock."""
+"""Kriging from the nearest samples, over an area that is too large for nodes as fine as its field."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def found() -> tuple[Rock, Samples, Kriged]:
 
 
 def between(*, astray: bool) -> FloatArray:
-    """Return places half way between lines, beside the one that went astray or far from it."""
+    """Return places half way between lines, next to the wrong line or far from it."""
     line = np.arange(1, 22)
     line = line[(np.abs(line + 0.5 - ASTRAY) < 1.0) == astray]
     return np.stack(np.meshgrid(np.arange(1000.0, 11_000.0, 300.0), APART * (line + 0.5)), axis=-1).reshape(
@@ -70,7 +70,7 @@ def test_depth_size_and_noise_are_found(found: tuple[Rock, Samples, Kriged]) -> 
 def test_sigma_between_lines_is_honest_also_beside_one_that_went_astray(
     found: tuple[Rock, Samples, Kriged],
 ) -> None:
-    """That line is told by the others, and believed less."""
+    """The other lines detect that line, and its weight is smaller."""
     rock, _, one = found
     assert np.argmax(one.share) == ASTRAY
     assert np.median(one.share) < 0.1 < one.share[ASTRAY]

@@ -1,4 +1,4 @@
-"""Raw logs to one map: several vehicles, a base station, and what a bad log is told."""
+"""Raw logs to one map: several vehicles, a base station, and the message for a bad log."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def judged(command: Command, folder: Path, *words: object) -> tuple[FloatArray, 
 
 
 def test_two_vehicles_with_a_calibration_each_make_one_map(command: Command, tmp_path: Path) -> None:
-    """Their hard irons are not the same, their levels 64 nT apart: no seam is left, and the sigma holds."""
+    """Their hard irons differ, and their levels by 64 nT: no seam remains, and the sigma is consistent."""
     words: list[object] = []
     for axis, vehicle in enumerate(IRON):
         write(flown(vehicle, lanes(axis), START + 1e5 * axis), tmp_path / f"{vehicle}.nc")
@@ -156,7 +156,7 @@ def test_what_correct_has_flagged_and_what_has_no_place_stay_out_of_the_map(
 
 
 def test_one_straight_line_has_rock_below_it(command: Command, tmp_path: Path) -> None:
-    """Told apart or not, what changes along it is neither noise nor all the vehicle's."""
+    """Distinguished or not, changes along it are neither noise nor only the vehicle's."""
     place = np.stack([np.linspace(-3000.0, 3000.0, 300), np.zeros(300)], axis=1)
     write(flown("comet", place), tmp_path / "log.nc")
     map_file = tmp_path / "map.nc"

@@ -69,7 +69,7 @@ def test_levels_are_found_at_the_crossovers(done: tuple[Rock, Result]) -> None:
 
 
 def test_map_is_right_within_its_sigma(done: tuple[Rock, Result]) -> None:
-    """Between the lines, apart from the level that all lines share."""
+    """Between the lines, without the common level of all lines."""
     rock, result = done
     at = np.random.default_rng(7).uniform(-2500, 2500, (400, 2))
     anomaly, sigma = result.gridded.at(at)
@@ -89,7 +89,7 @@ def test_far_from_the_lines_nothing_is_known(done: tuple[Rock, Result]) -> None:
 
 
 def test_a_map_is_continued_upward_with_its_sigma(done: tuple[Rock, Result]) -> None:
-    """600 m up every wave of the rock has fallen off by its own wave number; the error is what sigma says.
+    """600 m up every wave of the field has decayed by its wave number; the error agrees with sigma.
 
     So it is near the edge, where what lies beyond comes in: the survey's own sigma does not know of that.
     """
@@ -140,7 +140,7 @@ def test_map_of_a_vehicle_that_dives_is_right_between_its_tracks() -> None:
 
 
 def zigzag(rng: np.random.Generator, *, back: bool) -> tuple[Samples, FloatArray, FloatArray]:
-    """Return three hours of a zigzag over rock of 30 nT, as corrected; the rock, and a quiet day's change."""
+    """Return three hours of a corrected zigzag over a field of 30 nT, the field, and a quiet day's change."""
     n, legs = 1200, 6
     leg = np.arange(n) * legs // n
     course = np.radians(np.where(leg % 2, 50.0, -50.0) + 180.0 * (back & (leg >= legs // 2)))
@@ -174,7 +174,7 @@ def test_a_change_with_time_that_crossings_show_is_not_in_the_map() -> None:
 
 
 def test_where_a_track_jumps_the_map_is_as_uncertain_as_its_places() -> None:
-    """A fix moves the second half by 600 m: what contradicts itself then is no change with time."""
+    """A fix moves the second half by 600 m: the contradiction is not a change with time."""
     samples, rock, _ = zigzag(np.random.default_rng(4), back=True)
     place = samples.place.copy()
     place[500:, 0] += 600.0
@@ -225,7 +225,7 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_command_makes_a_map_that_navigate_reads(command: Command, table: Path) -> None:
-    """And GeoTIFF, tracks and crossovers beside it; the map says what the survey says."""
+    """Write GeoTIFF, tracks and crossovers as well; the map equals the survey."""
     out = table.parent
     output = command(
         "survey", table, "-o", out / "map.nc", "--geotiff", out / "map.tif", "--tracks", out / "t.geojson",
@@ -286,8 +286,8 @@ def test_a_bad_table_is_one_line(command: Command, tmp_path: Path, text: str, wo
 
 
 def test_a_vehicle_finds_itself_on_the_map_that_its_own_survey_drew() -> None:
-    """Between the tracks the map's errors last for hundreds of metres. Counted anew with every sample they
-    made the filter sure of a wrong place; a level taken off the map left the field unexplained by it.
+    """Between the tracks the map's errors last for hundreds of metres. Counted again with every sample they
+    made the filter sure of a wrong place; a level removed from the map left the field unexplained by it.
     """
     rock = synthetic(Map(40, 1000), 2)
     flown = track_over(rock, GLIDER, 2, hours=4.0)
