@@ -10,8 +10,8 @@ import xarray as xr
 
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
-from magbridge.field.declination import with_true_heading
 from magbridge.field.geodesy import wrap
+from magbridge.field.reference import with_true_heading
 from sitl.scenario import Scenario
 from sitl.trajectory import Track
 from sitl.twin import FINE_STEP, TEMPERATURE, Twin

@@ -61,11 +61,11 @@ from voyages import (
 
 from magbridge.estimation.residual import rms
 from magbridge.field.geodesy import metres_per_degree, separation
+from magbridge.navigate.bank import Tracker
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import Options
-from magbridge.navigate.tracker import Tracker
 
 MAPS = (Map(60, 2000), Map(60, 800), Map(20, 1000), Map(20, 1000, rough=True), Map(5, 1000), Map(1, 2000))
 STARTS = {"narrow": 0.2, "wide": 1.0}

@@ -31,10 +31,9 @@ from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.bound import position_bound
-from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.depth import at_depth
-from magbridge.navigate.model import Block, block_length
+from magbridge.navigate.model import Block, Collector, block_length
 from magbridge.navigate.navigator import Navigator
 from magbridge.navigate.options import Options, informed
 from magbridge.navigate.own_survey import localise

@@ -154,8 +154,8 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     from magbridge.calibration.fitting.parameter_choice import AUTO
     from magbridge.calibration.fitting.sources import unused_logs
     from magbridge.columns import CHANNELS, require
-    from magbridge.field.declination import with_true_heading
     from magbridge.field.read import read_grid
+    from magbridge.field.reference import with_true_heading
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 

@@ -126,7 +126,7 @@ def navigate(
 def _scalar(files: tuple[Path, ...], heading_reference: Heading, reading: Reading) -> xr.Dataset:
     """Return logs that hold the total field; WrongUse: they hold what must be corrected first."""
     from magbridge.errors import WrongUse
-    from magbridge.field.declination import with_true_heading
+    from magbridge.field.reference import with_true_heading
     from magbridge.logs import read
 
     with waiting("reading"):
@@ -147,7 +147,7 @@ def _corrected(
     """Return the logs with their field corrected by the calibration `known`, which the file holds."""
     from magbridge.columns import CHANNELS
     from magbridge.correction import Correction
-    from magbridge.field.declination import with_true_heading
+    from magbridge.field.reference import with_true_heading
     from magbridge.logs import read
     from magbridge.rows import correct_rows
 

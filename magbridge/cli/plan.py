@@ -58,7 +58,7 @@ def plan(
     """
     from magbridge.calibration.file import load
     from magbridge.calibration.planning import flight_plan, survey_patterns
-    from magbridge.field.declination import with_true_heading
+    from magbridge.field.reference import with_true_heading
     from magbridge.logs import read
 
     if calibration is None and survey is None:

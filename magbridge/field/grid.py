@@ -10,7 +10,7 @@ from __future__ import annotations
 from functools import cached_property
 from math import inf, nan, sqrt
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +19,9 @@ from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, OutOfRange
 from magbridge.field.geodesy import metres_per_degree, signed_longitude, wrap
 from magbridge.field.grid_netcdf import write
-from magbridge.field.local import OFF_THE_MAP, Local, T
 from magbridge.field.spline import WEIGHTS, coefficients, filled, weights
 
-__all__ = ["HOLE", "AnomalyGrid"]
+__all__ = ["HOLE", "AnomalyGrid", "Local", "T", "curvature"]
 
 EVEN = 1e-3
 """Share of a step by which rounded coordinates may deviate from an even spacing."""
@@ -342,3 +341,44 @@ def _axis(values: ArrayLike, name: str, what: str) -> tuple[FloatArray, bool]:
     if step <= 0.0 or np.abs(axis - even).max() > EVEN * step:
         raise FormatError(name, "expected evenly spaced coordinates in order", column=what)
     return even, flip
+
+
+T = TypeVar("T", float, FloatArray)
+
+
+class Local(NamedTuple, Generic[T]):
+    """The map around one place or n places; NaN outside the map and in its holes.
+
+    ``anomaly`` nT; ``north``, ``east`` nT/m, its gradient; ``north_north``, ``north_east``, ``east_east``
+    nT/m², its Hessian; ``variance`` nT², of the map's own error there.
+    """
+
+    anomaly: T
+    north: T
+    east: T
+    north_north: T
+    north_east: T
+    east_east: T
+    variance: T
+
+
+OFF_THE_MAP: Local[float] = Local(nan, nan, nan, nan, nan, nan, nan)
+
+
+def curvature(local: Local[T], nn: T, ne: T, ee: T) -> tuple[T, T]:
+    """Return what curvature adds to mean (nT) and variance (nT²) of the map under a position's spread.
+
+    Parameters
+    ----------
+    local : Local
+        The map at the position's mean.
+    nn, ne, ee : float or (n,) array
+        m², covariance P of the position.
+
+    Notes
+    -----
+    ``tr(C P)/2`` and ``tr((C P)²)/2``, C the Hessian (second-order filter; Bar-Shalom et al. 2001, 10.3).
+    """
+    a, b = local.north_north * nn + local.north_east * ne, local.north_north * ne + local.north_east * ee
+    c, d = local.north_east * nn + local.east_east * ne, local.north_east * ne + local.east_east * ee
+    return 0.5 * (a + d), 0.5 * (a * a + 2.0 * b * c + d * d)

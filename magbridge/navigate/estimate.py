@@ -9,13 +9,12 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.bank import Bank, widest
+from magbridge.navigate.bank import Bank, Innovation, Tracker, widest
 from magbridge.navigate.deadreckoning import MotionNoise, Step
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
 from magbridge.navigate.options import Options, any_level
 from magbridge.navigate.record import Jump, State
-from magbridge.navigate.tracker import Innovation, Tracker
 
 __all__ = ["Estimate"]
 

@@ -28,11 +28,11 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.field.grid import AnomalyGrid
+from magbridge.navigate.bank import Tracker
 from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.integrity import Unmapped, squared_mahalanobis
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import Options, any_level
-from magbridge.navigate.tracker import Tracker
 
 __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 

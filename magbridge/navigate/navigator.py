@@ -18,12 +18,11 @@ import numpy as np
 from magbridge.field.geodesy import offset, separation, worse_axis
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import widest
-from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.depth import lasting_errors
 from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
-from magbridge.navigate.model import Block, block_length, transition
+from magbridge.navigate.model import Block, Collector, block_length, transition
 from magbridge.navigate.options import Options
 from magbridge.navigate.record import Reckoned, Record, State
 from magbridge.records import Corrected, Quality

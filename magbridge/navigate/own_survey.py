@@ -2,12 +2,22 @@ r"""Localisation without a map: the track is bent to where the field that it met
 
 .. math:: y_i = f(x_i + d(t_i)) + b(t_i) + e_i
 
-d is the error of dead reckoning, b that of the calibration, f a Gaussian field in place whose size and length
-the data choose: localisation and mapping at once, as 'MagSLAM' (Lee & Canciani 2020), by a Rao-Blackwellised
-sampler: f is integrated out (:mod:`.own_field`), and particles follow the posterior of d as the track goes on
+d is the error of dead reckoning, b that of the calibration, f a Gaussian field in place whose size and
+length the data choose: localisation and mapping at once, as 'MagSLAM' (Lee & Canciani 2020), by a
+Rao-Blackwellised sampler: f is integrated out, and particles follow the posterior of d as the track goes on
 (:mod:`.particles`). One crossing leaves a curve of drifts that agree with it, and a drift as large as the
 field's length several: no single track with a Gaussian sigma describes that, the particles' spread does.
 Where the field says nothing they stay where dead reckoning has them.
+
+The likelihood of a drift d(t) in the field f with the calibration's error b is
+
+.. math:: y_i = f(x_i + d(t_i)) + b(t_i) + e_i, \quad
+          \log p(y | d) = -\tfrac12 y^T K^{-1} y - \tfrac12 \log|K| + \text{const},
+
+.. math:: K_{ij} = s^2 k(|x_i + d_i - x_j - d_j| / \ell) + \beta_{ij} + R_{ij}
+
+The Gaussian field (Rasmussen & Williams 2006, eq. 2.30; gradient eq. 5.9) has the size s and the length l.
+Its covariance k is one of :data:`COVARIANCE_KINDS`, from rough to smooth.
 """
 
 from __future__ import annotations
@@ -20,6 +30,7 @@ from math import ceil
 import numpy as np
 import xarray as xr
 from msgspec import structs
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs
 from threadpoolctl import threadpool_limits
 
 from magbridge.arrays import FloatArray
@@ -27,16 +38,13 @@ from magbridge.errors import FormatError
 from magbridge.field.geodesy import offset, separation
 from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.batch import COLUMN_UNITS, MOTIONS, columns_of, first_position, motion_of, samples_of
-from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.model import Block
+from magbridge.navigate.model import Block, Collector, transition
 from magbridge.navigate.options import Options
-from magbridge.navigate.own_bound import with_bound
-from magbridge.navigate.own_field import COVARIANCE_KINDS, OwnField
 from magbridge.navigate.particles import Particles, sample
 from magbridge.navigate.reference_track import reference_track, with_errors
 
-__all__ = ["localise"]
+__all__ = ["COVARIANCE_KINDS", "OwnField", "drift_functions", "localise", "own_bound"]
 
 STEP, LASTS, BLOCKS = 60.0, 100.0, 400
 """m that a block of samples covers at most, the share of the log that it lasts at most is one in so many, and
@@ -234,3 +242,208 @@ def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> 
             "the field adds little to dead reckoning: the track has to come back to places it has met, "
             "before it has drifted by more than the field's length"
         )
+
+
+COVARIANCE_KINDS = ("exponential, once smooth", "exponential, twice smooth", "Gaussian")
+"""Matern's covariances of smoothness 3/2 and 5/2, and the limit of both (Rasmussen & Williams, eq. 4.17)."""
+SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
+"""nT of the crustal field, and the 1-sigma of its logarithm: sea floor and land by airborne surveys."""
+LENGTH_SPREAD, NOISE_SPREAD = np.log(6.0), np.log(1.3)
+"""1-sigma of the logarithm of the length, and of the noise over what the calibration claims."""
+STEPS, SHARE = 4.0, 2.5
+"""The shortest length expected, over the distance of neighbours; the longest, over the track's extent."""
+LEVEL_SCATTERS = 10.0
+"""The level's 1-sigma, over the scatter of the measured field: it is not known."""
+KNOTS, WAVES, LEFT_OUT = 240, 48, 1e-4
+"""Times at which a drift's covariance is taken, its functions at most, and the share they may leave out."""
+FARTHEST = 8.0
+"""Sigmas of its prior beyond which no size, length or noise is tried."""
+IMPOSSIBLE_LOG_LIKELIHOOD = -1e300
+"""Log likelihood of an impossible track."""
+
+
+def drift_functions(time: FloatArray, options: Options) -> FloatArray:
+    """Return functions (n, r), m, whose sum with weights N(0, 1) is the error of dead reckoning on one axis.
+
+    `time` (n,) is in s. They are Karhunen-Loeve's: eigenvectors of the covariance that the state of
+    :mod:`.model` has, scaled by the root of their eigenvalues.
+    """
+    knots = np.linspace(time[0], max(time[-1], time[0] + 1.0), min(KNOTS, max(len(time), 2)))
+    F, Q = (one[np.ix_((0, 2), (0, 2))] for one in transition(options, knots[1] - knots[0], 0.0))
+    P = np.diag([options.start_sigma, options.current_sigma]) ** 2
+    C = np.zeros((len(knots), len(knots)))
+    for k in range(len(knots)):
+        later = P.copy()
+        for j in range(k, len(knots)):
+            C[j, k] = C[k, j] = later[0, 0]
+            later = F @ later
+        P = F @ P @ F.T + Q
+    values, vectors = np.linalg.eigh(C)
+    order = np.argsort(values)[::-1][:WAVES]
+    kept = order[values[order] > LEFT_OUT * values.max()]
+    functions = vectors[:, kept] * np.sqrt(values[kept])
+    return np.stack([np.interp(time, knots, one) for one in functions.T], axis=1)
+
+
+class OwnField:
+    """Blocks along a dead-reckoned track, and the likelihood of what they measured.
+
+    Unknown is u (q,), N(0, 1) each beforehand: the weights of the drift's functions north (r,) and east (r,),
+    and the logarithms of the field's size, its length and the noise over their spread.
+
+    Parameters
+    ----------
+    blocks : list of Block
+    place : (n, 2) array
+        m, north and east, where dead reckoning has them.
+    options : Options
+        How well start, current and calibration are known.
+
+    Attributes
+    ----------
+    time : (n,) array
+        s.
+    drift : (n, r) array
+        m, :func:`drift_functions`.
+    q : int
+        Number of unknowns.
+    """
+
+    def __init__(self, blocks: list[Block], place: FloatArray, options: Options) -> None:
+        rows = np.array(blocks)
+        self.time, self.place = rows[:, 0] * 1e-6, place
+        self.anomaly, self.variance, self.slope = rows[:, 3], rows[:, 4], rows[:, 5:7]
+        self.drift = drift_functions(self.time, options)
+        self.r = self.drift.shape[1]
+        self.q = 2 * self.r + 3
+        self.mean = float(np.median(self.anomaly))
+        step = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
+        extent = float(np.hypot(*np.ptp(place, axis=0)))
+        self.shortest = STEPS * max(step, 1.0)
+        self._middle = float(np.sqrt(self.shortest * max(extent / SHARE, 1.5 * self.shortest)))
+        apart = np.abs(self.time[:, None] - self.time) / options.bias_time
+        self._other = (
+            options.bias_sigma**2 * np.exp(-apart) + (LEVEL_SCATTERS * float(self.anomaly.std())) ** 2
+        )
+
+    def moved(self, u: FloatArray) -> FloatArray:
+        """Return the error of dead reckoning (n, 2), m, of u (q,); (k, n, 2) of several, (k, q)."""
+        by = np.stack([u[..., : self.r], u[..., self.r : 2 * self.r]], axis=-1)
+        return np.asarray(self.drift @ by)
+
+    def scales(self, u: FloatArray) -> FloatArray:
+        """Return the field's size, nT, its length, m, and the noise over the claimed one: (3,) or (k, 3)."""
+        at_zero = np.array([SIZE, self._middle, 1.0])
+        return np.asarray(at_zero * np.exp(u[..., -3:] * (SIZE_SPREAD, LENGTH_SPREAD, NOISE_SPREAD)))
+
+    def log_likelihood(self, u: FloatArray, kind: int, count: int) -> tuple[float, FloatArray]:
+        """Return log p of the first `count` blocks, up to a constant, and its gradient by u (q,)."""
+        gradient = np.zeros(self.q)
+        if np.abs(u[-3:]).max() > FARTHEST:
+            return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
+        n = slice(0, count)
+        size, length, noise = self.scales(u)
+        d, W = self.moved(u)[n], self.drift[n]
+        x, y = self.place[n] + d, self.anomaly[n] - self.mean - (self.slope[n] * d).sum(axis=1)
+        squared, k, h, K, R = self._covariance(x, kind, size, length, noise)
+        L, info = dpotrf(K.T, lower=1)
+        if info:
+            return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
+        alpha = dpotrs(L, y, lower=1)[0]
+        value = -0.5 * float(y @ alpha) - float(np.log(L.diagonal()).sum())
+        inverse = np.tril(dpotri(L, lower=1)[0])
+        G = np.outer(alpha, alpha) - inverse - np.tril(inverse, -1).T  # twice the slope by K
+        Gh = G * h
+        steep = (size / length) ** 2
+        by_place = steep * (Gh.sum(axis=1)[:, None] * x - Gh @ x) + self.slope[n] * alpha[:, None]
+        gradient[: 2 * self.r] = (W.T @ by_place).T.ravel()
+        gradient[-3] = size * size * float((G * k).sum()) * SIZE_SPREAD
+        gradient[-2] = -0.5 * steep * float((Gh * squared).sum()) * LENGTH_SPREAD
+        gradient[-1] = float(G.diagonal() @ R) * NOISE_SPREAD
+        return value, gradient
+
+    def covariance(self, place: FloatArray, u: FloatArray, kind: int) -> tuple[FloatArray, FloatArray]:
+        """Return K (n, n), nT², with the blocks at places (n, 2), m, and its part R (n,) that is noise."""
+        _, _, _, K, R = self._covariance(place, kind, *self.scales(u))
+        return K, R
+
+    def slopes(self, place: FloatArray, u: FloatArray, kind: int) -> FloatArray:
+        """Return the slopes (n, 2), nT/m, of the field that the blocks show if they are at places (n, 2), m.
+
+        Notes
+        -----
+        The mean, ``∂k(x_i, x) K^-1 y`` (Rasmussen & Williams 2006, eq. 2.25 and section 9.4).
+        """
+        size, length, noise = self.scales(u)
+        _, _, h, K, _ = self._covariance(place, kind, size, length, noise)
+        y = self.anomaly - self.mean - (self.slope * (place - self.place)).sum(axis=1)
+        weight = (size / length) ** 2 * h * np.linalg.solve(K, y)
+        return np.asarray(weight.sum(axis=1)[:, None] * place - weight @ place)
+
+    def _covariance(
+        self, x: FloatArray, kind: int, size: float, length: float, noise: float
+    ) -> tuple[FloatArray, ...]:
+        """Return ``|x_i - x_j|²``, k and h (n, n) of it, K (n, n), and R (n,)."""
+        squared = (x[:, None, 0] - x[:, 0]) ** 2 + (x[:, None, 1] - x[:, 1]) ** 2
+        k, h = _kind(np.sqrt(squared) / length, kind)
+        K = size * size * k + self._other[: len(x), : len(x)]
+        R = self.variance[: len(x)] * noise**2
+        K.flat[:: len(x) + 1] += R
+        return squared, k, h, K, R
+
+
+def _kind(a: FloatArray, kind: int) -> tuple[FloatArray, FloatArray]:
+    """Return covariances of unit variance at distances a over the length, and h = k'(a)/a."""
+    if kind == 2:
+        k = np.exp(-0.5 * a * a)
+        return k, -k
+    a = np.sqrt(2.0 * kind + 3.0) * a
+    falling = np.exp(-a)
+    if kind == 0:
+        return (1.0 + a) * falling, -3.0 * falling
+    return (1.0 + a + a * a / 3.0) * falling, -(5.0 / 3.0) * (1.0 + a) * falling
+
+
+def own_bound(
+    field: OwnField, place: FloatArray, slopes: FloatArray, typical: FloatArray, kind: int
+) -> FloatArray:
+    """Return the smallest covariance (n, 2, 2), m², that any estimator of the drift could reach.
+
+    Parameters
+    ----------
+    field : OwnField
+        The measured field.
+    place, slopes : (n, 2) array
+        The true places, m, and the field's slopes there, nT/m; NaN where not known: such blocks tell nothing.
+    typical : (q,) array
+        Unknowns of which size, length and noise are taken.
+    kind : int
+        Of the field.
+
+    Notes
+    -----
+    Field and drift are linearised at the truth, jointly Gaussian; with the field integrated out the posterior
+    Cramér-Rao bound of the drift's weights is ``(I + G' K^-1 G)^-1``, G the slopes times the drift's
+    functions (Tichavský, Muravchik & Nehorai 1998, eq. 21, for one batch). The field's covariance is taken
+    as known.
+    """
+    whole = np.asarray(np.isfinite(np.hstack([place, slopes])).all(axis=1))
+    K = field.covariance(np.where(whole[:, None], place, 0.0), typical, kind)[0][np.ix_(whole, whole)]
+    felt = slopes[whole] + field.slope[whole]
+    W = field.drift
+    G = np.hstack([felt[:, :1] * W[whole], felt[:, 1:] * W[whole]])
+    P = np.linalg.inv(np.eye(G.shape[1]) + G.T @ np.linalg.solve(K, G))
+    return np.asarray(np.einsum("nr,arbs,ns->nab", W, P.reshape(2, field.r, 2, field.r), W))
+
+
+def with_bound(
+    result: xr.Dataset, field: OwnField, moved: FloatArray, typical: FloatArray, kind: int
+) -> xr.Dataset:
+    """Add the smallest error possible, m, to a track that is `moved` (n, 2), m, and whose error is known."""
+    error = np.stack([result["error_north"], result["error_east"]], axis=1)
+    true = field.place + moved - error
+    whole = np.isfinite(true).all(axis=1)
+    slopes = field.slopes(np.where(whole[:, None], true, field.place), typical, kind)
+    P = own_bound(field, true, slopes, typical, kind)
+    about = {"units": "m", "long_name": "smallest possible position error (DRMS)"}
+    return result.assign(bound_sigma=("time", np.sqrt(np.trace(P, axis1=1, axis2=2)), about))

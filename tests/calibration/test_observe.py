@@ -10,7 +10,7 @@ from magbridge.calibration.fitting.draw import _abscissae
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.errors import CalibrationError, FormatError
-from magbridge.field.declination import with_true_heading
+from magbridge.field.reference import with_true_heading
 from sitl import load, simulate
 
 

@@ -7,8 +7,7 @@ import pytest
 import xarray as xr
 
 from magbridge.errors import FormatError
-from magbridge.field.declination import with_true_heading
-from magbridge.field.reference import earth_field, main_field, reference_field
+from magbridge.field.reference import earth_field, main_field, reference_field, with_true_heading
 
 N = 5
 

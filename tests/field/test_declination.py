@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magbridge.field.declination import with_true_heading
+from magbridge.field.reference import with_true_heading
 
 TIME = 1_400_000_000.0 + np.arange(3.0)
 

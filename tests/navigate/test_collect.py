@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magbridge.navigate.collect import Collector
 from magbridge.navigate.deadreckoning import DeadReckoning
-from magbridge.navigate.model import Block
+from magbridge.navigate.model import Block, Collector
 from magbridge.navigate.options import Options
 
 T0 = 1_600_000_000

@@ -9,8 +9,7 @@ from scipy.stats import multivariate_normal
 from magbridge.arrays import FloatArray
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import Options
-from magbridge.navigate.own_bound import own_bound
-from magbridge.navigate.own_field import COVARIANCE_KINDS, OwnField, drift_functions
+from magbridge.navigate.own_survey import COVARIANCE_KINDS, OwnField, drift_functions, own_bound
 from magbridge.navigate.particles import sample
 
 OPTIONS = Options(start_sigma=30.0, current_sigma=0.05, bias_sigma=2.0, bias_time=3600.0)

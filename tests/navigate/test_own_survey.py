@@ -12,8 +12,7 @@ from magbridge.field.geodesy import offset
 from magbridge.field.igrf import total_field
 from magbridge.navigate import own_survey
 from magbridge.navigate.options import Options
-from magbridge.navigate.own_field import OwnField
-from magbridge.navigate.own_survey import localise
+from magbridge.navigate.own_survey import OwnField, localise
 from magbridge.navigate.reference_track import errors
 
 START, HOURS, DT = (49.5, -57.9), 3.0, 60.0

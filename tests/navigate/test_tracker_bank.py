@@ -9,12 +9,10 @@ from scipy.stats import multivariate_normal
 from voyages import PLACE
 
 from magbridge.field.geodesy import metres_per_degree, offset
-from magbridge.field.grid import AnomalyGrid
-from magbridge.field.local import Local
-from magbridge.navigate.bank import Bank, widest
+from magbridge.field.grid import AnomalyGrid, Local
+from magbridge.navigate.bank import Bank, Tracker, widest
 from magbridge.navigate.model import Block, prior, transition
 from magbridge.navigate.options import Options
-from magbridge.navigate.tracker import Tracker
 
 Moments = tuple[np.ndarray, np.ndarray]
 

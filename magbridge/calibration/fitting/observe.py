@@ -13,9 +13,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.observations import TEMPERATURE, Observations
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import CalibrationError
-from magbridge.field.declination import with_true_heading
 from magbridge.field.geodesy import separation
-from magbridge.field.reference import earth_field, placed, positions
+from magbridge.field.reference import earth_field, placed, positions, with_true_heading
 from magbridge.one_time import interpolate_to_rows
 
 if TYPE_CHECKING:
