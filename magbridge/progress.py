@@ -1,4 +1,4 @@
-"""A progress bar on a terminal, for what takes more than two seconds; nothing elsewhere."""
+"""Progress of long work: a bar on a terminal; elsewhere nothing, or a line at intervals."""
 
 from __future__ import annotations
 
@@ -18,8 +18,18 @@ BAR_INTERVAL_S = 0.1
 """s between two updates of the bar: drawing takes longer than most items do."""
 
 
-def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator[T]:
-    """Yield `items`; once that has taken two seconds, show on a terminal how far it is."""
+LINE_INTERVAL_S = 10.0
+"""s between two lines where there is no terminal."""
+
+
+def track(items: Iterable[T], what: str, total: int | None = None, *, in_lines: bool = False) -> Iterator[T]:
+    """Yield `items`; once that has taken two seconds, show on a terminal how far it is.
+
+    Without a terminal nothing is shown, or with `in_lines` a line on stderr every :data:`LINE_INTERVAL_S`.
+    """
+    if in_lines and not sys.stderr.isatty():
+        yield from _lines(items, what, total)
+        return
     with _bar(what, total) as update:
         updated = time.monotonic()
         for done, item in enumerate(items, 1):
@@ -28,6 +38,19 @@ def track(items: Iterable[T], what: str, total: float | None = None) -> Iterator
             if now - updated > BAR_INTERVAL_S:
                 update(completed=done)
                 updated = now
+
+
+def _lines(items: Iterable[T], what: str, total: int | None) -> Iterator[T]:
+    """Yield `items`, and print how many are done: at intervals, and after the last where it took as long."""
+    begin = printed = time.monotonic()
+    of = "" if total is None else f" of {total}"
+    for done, item in enumerate(items, 1):
+        yield item
+        now = time.monotonic()
+        is_last = done == total and now - begin >= LINE_INTERVAL_S
+        if now - printed >= LINE_INTERVAL_S or is_last:
+            print(f"magbridge: {what}: {done}{of}, {now - begin:.0f} s", file=sys.stderr, flush=True)
+            printed = now
 
 
 @contextmanager

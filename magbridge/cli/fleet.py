@@ -169,7 +169,7 @@ def process(
     failures: list[str] = []
     if todo:
         with client_of(scheduler, workers, memory) as client:
-            for outcome in track(run(there, todo, client), "deployments", len(todo)):
+            for outcome in track(run(there, todo, client), "deployments", len(todo), in_lines=True):
                 failures += outcome.failures
                 for line in outcome.failures:
                     complain(line)

@@ -76,19 +76,20 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
 def chosen_parameters(named: Sequence[str], deployment: xr.Dataset, **options: Any) -> tuple[str, ...]:
     """Return the parameters of a fit: those that are named, or for ``auto`` the columns that are worth it.
 
+    ``auto`` tries positions, currents, temperatures and pressures.
     The improvement by each column on held-out parts is printed to stderr. `options` are of
     :func:`~magbridge.calibration.fitting.parameter_choice.best_parameters`.
 
     WrongUse: ``auto`` among names.
     """
     from magbridge.calibration.fitting.parameter_choice import AUTO, best_parameters, lines
-    from magbridge.logs.info import movers
+    from magbridge.logs.info import conditions, movers
 
     if AUTO not in named:
         return tuple(named)
     if len(named) > 1:
         raise WrongUse(f"--parameter {AUTO}: chooses them all, and goes with no other")
-    offered = movers(deployment)
+    offered = [*movers(deployment), *conditions(deployment)]
     taken, offers = best_parameters(deployment, offered, **options)
     for line in lines(offers) or [
         f"--parameter {AUTO}: none of {' '.join(offered) or 'its columns'} moves the field"

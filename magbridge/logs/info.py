@@ -14,8 +14,9 @@ from magbridge.field.igrf import magnitude
 from magbridge.logs.compasses import compasses_in
 from magbridge.logs.deployment import MEANING, named_losses, noted, passed_over
 from magbridge.logs.naming import READING_RANGE_NT
+from magbridge.logs.validity import states_validity
 
-__all__ = ["INFO_GAP_INTERVALS", "USES", "info", "lacking", "movers", "telemetry"]
+__all__ = ["INFO_GAP_INTERVALS", "USES", "conditions", "info", "lacking", "movers", "telemetry"]
 
 HORIZONTAL_POSITION = ("latitude", "longitude")
 ATTITUDE = ("roll", "pitch", "heading")
@@ -32,7 +33,7 @@ USES: dict[str, Needs] = {
     "calibrate": ((CHANNELS,), REFERENCE),
     "correct": ((CHANNELS,),),
     "diagnose": ((CHANNELS,), REFERENCE),
-    "navigate": ((CHANNELS,), RECKONING),
+    "navigate": ((CHANNELS, ("total_field",)), (*RECKONING, HORIZONTAL_POSITION)),
     "survey": ((CHANNELS, ("total_field",), ("anomaly",)), (HORIZONTAL_POSITION,)),
     "plan --mission": ((ATTITUDE,), (HORIZONTAL_POSITION,)),
     "replay": ((CHANNELS,),),
@@ -43,9 +44,11 @@ INFO_GAP_INTERVALS = 2.5
 """A pause longer than this many sampling intervals is a gap."""
 ABOVE = 2.0
 """m above the surface, from which on a vehicle that has a depth at all is hardly there."""
-STATES = {
-    *("degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar", "inHg", "V", "s", "m", "m/s", "nT", "arcmin")
-}
+FOLLOWED = "sensor_temperature", "depth"
+"""Columns with a meaning of their own that a fit may follow."""
+CONDITIONS = {"degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar"}
+"""Units of temperatures and pressures."""
+STATES = {*(*CONDITIONS, "inHg", "V", "s", "m", "m/s", "nT", "arcmin")}
 """Units of what a vehicle is in, or drifts by: temperatures, pressures, voltages, speeds."""
 
 
@@ -123,7 +126,27 @@ def movers(log: xr.Dataset) -> list[str]:
         name
         for name in telemetry(log)
         if name not in reckoned and log[name].attrs.get("units", "1") not in STATES
+        if not states_validity(name) and not _counts(log[name].to_numpy())
     ]
+
+
+def conditions(log: xr.Dataset) -> list[str]:
+    """Return the columns of temperatures and pressures, which may move the field: those that vary."""
+    reckoned = [name for name in FOLLOWED if name in log and float(np.ptp(_known(log, name))) > 0.0]
+    return reckoned + [name for name in telemetry(log) if log[name].attrs.get("units", "1") in CONDITIONS]
+
+
+def _known(log: xr.Dataset, name: str) -> FloatArray:
+    """Return the known values of a column, at least one: 0 where none is known."""
+    values = log[name].to_numpy().astype(float)
+    known = values[np.isfinite(values)]
+    return known if known.size else np.zeros(1)
+
+
+def _counts(values: FloatArray) -> bool:
+    """Return True if a column grows by the same step in every row, as a counter or a clock does."""
+    steps = np.diff(values.astype(float))
+    return len(steps) > 1 and bool(steps[0]) and bool(np.ptp(steps) <= 1e-6 * abs(steps[0]))
 
 
 def _column(name: str, column: xr.DataArray, time: FloatArray) -> dict[str, Any]:

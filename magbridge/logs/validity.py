@@ -27,7 +27,7 @@ from magbridge.errors import FormatError
 from magbridge.logs.deployment import with_losses
 from magbridge.logs.headings import bare
 
-__all__ = ["EXPECTED_VALUE", "Validity", "known", "unknown", "validity_of"]
+__all__ = ["EXPECTED_VALUE", "Validity", "known", "states_validity", "unknown", "validity_of"]
 
 VALID = re.compile("(is|data|row|sample)?valid(ity)?")
 MAG_VALID = re.compile("(mag|field|tmi)(is)?valid(ity)?")
@@ -53,6 +53,14 @@ class Validity(NamedTuple):
         what = " ".join(self.targets) or "rows"
         bad = " or ".join(f"{value:g}" for value in sorted(self.bad))
         return f"{what} not valid where {self.column} is {bad}"
+
+
+def states_validity(name: str) -> bool:
+    """Return True if a column of this name is about the validity of others."""
+    word = bare(name)
+    return any(pattern.fullmatch(word) for pattern in (VALID, MAG_VALID, FLAG)) or bool(
+        QUALITY_OF.fullmatch(name)
+    )
 
 
 def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Validity]:

@@ -1,4 +1,4 @@
-"""The panel of alarms: what began when, a button to say that it was seen, and a sound until then."""
+"""The panel of alarms, by cause: when each began, a button to acknowledge it, and a sound until then."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import partial
 
 from nicegui import ui
 
-from magbridge.monitor.alarms import Alarm
+from magbridge.monitor.alarms import AlarmGroup
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import State
 from magbridge.monitor.widgets import AMBER, MUTED, RED, Changes, button, card, clock, nothing
@@ -19,7 +19,7 @@ REPEAT = 5.0
 
 
 class Row:
-    """One alarm. Its elements stay as long as it does, so that a click finds the button that it aims at."""
+    """The alarms of one cause. Its elements stay as long as they do, so that a click finds its button."""
 
     def __init__(self, acknowledge: Callable[[], None]) -> None:
         self._acknowledge = acknowledge
@@ -29,7 +29,7 @@ class Row:
                 self._times = ui.label().classes(f"text-xs {MUTED}")
             self._seen: ui.button | None = None
 
-    def show(self, alarm: Alarm) -> None:
+    def show(self, alarm: AlarmGroup) -> None:
         """Show how it stands; the button is there until somebody has seen it."""
         color = RED if alarm.active else AMBER
         self.box.style(f"border-color: {'transparent' if alarm.acknowledged else color}")
@@ -73,31 +73,31 @@ class AlarmPanel:
 
     def show(self, state: State, now: float) -> None:
         """Show the alarms; sound while one was not acknowledged."""
-        alarms = list(state.alarms)
+        alarms = state.alarms.groups
         if state.alarms.unseen and self.sound and now - self._sounded >= REPEAT:
             self._sounded = now
             ui.run_javascript("magbridge.beep()")
         if not self._changes.new(
-            "alarms", [(a.key, a.text, a.active, a.acknowledged, a.count) for a in alarms]
+            "alarms", [(a.cause, a.text, a.active, a.acknowledged, a.count) for a in alarms]
         ):
             return
         unseen = [alarm.text for alarm in alarms if not alarm.acknowledged]
         self._spoken.set_text(f"Alarm: {unseen[0]}" if unseen else "")
         self._none.set_visibility(not alarms)
-        for key in self._rows.keys() - {alarm.key for alarm in alarms}:
-            self._rows.pop(key).box.delete()
+        for cause in self._rows.keys() - {alarm.cause for alarm in alarms}:
+            self._rows.pop(cause).box.delete()
         for place, alarm in enumerate(alarms):
-            if alarm.key not in self._rows:
+            if alarm.cause not in self._rows:
                 with self._box:
-                    self._rows[alarm.key] = Row(partial(self._acknowledge, alarm.key))
-            row = self._rows[alarm.key]
+                    self._rows[alarm.cause] = Row(partial(self._acknowledge, alarm.cause))
+            row = self._rows[alarm.cause]
             row.show(alarm)
             if self._box.default_slot.children[place] is not row.box:
                 row.box.move(target_index=place)
 
-    def _acknowledge(self, key: str | None) -> None:
+    def _acknowledge(self, cause: str | None) -> None:
         with self._station.lock:
-            self._state.alarms.acknowledge(key)
+            self._state.alarms.acknowledge(cause)
 
     def _switched(self) -> None:
         if self.sound:  # a browser sounds only once its reader has done something

@@ -9,14 +9,15 @@ from nicegui import ui
 from magbridge.monitor.link import StationLink
 from magbridge.monitor.state import State
 from magbridge.monitor.widgets import GRID, INK, RED, button, card, fact
-from magbridge.monitor.words import learnt
+from magbridge.monitor.words import learned_worth, learnt
 
 __all__ = ["LearningPanel"]
 
 TITLE = "Learning in flight"
 DO = "MB_LEARN_CMD"
+ACCEPT = "Accept"
 LEARNING_COMMANDS = {
-    "Accept": (1.0, "Use the learned calibration from now on, and acknowledge the alarm"),
+    ACCEPT: (1.0, "Use the learned calibration from now on, and acknowledge the alarm"),
     "Forget": (2.0, "Return to the first calibration, and restart learning"),
 }
 
@@ -32,8 +33,8 @@ class LearningPanel:
                 self._labels = [fact(name) for name in learnt(state)]
             with ui.row().classes("gap-x-4"):
                 self._buttons = [
-                    button(name, partial(self._order, value)).tooltip(meaning)
-                    for name, (value, meaning) in LEARNING_COMMANDS.items()
+                    button(name, partial(self._confirm, name)).tooltip(meaning)
+                    for name, (_, meaning) in LEARNING_COMMANDS.items()
                 ]
             self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
 
@@ -46,6 +47,25 @@ class LearningPanel:
         for one in self._buttons:
             one.set_enabled(DO in state.parameters)
         self._answer.set_text(state.parameters[DO].error if DO in state.parameters else "")
+
+    def _confirm(self, name: str) -> None:
+        """Ask before a command is sent; before the learned calibration is accepted, state its worth."""
+        value, meaning = LEARNING_COMMANDS[name]
+        text, good = learned_worth(self._state.learning) if name == ACCEPT else ("", True)
+
+        def answered(*, yes: bool) -> None:
+            dialog.close()
+            if yes:
+                self._order(value)
+
+        with ui.dialog() as dialog, ui.card():
+            ui.label(f"{meaning}?").classes("font-semibold")
+            ui.label(text).style(f"color: {INK if good else RED}").set_visibility(bool(text))
+            with ui.row():
+                button(f"{name} now" if good else f"{name} all the same", partial(answered, yes=True))
+                button("Cancel", partial(answered, yes=False))
+        dialog.on("hide", dialog.delete)
+        dialog.open()
 
     def _order(self, value: float) -> None:
         with self._station.lock:

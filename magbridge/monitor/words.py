@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import time
 from enum import IntEnum
-from math import hypot, isfinite, nan, sqrt
+from math import exp, hypot, isfinite, nan, sqrt
+from typing import Any
 
 from magbridge.field.geodesy import worse_axis
+from magbridge.learning.judge import JUDGE_MEMORY_SAMPLES
 from magbridge.mavlink.enums import (
     MAG_CAUSE,
     MAG_LEARNING_STATE,
@@ -16,7 +18,10 @@ from magbridge.mavlink.enums import (
 )
 from magbridge.monitor.state import State
 
-__all__ = ["FLAG_TEXTS", "ago", "conditions", "health", "learnt", "measured", "silence", "whereabouts"]
+__all__ = [
+    "FLAG_TEXTS", "ago", "conditions", "health", "learned_worth", "learnt", "measured", "silence",
+    "whereabouts",
+]  # fmt: skip
 
 SILENT, SLOW = 3.0, 30.0
 """s of silence that are reported: `SILENT` of the bridge, which sends every second; of the field and of the
@@ -40,6 +45,8 @@ STARTING = 15.0
 """s after its first message in which a bridge may still be waiting for its sensor and its autopilot."""
 MAX_ALARM_TIME_S = 4_102_444_800
 """s since 1970: no alarm began after 2099."""
+NORMAL_95 = 1.96
+"""Half width of the 95 % interval of a normal variable, standard deviations."""
 MAX_PLAIN_NUMBER = 1e9
 """No figure of the page is as large: larger ones are written with a power of ten."""
 LOSS_TEXTS = {
@@ -161,6 +168,33 @@ def learnt(state: State) -> dict[str, tuple[str, bool]]:
         "Samples learned from": (f"{get('samples', 0):,}", True),
         "Error of prediction, learned so far": (_figure(get("rms_learned", nan), ".2f", "nT"), True),
     }
+
+
+def learned_worth(learning: dict[str, Any]) -> tuple[str, bool]:
+    """Return what an accepted calibration is worth against the first, and whether it is better.
+
+    The text has the ratio of the errors of prediction with its 95 % interval. Errors of prediction are nearly
+    white, so that the logarithm of an RMS of n of them has the variance 1 / (2 n); the two count as
+    independent. n is the number of samples, at most the memory over which the bridge follows the errors.
+    """
+    published, first = learning.get("calibration_id", 0), learning.get("first_calibration_id", 0)
+    if published == first:
+        return "The first calibration is published: accepting only acknowledges the alarm.", True
+    before, after = learning.get("rms_first", nan), learning.get("rms_published", nan)
+    count = min(int(learning.get("samples", 0)), JUDGE_MEMORY_SAMPLES)
+    if not (before > 0.0 and after > 0.0 and count > 0):
+        return "The errors of prediction are not known yet.", False
+    ratio, spread = after / before, exp(NORMAL_95 / sqrt(count))
+    low, high = ratio / spread, ratio * spread
+    text = (
+        f"Error of prediction {before:.2f} nT with the first calibration, {after:.2f} nT with the learned "
+        f"one: {ratio:.2f} times (95 %: {low:.2f} to {high:.2f}, over {count} samples)."
+    )
+    if learning.get("better", 0.0) < 0.0:
+        return f"{text} The last samples speak for the first calibration.", False
+    if high >= 1.0:
+        return f"{text} It is not shown to be better.", False
+    return text, True
 
 
 def _calibration(published: int, first: int) -> str:

@@ -27,7 +27,7 @@ from magbridge.correction import Correction
 from magbridge.field.igrf import total_field
 from magbridge.field.read import read_grid
 from magbridge.logs import read, write
-from magbridge.progress import waiting
+from magbridge.progress import track, waiting
 from magbridge.records import Quality
 from magbridge.rows import correct_rows
 
@@ -318,6 +318,21 @@ def test_what_takes_long_says_that_it_is_at_work(monkeypatch: pytest.MonkeyPatch
         shown += os.read(master, 65536)
     os.close(master)
     assert b"\x1b[2K" in shown.rpartition(b"judging")[2]
+
+
+def test_progress_without_a_terminal_is_lines(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert list(track(range(3), "deployments", 3, in_lines=True)) == [0, 1, 2]
+    assert capsys.readouterr().err == "", "what is quick prints nothing"
+    monkeypatch.setattr("magbridge.progress.LINE_INTERVAL_S", 0.0)
+    assert list(track(range(2), "deployments", 2, in_lines=True)) == [0, 1]
+    assert (
+        capsys.readouterr().err
+        == "magbridge: deployments: 1 of 2, 0 s\nmagbridge: deployments: 2 of 2, 0 s\n"
+    )
+    assert list(track(range(2), "reading", 2)) == [0, 1]
+    assert capsys.readouterr().err == ""
 
 
 def test_only_what_the_sensor_measured_is_corrected(

@@ -35,6 +35,8 @@ def test_info_says_what_is_missing() -> None:
     assert facts["uses"].keys() == USES.keys()
     assert facts["uses"]["calibrate"] == ["mag_y mag_z", "reference_field, or latitude longitude"]
     assert facts["uses"]["correct"] == ["mag_y mag_z"]
+    places = {name: np.arange(9.0) for name in ("total_field", "latitude", "longitude")}
+    assert info(made("log", START + np.arange(9.0), places))["uses"]["navigate"] == []
     assert "never known: depth" in facts["hints"]
 
 
@@ -76,8 +78,11 @@ def test_a_vector_that_is_never_known_has_no_length() -> None:
 
 
 def test_what_moves_the_field_is_no_state_of_the_vehicle() -> None:
+    """Nor a counter, nor a statement that a value is valid."""
     names = {"pump": "A", "water": "degC", "supply": "V", "mast": "1", "speed": "m/s", "still": "A"}
-    columns = {name: np.arange(9.0) * (name != "still") for name in names}
+    names |= {"MagValid": "1", "Counter": "1"}
+    columns = {name: np.arange(9.0) ** 2 * (name != "still") for name in names}
+    columns["Counter"] = np.arange(9.0)
     assert movers(made("log", START + np.arange(9.0), columns, names)) == ["pump", "mast"]
 
 
@@ -103,7 +108,7 @@ def test_columns_are_declared_on_the_command_line(command: Command) -> None:
     ("arguments", "code", "words"),
     [
         (("--column", "mag_x"), 2, '--column mag_x: expected NAME="THEIRS [unit]"'),
-        (("--columns", "none.toml"), 2, "none.toml: No such file"),
+        (("--columns", "none.toml"), 1, "none.toml: expected a file, there is none"),
         (("--column", "mag_x=Q"), 1, "column 'Q': expected this column; there are: mag_x"),
     ],
 )

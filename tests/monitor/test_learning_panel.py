@@ -113,8 +113,14 @@ def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], cl
         assert re.fullmatch(rf"\d+ nT since {since} \d\d:\d\d UTC", shown["Not explained"])
         for which in ("first", "published"):
             assert float(shown[f"Error of prediction, {which}"].removesuffix(" nT")) > 1.0
-        press(panel.get_by_role("button", name="Accept"), page.get_by_text("explained again: acknowledged"))
-        press(panel.get_by_role("button", name="Forget"), page.get_by_text("learning: all forgotten"))
+        confirm = page.get_by_role("dialog")
+        press(panel.get_by_role("button", name="Accept"), confirm)
+        assert re.search(r"times \(95 %: \d|only acknowledges", confirm.inner_text())
+        press(confirm.get_by_role("button", name="Cancel"), panel)
+        press(panel.get_by_role("button", name="Accept"), confirm)
+        press(confirm.get_by_role("button", name="Accept"), page.get_by_text("explained again: acknowledged"))
+        press(panel.get_by_role("button", name="Forget"), confirm)
+        press(confirm.get_by_role("button", name="Forget"), page.get_by_text("learning: all forgotten"))
         panel.get_by_text(re.compile("the first$")).wait_for()
         browser.close()
     texts = {text.partition(" learned calibration")[0] for text in rig.texts()}
