@@ -18,8 +18,8 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.estimation.residual import robust_scale
 
 __all__ = [
-    "OUTLIER_SIGMA", "NoiseModel", "Whitening", "effective_fraction", "estimate_noise", "fit_slow_and_white",
-    "whiten",
+    "CLIP_SIGMA", "OUTLIER_SIGMA", "NoiseModel", "Whitening", "effective_fraction", "estimate_noise",
+    "fit_slow_and_white", "samples_per_independent", "whiten",
 ]  # fmt: skip
 
 OUTLIER_SIGMA = 5.0
@@ -35,6 +35,8 @@ MAX_AUTOCORRELATION = 0.99
 """Largest autocorrelation that :func:`estimate_noise` returns."""
 MIN_PAIRS = 30
 """Pairs of successive samples from which on their autocorrelation is estimated."""
+WINDOW_TIMES = 5.0
+"""Integrated autocorrelation times up to which :func:`samples_per_independent` sums."""
 STEADY_STATE_TOLERANCE = 1e-13
 """Relative change of the filter's variance below which it counts as steady."""
 
@@ -175,6 +177,38 @@ def effective_fraction(rho: float, white: float = 0.0) -> float:
     ``1 / (f + (1 - f)(1 + rho) / (1 - rho))``: Kay 1993, Fundamentals of statistical signal processing, 6.
     """
     return (1.0 - rho) / (white * (1.0 - rho) + (1.0 - white) * (1.0 + rho))
+
+
+def samples_per_independent(values: FloatArray, steps: FloatArray) -> float:
+    """Return how many samples of correlated values count as one independent sample, at least 1.
+
+    Parameters
+    ----------
+    values : (n, q) array
+        Residuals times the rows of their Jacobian, in units in which the q coefficients are alike: what each
+        sample contributes to the gradient.
+    steps : (n,) array
+        Sampling intervals since the previous sample; infinite at the first of a run.
+
+    Notes
+    -----
+    The integrated autocorrelation ``1 + 2 sum rho(l)``, summed up to the first lag that is
+    :data:`WINDOW_TIMES` times as long as the sum so far (Sokal 1997, Monte Carlo methods in statistical
+    mechanics, section 3). The error of a model lasts as long as a manoeuvre, so the sum is a time: it does
+    not depend on the sampling rate, as the autocorrelation of neighbours does.
+    """
+    longest = max(len(values) // 4, 1)
+    # place the samples on their intervals; runs are farther apart than the longest lag
+    gaps = np.minimum(np.where(np.isfinite(steps), steps, longest), longest)
+    slot = (np.cumsum(gaps) - gaps[0]).astype(int)
+    size = 2 ** int(np.ceil(np.log2(slot[-1] + 1 + longest)))
+    grid = np.zeros((size, values.shape[1]))
+    grid[slot] = values
+    power = (np.abs(np.fft.rfft(grid, axis=0)) ** 2).sum(axis=1)
+    products = np.fft.irfft(power, size)[:longest]
+    total = 2.0 * np.cumsum(products / (products[0] or 1.0)) - 1.0
+    window = np.flatnonzero(np.arange(longest) >= WINDOW_TIMES * 0.5 * total)
+    return max(float(total[window[0] if window.size else -1]), 1.0)
 
 
 def estimate_noise(

@@ -71,7 +71,7 @@ def test_auto_is_better_than_one_ellipsoid_where_the_first_part_differs() -> Non
         for method in squares:
             error, _ = in_sensor_units(fit(first, method).calibration, late)
             squares[method] += float(np.mean(error**2))
-    assert squares["auto"] < 0.84**2 * squares["nominal"]
+    assert squares["auto"] < 0.87**2 * squares["nominal"]
 
 
 def smoothed(window: int, roll: float = 0.0, pitch: float = 20.0, n: int = 7200) -> Observations:
@@ -95,7 +95,7 @@ def smoothed(window: int, roll: float = 0.0, pitch: float = 20.0, n: int = 7200)
 def test_a_smoothed_field_is_as_unsure_as_it_is_wrong_in_attitudes_not_seen() -> None:
     """Groups of similar attitude that are held out show a missing term; runs alone give too small a sigma."""
     found = fit(smoothed(12))
-    assert found.details["left_out_ratio"] > 1.8
+    assert found.details["left_out_ratio"] > 1.5
     for roll, pitch in ((0.0, 20.0), (25.0, 20.0), (0.0, 55.0)):
         other = smoothed(12, roll, pitch, 2400)
         _, standardised = in_sensor_units(found.calibration, other.part(other.time % 600.0 > 90.0))

@@ -142,8 +142,7 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
         one, simpler = nominal(data), fit_nominal(data)
     except CalibrationError:
         return None
-    # the nominal fit was not whitened, so its refits are not
-    samples, white = nominal_samples(data), replace(one.noise, autocorrelation=0.0, white=0.0)
+    samples, white = nominal_samples(data), one.weighted
     prior, z, noise = best.family.at(best.widths.eta), best.solution.z, best.noise
     forward = carried_forward(samples, one.prior, one.z, white) / found.details["forward_nT"]
     simpler.details["forward_nT"] = forward * found.details["forward_nT"]

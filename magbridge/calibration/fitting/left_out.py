@@ -73,8 +73,9 @@ def leave_out(
     runs: NDArray[np.generic],
     *,
     attitudes: bool = False,
+    weighted: NoiseModel | None = None,
 ) -> LeftOut:
-    """Predict each part of the samples from the others.
+    """Predict each part of the samples from the others, and later parts of the log from the earlier ones.
 
     Parameters
     ----------
@@ -91,32 +92,48 @@ def leave_out(
     attitudes : bool
         Leave out groups of like attitude, too. (Not where noise is correlated for longer than an attitude
         lasts, as on an aircraft: neighbours that stay would then predict the group.)
+    weighted : NoiseModel, optional
+        With which the samples were weighed, where that is not `noise`.
     """
-    found = _left_out(samples, prior, z, noise, _parts(runs))
+    weighted = noise if weighted is None else weighted
+    # positions that come late in the log are no test of the fit to its beginning
+    forward = samples.phi.shape[1] == 1
+    found = _left_out(samples, prior, z, noise, _parts(runs), weighted, forward)
     if attitudes and noise.autocorrelation < MAX_GROUP_AUTOCORRELATION:
-        apart = _left_out(samples, prior, z, noise, _alike(samples))
+        apart = _left_out(samples, prior, z, noise, _alike(samples), weighted)
         found = replace(found, ratio=max(found.ratio, apart.ratio))
     return found
 
 
 def _left_out(
-    samples: Samples, prior: Prior, z: FloatArray, noise: NoiseModel, parts: list[IndexArray]
+    samples: Samples,
+    prior: Prior,
+    z: FloatArray,
+    noise: NoiseModel,
+    parts: list[IndexArray],
+    weighted: NoiseModel,
+    forward: bool = False,
 ) -> LeftOut:
-    """Predict each of the `parts` from the others."""
+    """Predict each of the `parts` from the others; and, `forward`, from the earlier ones."""
     c = prior.coefficients(z)
-    normals = [_normal(samples, c, noise, rows).reduced(prior.E) for rows in parts]
+    normals = [_normal(samples, c, weighted, rows).reduced(prior.E) for rows in parts]
     hessian = np.sum([normal.hessian for normal in normals], axis=0)
     every = max(len(samples.field) // TESTED, 1)
     counted = np.ones(len(samples.field), bool)
     if noise.weight is not None and noise.rejected <= ISOLATED * len(counted):
         counted = noise.weight > 0.0
+    missing = [(k, hessian - normal.hessian, normal.gradient) for k, normal in enumerate(normals)]
+    if forward:
+        for k in range(1, len(parts)):
+            later = np.sum([normal.gradient for normal in normals[k:]], axis=0)
+            missing.append((k, np.sum([normal.hessian for normal in normals[:k]], axis=0), later))
     e, s2 = [], []
-    for rows, normal in zip(parts, normals, strict=True):
-        P = covariance_of((hessian - normal.hessian) / noise.sigma**2 + prior.precision)
-        tested = samples.part(rows[counted[rows]][::every])
+    for k, others, lacking in missing:
+        P = covariance_of(others / weighted.sigma**2 + prior.precision)
+        tested = samples.part(parts[k][counted[parts[k]]][::every])
         off, g = residuals(tested, c)
         J = jacobian(tested.phi, g) @ prior.E
-        e.append(off + J @ (P @ normal.gradient / noise.sigma**2))
+        e.append(off + J @ (P @ lacking / weighted.sigma**2))
         s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
     return _judged(
         np.concatenate(e), np.concatenate(s2), len(samples.field) * effective_fraction(*noise.shape)

@@ -15,38 +15,55 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.fitting.left_out import leave_out
+from magbridge.calibration.fitting.left_out import LeftOut, leave_out
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.result import Fit, assemble
 from magbridge.errors import NoSolutionError
 from magbridge.estimation.information import covariance_of
-from magbridge.estimation.noise import NoiseModel, effective_fraction, estimate_noise, fit_slow_and_white
-from magbridge.estimation.optimise import gauss_newton
+from magbridge.estimation.noise import CLIP_SIGMA, NoiseModel, estimate_noise, samples_per_independent
+from magbridge.estimation.optimise import Solution, gauss_newton
 from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
-from magbridge.estimation.residual import Samples, residuals_of, scales_and_offsets
+from magbridge.estimation.residual import Samples, residuals, scales_and_offsets
 
 __all__ = ["check_scales", "fit_nominal", "nominal", "nominal_samples", "starts"]
 
+WEIGHT_ITERATIONS = 5
+"""Fits, each with the noise and the number of independent samples that the last one left."""
+SAME_WEIGHT = 0.02
+"""Relative change of the weights below which they have converged."""
+CHOOSING_SAMPLES, MAX_FIT_SAMPLES = 3_000, 50_000
+"""Samples at most that choose the prior and the start, and that are fitted in the end."""
+WIDTH_FACTORS = (1.0, 2.0, 4.0, 8.0)
+"""Factors of the prior widths of gain and soft iron. Fluxgates have scales within a few per cent of 1, some
+compasses of 0.8 to 1.5; parts left out, later ones predicted from earlier ones among them, choose one."""
+WORTHWHILE = 0.7
+"""Share of the error on parts left out, below which a wider prior is taken."""
+MIN_LOG_LIKELIHOOD_GAIN = 0.02
+"""Gain in log likelihood of one more step, below which a fit has converged."""
 ALL_AROUND = 0.05
 """Least variance of the field along any axis, over its square: 1/3 where all attitudes are seen, and 1 % on a
 glider that never rolls."""
 
 
 class Ellipsoid(NamedTuple):
-    """Coefficients (9,) in nT, their covariance (9, 9) in nT², the noise; and z (q,) with its prior."""
+    """Coefficients (9,) in nT, their covariance (9, 9) in nT², the noise; and z (q,) with its prior.
+
+    `weighted` is the noise with which the samples are weighed: where so many residuals in a row count as one,
+    it is larger than that of a sample by the root of their number.
+    """
 
     coefficients: FloatArray
     covariance: FloatArray
     noise: NoiseModel
     prior: Prior
     z: FloatArray
+    weighted: NoiseModel
 
 
 def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # noqa: ARG001  (one ellipsoid has none)
     """Return the fit of :func:`nominal` as a calibration without parameters."""
-    one = nominal(data, **options)
+    one, left = _chosen(data, **options)
     samples = nominal_samples(data)
-    left = leave_out(samples, one.prior, one.z, one.noise, data.runs)
     return assemble(data, samples, (), ((),), one.coefficients, one.covariance, one.noise, "nominal", left)
 
 
@@ -83,38 +100,110 @@ def nominal(
     NoSolutionError
         The fit collapsed or did not converge.
     """
+    return _chosen(
+        data, axes_fixed=axes_fixed, equal_xz=equal_xz, scale_sigma=scale_sigma, gain_sigma=gain_sigma
+    )[0]
+
+
+def _chosen(
+    data: Observations,
+    *,
+    axes_fixed: bool = False,
+    equal_xz: bool = False,
+    scale_sigma: float = SOFT_IRON_SIGMA,
+    gain_sigma: float = GAIN_SIGMA,
+) -> tuple[Ellipsoid, LeftOut]:
+    """Return the ellipsoid of :func:`nominal`, and its errors on parts left out."""
     samples = nominal_samples(data)
     E = np.eye(9)
     if equal_xz:
         E[2, 0] = 1.0
     keep = [s for s in range(9) if not (axes_fixed and s in {3, 4, 5}) and not (equal_xz and s == 2)]
     E = E[:, keep]
-    prior = Prior(_precision(E, scale_sigma, gain_sigma) / samples.F_0**2, E)
-    best = None
-    for start in starts(samples):
-        z = np.asarray(np.linalg.lstsq(E, start, rcond=None)[0], float)
-        noise = NoiseModel(1e-3 * samples.F_0)  # wide at first: far from the answer, residuals are not noise
-        for _ in range(4):
-            found = gauss_newton(samples, prior, noise, z)
-            z = found.z
-            # the moving masses are still in the residual: do not whiten, but count fewer samples
-            noise = estimate_noise(residuals_of(samples, E @ z), samples.steps, len(keep))
-            rho, noise = noise.autocorrelation, replace(noise, autocorrelation=0.0)
-        value = found.normal.cost
-        if found.settled and (best is None or value < 0.999 * best[0]):
-            best = (value, found, noise, rho)
+    # a part of the samples chooses the prior and the start
+    step = max(-(-len(data) // CHOOSING_SAMPLES), 1)
+    few = _every(samples, step)
+    factors = WIDTH_FACTORS[:1] if axes_fixed or equal_xz else WIDTH_FACTORS
+    best: tuple[Ellipsoid, LeftOut] | None = None
+    failure: NoSolutionError | None = None
+    for factor in factors:
+        prior = Prior(_precision(E, factor * scale_sigma, factor * gain_sigma) / samples.F_0**2, E)
+        try:
+            one = _fitted(few, prior)
+        except NoSolutionError as error:
+            failure = failure or error
+            continue
+        left = leave_out(few, prior, one.z, one.noise, data.runs[::step], weighted=one.weighted)
+        if best is None or left.rms < WORTHWHILE * best[1].rms:
+            best = one, left
     if best is None:
-        check_scales(samples, E @ z)  # a collapsing fit never converges, so report the collapse first
+        assert failure is not None
+        raise failure
+    if step == 1:
+        return best
+    return _fitted(_every(samples, max(len(data) // MAX_FIT_SAMPLES, 1)), best[0].prior, best[0].z), best[1]
+
+
+def _every(samples: Samples, step: int) -> Samples:
+    """Return every so many samples, with their intervals counted in units of that."""
+    if step == 1:
+        return samples
+    part = samples.part(np.arange(0, len(samples.field), step))
+    begins = np.isinf(samples.steps)
+    run, slot = np.cumsum(begins)[::step], np.cumsum(np.where(begins, 0.0, samples.steps))[::step]
+    part.steps[:] = np.inf
+    same = run[1:] == run[:-1]
+    part.steps[1:][same] = np.maximum(np.rint(np.diff(slot)[same] / step), 1.0)
+    return part
+
+
+def _fitted(samples: Samples, prior: Prior, near: FloatArray | None = None) -> Ellipsoid:
+    """Return the fit with a prior, from the better one of two starts or from `near` (q,) its minimum.
+
+    NoSolutionError: the fit collapsed or did not converge.
+    """
+    best = None
+    begun = [np.asarray(np.linalg.lstsq(prior.E, start, rcond=None)[0], float) for start in starts(samples)]
+    for first in begun if near is None else [near]:
+        z = first
+        noise = weighted = NoiseModel(1e-3 * samples.F_0)  # wide at first: residuals are not noise yet
+        for _ in range(WEIGHT_ITERATIONS):
+            found = gauss_newton(samples, prior, weighted, z, tolerance=MIN_LOG_LIKELIHOOD_GAIN)
+            z = found.z
+            last, (noise, weighted) = weighted, _weighted(samples, prior, found, weighted)
+            if abs(weighted.sigma - last.sigma) < SAME_WEIGHT * last.sigma:
+                break
+        value = 0.5 * found.normal.cost / weighted.sigma**2 + 0.5 * float(z @ prior.precision @ z)
+        if found.settled and (best is None or value < 0.999 * best[0]):
+            best = (value, found, noise, weighted)
+    if best is None:
+        check_scales(samples, prior.coefficients(z))  # a collapsing fit never converges: report the collapse
         raise NoSolutionError("nominal: no start converged; are the samples those of one sensor?")
-    _, found, noise, rho = best
-    noise = fit_slow_and_white(
-        residuals_of(samples, E @ found.z), samples.steps, replace(noise, autocorrelation=rho)
-    )
-    precision = found.normal.hessian * effective_fraction(*noise.shape) / noise.sigma**2 + prior.precision
-    covariance = E @ covariance_of(precision) @ E.T
-    coefficients = E @ found.z
+    _, found, noise, weighted = best
+    precision = found.normal.hessian / weighted.sigma**2 + prior.precision
+    covariance = prior.E @ covariance_of(precision) @ prior.E.T
+    coefficients = prior.coefficients(found.z)
     check_scales(samples, coefficients)
-    return Ellipsoid(coefficients, covariance, noise, prior, found.z)
+    return Ellipsoid(coefficients, covariance, noise, prior, found.z, weighted)
+
+
+def _weighted(
+    samples: Samples, prior: Prior, found: Solution, weighted: NoiseModel
+) -> tuple[NoiseModel, NoiseModel]:
+    """Return the noise of a sample, and the noise with which each is weighed in the next fit.
+
+    The error of the model is in the residuals: it lasts, and is not whitened, but fewer samples are counted
+    (Newey & West 1987, Econometrica 55:703, with one factor for all coefficients). The autocorrelation is
+    that of an AR(1) process with as many independent samples.
+    """
+    e, g = residuals(samples, prior.coefficients(found.z))
+    noise = estimate_noise(e, samples.steps, len(found.z), shape=(0.0, 0.0))
+    limit = CLIP_SIGMA * noise.sigma
+    root = np.linalg.cholesky(covariance_of(found.normal.hessian / weighted.sigma**2 + prior.precision))
+    pulls = np.clip(e, -limit, limit)[:, None] * (g @ (prior.E @ root))
+    repeats = samples_per_independent(pulls, samples.steps)
+    weighted = replace(noise, sigma=noise.sigma * np.sqrt(repeats))
+    return replace(noise, autocorrelation=(repeats - 1.0) / (repeats + 1.0)), weighted
 
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
