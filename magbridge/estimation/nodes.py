@@ -1,4 +1,4 @@
-"""The nodes that a track comes near, and cubic B-splines between them."""
+"""Grid nodes near a track, and cubic B-splines on them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAX_BOX_CELLS = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """Nodes of a square grid, where there are any; numbered strip by strip along the longer side."""
+    """Existing nodes of a square grid, numbered strip by strip along the longer side."""
 
     spacing: float
     """Spacing of the nodes, m."""
@@ -35,7 +35,7 @@ class Nodes:
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """Number of nodes."""
         return int(self.number.max()) + 1
 
     @cached_property

@@ -1,4 +1,4 @@
-r"""Physical priors of the coefficients: Gaussians whose widths are themselves learned.
+r"""Physical priors of the coefficients: Gaussians whose widths are estimated.
 
 Notes
 -----

@@ -1,4 +1,4 @@
-r"""What a sparse precision is asked for: solutions, its determinant, and its inverse near the diagonal.
+r"""Sparse precision matrices: solutions, determinant, and the inverse near the diagonal.
 
 Solutions and determinant come from SuperLU, whose fill-in on nodes along a track is small (20,000 nodes:
 0.2 s, where the blocks below take 3 s). Variances need blocks of the inverse. Nodes that are numbered strip

@@ -1,4 +1,4 @@
-r"""Error of a reference along a track, and the noise's memory, as the states of a Kalman filter.
+r"""Error of a reference along a track, and autoregressive noise, as states of a Kalman filter.
 
 The field differs from its reference by a constant and by a crustal field along the track. The latter is a
 Gauss-Markov process of Matern covariance with smoothness 3/2: its value b and slope b' are two states

@@ -1,1 +1,1 @@
-"""The Earth's field where a sample was taken: the main field, and the anomaly on a map."""
+"""The Earth's field at a sample: the main field and the anomaly of a map."""

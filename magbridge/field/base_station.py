@@ -1,4 +1,4 @@
-"""The Earth's field as it varies with time, by a base station: an observatory, or a sensor that stood still.
+"""Time variation of the Earth's field from a base station: an observatory or a stationary sensor.
 
 Over a day the field varies by tens of nT, in a storm by hundreds, nearly the same over a hundred kilometres.
 A survey's log, or a calibration's, gets it as the column ``daily_variation``: the station's field minus its
@@ -26,7 +26,7 @@ MAX_EXTRAPOLATION_S = 600.0
 
 
 def apart(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
-    """Return the vehicle's logs, and those of an observatory among them."""
+    """Separate the vehicle's logs from those of an observatory."""
     own = [log for log in logs if "observatory" not in log.attrs]
     return own, [log for log in logs if "observatory" in log.attrs]
 

@@ -1,4 +1,4 @@
-r"""The field at another height: upward exactly, downward as far as a map allows, with an error estimate.
+r"""Continuation of a field to another height, with an error estimate.
 
 A map is flown in the air, or continued to one altitude above the sea; the vehicle is below. Every wave of a
 field whose sources lie deeper decays with height (Blakely 1995, eq. 12.8),
@@ -83,7 +83,7 @@ def continued(grid: AnomalyGrid, depth: ArrayLike) -> Continued:
 
 
 def raised(grid: AnomalyGrid, altitude: float) -> Callable[[FloatArray], FloatArray]:
-    """Return what continues values (ny, nx), nT, on a grid's nodes to another altitude, m, as its own are."""
+    """Return a function that continues values (ny, nx), nT, on a grid's nodes to another altitude, m."""
     from scipy.fft import dctn, idctn  # noqa: PLC0415 - the live path runs without scipy
 
     gain = _growth(_wavenumber(grid), grid.altitude - altitude, SURE)

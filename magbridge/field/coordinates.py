@@ -1,4 +1,4 @@
-"""Whether a grid's axes are degrees: by what the file states of them, else by what the numbers allow.
+"""Axes of a grid: degrees or metres, by the file's statements or else by the numbers.
 
 Nothing is taken for degrees only because it stands first: metres, kilometres and indices all fit between -180
 and 180, and a map that is read in them is wrong without a word.
@@ -38,7 +38,7 @@ EVEN = 1e-3
 
 
 class Axes(NamedTuple):
-    """What a file states of its axes: their ``unit`` ("" if nothing), and the reference system, if one.
+    """Statements of a file on its axes: ``unit`` ("" if none), and the reference system or None.
 
     ``crs`` is what pyproj takes: an authority's code, WKT, or the attributes of CF's grid mapping.
     """

@@ -1,4 +1,4 @@
-"""Metres and degrees on the WGS84 ellipsoid, for distances that a vehicle covers."""
+"""Metres and degrees on the WGS84 ellipsoid."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ class AnomalyGrid:
         return AnomalyGrid(**{name: getattr(self, name) for name in PARAMETERS} | changes)
 
     def error(self, variance: T) -> tuple[T | float, T | float]:
-        """Return how many typical lasting errors a local variance (nT²) is, and the variance that is none."""
+        """Split a local variance (nT²) into a multiple of the typical lasting error and a remainder."""
         if not self.typical_error:
             return 1.0, variance
         return variance**0.5 / self.typical_error, 0.0

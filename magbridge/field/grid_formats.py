@@ -1,4 +1,4 @@
-"""Anomaly grids that are not netCDF: Surfer, Geosoft, ESRI ASCII, GeoTIFF, MagNav's folder."""
+"""Anomaly grids in Surfer, Geosoft, ESRI ASCII and GeoTIFF files, and in MagNav's folder."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def grd(path: Path) -> Parts:
 
 
 def libraries(path: Path) -> list[str]:
-    """Return the modules that reading a file with this suffix and beginning takes, if they are there."""
+    """Return the installed modules that a file with this suffix and beginning needs."""
     if path.suffix.lower().startswith(".tif"):
         names = ["PIL.Image"]
     else:
@@ -99,7 +99,7 @@ def _surfer_7(path: Path) -> Surfer:
 
 
 def _held(raw: bytes, start: int, size: int, claimed: int) -> int:
-    """Return how many of the claimed values, `size` bytes each from `start` on, are there."""
+    """Return the number of values, `size` bytes each from `start` on, that the file contains."""
     return max(min(claimed, (len(raw) - start) // size), 0)
 
 

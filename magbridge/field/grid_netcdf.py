@@ -1,4 +1,4 @@
-"""Anomaly grids in netCDF: CF's, today's GMT's, and GMT's of before 2007."""
+"""Anomaly grids in netCDF by CF, GMT, and GMT before 2007."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _along_its_axes(path: Path, grid: Any, data: Any) -> Coordinates:
 
 
 def _two_dimensional(path: Path, grid: Any, data: Any) -> Coordinates | None:
-    """Return the coordinates of a grid whose longitudes and latitudes stand node by node, if they do."""
+    """Return the coordinates of a grid with longitudes and latitudes at each node, if it has them."""
     found = {}
     for names in (LONGITUDE[:-1], LATITUDE[:-1]):
         for name, variable in data.variables.items():

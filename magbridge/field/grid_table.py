@@ -1,4 +1,4 @@
-"""Anomaly grids in text, a node a row: which column is what by its name and its numbers, not by its place."""
+"""Anomaly grids in text, one node per row; columns are identified by name and values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The main field near one place, for a filter that needs it at every sample: a quadratic fit.
+"""The main field near a place by a quadratic fit, for filters that need it at every sample.
 
 The IGRF's shortest wave is 3,000 km, so over some tens of kilometres and a dive a quadratic is exact to a
 thousandth of a nanotesla, at a hundredth of the cost of the series.

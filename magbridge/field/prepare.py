@@ -1,4 +1,4 @@
-"""Several surveys to one map: continued to one altitude, merged, masked, smoothed if asked for.
+"""Combine several surveys into one map: continue to one altitude, merge, mask, smooth on request.
 
 The pictures show every step, because a map should be looked at before it is used.
 """
@@ -40,7 +40,7 @@ def prepare(
     mask: ArrayLike | None = None,
     spacing: float | None = None,
 ) -> tuple[AnomalyGrid, list[Step]]:
-    """Return one map from several surveys, and each step on the way.
+    """Return one map from several surveys, and each intermediate step.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Anomaly grids from the formats in which surveys come.
+"""Read anomaly grids from all supported formats.
 
 A format is a function from a path to ``(longitude, latitude, anomaly, options of AnomalyGrid)``. The table
 :data:`READERS` chooses it by the file's suffix. The formats that share the suffix GRD are distinguished by
@@ -53,7 +53,7 @@ GUARDED = {".nc", ".grd", ".tif", ".tiff"}
 
 
 def read_grid(path: str | Path) -> AnomalyGrid:
-    """Return the anomaly grid that a file holds.
+    """Return the anomaly grid of a file.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def read_grid(path: str | Path) -> AnomalyGrid:
 
 
 def without_fill(path: str | Path, values: RealArray) -> RealArray:
-    """Return the values with those numbers that stand for "not known", without being declared, as NaN.
+    """Return the values with undeclared missing-value codes as NaN.
 
     One of :data:`FILLS` that lies beyond the others by more than half their range is a hole.
 

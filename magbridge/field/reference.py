@@ -1,4 +1,4 @@
-"""What the total field should be at every sample of a deployment: equation 4 of the paper."""
+"""Reference field at every sample of a deployment: equation 4 of the paper."""
 
 from __future__ import annotations
 

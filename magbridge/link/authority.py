@@ -1,4 +1,4 @@
-"""Who may change what the bridge does, and whose telemetry counts where two send the same."""
+"""Authority to change the bridge, and the source of each telemetry parameter."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MAX_COMPONENTS = 64
 
 
 class Authority:
-    """Lets the autopilot and ground stations change parameters and rates, and no other component.
+    """Allow the autopilot and ground stations, and no other component, to change parameters and rates.
 
     A station is a sender with a heartbeat of that type. A sender of another system without a heartbeat is
     taken for one, because small programs send none; another component of our own vehicle is not.
@@ -32,7 +32,7 @@ class Authority:
         self._kinds: dict[tuple[int, int], int] = {}
 
     def heartbeat(self, message: Message) -> bool:
-        """Note what a component is; return whether it is a ground station."""
+        """Record the type of a component; return True for a ground station."""
         kind: int = message["type"]
         self._kinds.pop((message.system, message.component), None)
         self._kinds[message.system, message.component] = kind
@@ -49,7 +49,7 @@ class Authority:
 
 
 class Sources:
-    """Lets each telemetry parameter come from one component at a time, and tells where two send it.
+    """Select one component as the source of each telemetry parameter, and report conflicts.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The autopilot's clock against ours, from TIMESYNC."""
+"""Offset of the autopilot's clock from the bridge's clock, estimated from TIMESYNC."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PENDING = 8
 
 
 class VehicleClock:
-    """Estimates ``offset = vehicle clock - our clock`` and its drift.
+    """Estimate ``offset = vehicle clock - bridge clock`` and its drift.
 
     Notes
     -----
@@ -58,7 +58,7 @@ class VehicleClock:
         return now_us * 1000
 
     def answer(self, tc1: int, ts1: int, now_us: int) -> None:
-        """Process an answer (ns) received at `now_us`; one to a request that is not ours is ignored."""
+        """Process an answer (ns) received at `now_us`; ignore answers to other components."""
         if ts1 not in self._asked:
             return
         self._asked.remove(ts1)

@@ -24,7 +24,7 @@ AUTOPILOT_VERSION, MESSAGE_INTERVAL = spec("AUTOPILOT_VERSION").id, spec("MESSAG
 
 
 class Commands:
-    """Answers COMMAND_LONG and COMMAND_INT.
+    """Answer COMMAND_LONG and COMMAND_INT.
 
     A command to component 0 is for any component that can execute it. The bridge then executes only what
     concerns messages of its own dialect and never refuses, because a ground station would take the refusal
@@ -154,5 +154,5 @@ class Commands:
 
 
 def whole(value: float) -> int:
-    """Return a float parameter as an integer; -1, the id of no message, where it is not finite."""
+    """Return a float parameter as an integer, or -1 (no message has this id) if it is not finite."""
     return int(value) if isfinite(value) else -1

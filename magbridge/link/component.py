@@ -1,4 +1,4 @@
-"""The bridge as a MAVLink component: its answers, and the messages that it sends unasked."""
+"""The bridge as a MAVLink component: its answers and its periodic messages."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ class Component:
         self.timers.every("TIMESYNC", TIMESYNC_US, self._ask_time, start_us + TIMESYNC_US // 2)
 
     def _report_status(self) -> None:
-        """Send MAG_STATUS, and what is sent with it."""
+        """Send MAG_STATUS and the messages of the same rate."""
         self._reports.status()
         for report in self.more_reports:
             report()
@@ -163,7 +163,7 @@ class Component:
         return self._link.system, self._link.autopilot
 
     def use_calibration(self, calibration_id: int) -> None:
-        """Name another calibration in every message from now on."""
+        """Set the calibration id of all later messages."""
         self.publisher.calibration_id = self._reports.calibration_id = calibration_id
 
     def another_publisher(self, sensor_id: int, calibration_id: int) -> Publisher:
@@ -173,11 +173,11 @@ class Component:
 
     @property
     def next_deadline(self) -> int:
-        """Event time in µs by which :meth:`advance` has something to do."""
+        """Event time (µs) of the next timer."""
         return self.timers.next_deadline
 
     def advance(self, t_us: int) -> None:
-        """Advance the time to `t_us`; everything sent carries the time at which it was due."""
+        """Advance the time to `t_us`; each message carries the time at which it was due."""
         if self.timers.next_deadline <= t_us:
             self.timers.advance(t_us, self._begin)
         self.codec.now_us = t_us
@@ -209,7 +209,7 @@ class Component:
         return ours
 
     def _report_refusals(self, message: Message) -> None:
-        """Announce once for each reason why frames are rejected: else their sender would only seem absent."""
+        """Announce each reason why frames are rejected once. Otherwise their sender would seem absent."""
         if message.frame[7:10] == SETUP_SIGNING:
             text = f"key from {message.system}:{message.component} not taken: keys come from a file"
             self.announcer.state("key", text, MAV_SEVERITY.WARNING)
@@ -224,7 +224,7 @@ class Component:
         self._refusals_reported = len(refusals)
 
     def _report_clock(self) -> None:
-        """Report that our clock is days behind the autopilot's, which refuses our frames meanwhile."""
+        """Report that the bridge's clock is days behind the autopilot's, which refuses its frames."""
         if self.codec.signing is not None and (days := self.codec.signing.followed_days) >= 1.0:
             text = f"clock is {days:.0f} days behind the autopilot's: signatures follow its time"
             self.announcer.state("signing clock", text, MAV_SEVERITY.WARNING)
@@ -249,7 +249,7 @@ class Component:
             self._service.greet((message.system, message.component))
 
     def _if_to_us_alone(self, handler: Callable[[Message], None]) -> Callable[[Message], None]:
-        """Return the handler of what the autopilot has as well: files, and logs."""
+        """Return the handler of a service that the autopilot also offers: files and logs."""
         us = self._link.system, self._link.component
         return lambda message: (
             handler(message) if (message["target_system"], message["target_component"]) == us else None
@@ -274,7 +274,7 @@ class Component:
         self.outbox.put(TIMESYNC, TIMESYNC.struct.pack(0, ts1, self._link.system, self._link.autopilot))
 
     def _requestable(self, by_clock: Mapping[str, Callable[[], None]]) -> dict[int, Callable[[], bool]]:
-        """Return what REQUEST_MESSAGE can ask for: id to a function that sends it, False if it cannot."""
+        """Return the messages that REQUEST_MESSAGE can request: id to a function that sends the message."""
         reports = {
             **by_clock,
             "AUTOPILOT_VERSION": self._reports.version,
@@ -294,6 +294,6 @@ class Component:
 
 
 def always(report: Callable[[], None]) -> bool:
-    """Send a report; return True, because there is always one to send."""
+    """Send a report; return True, because a report is always available."""
     report()
     return True

@@ -1,4 +1,4 @@
-"""A position fix, in the messages that autopilots take as one: each as the receiver's own source asks for it.
+"""Position fixes in the messages that autopilots accept, by the source code of each receiver.
 
 A comment at each field names what a receiver does with it, and the source file: ArduPilot's of
 December 2025, PX4's of August 2026.
@@ -31,7 +31,7 @@ WALK = 1e-3
 
 
 class Pose(NamedTuple):
-    """What ODOMETRY holds besides the position: from the vehicle's own telemetry."""
+    """Content of ODOMETRY in addition to the position, from the vehicle's telemetry."""
 
     north: float
     east: float
@@ -62,7 +62,7 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
 
     @property
     def sigma(self) -> float:
-        """m, 1-sigma on each axis of a circle that stands for the ellipse: as many squared metres in all.
+        """1-sigma (m) on each axis of the circle with the area of the ellipse.
 
         Receivers know only circles. That of the worse axis would claim less than is known, by up to a third.
         """
@@ -70,7 +70,7 @@ class Fix(msgspec.Struct, frozen=True, gc=False):
 
 
 def widened(fix: Fix, seconds: float) -> Fix:
-    """Return a fix that a filter may fuse, `seconds` after the previous one, as if its error were new.
+    """Return a fix that a filter may fuse as independent, `seconds` after the previous one.
 
     Notes
     -----
@@ -100,7 +100,7 @@ def widened(fix: Fix, seconds: float) -> Fix:
 
 
 def external_position(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:
-    """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE: the autopilot puts its position there, and answers.
+    """Send MAV_CMD_EXTERNAL_POSITION_ESTIMATE: the autopilot sets its position and answers.
 
     ArduPilot (``AP_NavEKF3_PosVelFusion.cpp``, setLatLng) moves it on by its own velocity over the age, which
     is 0 here; PX4 (``EKF2.cpp``) insists that the age is a number.
@@ -177,7 +177,7 @@ def odometry(outbox: Outbox, fix: Fix, system: int, autopilot: int) -> None:  # 
 
 
 class Kind(NamedTuple):
-    """How a fix is sent, and what its receiver makes of it."""
+    """Message of a fix, and how its receiver uses it."""
 
     send: Callable[[Outbox, Fix, int, int], Any]
     """Sends a :class:`Fix` to a system and component."""
@@ -195,7 +195,7 @@ class Kind(NamedTuple):
     """Hz below which the receiver takes the source for dead."""
 
     def overrated(self, fix: Fix) -> bool:
-        """Return whether ArduPilot, given such fixes at this rate, will claim to know its position better."""
+        """Return True if ArduPilot would state a smaller error than such fixes have at this rate."""
         if self.trusted_to == inf:
             return False
         return widened(fix, 1.0 / max(self.rate, self.least)).sigma > self.trusted_to

@@ -1,4 +1,4 @@
-"""MAVLink FTP: a station reads files of the bridge; it never writes any.
+"""MAVLink FTP: a station reads files of the bridge and cannot write.
 
 Requests in, replies out, without port and clock (MAVLink guide, 'File Transfer Protocol'). A request that
 cannot be granted gets the protocol's own error.
@@ -53,7 +53,7 @@ WRITES = range(6, 14)
 
 
 class Error(IntEnum):
-    """Why it was not granted."""
+    """Reason why a request was refused."""
 
     FAIL_ERRNO = 2
     INVALID_SIZE = 3
@@ -66,7 +66,7 @@ class Error(IntEnum):
 
 
 class Refused(Exception):
-    """A request that is not granted."""
+    """A refused request."""
 
     def __init__(self, error: Error, number: int = 0) -> None:
         self.data = bytes((error, number & 0xFF)) if error is Error.FAIL_ERRNO else bytes((error,))
@@ -119,7 +119,7 @@ class Session:
 
 
 class FtpServer:
-    """Answers the requests of all stations.
+    """Answer the requests of all stations.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class FtpServer:
 
     @staticmethod
     def refusal(reply: bytes) -> str:
-        """Return in words why a reply refuses; empty where it grants, or the end of a file was reached."""
+        """Return the reason of a refusal as text; empty for a grant and at the end of a file."""
         if reply[3] != Opcode.NAK or reply[FTP_HEADER.size] == Error.END_OF_FILE:
             return ""
         return Error(reply[FTP_HEADER.size]).name.lower().replace("_", " ")

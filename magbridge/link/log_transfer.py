@@ -1,4 +1,4 @@
-"""The older way of reading logs: LOG_REQUEST_LIST, LOG_REQUEST_DATA, LOG_REQUEST_END. Nothing is erased."""
+"""Transfer logs by LOG_REQUEST_LIST, LOG_REQUEST_DATA and LOG_REQUEST_END; logs are never erased."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LAST_LOG_ID = 0xFFFF
 
 
 class LogTransfer:
-    """Lists logs and sends their data.
+    """List logs and send their data.
 
     Logs are numbered from 1, the oldest, as they were when they were last listed.
     """

@@ -1,4 +1,4 @@
-"""Frames that are missing by their sender's numbers, and whose they are."""
+"""Count the frames that are missing by the sequence numbers of each sender."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Numbers:
         self._missing = 0  # bit k: the frame k before the latest has not come
 
     def count(self, number: int) -> None:
-        """Count a frame; one that comes late is no longer lost, and a duplicate changes nothing."""
+        """Count a frame. A late frame is no longer lost; a duplicate changes nothing."""
         self.received += 1
         ahead = (number - self._last + 128) % 256 - 128
         if -LATE_FRAMES < ahead <= 0:
@@ -52,7 +52,7 @@ class Numbers:
 
 
 class Losses:
-    """Counts the lost frames of each component of one vehicle, and tells which loses many.
+    """Count the lost frames of each component of one vehicle, and report components that lose many.
 
     Parameters
     ----------

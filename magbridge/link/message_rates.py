@@ -1,4 +1,4 @@
-"""How often each of the bridge's messages goes out: as configured, or as a station has asked for."""
+"""Rate of each message: as configured, or as requested by a station."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def check_publish(publish: Mapping[str, float], path: Path) -> None:
 
 
 class MessageRates:
-    """Each message's rate, which is also a parameter."""
+    """Rate of each message; each rate is also a parameter."""
 
     def __init__(self, parameters: Parameters, timers: Timers, codec: Codec) -> None:
         self._parameters, self._timers, self._codec = parameters, timers, codec
@@ -59,7 +59,7 @@ class MessageRates:
         return rate
 
     def send_by_clock(self, name: str, report: Callable[[], None]) -> None:
-        """Send a message at times of the clock, not with the samples; here a rate of 0 is off."""
+        """Send a message by the clock instead of with the samples; a rate of 0 is off."""
         self._by_clock[name] = report
         self._start_timer(name)
 
@@ -81,7 +81,7 @@ class MessageRates:
         return parameter if self._parameters.set(parameter, value) else ""
 
     def _changed(self, parameter: str) -> None:
-        """Apply a parameter that was changed, if it is a message's rate."""
+        """Apply a changed parameter if it is the rate of a message."""
         for name, rate in self._more:
             if rate_name(name) == parameter:
                 rate.set(self._parameters[parameter])
@@ -100,7 +100,7 @@ class MessageRates:
 
 
 def name_of(number: int) -> str:
-    """Return the name of a message whose rate can be set; KeyError where it has none."""
+    """Return the name of a message whose rate can be set, else raise KeyError."""
     name = spec(number).name
     if name not in LIMITS:
         raise KeyError(name)

@@ -1,4 +1,4 @@
-"""What a ground station shows next to a parameter: its text, unit, range and default, as MAVLink metadata.
+"""MAVLink metadata of the parameters: text, unit, range and default for ground stations.
 
 A station asks for COMPONENT_METADATA, reads the general file that it names by MAVLink FTP, and from there the
 file of the parameters (MAVLink guide, 'Component Metadata Protocol').
@@ -30,7 +30,7 @@ def crc32(data: bytes, before: int = 0) -> int:
 
 
 def uri(component: int, path: str) -> str:
-    """Return where `component` has a file."""
+    """Return the URI of a file of `component`."""
     return f"mftp://[;comp={component}]{path}"
 
 
@@ -43,7 +43,7 @@ def files(parameters: Iterable[Tunable], component: int) -> Mapping[str, bytes]:
 
 
 def describe(row: Tunable) -> dict[str, object]:
-    """Return what the schema of parameter metadata says of one parameter."""
+    """Return the metadata of one parameter by the schema of MAVLink."""
     smallest = min((abs(value) for value in (row.default, row.low) if value), default=1.0)
     return {
         "name": row.name,

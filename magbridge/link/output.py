@@ -1,4 +1,4 @@
-"""What the component sends, and when: the queue of frames, timers, rates and announcements.
+"""Sending: the queue of frames, timers, rates and announcements.
 
 All times are event times in µs since 1970 UTC, so that a replay sends the same frames at the same times.
 """
@@ -27,7 +27,7 @@ ANNOUNCEMENT_INTERVAL_US = 1_000_000
 
 
 class Outbox:
-    """Packs and queues what the services send; the bridge drains it.
+    """Pack and queue the messages of the services; the bridge drains the queue.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Outbox:
 
 
 class Timers:
-    """Calls the actions that are due, in the order of their deadlines.
+    """Call the actions that are due, in the order of their deadlines.
 
     The result depends only on the times given to :meth:`advance`, not on when it is called: a replay, which
     calls it at other moments, fires the same timers at the same times.
@@ -112,7 +112,7 @@ class Timers:
             self._find_next()
 
     def _find_next(self) -> None:
-        """Find the next timer; of two with the same deadline, the one that was set first."""
+        """Find the next timer; with equal deadlines, the one that was set first."""
         self._next = min(self._deadlines, key=self._deadlines.__getitem__, default="")
         self.next_deadline = self._deadlines.get(self._next, FOREVER)
 
@@ -123,7 +123,7 @@ def period_us(hertz: float) -> int:
 
 
 class Rate:
-    """Thins a stream of samples to a rate, in event time and without drift.
+    """Thin a stream of samples to a rate, in event time and without drift.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ class Rate:
 
 
 class Announcer:
-    """Sends STATUSTEXT, and the text of a state only when the state has changed.
+    """Send STATUSTEXT; the text of a state only if the state has changed.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ class Announcer:
             )
 
     def forget(self, key: str) -> None:
-        """Announce the next state of `key` even if it is the one that was announced last."""
+        """Forget the last announced state of `key`, so that the next one is announced."""
         self._announced.pop(key, None)
 
     def state(

@@ -1,4 +1,4 @@
-"""The parameter protocol: a station lists, reads and writes what can be tuned."""
+"""The parameter protocol: a station lists, reads and writes parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STATIONS = 16
 
 
 class ParameterService:
-    """Answers PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET, all values REAL32.
+    """Answer PARAM_REQUEST_LIST, PARAM_REQUEST_READ and PARAM_SET; all values are REAL32.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class ParameterService:
         )
 
     def greet(self, station: tuple[int, int]) -> None:
-        """Send all parameters to a station that is new, and once more `REPEAT_US` later.
+        """Send all parameters to a new station, and again `REPEAT_US` later.
 
         QGroundControl with an autopilot never asks another component for its parameters, and it forgets those
         that it receives before it has the autopilot's.
@@ -78,7 +78,7 @@ class ParameterService:
             self._timers.once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
-        """Begin to send all parameters, one every `PACE_US`; of a list under way, the rest comes first."""
+        """Begin to send all parameters, one every `PACE_US`, after the rest of a list that is being sent."""
         self._begin()
 
     def _begin(self) -> None:
@@ -97,7 +97,7 @@ class ParameterService:
             self._timers.cancel("parameters")
 
     def read(self, message: Message) -> None:
-        """Send the parameter asked for by index or name; a request for one that does not exist is ignored."""
+        """Send the parameter of an index or a name; ignore a request for a parameter that does not exist."""
         index = message["param_index"]
         names = self._parameters.names
         if index != -1 and message["target_component"] == 0:

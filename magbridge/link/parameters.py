@@ -1,4 +1,4 @@
-"""What can be tuned while the bridge runs: a table, and its values."""
+"""Parameters that can be changed while the bridge runs: their table and their values."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def alignment(align: Align) -> list[Tunable]:
 
 
 def file_rate() -> list[Tunable]:
-    """Return the tunable for how fast files are sent."""
+    """Return the tunable for the rate at which files are sent."""
     doc = "at which files are sent to stations; 0 sends none"
     return [Tunable("MB_FILE_RATE", "files.rate", 250.0, 0, 10_000, "kB/s", doc)]
 
@@ -129,15 +129,15 @@ class Parameters:
         return self._values[self._names_of[key]]
 
     def changed(self) -> dict[str, float]:
-        """Return the values that are no longer the defaults, by name: those to store."""
+        """Return the values that differ from the defaults, by name; these are stored."""
         return {name: value for name, value in self._values.items() if value != self.table[name].default}
 
     def watch(self, watcher: Callable[[str], None]) -> None:
-        """Call ``watcher(name)`` at every change from now on: this is how a value takes effect."""
+        """Call ``watcher(name)`` at every later change, so that the value takes effect."""
         self._watchers.append(watcher)
 
     def set(self, name: str, value: float) -> bool:
-        """Set a value; return False, and change nothing, when it is not finite or out of its range."""
+        """Set a value; return False and change nothing if it is not finite or out of range."""
         row = self.table[name]
         if not isfinite(value) or abs(value) > 1e38:
             return False
@@ -153,5 +153,5 @@ class Parameters:
         return True
 
     def restore(self, values: Mapping[str, float]) -> list[str]:
-        """Set the values kept from an earlier run; return the names that no longer exist or fit."""
+        """Set the stored values of an earlier run; return names that no longer exist or fit."""
         return [name for name, value in values.items() if name not in self.table or not self.set(name, value)]

@@ -1,4 +1,4 @@
-"""Samples as messages: our own dialect in full, and the standard messages that every station plots."""
+"""Samples as messages of the magbridge dialect and as standard messages that every station plots."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NO_HEADING: Final = (0.0, 0.0, 0.0)
 
 
 class Publisher:
-    """Sends each sample as the messages that are due.
+    """Send each sample as the messages that are due.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class Publisher:
                 send(sample, corrected, anomaly, attitude)
 
     def repeat(self, name: str) -> bool:
-        """Send message `name` of the latest sample again; False where there is none yet."""
+        """Send message `name` of the latest sample again; return False before the first sample."""
         if self.latest is None:
             return False
         send: Callable[[Sample, Corrected, float, Attitude], None] = getattr(self, PUBLISHED[name])

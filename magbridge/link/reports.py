@@ -1,4 +1,4 @@
-"""What the bridge reports of itself: heartbeat, status, version."""
+"""Reports of the bridge on itself: heartbeat, status and version."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Condition(NamedTuple):
 
 
 class Reports:
-    """Sends HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and what describes the component.
+    """Send HEARTBEAT, MAG_STATUS, AUTOPILOT_VERSION and the description of the component.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class Reports:
         )
 
     def metadata(self) -> None:
-        """Send COMPONENT_METADATA: where the files are that describe the parameters."""
+        """Send COMPONENT_METADATA with the URI of the files that describe the parameters."""
         codec = self._outbox.codec
         self._outbox.send(
             "COMPONENT_METADATA",

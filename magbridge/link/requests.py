@@ -32,7 +32,7 @@ UNREQUESTABLE: Final = frozenset(
 def needed_rates(
     *, attitude: bool, navigation: bool, telemetry: tuple[str, ...]
 ) -> dict[str, tuple[float, float]]:
-    """Return the rates in Hz, of an aircraft and of any other vehicle, that each message is needed at.
+    """Return the needed rate (Hz) of each message, for an aircraft and for any other vehicle.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def needed_rates(
 
 
 class StreamRequests:
-    """Measures at which rate each needed message arrives, and requests those that arrive too rarely.
+    """Measure the rate of each needed message, and request messages that arrive too rarely.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class StreamRequests:
             self._received[message.id] += 1
 
     def rebooted(self) -> None:
-        """Restart: the autopilot has forgotten the requests."""
+        """Restart after a reboot of the autopilot, which has forgotten the requests."""
         self._attempts.clear()
         self._received.clear()
         self.denied.clear()
@@ -133,7 +133,7 @@ class StreamRequests:
             self._ask_next()
 
     def _ask_next(self) -> None:
-        """Send the next request; one is under way at a time, because an answer does not name its message."""
+        """Send the next request; only one is pending, because an answer does not name its message."""
         self._asked = None
         if not self._queue:
             return
@@ -152,7 +152,7 @@ class StreamRequests:
         self._timers.once("stream request", deadline, lambda _: self._ask_next())
 
     def _answered(self, result: int) -> None:
-        """Report a denial, and go on with the next request."""
+        """Report a denial and continue with the next request."""
         assert self._asked is not None
         name = spec(self._asked).name
         if result not in (MAV_RESULT.ACCEPTED, MAV_RESULT.IN_PROGRESS):

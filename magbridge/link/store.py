@@ -1,4 +1,4 @@
-"""The file of what outlives a run: parameters that a station changed, and time stamps of signed streams."""
+"""The file of the state between runs: changed parameters, and time stamps of signed streams."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class StoredState(msgspec.Struct, frozen=True):
 
 
 def load(path: str | Path) -> StoredState:
-    """Read the file; one that does not exist yet keeps nothing.
+    """Read the file; return an empty state if it does not exist.
 
     FormatError: it is not what :func:`save` wrote.
     """

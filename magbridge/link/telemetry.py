@@ -23,7 +23,7 @@ YEAR_2001_US = 10**15
 
 
 class Extractor:
-    """Takes one parameter out of one kind of message."""
+    """Extract one parameter from one kind of message."""
 
     __slots__ = ("field", "index", "match", "name", "offset", "scale", "texts")
 
@@ -57,7 +57,7 @@ class Extractor:
                 self.match.append((field, value))
 
     def value(self, payload: bytes) -> float | None:
-        """Return the value, NaN where the sender does not know it, None where the message does not match."""
+        """Return the value; NaN if the sender does not know it, None if the message does not match."""
         for offset, text in self.texts:
             if not payload.startswith(text, offset):
                 return None
@@ -80,7 +80,7 @@ def find(layout: Spec, name: str, path: Path, key: str) -> Field:
 
 
 class TelemetryMap:
-    """Takes the configured parameters out of messages, with the time at which they were true.
+    """Extract the configured parameters from messages, with the time of each value.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The files that a station may read, and no others: texts made here, and the logs in one folder."""
+"""The files that a station may read: generated texts, and the logs in one folder."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Tree:
 
 
 def parts(path: str) -> list[str]:
-    """Return the names along a path; raises OSError where it leads upward."""
+    """Return the names along a path; raise OSError if it leads upward."""
     names = [name for name in path.split("/") if name not in ("", ".")]
     if ".." in names or "\0" in path:
         raise PermissionError(errno.EACCES, path)
@@ -83,6 +83,6 @@ def parts(path: str) -> list[str]:
 
 
 def began_s(name: str) -> int:
-    """Return when the run of a log began, by the log's name: s of UNIX time."""
+    """Return the start of a log's run by the log's name, s since 1970."""
     found = LOG.fullmatch(name)
     return int(datetime.strptime(found[1], "%Y%m%dT%H%M%S").replace(tzinfo=UTC).timestamp()) if found else 0

@@ -1,4 +1,4 @@
-"""Check that a message about the vehicle's motion states something that a vehicle can do."""
+"""Check that the values of a motion message are possible for a vehicle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vehicle that the bridge is attached to: whether its autopilot is there, rebooted, or not alone."""
+"""State of the vehicle: whether its autopilot is present, rebooted, or shares its system id."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BOOT_TIMES: Final = {
 
 
 class VehicleState:
-    """Watches what the configured system says of itself.
+    """Watch the messages of the configured system.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class VehicleState:
         return True
 
     def count(self, message: Message, t_us: int) -> None:
-        """Count a frame of our vehicle that is not read: its id is unknown, or its signature was refused."""
+        """Count a frame of the vehicle with an unknown id or a refused signature."""
         if message.system == self.system and message.component != self.component:
             self._losses.count(message.component, message.sequence, t_us)
 
@@ -138,7 +138,7 @@ class VehicleState:
             self._boot_ms, self._boot_us = boot_ms, t_us
 
     def _change(self, t_us: int) -> None:
-        """Count how often the boot clock went back and forth."""
+        """Count alternations of the boot clock."""
         self._changes = [*(when for when in self._changes if t_us - when < CHANGES_US), t_us][-TWICE:]
         if len(self._changes) == TWICE:
             self._announcer.state(

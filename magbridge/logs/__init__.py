@@ -1,4 +1,4 @@
-"""Deployments in and out: one module per format, one table of them, one reader and one writer.
+"""Read and write deployments: a module for each format, a table of formats, one reader and one writer.
 
 A deployment is an ``xarray.Dataset`` on ``time`` (:mod:`magbridge.columns`). A row is one time of the
 magnetometer sample; every other column holds the values known at that time:

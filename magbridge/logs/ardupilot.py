@@ -83,7 +83,7 @@ def _run(fields: Fields, records: dict[str, Records]) -> BootRun:
 
 
 def _in_microseconds(name: str, records: Records) -> Records:
-    """Return records with the times of today: up to ArduPilot 3.2 they are in ms, a GPS' of its week."""
+    """Return records with times in µs; up to ArduPilot 3.2 they are ms, those of GPS in its week."""
     fields = records.fields
     if "TimeMS" not in fields or "TimeUS" in fields:
         return records
@@ -139,7 +139,7 @@ def _estimators(records: Records | None) -> int | None:
 def _magnetometer(
     number: int, records: Records, parameters: Mapping[str, float], chosen: int | None
 ) -> Magnetometer:
-    """Return the raw channels in nT, and what the log says of the compass."""
+    """Return the raw channels in nT, and the log's description of the compass."""
     fields = records.fields
     time = fields["TimeUS"] * 1e-6
     field: FloatArray = np.stack([fields[f"Mag{axis}"] for axis in "XYZ"])
@@ -185,7 +185,7 @@ def _survey_magnetometers(records: Records | None, first: int) -> list[Magnetome
 
 
 def _numbered(number: int) -> str:
-    """Return how the names of parameters number a compass: the first not at all, the second with 2."""
+    """Return the number of a compass in the names of parameters: none for the first, 2 for the second."""
     return str(number + 1) if number else ""
 
 
@@ -367,7 +367,7 @@ def _converted(
 
 
 def _declared(flash: Flash) -> dict[tuple[str, str], tuple[str, float]]:
-    """Return kind and field to the label of its unit, and what the number is to be multiplied with."""
+    """Return a mapping from kind and field to the label of the unit and the multiplier of the number."""
     try:
         formats, fmtu, unit, mult = (flash.records[name] for name in ("FMT", "FMTU", "UNIT", "MULT"))
         labels = dict(zip(_characters(unit.fields["Id"]), unit.texts["Label"], strict=True))

@@ -1,4 +1,4 @@
-"""An autopilot's own log as a deployment: what ArduPilot's, PX4's and a robot's have in common.
+"""Logs of autopilots as deployments: the common part of ArduPilot, PX4 and ROS.
 
 A row is a sample of one of the magnetometers, that in use (:mod:`.compasses`); every other column is the last
 value before it. A log that does not tell UTC counts from the boot, and has the attribute
@@ -92,7 +92,7 @@ def pieces(
 
 
 def _assembled(path: Path, run: BootRun, wanted: LogCompass) -> xr.Dataset:
-    """Return a run on the times of a compass, or where the run lacks it, of its own choice."""
+    """Return a run at the times of a compass; without that compass, at those of the run's own choice."""
     there = [one.compass for one in run.magnetometers]
     same = [one for one in there if (one.id, one.number) == (wanted.id, wanted.number)]
     compass = same[0] if same else next(one for one in choose(path, there, None) if one.chosen)
@@ -113,7 +113,7 @@ def _assembled(path: Path, run: BootRun, wanted: LogCompass) -> xr.Dataset:
 
 
 def _one_after_the_other(runs: list[xr.Dataset]) -> list[str]:
-    """Move runs that begin before the end of the one before them, in place; return a note for each."""
+    """Shift runs that begin before the end of the previous run, in place; return a note for each."""
     notes, ended = [], -inf
     for k, run in enumerate(runs):
         time = run["time"].values

@@ -1,4 +1,4 @@
-"""What programs write to a terminal for others to capture: lines without headings.
+"""Terminal captures of logging programs: lines without headings.
 
 MotionCal (PJRC) takes nine numbers a line, ``Raw:`` and the counts of accelerometer, gyroscope and
 magnetometer; the last three are in 0.1 uT. Adafruit's sketches add ``Uni:`` with the same in m/s2, rad/s and
@@ -53,7 +53,7 @@ Pieces = Iterator[tuple[xr.Dataset, Sequence[int]]]
 
 
 def reader(header: Sequence[str]) -> Callable[[Path, Iterator[str], int], Pieces] | None:
-    """Return the reader of a capture that begins with these lines; None: it is none that is known."""
+    """Return the reader of a capture that begins with these lines, or None if it is unknown."""
     kinds = [match[1] for line in header if (match := CAPTURE_LINE.fullmatch(line.strip()))]
     if not kinds or len(kinds) < len(header) / 4:
         return None
@@ -87,7 +87,7 @@ def _explorer(lines: Iterator[str]) -> Iterator[str]:
 
 
 def _json(line: str) -> dict[str, object] | None:
-    """Return the object that a line holds; None where it holds none."""
+    """Return the JSON object of a line, or None."""
     try:
         found = json.loads(line) if line.startswith("{") else None
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""The numbers of a netCDF variable, as the CF conventions mean them.
+"""Numbers of a netCDF variable by the CF conventions.
 
 References
 ----------
@@ -49,7 +49,7 @@ def epoch(path: Path, variable: Any) -> tuple[float, float]:
 
 
 def floats(variable: Any, rows: slice | tuple[slice, ...] = WHOLE_AXIS) -> FloatArray:
-    """Return rows of a variable, in its shape, NaN where a value is missing.
+    """Return rows of a variable in its shape; a missing value is NaN.
 
     Missing are the values that the variable declares as missing, compared as stored, before unpacking, and
     rounded to the variable's type where they are of another; and those never written, which the library fills

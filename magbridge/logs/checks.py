@@ -1,4 +1,4 @@
-"""Drop and count values that no deployment can hold: times that do not increase, impossible values.
+"""Drop and count impossible data: times that do not increase, and values beyond physical limits.
 
 One damaged record costs only itself. The longest increasing series of times is kept: a clock
 that was set back costs the rows that it lived through twice, a single wrong stamp its row. Rows at one time
@@ -66,7 +66,7 @@ def increasing(file: str | Path, time: FloatArray, *, after: float = -np.inf) ->
 
 
 def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) -> Iterator[xr.Dataset]:
-    """Yield the pieces of a deployment, each given with the numbers of its rows, without what cannot be.
+    """Yield the pieces of a deployment, given with the numbers of their rows, without impossible data.
 
     Attributes of a piece count its losses, ``rows_dropped duplicate_rows values_dropped``; ``losses`` has a
     line for the first in each column of the file.
@@ -94,7 +94,7 @@ def checked(file: str | Path, pieces: Iterable[Piece], *, strict: bool = False) 
 
 
 def _up_to_error(pieces: Iterable[Piece], broken: list[FormatError]) -> Iterator[Piece]:
-    """Yield the pieces; append to `broken` the error with which they end, if they do."""
+    """Yield the pieces; append the error with which they end, if any, to `broken`."""
     try:
         yield from pieces
     except FormatError as error:
@@ -110,7 +110,7 @@ class _Checks:
         self.finish = self._faults.finish
 
     def sound(self, dataset: xr.Dataset, rows: Sequence[int], ahead: FloatArray) -> xr.Dataset:
-        """Return the piece without what cannot be. `ahead` are the times of the next."""
+        """Return the piece without impossible data. `ahead` are the times of the next piece."""
         index, duplicates = self._times(dataset["time"].values, rows, ahead)
         dropped = dataset.sizes["time"] - len(index)
         if dropped:
@@ -165,7 +165,7 @@ class _Checks:
 
 
 def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> tuple[BoolArray, str]:
-    """Return which `values` (n,) of a column cannot be, and the expectation; "" where anything can be."""
+    """Return the impossible `values` (n,) of a column as a mask, and the expected range; "" without one."""
     unit = usual(unit)
     if name in MAX_MAGNITUDE:
         return np.abs(values) > MAX_MAGNITUDE[name], f"expected {unit}, at most {MAX_MAGNITUDE[name]:g}"
@@ -281,7 +281,7 @@ class Faults:
         self._counts.update(counts)
 
     def since_last(self) -> tuple[Counter[str], list[str]]:
-        """Return the losses since the last call: how much, and the lines that name it."""
+        """Return the losses since the last call: counts, and lines that name them."""
         last = self._counts, self._lines
         self._counts, self._lines = Counter(), []
         return last
@@ -301,7 +301,7 @@ MEDIAN_ROWS = 5
 
 
 def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
-    """Return which rows to keep so that time increases and the fewest are left out.
+    """Return the rows to keep so that time increases and the fewest rows are dropped.
 
     A single time that is ahead costs its own row, and not all that follow; so does one set back.
 
@@ -346,7 +346,7 @@ def in_order(time: FloatArray, *, strictly: bool = True) -> NDArray[np.bool_]:
 
 
 def boots(time: FloatArray) -> IndexArray:
-    """Return the rows at which the clock started again, the first row included.
+    """Return the rows at which the clock restarted, including the first row.
 
     Parameters
     ----------

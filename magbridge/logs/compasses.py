@@ -1,4 +1,4 @@
-"""The compasses of a log: which there are, what the log says of each, and which is read as ``mag_x``.
+"""The compasses of a log, their descriptions, and the choice of the one that is read as ``mag_x``.
 
 A log tells which compass was in use by the vehicle's settings and by its state: the one that the estimator
 names, that is enabled and healthy. Unless the user asks for another, this one becomes ``mag_x``, ``mag_y``,
@@ -57,12 +57,12 @@ class LogCompass(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def fit(self) -> bool:
-        """Return True if the log has no reason against its use."""
+        """Return True if the log states no reason against the use of the compass."""
         return self.enabled is not False and (self.healthy is None or self.healthy >= HEALTHY)
 
     @property
     def words(self) -> str:
-        """Description of the compass, in a few words."""
+        """Short description of the compass."""
         facts = [f"id {self.id}"] if self.id else []
         facts.append(f"{self.rate:.3g} Hz, {counted(self.samples, 'sample')}")
         facts += ["disabled"] if self.enabled is False else []

@@ -62,7 +62,7 @@ class Records(NamedTuple):
 
 
 class Flash(NamedTuple):
-    """The records that were read of a log."""
+    """The records read from a log."""
 
     records: dict[str, Records]
     """By the name of the kind."""
@@ -110,7 +110,7 @@ def read_binary(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
 
 
 def _headers(data: Bytes) -> IndexArray:
-    """Return where the bytes A3 95 stand, with at least one more after them."""
+    """Return the offsets of the bytes A3 95 that at least one byte follows."""
     found = [
         start + np.flatnonzero((data[start:stop] == 0xA3) & (data[start + 1 : stop + 1] == 0x95))
         for start in range(0, data.size - 2, PASS)
@@ -120,7 +120,7 @@ def _headers(data: Bytes) -> IndexArray:
 
 
 def _kinds(data: Bytes, headers: IndexArray) -> list[_Kind]:
-    """Return what the log describes, in the order of the file; what contradicts itself is left out."""
+    """Return the descriptions of the log in the order of the file, without contradictory ones."""
     at = headers[(headers <= data.size - FORMAT_LAYOUT.itemsize)]
     at = at[data[at + 2] == FMT]
     kinds = []
@@ -164,7 +164,7 @@ def _lengths(data: Bytes, headers: IndexArray, kinds: list[_Kind]) -> IndexArray
 
 
 def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
-    """Return which of the records that may begin at `starts` are believed, as indices."""
+    """Return the indices of the accepted records among those that may begin at `starts`."""
     n = len(starts)
     if not n:
         return np.empty(0, dtype=np.intp)
@@ -227,7 +227,7 @@ def _joined(first: Records, second: Records) -> Records:
 
 
 def number_of(text: str) -> float:
-    """Return the number that a text is; NaN where it is none."""
+    """Return the number of a text; NaN if it is no number."""
     try:
         return float(text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""A deployment in memory: one ``xarray.Dataset`` on ``time``, built and joined here only."""
+"""A deployment in memory: build and join ``xarray.Dataset`` objects on ``time``."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def with_losses(dataset: xr.Dataset, counts: Mapping[str, int], lines: Sequence[
 
 
 def lasting(attrs: Mapping[Any, Any]) -> dict[str, str | float]:
-    """Return what a format that cannot keep all attributes must: those of :data:`MEANING`, and settings."""
+    """Return the attributes that every format must keep: those of :data:`MEANING`, and settings."""
     return {
         str(name): value
         for name, value in attrs.items()
@@ -237,7 +237,7 @@ def named_losses(*pieces: Mapping[str, Any]) -> list[str]:
 
 
 def noted(*pieces: Mapping[str, Any]) -> list[str]:
-    """Return what a user should know of how the pieces of a deployment were read."""
+    """Return notes for the user on how the pieces of a deployment were read."""
     return [line for attrs in pieces for line in str(attrs.get(NOTES, "")).splitlines()]
 
 

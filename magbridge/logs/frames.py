@@ -1,4 +1,4 @@
-"""Deployments from and to pandas' data frames, for notebooks."""
+"""Convert deployments from and to pandas data frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NAME = "the data frame"
 
 
 def from_frame(frame: pd.DataFrame, units: Mapping[str, str] | None = None, **attrs: Any) -> xr.Dataset:
-    """Return a data frame as a deployment, which every function takes that takes a log.
+    """Return a data frame as a deployment; every function that accepts a log accepts it.
 
     Parameters
     ----------

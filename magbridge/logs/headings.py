@@ -99,17 +99,17 @@ def split(heading: str) -> tuple[str, str]:
 
 
 def bare(name: str) -> str:
-    """Return a name in small letters, without punctuation."""
+    """Return a name in lower case, without punctuation."""
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def is_unit(text: str) -> bool:
-    """Whether a cell under the headings is a unit: of a row of them at least one must be."""
+    """Return True if a cell under the headings is a unit."""
     return usual(text.strip().strip("[]()")) in KNOWN_UNITS
 
 
 def aliases(names: Sequence[str], units: Sequence[str] = ()) -> Mapping[int, str]:
-    """Return, for columns under another name than ours that are known to mean the same: position -> our name.
+    """Return a mapping from position to our name for columns with a known other name.
 
     The three axes are recognised together or not at all: one `b_x` alone may be anything. Three columns in
     units of a magnetic field, with names that differ only in x, y and z, are the axes whatever they are

@@ -1,4 +1,4 @@
-"""What a log holds, and what could be done with it."""
+"""Describe a log: its columns, and the commands that can use it."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ STATES = {*(*CONDITIONS, "inHg", "V", "s", "m", "m/s", "nT", "arcmin")}
 
 
 def info(log: xr.Dataset) -> dict[str, Any]:
-    """Return what a log holds: as a dictionary that JSON can hold.
+    """Return the description of a log as a dictionary for JSON.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def info(log: xr.Dataset) -> dict[str, Any]:
 
 
 def lacking(log: xr.Dataset, needs: Needs) -> list[str]:
-    """Return what of `needs` a log lacks, as ``a b, or c``; a column without any value is not there."""
+    """Return the columns of `needs` that a log lacks or has without values, as ``a b, or c``."""
     there = {str(name) for name in log.data_vars if bool(log[name].notnull().any())}
     return [
         ", or ".join(" ".join(name for name in one if name not in there) for one in alternatives)

@@ -199,7 +199,7 @@ def _separator(body: Sequence[str]) -> str:
 
 
 def _preamble(lines: Sequence[str], found: Layout) -> int:
-    """Return how many lines come before the headings: those with fewer fields than most rows have."""
+    """Return the number of lines before the headings: lines with fewer fields than most rows."""
     counts = [_count(line, found.separator) if line.strip() else 0 for line in lines]
     usual, often = Counter(counts[1:] or counts).most_common(1)[0]
     if counts[0] >= usual or often < max(2, len(counts) // 2) or usual < 2:
@@ -214,7 +214,7 @@ def _preamble(lines: Sequence[str], found: Layout) -> int:
 def _headings_elsewhere(
     path: Path, lines: Sequence[str], comments: int, start: int, declared: ColumnMapping, found: Layout
 ) -> tuple[int, list[str]]:
-    """Return where the headings of rows without any are, and they: in a comment above, or as declared."""
+    """Return position and text of headings in a comment above the rows, or as declared."""
     width = _count(lines[start], found.separator)
     for k in reversed(range(comments)):
         headings = cells(lines[k].lstrip("#%/ "), found.separator)
@@ -233,7 +233,7 @@ def _headings_elsewhere(
 
 
 def _units_row(lines: Sequence[str], found: Layout) -> list[str]:
-    """Return the units, where the first row has them and no numbers; that row is then no longer one."""
+    """Return the units if the first row has units and no numbers, and skip that row."""
     if found.first >= len(lines):
         return []
     row = cells(lines[found.first], found.separator)

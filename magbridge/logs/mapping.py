@@ -1,4 +1,4 @@
-"""``--column`` and ``columns.toml``: which of their columns is which of ours, in what unit.
+"""Map columns of other programs to ours, with units: ``--column`` and ``columns.toml``.
 
 :data:`MAKERS` has the same for instruments and autopilots whose makers state what the columns mean. PX4's
 topics as ``ulog2csv`` writes them are in microseconds since the boot and in gauss (PX4, msg/SensorMag.msg,
@@ -75,7 +75,7 @@ class ColumnMapping(Table, frozen=True):
 
 
 def declared(column: Sequence[str], file: Path | None) -> ColumnMapping:
-    """Return what a mapping file and the texts of ``--column`` say together.
+    """Return the combined declarations of a mapping file and of ``--column``.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def _named(text: str) -> tuple[str, ColumnSource]:
 
 
 def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
-    """Return a deployment of a format that names its columns itself with the columns as declared.
+    """Rename the columns of a deployment as declared, for formats with column names of their own.
 
     FormatError: a column that is not there, or a unit that does not fit ours.
     """
@@ -132,7 +132,7 @@ def renamed(dataset: xr.Dataset, declaration: ColumnMapping) -> xr.Dataset:
 
 
 def _column(dataset: xr.Dataset, name: str, source: ColumnSource) -> tuple[str, str]:
-    """Return the name of the column that `source` means, and the unit that is declared for it."""
+    """Return the name of the column of `source`, and its declared unit."""
     theirs = source.heading or name
     if theirs in dataset:
         return theirs, source.unit or ""
@@ -192,7 +192,7 @@ MAKERS: dict[str, tuple[set[str], dict[str, ColumnSource]]] = {
 
 
 def declared_by_maker(headings: Sequence[str], declared: ColumnMapping) -> tuple[str, ColumnMapping]:
-    """Return the instrument's name, and what its maker says of these columns; the user's word counts more.
+    """Return the instrument's name and its maker's declarations; the user's declarations have priority.
 
     The name is empty where the headings are of no known instrument.
     """

@@ -109,7 +109,7 @@ def _read(path: Path, reader: Any) -> xr.Dataset:
 
 
 class FileWriter:
-    """Writes deployments one after the other; the columns are those of the first."""
+    """Write successive deployments with the columns of the first one."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -119,7 +119,7 @@ class FileWriter:
         self._topics: dict[str, tuple[int, list[str]]] = {}
 
     def append(self, dataset: xr.Dataset, *, first: bool) -> None:
-        """Write the rows, and before the first ones what the topics hold.
+        """Write the rows; before the first ones, describe the topics.
 
         WriteError: a time before 1970, which MCAP does not have.
         """
@@ -177,7 +177,7 @@ class FileWriter:
         self._topics[topic] = self._writer.register_channel(topic, "json", number), names
 
     def _rows(self, dataset: xr.Dataset, names: Iterable[str]) -> Iterator[dict[str, Any]]:
-        """Yield what each row knows of the columns; of none, the place as a fix."""
+        """Yield the values of each row by topic; the position as a fix."""
         if not names:
             yield from _fixes(dataset)
             return
@@ -193,7 +193,7 @@ def _flags(bits: int) -> dict[str, bool]:
 
 
 def _fixes(dataset: xr.Dataset) -> Iterator[dict[str, Any]]:
-    """Yield each row's place as a LocationFix; an empty one where it is not known."""
+    """Yield each row's position as a LocationFix; empty if it is unknown."""
     empty: FloatArray = np.full(dataset.sizes["time"], np.nan)
     depth = dataset["depth"].to_numpy() if "depth" in dataset else empty
     places = (dataset["latitude"].to_numpy(), dataset["longitude"].to_numpy(), -np.nan_to_num(depth))

@@ -1,4 +1,4 @@
-"""Several logs as one stream, sorted in time, without holding them whole."""
+"""Merge several logs into one stream, sorted in time, in bounded memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which column of a text file is which of ours, in what unit, and which of them together are the time."""
+"""Identify the columns of a text file, their units, and the columns that form the time."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ HEMISPHERES = {"latitude": "NS", "longitude": "EW"}
 def name_columns(
     path: Path, found: Layout, headings: list[str], units: Sequence[str], rows: Sequence[Sequence[str]]
 ) -> None:
-    """Give each column its name and unit: as declared, as its heading says, as others call it.
+    """Set name and unit of each column: as declared, by its heading, or by a known other name.
 
     `units` are those of a row of units, or empty; `rows` the cells of the first rows.
 
@@ -90,7 +90,7 @@ def name_columns(
 
 
 def _named(path: Path, found: Layout, names: list[str], units: Sequence[str]) -> list[str]:
-    """Return the columns' names, '' for those that are not read."""
+    """Return the names of the columns; '' for columns that are not read."""
     headings, row = found.headings, found.row
     # a name that stands twice, with different units: the second keeps them in its name
     names = [name if name not in names[:k] else headings[k] for k, name in enumerate(names)]
@@ -165,7 +165,7 @@ def _declared(path: Path, found: Layout, names: Sequence[str]) -> dict[int, str]
 
 
 def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Find the column that is the time, or those that are it together: date and time of day ..."""
+    """Find the column of the time, or the columns that form it, such as date and time of day."""
     place = found.names.index("time") if "time" in found.names else None
     ours = [name if name in found.declared.columns else "" for name in found.names]
     called = [bare(name or split(theirs)[0]) for name, theirs in zip(ours, found.headings, strict=True)]
@@ -203,7 +203,7 @@ def _find_time(found: Layout, rows: Sequence[Sequence[str]]) -> None:
 
 
 def _all_match(pattern: re.Pattern[str], rows: Sequence[Sequence[str]], place: int) -> bool:
-    """Return True if all cells of a column that are not empty match a pattern, and some are there."""
+    """Return True if all non-empty cells of a column match a pattern and there is at least one."""
     values = {row[place] for row in rows if place < len(row) and row[place]}
     return bool(values) and all(map(pattern.fullmatch, values))
 
@@ -235,7 +235,7 @@ def _in_a_day(cell: str) -> bool:
 
 
 def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
-    """Leave out columns of other programs that hold texts; N and S, E and W are signs of a position."""
+    """Drop columns of text from other programs; N and S, E and W are the signs of a position."""
     left = []
     for k, name in enumerate(found.names):
         values = {row[k] for row in rows if k < len(row) and row[k]}
@@ -258,14 +258,14 @@ def _leave_texts(found: Layout, rows: Sequence[Sequence[str]]) -> None:
 
 
 def _unit_behind(cells: Sequence[str]) -> str:
-    """Return the unit that stands behind each number, as in ``5.8m``; "" where there is none in common."""
+    """Return the common unit behind all numbers, as in ``5.8m``; "" without one."""
     units = {match[2] if (match := WITH_UNIT.fullmatch(cell)) else "" for cell in cells}
     unit = units.pop()
     return unit if not units and unit and is_unit(unit) else ""
 
 
 def on_side(name: str, values: FloatArray, letters: pd.Series) -> FloatArray:
-    """Return latitudes or longitudes (n,) on the side that letters (n,) say; NaN where there is none."""
+    """Return latitudes or longitudes (n,) with the sign of letters (n,); NaN without a letter."""
     side = letters.astype("str").str.strip().str.upper()
     signed = np.where(side.isin(["S", "W"]), -np.abs(values), values)
     return np.asarray(np.where(side.isin([*HEMISPHERES[name]]), signed, np.nan))
@@ -356,7 +356,7 @@ def find_total(found: Layout, rows: Sequence[Sequence[str]]) -> None:
 
 
 def _numbers(found: Layout, rows: Sequence[Sequence[str]], place: int) -> FloatArray:
-    """Return the numbers (m,) in one column, without cells that are none."""
+    """Return the numbers (m,) of one column, without other cells."""
     texts = [
         row[place].replace(",", ".") if found.decimal == "," else row[place]
         for row in rows

@@ -1,4 +1,4 @@
-"""netCDF in and out: one trajectory.
+"""Read and write netCDF: one trajectory.
 
 A file is written along the dimension ``time`` with the documented names of the columns, so that
 ``xarray.open_dataset`` gives the same names as :func:`magbridge.logs.read`. With the vocabulary of
@@ -81,7 +81,7 @@ def chunks(path: Path, rows: int) -> Iterator[tuple[xr.Dataset, Sequence[int]]]:
 
 
 class FileWriter:
-    """Writes deployments one after the other; the columns are those of the first.
+    """Write successive deployments with the columns of the first one.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ class FileWriter:
 
 
 def _history(before: str) -> str:
-    """Return the history, an entry a line, with this writing at its end."""
+    """Return the history, one entry per line, with an entry for this file."""
     written = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by magbridge {__version__}"
     return "\n".join(line for line in (*before.splitlines(), written) if line)
 

@@ -1,4 +1,4 @@
-"""OceanGliders OG1.0: what a glider's file must say beyond its measurements.
+"""OceanGliders OG1.0: the metadata of a glider's file.
 
 A ``metadata.toml`` says of people, platform and sensor the facts that no log has. Positions of GPS fixes are
 those of ``gps_latitude`` and ``gps_longitude``, where a log has them.
@@ -82,7 +82,7 @@ def read_metadata(path: Path) -> OgMetadata:
 
 
 def complete(path: Path, metadata: OgMetadata) -> None:
-    """Add to a trajectory that :mod:`.netcdf` has written what makes it a file of OG1.0.
+    """Complete a trajectory of :mod:`.netcdf` to a file of OG1.0.
 
     FormatError: it has no positions and depths.
     """
@@ -120,7 +120,7 @@ def _scalar(file: Any, name: str, kind: Any, value: object, **attributes: object
 
 
 def _deployed(file: Any, known: dict[str, Any]) -> None:
-    """Set when and where the mission began: at the first row whose place is known."""
+    """Set start time and position of the mission from the first row with a known position."""
     placed = np.isfinite(known["LATITUDE"]) & np.isfinite(known["LONGITUDE"])
     first = int(np.argmax(placed))
     when = {"standard_name": "time", "calendar": "gregorian", "units": EPOCH}

@@ -1,4 +1,4 @@
-"""What a user can say about logs that they do not say themselves."""
+"""Declarations of the user about logs."""
 
 from __future__ import annotations
 
@@ -32,5 +32,5 @@ class Options:
 
     @cached_property
     def declared(self) -> ColumnMapping:
-        """What `columns` and `column` say together; ConfigError, WrongUse: one is wrong."""
+        """Combined declarations of `columns` and `column`; raise ConfigError or WrongUse for a wrong one."""
         return declared(self.column, self.columns)

@@ -79,7 +79,7 @@ def _chunks(path: Path, file: Any, rows: int) -> Iterator[tuple[xr.Dataset, Sequ
 
 
 def _layout(path: Path, file: Any, *, foreign: bool) -> tuple[Layout, TimeFormat | None]:
-    """Return what the columns are, by names and first rows; and how times that are not stamps are read."""
+    """Return the columns by names and first rows, and the format of times that are not timestamps."""
     schema = file.schema_arrow
     first = next(file.iter_batches(batch_size=LAYOUT_LINES), None)
     if first is None:
@@ -137,7 +137,7 @@ def _floats(path: Path, field: Any, array: Any) -> FloatArray:
 
 
 class FileWriter:
-    """Writes deployments one after the other; the columns are those of the first."""
+    """Write successive deployments with the columns of the first one."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -242,7 +242,7 @@ def _telemetry(topics: Topics) -> Iterator[Series]:
 
 
 def _known(table: Table) -> Table:
-    """Return a table without the -1 A by which ``battery_status`` says that the current is not measured."""
+    """Return a table without the -1 A of ``battery_status``, which means that the current is not measured."""
     if "current_a" not in table:
         return table
     return {**table, "current_a": np.where(table["current_a"] == -1.0, np.nan, table["current_a"])}

@@ -1,4 +1,4 @@
-"""Deployments from files of any format, one or several, whole or in pieces.
+"""Read deployments from files of any format, whole or in pieces.
 
 Bad rows and values are dropped, counted and named in attributes
 (:func:`magbridge.logs.deployment.with_losses`), and the rest is read: rows and values by
@@ -79,7 +79,7 @@ def read(
 
 
 def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
-    """Return the deployment that each file holds, a Slocum's flight and science file as one.
+    """Return the deployment of each file; a Slocum's flight and science file are one.
 
     A sensor's own logs get the telemetry of the vehicle's logs, which are then not among the results
     (:mod:`magbridge.logs.sensor_log`). Files that were skipped are counted in the first.
@@ -101,7 +101,7 @@ def read_each(paths: Paths, *, options: Options = DEFAULTS) -> list[xr.Dataset]:
 def read_chunks(
     paths: Paths, rows: int = 65536, *, required: Iterable[str] = (), options: Options = DEFAULTS
 ) -> Iterator[xr.Dataset]:
-    """Yield what :func:`read` returns in pieces of about `rows` rows, in bounded memory.
+    """Yield the result of :func:`read` in pieces of about `rows` rows, in bounded memory.
 
     Every piece has the same columns. CSV, netCDF, Parquet and ``.tlog`` are streamed; files of the other
     formats are held in memory one at a time. Of files that overlap in time, one piece each is held. A file
@@ -149,7 +149,7 @@ class _Files:
                 raise
 
     def is_sensor_log(self, k: int) -> bool:
-        """Return True if the user calls a file a sensor's own log."""
+        """Return True if the user declares a file as a sensor's own log."""
         return self.paths[k] in self._options.sensor_log
 
     def counted(self, dataset: xr.Dataset) -> xr.Dataset:
@@ -173,7 +173,7 @@ def _paths(paths: Paths, options: Options) -> list[Path]:
 
 
 def _with_another(path: Path, given: Collection[Path]) -> bool:
-    """Return True if the companion file is given, too, as a flight file with its science file."""
+    """Return True if the companion file is also given, such as the science file of a flight file."""
     leads = LEADS.get(path.suffix.lower())
     return leads is not None and any(path.with_suffix(name) in given for name in (leads, leads.upper()))
 
@@ -194,7 +194,7 @@ def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[i
 
 
 def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]:
-    """Yield the pieces of a file as its format's module does."""
+    """Yield the pieces of a file from the module of its format."""
     chunks = form.load().chunks
     more = (options,) if "options" in signature(chunks).parameters else ()
     return _blamed(form, partial(chunks, path, rows, *more))
@@ -271,7 +271,7 @@ def _dated(part: xr.Dataset, date: float | None) -> xr.Dataset:
 
 
 def _origin(source: str) -> str:
-    """Return what the file named in `source` was made from (of ``b.nc (a.csv)``: ``a.csv``), or `source`."""
+    """Return the origin of the file in `source` (``a.csv`` for ``b.nc (a.csv)``), or `source`."""
     name, opened, inside = source.partition(" (")
     depths = accumulate((char == "(") - (char == ")") for char in inside)
     closed = next((k for k, depth in enumerate(depths) if depth < 0), None)

@@ -1,4 +1,4 @@
-"""The table of formats: which module reads and writes what, and how a file is recognised.
+"""The table of formats: the module of each format, and how a file is recognised.
 
 A file is what its first bytes say; its suffix counts only where they say nothing (CSV, or a log that begins
 with damage). Text files may be compressed by gzip, bzip2 or xz. A package adds a format with an entry point
@@ -78,7 +78,7 @@ class Format(NamedTuple):
         return module
 
     def blamed(self) -> AbstractContextManager[None]:
-        """Return a context in which what another package's code raises becomes a PluginError."""
+        """Return a context that turns exceptions of another package's code into a PluginError."""
         return nullcontext() if self.plugin is None else blamed(self.plugin)
 
 
@@ -138,7 +138,7 @@ UNREADABLE = {
 
 @cache
 def _plugins() -> dict[str, Format]:
-    """Return the formats that packages add; those that name a suffix of ours are left out."""
+    """Return the formats of other packages, without those that claim a built-in suffix."""
     ours = {suffix for one in FORMATS.values() for suffix in one.suffixes}
     others = {f".{name.lower()}": point for name, point in plugins("magbridge.formats").items()}
     return {
@@ -163,7 +163,7 @@ def suffixes(*, write: bool = False) -> list[str]:
 
 
 def format_of(path: Path, *, write: bool = False) -> Format:
-    """Return the format of a file, or in which one of this name is written.
+    """Return the format of an existing file, or the format in which a file of this name is written.
 
     FormatError: neither its first bytes nor its name are those of a known format.
     """
@@ -203,13 +203,13 @@ def _start(path: Path) -> bytes:
 
 
 def _recognised(start: bytes) -> Format | None:
-    """Return the format whose signature a file bears that begins so; None where it bears none."""
+    """Return the format with the signature of these first bytes, or None."""
     signed = (one for one in FORMATS.values() if one.signature is not None)
     return next((one for one in signed if re.match(one.signature or b"", start, re.DOTALL)), None)
 
 
 def metadata_path(path: Path) -> Path:
-    """Return where the metadata of a table stand: W3C, *Model for Tabular Data and Metadata*, section 5.3."""
+    """Return the path of a table's metadata: W3C, *Model for Tabular Data and Metadata*, section 5.3."""
     return path.with_name(f"{path.name}-metadata.json")
 
 
@@ -220,7 +220,7 @@ DECOMPRESSION_ERRORS = EOFError, zlib.error, lzma.LZMAError
 
 
 def is_packed(path: Path) -> bool:
-    """Whether a file is compressed, by its first bytes."""
+    """Return True if a file is compressed, by its first bytes."""
     with path.open("rb") as file:
         return file.read(6).startswith(tuple(PACKERS))
 

@@ -1,4 +1,4 @@
-"""Telemetry on its own time base, brought to the rows of a deployment; and what gliders write for degrees."""
+"""Interpolate telemetry to the rows of a deployment; read the degrees of gliders."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CIRCLES = {
 
 
 def latest(at: FloatArray, time: FloatArray, values: FloatArray, max_age: float = MAX_AGE) -> FloatArray:
-    """Return the last value at or before each time, as a live listener would know it.
+    """Return the last value at or before each time, as known live.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def linear(
 
 
 def degrees(written: ArrayLike) -> FloatArray:
-    """Return degrees (n,) from ``-13036.442``, degrees and minutes written together (n,)."""
+    """Return degrees (n,) from numbers of degrees and minutes (n,), as ``-13036.442``."""
     values = np.asarray(written, np.float64)
     whole = np.trunc(values / 100.0)
     return np.asarray(whole + (values - 100.0 * whole) / 60.0)

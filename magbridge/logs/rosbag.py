@@ -1,4 +1,4 @@
-"""Robots' logs: bags of ROS 1 (``.bag``) and ROS 2 (a folder with ``metadata.yaml``), and MCAP, by rosbags.
+"""Logs of robots, by rosbags: ROS 1 (``.bag``), ROS 2 (a folder with ``metadata.yaml``) and MCAP.
 
 A row is a ``sensor_msgs/MagneticField`` (tesla). ROS has x forward, y left, z up in the body (FLU) and east,
 north, up in the world (ENU); here it is forward, right, down (FRD) and north, east, down (NED). mavros'
@@ -118,7 +118,7 @@ def _magnetometer(number: int, stream: _Stream, notes: list[str]) -> Magnetomete
 
 
 def _unit(length: float) -> str:
-    """Return the unit in which a median length is one of the Earth's; T where it is, or where none fits."""
+    """Return the unit in which a median length is that of the Earth's field; T if none fits."""
     if TESLA[0] <= length <= TESLA[1]:
         return "T"
     return next((unit for unit in FIELD_UNITS if EARTH[0] <= NT_PER_UNIT[unit] * length < EARTH[1]), "T")
@@ -166,7 +166,7 @@ def _opened(path: Path) -> Iterator[_Bag]:
 
 
 def _streams(bag: _Bag) -> tuple[list[_Stream], int]:
-    """Return the topics that are read, and how many messages could not be."""
+    """Return the topics, and the number of messages that could not be read."""
     wanted = [one for one in bag.connections if _short(one.msgtype) in MESSAGE_KINDS]
     raw: dict[str, tuple[Any, list[int], list[bytes]]] = {one.topic: (one, [], []) for one in wanted}
     for connection, stamp, data in bag.messages(connections=wanted) if wanted else ():
@@ -203,7 +203,7 @@ def _times(kind: MessageKind, recorded: FloatArray, messages: Sequence[bytes]) -
 def _decoded(
     bag: _Bag, name: str, kind: MessageKind, messages: Sequence[bytes]
 ) -> tuple[Sequence[int], dict[str, FloatArray]]:
-    """Return which messages could be read, and their values (n,) by name."""
+    """Return the indices of the readable messages, and their values (n,) by name."""
     if (table := _doubles(bag, name, kind, messages)) is not None:
         return range(len(messages)), table
     rows, good = [], []
@@ -274,7 +274,7 @@ def _numbered(number: int) -> str:
 
 
 def _angles(v: Values) -> Columns:
-    """Yield roll, pitch and heading (deg) of the quaternion that turns FLU into ENU, if it is ever known."""
+    """Yield roll, pitch and heading (deg) of the quaternion from FLU to ENU, if it is known."""
     x, y, z, w = (v[f"q{axis}"] for axis in "xyzw")
     norm = x * x + y * y + z * z + w * w
     known = (np.abs(norm - 1) < 0.1) & (v["unknown"] != -1)  # the first covariance is -1: no orientation

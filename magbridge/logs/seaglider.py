@@ -76,7 +76,7 @@ MASSES = {"pitchCtl": ("pitch", "C_PITCH"), "rollCtl": ("roll", "C_ROLL_DIVE"), 
 
 @dataclass
 class Dive:
-    """What a glider tells of a dive."""
+    """Data of a glider's dive."""
 
     time: FloatArray
     """(n,), s since 1970 UTC, of the compass samples."""
@@ -94,7 +94,7 @@ class Dive:
 
 
 def dive(path: Path, known: Dive) -> xr.Dataset:
-    """Return one dive as a deployment, without the field, and said, where the compass was not logged raw.
+    """Return one dive as a deployment; without the field, and with a note, if the compass was not logged raw.
 
     FormatError: one of the compass' axes is there, and another is not.
     """
@@ -135,7 +135,7 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
 
 
 def _count(path: Path, known: Dive, columns: Mapping[str, FloatArray]) -> tuple[float, list[str]]:
-    """Return the nT in a count of the compass in use, and a remark where that had to be estimated.
+    """Return the nT per count of the compass in use, and a note if that was estimated.
 
     For an unknown type: what gives the sphere through the counts the radius of the Earth's field. The
     calibration's scales are free to differ from it.
@@ -164,7 +164,7 @@ def _by_length(time: FloatArray, columns: Mapping[str, FloatArray]) -> float:
 
 
 def _position(known: Dive, column: str) -> FloatArray | None:
-    """Return where a mass was at each sample, by its manoeuvres: measured, else commanded; None: neither."""
+    """Return the position of a mass at each sample: measured, else commanded, else None."""
     motor, centre = MASSES[column]
     each = known.manoeuvres
     if not {"st_secs", "end_secs"} <= each.keys():
@@ -237,7 +237,7 @@ def read_netcdf(path: Path, file: Any) -> Dive:
 
 
 def _numbers(file: Any, name: str, size: int) -> FloatArray | None:
-    """Return a variable (size,); None where the file has none of that size, or no numbers."""
+    """Return a variable (size,), or None if it has another size or no numbers."""
     if name not in file.variables or file[name].shape != (size,) or file[name].dtype == str:
         return None
     return floats(file[name]) if file[name].dtype.kind in "iuf" else None
@@ -262,7 +262,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
 
 
 def _samples(path: Path) -> Dive:
-    """Return what the ``.eng`` holds."""
+    """Return the samples of the ``.eng``."""
     header, rows = _split(path)
     names = re.split(r"[,\s]+", header.get("columns", "").replace(".", "_").strip())
     start = _start(path, header)
@@ -281,7 +281,7 @@ def _samples(path: Path) -> Dive:
 
 
 def _add_log(known: Dive, path: Path) -> None:
-    """Add what the ``.log`` holds: parameters, manoeuvres (s from the start of the dive), fixes."""
+    """Add the ``.log``: parameters, manoeuvres (s from the start of the dive) and fixes."""
     header, rows = _split(path)
     start = _start(path, header)
     names: list[str] = []

@@ -1,4 +1,4 @@
-"""A sensor's own log next to a vehicle's logs: the vehicle's telemetry at the sensor's times.
+"""Combine a sensor's own log with a vehicle's logs: the vehicle's telemetry at the sensor's times.
 
 A fluxgate with a logger of its own records the field, but neither attitude nor position; the vehicle's logs
 have these, on another time base. The sensor's rows stay as they are. Each column of the vehicle is brought to
@@ -40,7 +40,7 @@ MAGNETIC_COLUMNS = {name for name, column in COLUMNS.items() if column.units == 
 
 
 def sensor_logs(logs: Sequence[xr.Dataset], named: Sequence[bool]) -> tuple[list[int], list[int]]:
-    """Return which logs are a sensor's own, and which are the vehicle's that belong to them.
+    """Return the indices of the sensors' own logs, and of the vehicle's logs that belong to them.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def _is_placed(log: xr.Dataset) -> bool:
 
 
 class VehicleTelemetry:
-    """A vehicle's telemetry, brought to the times of sensors' logs, in pieces.
+    """A vehicle's telemetry, interpolated to the times of sensors' logs, in pieces.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class VehicleTelemetry:
         return combined
 
     def note(self, source: str) -> str:
-        """Return how the logs were combined, for the user.
+        """Return a note for the user on how the logs were combined.
 
         Raises
         ------
@@ -250,7 +250,7 @@ def _interpolated(at: FloatArray, time: FloatArray, name: str, values: FloatArra
 
 
 def _is_state(values: FloatArray) -> bool:
-    """Return True if values (m,) are few integers, as of a switch, a mode or a counter."""
+    """Return True if values (m,) are a few integers, such as those of a switch or a mode."""
     distinct = np.unique(values)
     return len(distinct) <= MAX_STATES and bool((distinct == np.round(distinct)).all())
 

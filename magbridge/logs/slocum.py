@@ -129,7 +129,7 @@ def _pair(path: Path) -> tuple[Path | None, Path | None]:
 
 
 def _measured(tracks: Tracks) -> Tracks:
-    """Return the tracks of a science file without the CTD's samples that are 0 in all that it measures.
+    """Return the tracks of a science file without CTD samples in which all values are 0.
 
     As pyglider does: the sensors' values before their first sample are 0.
     """

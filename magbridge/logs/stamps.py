@@ -1,4 +1,4 @@
-"""Dates and times of day as text files write them: which pattern fits them all, and when that was.
+"""Dates and times of day in text files: the pattern that fits all of them, and their values.
 
 A pattern is one of :meth:`datetime.strptime`, or ends in `` s``, for the seconds of the day. A second's
 fraction is not part of it: behind the seconds, after a point, a comma or a colon, it is read whatever the
@@ -35,7 +35,7 @@ FRACTION = r"(?:(?P<clock>\d:\d\d:\d\d)[.,:]|(?P<digits>\d{6}| \d\d?)\.)(?P<frac
 
 
 def patterns(texts: Sequence[str]) -> list[str]:
-    """Return the patterns that fit all of these texts, one of those that mean the same."""
+    """Return the patterns that fit all of these texts, one of each set of equivalent patterns."""
     whole, _ = _plain(pd.Series(list(texts), dtype="string"))
     candidates = [
         *WHOLE_MOMENTS,
@@ -53,7 +53,7 @@ def patterns(texts: Sequence[str]) -> list[str]:
 
 
 def _fits(text: str, pattern: str) -> bool:
-    """Whether a text may have been written by a pattern; much faster than to read them all."""
+    """Return True if a pattern may have written a text; much faster than parsing all texts."""
     if pattern.endswith(SECONDS_SUFFIX):
         text, pattern = text.rpartition(" ")[0], pattern.removesuffix(SECONDS_SUFFIX)
     try:

@@ -1,4 +1,4 @@
-"""Lines of a text file into columns of numbers; other cells are dropped, counted and named."""
+"""Convert lines of text to columns of numbers; other cells are dropped, counted and named."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ EMPTY_CELLS = "-", "--", "*", "---"
 
 
 class TextTable:
-    """Reads lines of one layout into columns.
+    """Read lines of one layout into columns.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class TextTable:
         return float(np.nanmedian(ahead)) + cut
 
     def _clock_by(self, first_lines: Sequence[str]) -> TimeFormat:
-        """Return how the column of times is read, by its heading, its unit and its first cells."""
+        """Return the format of the times, from the heading, the unit and the first cells."""
         layout = self._layout
         heading, unit = layout.headings[layout.stamp[-1]].strip(), layout.units.pop("time", "")
         if order := date_order([layout.headings[k] for k in layout.stamp]):
@@ -144,7 +144,7 @@ class TextTable:
     def _valid(
         self, times: FloatArray, columns: dict[str, FloatArray], numbers: list[int]
     ) -> tuple[FloatArray, dict[str, FloatArray], list[int]]:
-        """Return times, columns and numbers without what a column of the file states not to be valid."""
+        """Return times, columns and numbers without values that a column of the file marks as invalid."""
         for rule in self._layout.validity:
             bad = np.isin(columns[rule.column], list(rule.bad))
             for name in rule.targets:
@@ -230,7 +230,7 @@ class TextTable:
         return frame
 
     def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:
-        """Return the times, and which of the rows have something else there."""
+        """Return the times, and the rows in which the cell is no time."""
         if self._layout.rate:  # a row that was left out keeps its time
             lines = np.asarray(numbers, np.float64) - 1.0 - self._layout.first
             return lines / self._layout.rate, np.zeros(len(lines), bool)
@@ -260,7 +260,7 @@ class TextTable:
         return times, wrong
 
     def _unwound(self, times: FloatArray) -> FloatArray:
-        """Return times of day (n,) that go on after midnight."""
+        """Return times of day (n,) unwrapped at midnight."""
         known = np.isfinite(times)
         steps = np.diff(times[known], prepend=self._last)
         days = self._midnights + DAY * np.cumsum(steps < -DAY / 2)
@@ -302,7 +302,7 @@ class TextTable:
 
 
 def _numbers(name: str, texts: pd.Series, decimal: str, unit: str) -> FloatArray:
-    """Return what texts (n,) mean, also 1.5D+03, 18.300,25 and 52.7 W; NaN for other texts."""
+    """Return the numbers of texts (n,), such as 1.5D+03, 18.300,25 and 52.7 W; NaN for other texts."""
     group = re.escape("." if decimal == "," else ",")
     grouped = rf"^([-+]?\d{{1,3}}(?:{group}\d{{3}})+)(?=\D|$)"
     texts = texts.str.replace(grouped, lambda match: re.sub(r"[.,]", "", match[1]), regex=True)

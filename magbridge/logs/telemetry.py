@@ -1,4 +1,4 @@
-"""MAVLink telemetry logs (``.tlog``), ours and anyone's, as deployments.
+"""MAVLink telemetry logs (``.tlog``) as deployments.
 
 A row is a magnetometer message of the best kind that the log holds
 (:data:`~magbridge.logs.telemetry_fields.SOURCES`), from the component that sent most of them; every other

@@ -1,4 +1,4 @@
-"""Which fields of which MAVLink messages become columns, and in what unit."""
+"""The fields of MAVLink messages that become columns, with their units."""
 
 from __future__ import annotations
 

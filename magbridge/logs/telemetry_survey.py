@@ -1,4 +1,4 @@
-"""The first pass through a telemetry log: its contents."""
+"""First pass through a telemetry log: find its contents."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ RESERVED_COLUMNS = {"time", *CHANNELS}
 
 
 class LogContents:
-    """What a log holds: found in a first pass, so that every piece of a stream has the same columns.
+    """Contents of a log, found in a first pass, so that all pieces of a stream have the same columns.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class LogContents:
 
     @property
     def plain(self) -> bool:
-        """Return True if no bridge wrote the log: one clock, and nothing declared."""
+        """Return True if no bridge wrote the log."""
         return self.source not in ("MAG_RAW", "MAG_FIELD") and not (
             self.ours or self.declared or self.stepped_us
         )
@@ -260,5 +260,5 @@ class LogContents:
 
 @lru_cache(maxsize=64)
 def survey(path: Path, mtime_ns: int, size: int) -> LogContents:  # noqa: ARG001 - a log that changed is surveyed again
-    """Return what a log holds; cached, so that a log is surveyed only once."""
+    """Return the contents of a log; cached."""
     return LogContents(path)

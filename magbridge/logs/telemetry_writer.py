@@ -1,4 +1,4 @@
-"""A deployment as a MAVLink telemetry log: what a bridge and an autopilot would have sent.
+"""Write a deployment as a MAVLink telemetry log, with the messages that a bridge and an autopilot would send.
 
 A row becomes these messages, all with its time: ``ATTITUDE`` (float32), ``GLOBAL_POSITION_INT`` (1e-7 deg,
 mm), a ``NAMED_VALUE_FLOAT`` (float32) for every other column, ``MAG_RAW`` (float32 nT, µs) and, where the
@@ -45,7 +45,7 @@ Row = dict[str, float]
 
 
 class FileWriter:
-    """Writes deployments one after the other; the columns are those of the first."""
+    """Write successive deployments with the columns of the first one."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("wb")

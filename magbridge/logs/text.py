@@ -1,4 +1,4 @@
-"""CSV and other text: a header row, one row per sample, an empty field for a missing value.
+"""Read and write CSV and other text: a header row, one row per sample, empty fields for missing values.
 
 A heading is ``name``, ``name [unit]`` or ``name (unit)``: ``battpos [in]``. Columns of
 :data:`magbridge.columns.COLUMNS` need no unit; those in another known unit (``mag_x [uT]``, ``roll [rad]``)
@@ -132,7 +132,7 @@ def _chunks(
 
 
 def _lines(file: TextIO) -> Iterator[str]:
-    """Yield the lines; of an endless one, as of the zeros that a crash leaves, the beginning."""
+    """Yield the lines; only the beginning of an endless one, such as zeros after a crash."""
     while line := file.readline(MAX_LINE_CHARACTERS):
         if len(line) == MAX_LINE_CHARACTERS:
             rest = line
@@ -143,7 +143,7 @@ def _lines(file: TextIO) -> Iterator[str]:
 
 
 class FileWriter:
-    """Writes deployments one after the other; the columns are those of the first.
+    """Write successive deployments with the columns of the first one.
 
     Attributes
     ----------

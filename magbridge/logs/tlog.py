@@ -1,4 +1,4 @@
-"""The live log: everything read and sent, as a ``.tlog`` that any MAVLink tool reads.
+"""The live log: all bytes received and sent, as a ``.tlog`` for any MAVLink tool.
 
 A record is an 8-byte big-endian stamp and a MAVLink frame. The stamp is the event's time in µs since 1970
 UTC, a multiple of 4, plus the :class:`~magbridge.records.Channel` in its low two bits.
@@ -44,7 +44,7 @@ file."""
 
 
 class TlogWriter:
-    """Writes records to ``UTC-start_index.tlog`` files in a directory.
+    """Write records to ``UTC-start_index.tlog`` files in a directory.
 
     `start` is that of the run, so that the files of one run are sorted together even if others write to the
     directory; it is some seconds late where another run has taken the name.
@@ -120,7 +120,7 @@ class TlogWriter:
         self._thread.join(timeout)
 
     def _run(self) -> None:
-        """Write the received records, until an event without records ends it."""
+        """Write the received records until an event without records."""
         events: list[Sequence[Record]] = []
         while not events or events[-1]:
             events = [self._queue.get()]
@@ -131,7 +131,7 @@ class TlogWriter:
         self._end_file()
 
     def _put_all(self, records: list[Record]) -> None:
-        """Write records, where they do not fit the file one by one and into the next."""
+        """Write records; continue in the next file when one is full."""
         data = pack_records(records)
         if self._fits(len(data), records[-1][0]):
             self._put_down(data, records)

@@ -1,4 +1,4 @@
-"""A trajectory in netCDF by what its attributes mean, whatever its names: the CF conventions.
+"""Trajectories in netCDF by the CF conventions: attributes count, not names.
 
 pyglider, the IOOS Glider DAC, EGO, OG1.0, seagliderOG1, VOTO and Argo differ in the names of dimensions and
 variables; `standard_name`, units and flags are common to them. The time is the variable with the standard
@@ -223,7 +223,7 @@ def _sizes(variable: Any) -> tuple[int, ...]:
 
 
 def _bad(flags: Any, rows: slice) -> BoolArray:
-    """Return which rows are flagged as bad or missing."""
+    """Return the rows that are flagged as bad or missing."""
     flags.set_auto_maskandscale(False)
     stored = np.asarray(flags[tuple(rows if size != 1 else slice(None) for size in _sizes(flags))]).ravel()
     if stored.dtype.kind in "SU":

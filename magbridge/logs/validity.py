@@ -95,7 +95,7 @@ def validity_of(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[Val
 
 
 def _column(name: str, names: Sequence[str]) -> str:
-    """Return the column that a name means, also in other letters; '' where there is none."""
+    """Return the column with a name, ignoring case; '' without one."""
     return next((other for other in names if other and bare(other) == bare(name)), "")
 
 
@@ -113,7 +113,7 @@ MIN_FILL_VALUE = 1e30
 
 
 def unknown(columns: dict[str, FloatArray]) -> dict[str, BoolArray]:
-    """Return which values of some columns, (n,) each, stand for "not known", without being declared.
+    """Return the undeclared missing-value codes among columns (n,) as masks.
 
     They are huge, or one of :data:`CODES` that lies beyond all others by half their range. A field whose
     three axes are 0, or the same code, is none, nor is a place at 0, 0: a receiver without a fix writes it.
@@ -141,7 +141,7 @@ def _is_code(values: FloatArray) -> BoolArray:
 
 
 def known(path: Path, dataset: xr.Dataset) -> xr.Dataset:
-    """Return a deployment of another program without what stands for "not known": counted, and named."""
+    """Return a deployment of another program without missing-value codes; they are counted and named."""
     codes = unknown({str(name): column.to_numpy() for name, column in dataset.data_vars.items()})
     lines = []
     for name, wrong in codes.items():

@@ -1,4 +1,4 @@
-"""Deployments out: one writer for all formats that can be written."""
+"""Write deployments in any format that can be written."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write(dataset: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 
 class Writer:
-    """A file that grows by deployments, one after the other in time, and appears when it is complete.
+    """A file to which successive deployments are appended; it appears when it is complete.
 
     The columns are those of the first deployment; a later one that lacks a column has NaN there. When the
     block raises, nothing is left behind. `finish` may add to the file once all rows are in it; `options` are

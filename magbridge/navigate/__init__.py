@@ -1,4 +1,4 @@
-"""Position from the corrected field and an anomaly map, where there is no GPS.
+"""Position from the corrected field and an anomaly map, without GPS.
 
 ::
 

@@ -1,4 +1,4 @@
-"""Many hypotheses: a bank of extended Kalman filters over a position that is not known well enough for one.
+"""Bank of extended Kalman filters, for a position whose uncertainty is too large for one filter.
 
 A Gaussian too wide for the map to be linear within it is split into many that are narrow enough. Each is
 filtered as if it were alone, all in one pass of arrays, and weighted by its likelihood (Alspach & Sorenson

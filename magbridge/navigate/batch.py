@@ -1,4 +1,4 @@
-"""A whole log against a map: the navigator over every row, a smoother's backward pass, and findings."""
+"""Match a whole log to a map: the navigator over all rows, a smoother's backward pass, and findings."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def motion_of(deployment: xr.Dataset, source: str) -> str:
 
 
 def _glides(deployment: xr.Dataset) -> bool:
-    """Return whether the vehicle sinks nose down and rises nose up, as only a glider must."""
+    """Return True if the vehicle sinks nose down and rises nose up, as a glider does."""
     known = deployment[["depth", "pitch"]].dropna("time", how="any")
     rate = np.gradient(known["depth"].to_numpy().astype(float)) if known.sizes["time"] > 2 else np.zeros(0)
     steep = np.abs(known["pitch"].to_numpy()[: rate.size]) > GLIDE

@@ -1,4 +1,4 @@
-"""What a map is worth before the dive: the best that any estimator could do along a track."""
+"""Posterior Cramér-Rao bound of the position along a planned track."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class Step(NamedTuple):
 
 
 class DeadReckoning:
-    """A position moved along by telemetry, of whichever kind the vehicle has.
+    """Dead-reckoned position from any kind of telemetry that the vehicle has.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class DeadReckoning:
         self.latitude, self.longitude = latitude, longitude
 
     def forget(self) -> None:
-        """Forget what the motion was computed from: other telemetry follows. It goes on until then."""
+        """Discard the telemetry, because another source follows; the velocity is kept until then."""
         self._heading = self._pitch = self._speed = self._reported = nan
         self._local = self._carrier = None
 

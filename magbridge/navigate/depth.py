@@ -1,4 +1,4 @@
-"""A map continued to the vehicle's depth; the errors of that, and between nodes, count as map error."""
+"""Continue a map to the vehicle's depth; the errors of continuation and interpolation count as map error."""
 
 from __future__ import annotations
 
