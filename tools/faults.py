@@ -1,26 +1,24 @@
-"""What the sensor, the telemetry and the computer can do to a value, and what the bridge says of it.
+"""Put faults of sensor, telemetry and computer into a survey, and count the wrong samples without a flag.
 
     python3 tools/faults.py                      the table: each fault on a simulated survey
     python3 tools/faults.py --hours 6 spikes     some of it, longer
-    python3 tools/faults.py --clean 30           days without a fault: how often a flag is a false alarm
+    python3 tools/faults.py --clean 30           30 days without a fault: false alarms
 
-A glider like that of ``magbridge demo`` flies calibration spirals and a survey; the survey's bytes, with a
-fault in them, go through the bridge. A sample is wrong if it carries no flag and lies beyond three of its own
-sigmas.
+A glider like that of ``magbridge demo`` flies calibration spirals and a survey. The survey's bytes, with a
+fault in them, go through the bridge. A sample is wrong if it has no flag and its error exceeds three sigmas.
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from rich.console import Console
-from studies import command_line, table
+from studies import Column, Row, Study, study_options
 
 from magbridge.arrays import FloatArray
 from magbridge.bridge import states
@@ -250,72 +248,66 @@ def stalls(length_us: int, every_us: int = 600_000_000) -> Callable[[Events], Ev
     return change
 
 
-def main() -> int:
-    parser = command_line(__doc__)
-    parser.add_argument("names", nargs="*", metavar="FAULT", help="; ".join(FAULTS).replace("%", "%%"))
+STALLS = {f"stands still for {seconds} s every 100 s": seconds for seconds in (1.5, 8.0)}
+OTHER = "another glider's calibration"
+
+
+@cache
+def flight_of(seed: int, hours: float, calibrated_by: int | None) -> tuple[Flight, object]:
+    """Return a prepared flight, and the temporary folder that it lives in."""
+    folder = tempfile.TemporaryDirectory()
+    return prepare(Path(folder.name), seed, hours, calibrated_by=calibrated_by), folder
+
+
+def run(fault: str, seed: int, hours: float) -> list[Row]:
+    """Fly one glider with one fault."""
+    flight, _ = flight_of(seed, hours, seed + 100 if fault == OTHER else None)
+    rows = FAULTS[fault](flight.survey) if fault in FAULTS else flight.survey
+    pause = STALLS.get(fault)
+    change = stalls(round(pause * 1e6), 100_000_000) if pause else iter
+    found = score(flight, rows, change)
+    words = ("field", "axis", "noise")
+    texts = [t for t in found.reported if any(w in t for w in words) and not t.startswith("field: ")]
+    return [
+        {
+            "fault": fault, "seed": seed, "samples": found.samples, "flagged": found.flagged / found.samples,
+            "wrong": found.wrong / found.samples, "worst": found.worst, "sigma": found.sigma,
+            "messages": " | ".join(dict.fromkeys(texts))[:120],
+        }
+    ]  # fmt: skip
+
+
+STUDY = Study(
+    run,
+    ("fault", "messages"),
+    {
+        "samples": Column("samples", np.sum, ".0f"),
+        "flagged": Column("flagged", np.mean, ".1%"),
+        "wrong": Column("wrong", np.mean, ".2%"),
+        "largest error, nT": Column("worst", np.max, ".0f"),
+        "sigma, nT": Column("sigma", form=".1f"),
+    },
+)
+
+
+def main() -> None:
+    """Fly the faults, or days without a fault; print the table."""
+    names = (*FAULTS, *STALLS, OTHER)
+    parser = study_options(__doc__)
+    parser.add_argument("names", nargs="*", metavar="FAULT", help="; ".join(names).replace("%", "%%"))
     parser.add_argument("--hours", type=float, default=6.0)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--clean", type=float, default=0.0, metavar="DAYS")
     parser.add_argument("--first", type=int, default=1000, metavar="SEED", help="of the first clean glider")
-    chosen = parser.parse_args()
-    if chosen.clean:
-        return clean(chosen.clean, chosen.first)
-    totals: dict[str, list[Score]] = {}
-    for seed in range(1, chosen.seeds + 1):
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            flight = prepare(folder, seed, chosen.hours)
-            for fault, change in FAULTS.items():
-                if not chosen.names or fault in chosen.names:
-                    totals.setdefault(fault, []).append(score(flight, change(flight.survey)))
-            for seconds in (1.5, 8.0):
-                fault = f"stands still for {seconds} s every 100 s"
-                if not chosen.names or fault in chosen.names:
-                    found = score(flight, flight.survey, stalls(round(seconds * 1e6), 100_000_000))
-                    totals.setdefault(fault, []).append(found)
-            if not chosen.names:
-                other = prepare(folder / "other", seed, chosen.hours, calibrated_by=seed + 100)
-                totals.setdefault("another glider's calibration", []).append(score(other, other.survey))
-    show(totals)
-    return 0
-
-
-def clean(days: float, seed: int) -> int:
-    """Fly gliders without a fault, a day each; print the flags that were false alarms."""
-    samples = flagged = wrong = 0
-    reported: list[str] = []
-    while samples < days * 21_600:
-        with tempfile.TemporaryDirectory() as name:
-            flight = prepare(Path(name), seed, 24.0)
-            found = score(flight, flight.survey)
-        seed += 1
-        samples, flagged, wrong = samples + found.samples, flagged + found.flagged, wrong + found.wrong
-        reported += [text for text in found.reported if "calibration " not in text]
-        print(f"{samples} samples, {flagged} flagged, {wrong} beyond 3 sigma; {found.reported}", flush=True)
-    return 0
-
-
-def show(totals: dict[str, list[Score]]) -> None:
-    """Print the table."""
-    shown = table("", "fault", "flagged", "wrong", "worst, nT", "sigma, nT", "said", left=("fault", "said"))
-    for fault, scores in totals.items():
-        samples = sum(one.samples for one in scores)
-        reported = [
-            text
-            for one in scores
-            for text in one.reported
-            if "field" in text or "axis" in text or "noise" in text
-        ]
-        shown.add_row(
-            fault,
-            f"{100 * sum(one.flagged for one in scores) / samples:.1f} %",
-            f"{100 * sum(one.wrong for one in scores) / samples:.2f} %",
-            f"{max(one.worst for one in scores):.0f}",
-            f"{np.median([one.sigma for one in scores]):.1f}",
-            " | ".join(dict.fromkeys(t for t in reported if not t.startswith("field: ")))[:120],
-        )
-    Console(width=None if sys.stdout.isatty() else 200).print(shown)
+    options = parser.parse_args()
+    if options.clean:
+        days = range(options.first, options.first + int(np.ceil(options.clean)))
+        cases = [("none", seed, 24.0) for seed in days]
+    else:
+        chosen = [name for name in names if name in options.names or not options.names]
+        cases = [(name, seed, options.hours) for seed in range(1, options.seeds + 1) for name in chosen]
+    STUDY.main("Faults", cases, options)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,9 +1,10 @@
-"""A second world to examine ``diagnose`` by: another glider, another hand, and none of ``sitl``'s code.
+"""Test ``diagnose`` in a second world: another glider, mission and noise, without the code of ``sitl``.
 
-Run it as ``python tools/second_world.py --cases 40``. It shares with the simulator neither the forward model
-(dipoles with an induced part, eddy currents of a plate with a time constant, currents in a loop), nor the
-mission, nor the noise, and nothing was tuned on it. A name is *right* if the hidden cause is named, *alone*
-if nothing else is; a *second* is any further name; *foreign* effects are not in the table of causes, and
+    python tools/second_world.py --cases 40
+
+Its forward model has dipoles with an induced part, eddy currents of a plate with a time constant, and
+currents in a loop. Nothing was tuned on it. A name is *right* if the hidden cause is named, *alone* if
+nothing else is named; *a second* is any further name. *Foreign* effects are not in the table of causes, and
 any name is wrong for them.
 """
 
@@ -15,11 +16,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from studies import command_line, fraction
+from rich.console import Console
+from studies import Column, Row, Study, study_options
 from study.ideal import cause_names
 
 from magbridge.arrays import FloatArray
@@ -131,8 +132,6 @@ class Glider:
         return H
 
 
-Case = Callable[[int, str, float], dict[str, Any]]
-"""Number, name of the hidden effect, S/N -> the names given."""
 Effect = Callable[[Log, np.random.Generator], FloatArray]
 
 
@@ -222,7 +221,7 @@ def dataset(log: Log, H: FloatArray, reference: FloatArray | float = 0.0) -> xr.
     return ds.assign_attrs(source="second world")
 
 
-def case(number: int, name: str, snr: float) -> dict[str, Any]:
+def case(number: int, name: str, snr: float) -> list[Row]:
     """Calibrate a glider, hide one effect in its survey, and return what `diagnose` names."""
     rng = np.random.default_rng([20_251, number])
     glider, spins, survey = Glider(rng), logged(rng, 1.0, spins=True), logged(rng, HOURS, spins=False)
@@ -241,42 +240,48 @@ def case(number: int, name: str, snr: float) -> dict[str, Any]:
     effect = effect * snr / (np.std(seen) * np.sqrt(len(seen)))
     H = glider.reads(survey) + noise(len(seen)) + (effect if effect.ndim == 2 else 0.0)
     log = dataset(survey, H, effect if effect.ndim == 1 else 0.0)
-    return reported(name, diagnose([log], calibration).diagnosis)
+    return reported(name, diagnose([log], calibration).diagnosis, OWN)
 
 
-def reported(name: str, found: Diagnosis) -> dict[str, Any]:
-    """Return the hidden, the named and the possible causes."""
+def reported(name: str, found: Diagnosis, own: Container[str]) -> list[Row]:
+    """Return the row of a case; `own` are the effects that are causes of the table."""
     named = cause_names(one.candidate.cause for one in found.findings)
     named |= {"outliers"} if found.wrong is not None else set()
     sets = named | cause_names(r.candidate.cause for one in found.findings for r in one.competing)
-    return {"hidden": name, "named": sorted(named), "sets": sorted(sets), "verdict": found.verdict}
+    truth = cause_names([name])
+    row: Row = {"kind": "foreign" if name else "nothing", "hidden": name, "named": ", ".join(sorted(named))}
+    row["name"] = float(bool(named))
+    if name in own:
+        row |= {
+            "kind": "cause", "right": float(truth <= named), "in_set": float(truth <= sets),
+            "alone": float(sets == truth), "second": float(len(named) > 1),
+        }  # fmt: skip
+    return [row]
 
 
-def study(run: Case, names: Sequence[str], own: Container[str], doc: str | None) -> None:
+def study(run: Callable[..., list[Row]], names: Sequence[str], doc: str | None) -> None:
     """Run cases, each hiding one of `names` (nothing, where empty) in turn, and count the names."""
-    parser = command_line(doc)
+    parser = study_options(doc)
     parser.add_argument("--cases", type=int, default=2 * len(names))
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
-    parser.add_argument(
-        "--snr", type=float, default=25.0, help="RMS along the field, in units of noise per log"
-    )
+    parser.add_argument("--snr", type=float, default=25.0, help="signal-to-noise of the effects")
     options = parser.parse_args()
-    rows = []
-    for number in range(options.first, options.first + options.cases):
-        row = run(number, names[number % len(names)], options.snr)
-        rows.append(row)
-        print(number, *row.values(), sep=" | ", flush=True)
-    known = [r for r in rows if r["hidden"] in own]
-    print(f"right: {fraction([r['hidden'] in r['named'] for r in known])}")
-    print(f"in the set: {fraction([r['hidden'] in r['sets'] for r in known])}")
-    print(f"named alone: {fraction([r['sets'] == [r['hidden']] for r in known])}")
-    print(f"a false second name: {fraction([len(r['named']) > 1 for r in known])}")
-    for what, some in (
-        ("foreign", [r for r in rows if r["hidden"] and r["hidden"] not in own]),
-        ("nothing hidden", [r for r in rows if not r["hidden"]]),
-    ):
-        print(f"{what}, a name: {fraction([bool(r['named']) for r in some])}")
+    numbers = range(options.first, options.first + options.cases)
+    cases = [(number, names[number % len(names)], options.snr) for number in numbers]
+    headings = {
+        "a name": "name",
+        "right": "right",
+        "in the set": "in_set",
+        "alone": "alone",
+        "a second": "second",
+    }
+    columns = {heading: Column(source, np.mean, ".0%") for heading, source in headings.items()}
+    shown = Study(run, ("kind",), columns)
+    rows = shown.rows(cases, options)
+    console = Console(width=120)
+    console.print(shown.table(f"{options.cases} cases", rows))
+    console.print(rows[["hidden", "named"]].to_string())
 
 
 if __name__ == "__main__":
-    study(case, (*OWN, *FOREIGN), OWN, __doc__)
+    study(case, (*OWN, *FOREIGN), __doc__)
