@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from benchmarks.row import Row, processor_time
+from benchmarks.row import Row, in_own_process, processor_time
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
@@ -23,10 +23,21 @@ from sitl import load, segments, simulate
 __all__ = ["correcting", "fitting"]
 
 NAMES = ("battpos", "ballast")
+MANY = (100_000, 1_000_000)
+IN_ANOTHER = """
+import json, resource, sys, time
+from benchmarks.calibration import many
+from magbridge.calibration.fitting.fit import fit
+data = many(int(sys.argv[1]))
+begun = time.process_time()
+fit(data)
+used = time.process_time() - begun
+print(json.dumps([used, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]))
+"""
 
 
 def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the others write there)
-    """Time `auto` on a glider's calibration runs, and scipy's least squares on the same samples."""
+    """Time `auto` on a glider's runs, scipy's least squares on them, and `auto` on very many samples."""
     data = table_1()
     samples = polynomial_samples(data, full_order(2, 3))
 
@@ -40,18 +51,15 @@ def fitting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001  (the 
             ours.append(processor_time(lambda: fit(data)))
             theirs.append(processor_time(by_scipy))
     ratio = median(b / a for a, b in zip(ours, theirs, strict=True))
+    (few, _), (most, memory) = (in_own_process(IN_ANOTHER, count) for count in MANY)
+    tenfold = f"{MANY[1] // MANY[0]} times {MANY[0]:,}"
     return [
         Row(f"auto, {len(data)} samples, 2 masses, one core", median(ours), "s", most=1.0),
-        Row(
-            "scipy.optimize.least_squares on them",
-            median(theirs),
-            "s",
-            median(ours),
-            "auto",
-            ratio,
-            least=20.0,
-        ),
-    ]
+        Row("scipy.optimize.least_squares on them", median(theirs), "s", median(ours), "auto", ratio,
+            least=20.0),
+        Row(f"auto, {MANY[1]:,} samples", most, "s", few * MANY[1] / MANY[0], tenfold),
+        Row("memory of that", memory, "MB", most=1000.0),
+    ]  # fmt: skip
 
 
 def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
@@ -98,7 +106,23 @@ def correcting(folder: Path, repetitions: int) -> list[Row]:  # noqa: ARG001
     ]  # fmt: skip
 
 
-def table_1() -> Observations:
-    """Return a random glider's runs of the paper's Table 1, with 1 nT of noise."""
-    scenario = load("random_glider").replace(instrument={"noise_sigma": 1.0})
+def table_1(noise: float = 1.0) -> Observations:
+    """Return a random glider's runs of the paper's Table 1; `noise` in nT."""
+    scenario = load("random_glider").replace(instrument={"noise_sigma": noise})
     return observations(segments(simulate(scenario, 1))["calibration"], NAMES)
+
+
+def many(count: int) -> Observations:
+    """Return `count` samples: the same runs repeated, each time with new noise."""
+    runs = table_1(0.0)
+    rng = np.random.default_rng(2)
+    pick = np.arange(count) % len(runs)
+    return Observations(
+        field=runs.field[pick] + rng.normal(0.0, 1.0, (count, 3)),
+        reference=runs.reference[pick],
+        parameters=runs.parameters[pick],
+        names=runs.names,
+        units=runs.units,
+        runs=runs.runs[pick].astype(int) + 10 * (np.arange(count) // len(runs)),
+        time=4.0 * np.arange(float(count)),
+    )
