@@ -55,7 +55,6 @@ LEFT = {"auto": 0.5, "nominal": 125.0}
 """Slow error that a calibration leaves in addition to 1 nT of white noise, nT (tools/accuracy.py)."""
 GLIDER = Options(current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0)
 """A glider moves 14 m in 40 s: less than 2 % of any correlation length here."""
-AT_HOURS = (3.0, 4.0, 5.0, 6.0)
 OUTSIDE = float(chi2.ppf(0.9999, 2))
 """Squared distance beyond which the filter is wrong."""
 
@@ -214,7 +213,6 @@ class Run:
             unaided=self.unaided,
             lost=longest(self.nees[half] > OUTSIDE, self.hours[half]) > 0.5,
             nees=float(np.mean(self.nees[half])) / 2,
-            at_hours=tuple(self.nees[np.searchsorted(self.hours, AT_HOURS) - 1].tolist()),
             false_alarm=bool((self.state == State.LOST).any()) and away <= 0.1,
             valid=float(np.mean(self.valid)),
             waited=float(self.hours[self.valid][0]) if self.valid.any() else inf,
@@ -230,7 +228,6 @@ class Score(NamedTuple):
     unaided: float
     lost: bool  # the truth lay outside for half an hour on end, in the second half
     nees: float
-    at_hours: tuple[float, ...]  # NEES at AT_HOURS
     false_alarm: bool  # said to be lost, and the truth was never outside for more than 6 minutes
     valid: float  # share of the time
     waited: float  # hours, until its position was first valid

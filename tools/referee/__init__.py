@@ -1,8 +1,8 @@
-"""Autopilots that do with position fixes what ArduPilot and PX4 do, for a bridge to be tried against.
+"""Emulated autopilots that use position fixes by the rules of ArduPilot and PX4, for tests of the bridge.
 
-Each rule of theirs is a line that names the source file it stands in. What is left out is what a fix does not
-touch: attitude, height, and the delayed time horizon. :mod:`.filter` is the position filter,
-:mod:`.autopilot` what both share, and :mod:`.loop` sails a bridge's navigation with one of them.
+Each rule is a line that names its source file. Attitude, height and the delayed time horizon, which a fix
+does not change, are not emulated. :mod:`.filter` is the position filter, :mod:`.autopilot` the common part,
+and :mod:`.loop` runs a bridge's navigation with one of them.
 """
 
 from referee.ardupilot import ArduPilot

@@ -78,7 +78,7 @@ class ArduPilot(Autopilot):
 
     @property
     def healthy(self) -> bool:
-        """Whether visual odometry came lately."""
+        """True if visual odometry came recently."""
         return (self._now_us - self._visual_us) * 1e-6 < UNHEALTHY
 
     @property
@@ -101,7 +101,7 @@ class ArduPilot(Autopilot):
         # GCS_Common.cpp, handle_command_int_external_position_estimate
         if message["frame"] not in (MAV_FRAME.GLOBAL, 5):
             return MAV_RESULT.DENIED
-        # AP_NavEKF3_PosVelFusion.cpp, setLatLng: GPS still aids, nothing does, or there is no origin
+        # AP_NavEKF3_PosVelFusion.cpp, setLatLng: GPS still aids, nothing does, or the origin is unknown
         if self.since_gps() < DECLARED or not self.aiding or self._gps_us is None:
             return MAV_RESULT.FAILED
         accuracy = message["param3"]
@@ -126,7 +126,7 @@ class ArduPilot(Autopilot):
 
     @property
     def can_arm(self) -> bool:
-        """Whether it passes the check 'VisOdom: not healthy' (AP_Arming.cpp), with VISO_TYPE 1."""
+        """True if it passes the check 'VisOdom: not healthy' (AP_Arming.cpp), with VISO_TYPE 1."""
         return self.healthy
 
     def _status(self, truth: Truth) -> bytes:  # noqa: ARG002 - as the other messages
@@ -160,7 +160,7 @@ class ArduPilot(Autopilot):
         place, unfused = (message["x"], message["y"]), (self._now_us - self._fused_us) * 1e-6
         reset = self._reset_counter not in (None, message["reset_counter"])  # get_reset_timestamp_ms
         self._reset_counter = message["reset_counter"]
-        if reset:  # ResetPositionNE: what is claimed stays, and the position is fused as ever
+        if reset:  # ResetPositionNE: the claimed variance stays, and the position is fused as ever
             self.filter.position = place
             self._resets += 1
         if unfused > RETRY:  # ResetPosition

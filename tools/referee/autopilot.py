@@ -16,7 +16,7 @@ from referee.filter import PositionFilter
 __all__ = ["GPS_SIGMA", "Autopilot", "Truth", "finite"]
 
 GPS_SIGMA = 2.5
-"""m."""
+"""1-sigma of a GPS position on an axis, m."""
 FIX_3D, NO_FIX = 3, 1
 """GPS_RAW_INT.fix_type"""
 HEARTBEAT_HZ = 1.0
@@ -64,7 +64,7 @@ class Autopilot:
         µs since 1970 UTC, when it boots.
     streams : collection of str
         The messages that it sends besides HEARTBEAT, ATTITUDE, GPS_RAW_INT and GLOBAL_POSITION_INT. Without
-        ``VFR_HUD`` nobody learns its speed; with ``GLOBAL_POSITION_INT`` that message has a velocity, too.
+        ``VFR_HUD`` its speed is unknown; with ``GLOBAL_POSITION_INT`` that message has a velocity, too.
     airspeed : bool
         It measures its speed through the water or air.
     obeys : bool
@@ -123,7 +123,7 @@ class Autopilot:
 
     @property
     def place(self) -> Place:
-        """deg, where it believes to be."""
+        """Its estimated position, deg."""
         return offset(*self.origin[:2], *self.filter.position)
 
     def local(self, place: Place) -> Place:
@@ -135,7 +135,7 @@ class Autopilot:
         return 1e9 if self._gps_us is None else (self._now_us - self._gps_us) * 1e-6
 
     def step(self, time_us: int, truth: Truth) -> bytes:
-        """Let time pass until a new `truth`; return the telemetry."""
+        """Advance the time to a new `truth`; return the telemetry."""
         self._truth = truth
         along = radians(truth.heading)
         self._motion = truth.speed * cos(along), truth.speed * sin(along)
@@ -145,7 +145,7 @@ class Autopilot:
         return self._telemetry(truth)
 
     def receive(self, data: bytes, time_us: int) -> bytes:
-        """Take in frames; return the answers."""
+        """Receive frames; return the replies."""
         self._advance(time_us)
         answers = b""
         for message in self._codec.parse(data):
@@ -223,7 +223,7 @@ class Autopilot:
         return MAV_RESULT.ACCEPTED
 
     def _status(self, truth: Truth) -> bytes:
-        """Return what it reports of its filter."""
+        """Return the report of its filter."""
         raise NotImplementedError
 
     # ---- telemetry -----------------------------------------------------------------------------------

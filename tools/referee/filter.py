@@ -10,7 +10,7 @@ Pair = tuple[float, float]
 
 
 class PositionFilter:
-    """Position and wind on two axes, which share one covariance: all that comes in is alike on both.
+    """Position and wind on two axes, which share one covariance: all inputs have equal variances on both.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class PositionFilter:
         return hypot(*away) / sqrt(2.0 * (self.pp + variance))
 
     def fuse(self, place: Pair, variance: float) -> None:
-        """Take in a measured position (m), as the Kalman filter does."""
+        """Fuse a measured position (m), as a Kalman filter does."""
         s = self.pp + variance
         self._shift(place, self.pp / s, self.pw / s)
         self.pp, self.pw, self.ww = (
@@ -74,7 +74,7 @@ class PositionFilter:
         )
 
     def force(self, place: Pair, variance: float) -> None:
-        """Take in a measured position with a position gain of 1, the wind learning from it as ever.
+        """Fuse a measured position with a position gain of 1, the wind learning from it as ever.
 
         Notes
         -----

@@ -82,7 +82,7 @@ class Run(NamedTuple):
     gnss : ndarray, (n,)
         State of the receiver's positions by the bridge.
     texts : list of (float, str)
-        s since the start, and what was announced.
+        s since the start, and the announced text.
     """
 
     seconds: FloatArray
