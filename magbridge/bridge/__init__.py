@@ -1,1 +1,1 @@
-"""The bridge: a pure pipeline, and the threads and ports that feed it."""
+"""The bridge: a pipeline without input or output, and the threads and ports that feed it."""

@@ -1,4 +1,4 @@
-"""A sensor on an I2C or SPI bus of this computer, polled by a thread, as a port that gives bytes."""
+"""A sensor on an I2C or SPI bus, polled by a thread, as a port."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def open_bus(name: str) -> Any:
 
 
 class BusPort(Port):
-    """Polls a part on a bus, and gives the lines of its readings.
+    """Poll a part on a bus; return the readings as lines.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class BusPort(Port):
 
     @property
     def is_open(self) -> bool:
-        """Whether the part is polled."""
+        """True while the part is polled."""
         return self._bus is not None
 
     def open(self) -> None:
@@ -124,7 +124,7 @@ class BusPort(Port):
         self._thread.start()
 
     def move_on(self) -> None:
-        """Close the port: a part that is silent is configured again when it is opened."""
+        """Close the port; opening it configures a silent part again."""
         self.close()
 
     def fds(self) -> list[int]:
@@ -142,10 +142,10 @@ class BusPort(Port):
         return data
 
     def write(self, data: bytes) -> None:
-        """Drop the bytes: the part takes no commands from the bridge's pipeline."""
+        """Drop the bytes: the part accepts no commands from the pipeline."""
 
     def close(self) -> None:
-        """Stop to poll, and close the bus."""
+        """Stop polling and close the bus."""
         bus, self._bus, self._running = self._bus, None, False
         if bus is None:
             return

@@ -1,4 +1,4 @@
-"""What happens at the edge: ports open or are lost, the host's clock is set, the log or the bridge stalls."""
+"""Changes of ports, host clock, log and processing time, and their announcements."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NOTICE_US = 1_000_000
 
 
 class StateChanges:
-    """Takes note of the changes that the frames of :mod:`.states` report, and announces them.
+    """Record and announce the changes that the frames of :mod:`.states` report.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class StateChanges:
 
     @staticmethod
     def held_up(data: bytes) -> int:
-        """Return for how many µs the bridge stood still by these frames; 0 where it did not."""
+        """Return the duration (µs) of a stall of the bridge by these frames; 0 without one."""
         return sum(one["duration"] for one in Codec(0, 0).parse(data) if one.id == STANDSTILL)
 
     def receive(self, data: bytes, time_us: int) -> None:
@@ -73,7 +73,7 @@ class StateChanges:
                 self._port(message["port"], well, message["reason"], message["dropped"], time_us)
 
     def check_clock(self) -> None:
-        """Announce that the host's clock was never set, as on a computer without a battery for it."""
+        """Announce that the host's clock was never set."""
         unset = self._codec.utc_us < CLOCK_SET_US
         if unset or self._clock_unset:
             text = "host clock was never set: no date, no main field" if unset else "host clock is set"

@@ -1,4 +1,4 @@
-"""What would go wrong with a ``bridge.toml``, all of it, without opening a port."""
+"""Find all faults of a ``bridge.toml`` without opening a port."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MIN_FREE_BYTES = 100e6
 
 
 class ConfigFault(NamedTuple):
-    """Something that would go wrong."""
+    """A fault of a configuration."""
 
     fatal: bool
     """The bridge would not start; otherwise it would start and wait, or run worse."""
@@ -43,7 +43,7 @@ class ConfigFault(NamedTuple):
 
 
 def findings(path: Path) -> list[ConfigFault]:
-    """Return all that would go wrong with a configuration; nothing is opened but the files that it names.
+    """Return all faults of a configuration; only the files that it names are opened.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def findings(path: Path) -> list[ConfigFault]:
 
 
 def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[ConfigError]:
-    """Yield the faults of a table: each faulty key is removed, so that the next is found, too."""
+    """Yield the faults of a table; each faulty key is removed so that the next one is found."""
     while True:
         try:
             attempt()
@@ -83,7 +83,7 @@ def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[Co
 
 
 def _without(table: dict[str, Any], key: str) -> bool:
-    """Take a dotted key out of nested tables; False: it is not there, as where it is missing."""
+    """Remove a dotted key from nested tables; return False if it does not exist."""
     first, _, rest = key.replace("[...]", "").partition(".")
     if rest and isinstance(table.get(first), dict):
         return _without(table[first], rest)
@@ -131,7 +131,7 @@ def _contents(config: Config) -> Iterator[ConfigFault]:
 
 
 def _files(config: Config) -> Iterator[ConfigFault]:
-    """Yield each file that the configuration names and that is not there."""
+    """Yield each missing file that the configuration names."""
     for key, name in config.files.items():
         if name is not None and not (file := config.resolve(name)).exists():
             yield ConfigFault(fatal=True, text=str(ConfigError(config.path, key, f"no such file: {file}")))
@@ -190,7 +190,7 @@ def _device(config: Config, key: str, name: str) -> Iterator[ConfigFault]:
 
 
 def access(device: str) -> str:
-    """Return why a device may not be opened by this user, and what to do; empty where it may."""
+    """Return why this user may not open a device, and the remedy; empty if the user may."""
     if os.access(device, os.R_OK | os.W_OK):
         return ""
     group = _group(device)

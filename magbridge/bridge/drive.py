@@ -1,4 +1,4 @@
-"""The pipeline of a configuration, driven by what its lines carry: live, or in a replay."""
+"""Create the pipeline of a configuration and feed it with events, live or in a replay."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ __all__ = ["Edge", "drive", "set_up"]
 
 
 class Edge(Protocol):
-    """Where events come from, and where bytes go."""
+    """Source of events and destination of bytes."""
 
     def events(self, deadline: Callable[[], int]) -> Iterator[Event]:
-        """Yield events in order; one, if only an empty one, by `deadline` (µs)."""
+        """Yield events in order; at least an empty one by `deadline` (µs)."""
         ...
 
     def send(self, number: int, data: bytes) -> None:
@@ -29,7 +29,7 @@ class Edge(Protocol):
         ...
 
     def credit(self, frames: list[bytes]) -> None:
-        """Learn which frames of the last event from the link were signed by someone who has the key."""
+        """Record which frames of the last event from the link were signed with the key."""
         ...
 
 
@@ -50,7 +50,7 @@ def set_up(config: Config, start: Start) -> Pipeline:
 
 
 def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:
-    """Feed the pipeline until the edge ends; call ``after(time_us)`` when each event is dealt with."""
+    """Feed the pipeline until the edge ends; call ``after(time_us)`` after each event."""
     for event in edge.events(lambda: pipeline.deadline):
         sent = pipeline.feed(event)
         if pipeline.component.genuine:

@@ -1,4 +1,4 @@
-"""The events that reach the bridge: all its inputs, and so all that a log must hold."""
+"""Events: all inputs of the bridge, which a log must therefore contain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Event", "HostClock", "Start", "port_number", "source_of"]
 
 
 class Start(msgspec.Struct, frozen=True):
-    """What a run depends on besides its configuration, its calibration and its events."""
+    """State of a run in addition to its configuration, its calibration and its events."""
 
     time_us: int
     """µs since 1970 UTC, a multiple of 4."""
@@ -52,7 +52,7 @@ def source_of(port: int) -> tuple[Channel, int]:
 
 
 class HostClock:
-    """The bridge's only clock: begins at the host's UTC and then follows the host's monotonic clock.
+    """The bridge's only clock: starts at the host's UTC and follows the host's monotonic clock.
 
     A step of the host's UTC does not change it but is reported separately (:meth:`step_us`), so that no
     interval is ever measured across a step.
@@ -74,7 +74,7 @@ class HostClock:
         return (time.monotonic_ns() // 1000 + self._offset_us) & ~3
 
     def step_us(self) -> int:
-        """Return by how many µs the host's clock was set since the last call; 0 where it was not."""
+        """Return the step (µs) of the host's clock since the last call; 0 without one."""
         difference = self._ahead_us() - self._offset_us - self._known_step_us
         if abs(difference) < self.THRESHOLD_US:
             return 0

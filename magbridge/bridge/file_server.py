@@ -1,4 +1,4 @@
-"""Files for stations, read by a thread of its own and sent between the bridge's measurements.
+"""File server for stations: a thread reads the files, and the bridge sends them between measurements.
 
 The live thread hands on requests and takes replies, a few messages at a time; it never waits for the disk.
 Replies are not in the log, which would grow by everything that is read of it. The log has their number, so
@@ -42,7 +42,7 @@ Sender = tuple[int, int]
 
 
 class FileServer:
-    """Serves the metadata of the parameters, and the logs.
+    """Serve the metadata of the parameters, and the logs.
 
     Parameters
     ----------
@@ -75,12 +75,12 @@ class FileServer:
         self._thread.start()
 
     def ask(self, request: Message) -> None:
-        """Hand on a request; returns at once."""
+        """Queue a request; return at once."""
         if self._asked.qsize() < REQUESTS:
             self._asked.put(request)
 
     def drain(self) -> tuple[Sender, list[Reply]]:
-        """Return the replies to send now, and their receiver; returns at once."""
+        """Return the pending replies and their receiver, at once."""
         sender, replies = (0, 0), list[Reply]()
         while self._ready and len(replies) < BATCH and (not replies or self._ready[0][0] == sender):
             sender, reply = self._ready.popleft()
@@ -107,7 +107,7 @@ class FileServer:
             self._ftp.close()
 
     def _waiting(self, timeout: float) -> Iterator[Message | None]:
-        """Yield the requests that wait, or the first that comes."""
+        """Yield the pending requests, or wait for the first one."""
         try:
             yield self._asked.get(timeout=timeout) if timeout else self._asked.get_nowait()
             for _ in range(self._asked.qsize()):
@@ -140,7 +140,7 @@ class FileServer:
                     self._notify(states.notice(text[:50]))
 
     def _turn(self) -> None:
-        """Make ready a batch, of each station in turn, and pause as long as it may take."""
+        """Prepare a batch for each station in turn, and pause as long as sending takes."""
         rate, size = self._rate(), 0
         if rate <= 0:
             self._under_way.clear()

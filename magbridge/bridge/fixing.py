@@ -1,4 +1,4 @@
-"""Send fixes to the autopilot and report, once each, every start, stop and refusal."""
+"""Send fixes to the autopilot; report each start, stop and refusal once."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ HINTS = {
 
 
 class Gps:
-    """Follow whether the autopilot's GPS has a position."""
+    """Track whether the autopilot's GPS has a position."""
 
     def __init__(self) -> None:
         self._last_us = self._since_us = -LONGEST_US
         self._allowed_us = 0
 
     def receive(self, message: Message, time_us: int, *, used: bool = True) -> bool:
-        """Process a GPS_RAW_INT; return whether it has a position that is used."""
+        """Process a GPS_RAW_INT; return True if its position is used."""
         good: bool = message["fix_type"] >= FIX_3D and used
         if not good:
             self._allowed_us = 0
@@ -66,16 +66,16 @@ class Gps:
         return True
 
     def good(self, time_us: int) -> bool:
-        """Return whether there is a position, one that is not too old."""
+        """Return True if there is a recent position."""
         return time_us - self._last_us < self._allowed_us
 
     def held(self, time_us: int) -> bool:
-        """Return whether there has been a position long enough for the autopilot to have come to it."""
+        """Return True if there has been a position long enough for the autopilot to adopt it."""
         return self.good(time_us) and time_us - self._since_us > HELD_US
 
 
 class Fixing:
-    """Sends fixes while the autopilot has no GPS, and receives its answers.
+    """Send fixes while the autopilot has no GPS, and process its answers.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class Fixing:
             handler(message, time_us)
 
     def send(self, at: Reckoned | None, resets: int) -> bool:
-        """Send a position that holds now as a fix, if it is wanted; return whether it was sent."""
+        """Send the present position as a fix if the autopilot needs it; return True if it was sent."""
         now_us = self._component.codec.now_us
         fix = self._fix(at, resets, now_us)
         if isinstance(fix, str):
@@ -188,7 +188,7 @@ class Fixing:
         return fix
 
     def _unwanted(self, now_us: int) -> str:
-        """Return the reason why the autopilot needs or takes no fix; empty if it does."""
+        """Return the reason why the autopilot needs or accepts no fix; empty without one."""
         accepted = self._ardupilot_fuses and not self._kind.local
         if self.stack in self._kind.refused_by and not accepted:
             return self._kind.refused_by[self.stack]
@@ -245,7 +245,7 @@ class Fixing:
             self._version = version >> 24, version >> 16 & 0xFF
 
     def _has_gps(self, time_us: int) -> bool:
-        """Return True if the receiver sends positions, used or not."""
+        """Return True if the receiver sends positions, even unused ones."""
         return time_us - self._position_us < LONGEST_US
 
     def _gps(self, message: Message, time_us: int) -> None:

@@ -1,4 +1,4 @@
-"""The autopilot's local frame, and the vehicle's height and attitude in it: what an ODOMETRY has to hold."""
+"""The autopilot's local frame, and the vehicle's height and attitude in it, for ODOMETRY."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNSET = (0, 0)
 
 
 class Frame:
-    """Hears the origin of the autopilot's local frame, and the vehicle's height and attitude.
+    """Track the origin of the autopilot's local frame, and the vehicle's height and attitude.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Frame:
             handler(message, time_us)
 
     def altitude(self, time_us: int) -> float:
-        """Return m above the sea; NaN where it is not known."""
+        """Return the altitude (m above the sea); NaN if unknown."""
         if time_us - self._altitude_us < MAX_STATE_AGE_US:
             return self._altitude
         if self.origin is not None and time_us - self._down_us < MAX_STATE_AGE_US:
@@ -52,7 +52,7 @@ class Frame:
         return nan
 
     def depth(self, time_us: int) -> float:
-        """Return m below the sea; without an origin, a local height alone counts from there."""
+        """Return the depth (m below the sea); without an origin, the local height counts from the start."""
         altitude = self.altitude(time_us)
         return self._down if isnan(altitude) and time_us - self._down_us < MAX_STATE_AGE_US else -altitude
 

@@ -42,7 +42,7 @@ NO_HEADING_FLAGS: Final = int(
 
 
 class LiveHeading:
-    """Computes the heading of each sample, and sends it to the autopilot and to NMEA receivers.
+    """Compute the heading of each sample; send it to the autopilot and to NMEA receivers.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ class LiveHeading:
         return published_covariance(self._covariance, turn, np.array([corrected.field]), published), turn
 
     def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
-        """Send the heading of a sample where it is due and good enough; `time_us` is the sample's time."""
+        """Send the heading of a sample if it is due and accurate; `time_us` is the sample's time."""
         if not attitude.is_known or quality & NO_HEADING_FLAGS or attitude.sigma > MAX_SENT_SIGMA_DEG:
             return
         utc_us = time_us + self._component.codec.utc_offset_us

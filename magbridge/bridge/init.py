@@ -129,7 +129,7 @@ def _telemetry(units: dict[str, str]) -> list[str]:
 
 
 def _source(name: str, unit: str) -> list[str]:
-    """Return the keys that say which message holds a parameter: an autopilot's own one where it is known.
+    """Return the keys of the message that carries a parameter: the autopilot's own one if known.
 
     The columns that magbridge reads from a telemetry log are named in
     :mod:`magbridge.logs.telemetry_fields`; a calibration that was fitted to such a log has these names.

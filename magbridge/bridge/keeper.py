@@ -1,4 +1,4 @@
-"""State that outlives a bridge's process: parameters set over the link, time stamps, learned calibrations."""
+"""State between runs of a bridge: parameters set over the link, time stamps, learned calibrations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SAVE_US = 1_000_000
 
 
 class Keeper:
-    """Saves it while the bridge runs, and when it ends."""
+    """Save the state while the bridge runs and when it ends."""
 
     AHEAD = 2 * STAMP_INTERVAL_US // 10
     """Units of 10 µs for which stamps are reserved at each saving, lest the next run use them again."""

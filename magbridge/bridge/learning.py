@@ -25,7 +25,7 @@ FILE_INTERVAL_US = 600_000_000
 
 
 def first_calibration(config: Config) -> Calibration | None:
-    """Return the calibration that a bridge begins with, or what ``[learning]`` expects; None without either.
+    """Return the initial calibration of a bridge, or the prior of ``[learning]``, or None.
 
     FormatError, CalibrationError: a file is not a calibration.
     """
@@ -47,7 +47,7 @@ def first_calibration(config: Config) -> Calibration | None:
 def open_learner(
     config: Config, calibration: Calibration | None, currents: tuple[str, ...] | None = None
 ) -> Learner | None:
-    """Return the learner that ``[learning]`` asks for; None without that table, or without a calibration.
+    """Return the learner of ``[learning]``; None without that table or a calibration.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def kept_path(config: Config) -> Path | None:
 
 
 class Learning:
-    """Speaks for a learner.
+    """Connect a learner to the link.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class Learning:
 
 
 def keep(learning: Learning, path: Path) -> str:
-    """Write the calibration published last, if it is new; return why that failed, or nothing.
+    """Write the last published calibration if it is new; return the reason of a failure, or nothing.
 
     The first calibration, gone back to, is written as well: the file is what the bridge corrects with.
     """

@@ -1,4 +1,4 @@
-"""The live edge: the ports and the one clock, turned into events.
+"""Live edge: convert the input of the ports and the clock to events.
 
 One thread reads, corrects and sends. Each port has a thread of its own that opens it when it is down, so that
 an open that takes long (a host name that does not resolve) never holds up another port.
@@ -36,7 +36,7 @@ STANDSTILL_US = 400_000
 
 
 class LiveEdge:
-    """Turns what happens on the ports into events, in the order in which it happens.
+    """Convert the input of the ports to events in order.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class LiveEdge:
                 yield Event(now_us, Channel.STATE, b"")
 
     def _look(self, now_us: int) -> Iterator[bytes]:
-        """Yield the states of the host's clock and of the link, where they are to be reported."""
+        """Yield the state frames of the host's clock and of the link that are due."""
         if step_us := self._clock.step_us():
             yield states.clock_step(now_us, step_us)
         if text := self._ports[Channel.LINK].notice():
@@ -117,7 +117,7 @@ class LiveEdge:
             self._lost(number, error)
 
     def answer(self, sender: tuple[int, int], data: bytes) -> None:
-        """Send over the link what only one system and component wants."""
+        """Send data over the link to one system and component only."""
         link = self._ports[Channel.LINK]
         try:
             if link.is_open:
@@ -130,7 +130,7 @@ class LiveEdge:
         self._ports[Channel.LINK].credit(frames)
 
     def _flush(self, number: int) -> None:
-        """Go on sending what waits for a slow line."""
+        """Continue to send pending data over a slow line."""
         try:
             self._ports[number].flush()
         except PortError as error:
@@ -169,7 +169,7 @@ class LiveEdge:
             return b""
 
     def _waiting(self, number: int, fd: int, held: bool) -> bytes:
-        """Return what waits; after a standstill, all of the link: readings need the telemetry then."""
+        """Return the pending events; after a stall all of the link, because readings need the telemetry."""
         data = self._read(number, fd)
         while held and data and number == Channel.LINK and len(data) < BACKLOG:
             more = select.select([fd], [], [], 0)[0] if fd in self._ports[number].fds() else []

@@ -1,4 +1,4 @@
-"""What arrives on the ports of a ``bridge.toml`` now, compared with what the bridge needs."""
+"""Compare the messages that arrive on the ports of a ``bridge.toml`` with the needed ones."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Arrived(NamedTuple):
 
 
 class LiveCheck:
-    """Opens the ports of a configuration for some seconds, and counts what arrives.
+    """Open the ports of a configuration for some seconds and count the messages.
 
     The bridge's own pipeline reads the bytes, so that the sensor is started and messages are requested as by
     ``run``. No sample and no fix is sent, and no log is written.
@@ -197,7 +197,7 @@ class LiveCheck:
                 self._warn(stream.sensor.key, text)
 
     def _no_autopilot(self) -> str:
-        """Return what is missing where no heartbeat of the autopilot came."""
+        """Return the faults of a link without a heartbeat of the autopilot."""
         text = f"no HEARTBEAT of {self._link.system}:{self._link.autopilot}"
         senders = sorted({f"{system}:{component}" for system, component, _ in self._counts})
         if not senders:
@@ -222,7 +222,7 @@ class LiveCheck:
 
 
 def _too_rare(arrived: Arrived, denied: str) -> str:
-    """Return that a needed message arrives too rarely, and the remedy."""
+    """Return the fault of a message that arrives too rarely, with the remedy."""
     arrives = f"arrives at {arrived.rate_hz:.2g} Hz" if arrived.rate_hz else "does not arrive"
     why = f" ({denied})" if denied else ""
     remedy = f"request it of PX4 by `mavlink stream -s {arrived.name} -r {arrived.needed_hz:g}`"
@@ -245,7 +245,7 @@ class _Tap:
             yield event
 
     def send(self, number: int, data: bytes) -> None:
-        """Send to a sensor, and to the link what a check may send."""
+        """Send to a sensor; send only permitted messages to the link."""
         if number == Channel.LINK:
             data = b"".join(frame for frame in cut(data) if int.from_bytes(frame[7:10], "little") in SENT)
         if data:

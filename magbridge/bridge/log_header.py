@@ -1,4 +1,4 @@
-"""What a log begins with: how the run started, and what each column of the log comes from."""
+"""Beginning of a log: the start of the run, and the source of each column."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def declarations(
     settings: Mapping[str, float] | None = None,
     sensors: Sequence[tuple[Sensor, Driver]] = (),
 ) -> list[bytes]:
-    """Return the frames that tell a reader of the log what each column comes from, and how it was corrected.
+    """Return the frames that declare source and correction of each column of the log.
 
     Parameters
     ----------

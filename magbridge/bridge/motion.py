@@ -1,4 +1,4 @@
-"""Which telemetry dead reckoning follows: none that contains our own fixes.
+"""Select the telemetry for dead reckoning, without telemetry that contains the bridge's own fixes.
 
 An autopilot that takes our fixes sends them back in LOCAL_POSITION_NED, GLOBAL_POSITION_INT and ODOMETRY.
 Taken for the vehicle's motion, they move the track that the next fix is computed from, which moves the
@@ -40,7 +40,7 @@ JUMP = 10.0
 
 
 class Source(IntEnum):
-    """What dead reckoning follows; the earlier is preferred."""
+    """Source of dead reckoning; earlier ones are preferred."""
 
     OTHER = 0
     """The position that another component of the vehicle measures, as a Doppler log's does."""
@@ -56,7 +56,7 @@ class Source(IntEnum):
 
 
 class Motion:
-    """Passes the vehicle's motion on to the navigator, from the best source that there is.
+    """Pass the vehicle's motion to the navigator, from the best available source.
 
     Parameters
     ----------
@@ -105,13 +105,13 @@ class Motion:
             handler(message, time_us)
 
     def fixes_sent(self) -> None:
-        """From now on the autopilot's position contains our fixes."""
+        """Record that the autopilot's position contains the bridge's fixes from now on."""
         if not self.fed_back and self.source is Source.TRACK and not self._velocity_stays():
             self.source = Source.NONE  # the next best is used at once
         self.fed_back = True
 
     def gps_held(self) -> None:
-        """GPS has put the autopilot's position right."""
+        """Record that GPS has corrected the autopilot's position."""
         self.fed_back = False
 
     def _attitude(self, message: Message, time_us: int) -> None:
@@ -200,7 +200,7 @@ class Motion:
     def _move(
         self, time_us: int, place: tuple[float, float], velocity: tuple[float, float] | None, resets: int
     ) -> None:
-        """Follow a position, without the jumps of the estimator that it comes from."""
+        """Follow a position without the jumps of its estimator."""
         if self._step is not None:
             then_us, *before, count = self._step
             seconds = (time_us - then_us) * 1e-6
@@ -214,7 +214,7 @@ class Motion:
         self._pass(time_us, north=place[0] - self._jumps[0], east=place[1] - self._jumps[1])
 
     def _use(self, source: Source, time_us: int, words: str, stream: tuple[int, int] | None = None) -> bool:
-        """Return whether dead reckoning follows a source, as it does if no better one is fresh."""
+        """Return True if dead reckoning uses a source, because no better one is recent."""
         same = (source, stream) == (self.source, self._stream)
         if not same and source >= self.source and time_us - self._received_us < MAX_SOURCE_AGE_US:
             return False

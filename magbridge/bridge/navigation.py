@@ -58,7 +58,7 @@ COPIED_FIELDS = (
 
 
 class Navigation:
-    """Feeds the navigator, and sends its updates and fixes.
+    """Feed the navigator, and send its updates and fixes.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Navigation:
         self._state = State.OFF
 
     def receive(self, message: Message, time_us: int) -> None:
-        """Pass on the vehicle's motion, or its position at the surface, from a message to the navigator."""
+        """Pass the vehicle's motion or surface position in a message to the navigator."""
         if message.id == INTEGRITY:
             states = message["jamming_state"], message["spoofing_state"]
             self.navigator.gnss.receive_integrity(time_us, *states)
@@ -98,7 +98,7 @@ class Navigation:
             self._send()  # the first fix does not wait for the next update
 
     def sample(self, time_us: int, corrected: Corrected) -> None:
-        """Take a corrected sample."""
+        """Process a corrected sample."""
         self.navigator.utc_offset_us = self._component.codec.utc_offset_us
         self._notify(self.navigator.sample(time_us, corrected))
 

@@ -1,4 +1,4 @@
-"""What a calibration needs of the link, compared with what the configuration will provide."""
+"""Compare the telemetry that a calibration needs with that of the configuration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def check(calibration: Calibration, config: Config) -> None:
 
 
 def unmet(calibration: Calibration, config: Config) -> list[ConfigError]:
-    """Return what the calibration needs and the link will not provide: each as :func:`check` raises it."""
+    """Return an error for each need of the calibration that the link does not provide."""
     units = calibration.units
     return _unmet({name: units.get(name, "") for name in calibration.channels if name != TEMPERATURE}, config)
 

@@ -1,4 +1,4 @@
-"""Who is at the other end of a link that anyone can come to: by ``udpin`` or ``tcpin``.
+"""Peers of a link that accepts connections: ``udpin`` or ``tcpin``.
 
 Each peer has a parser of its own, so that what one sends never swallows what another does: the bridge gets
 whole frames, and after them the bytes that belong to none. A peer is answered once it has sent something
@@ -130,7 +130,7 @@ class Peers:
         self._authors.clear()
 
     def forget(self, address: Hashable) -> None:
-        """Forget a peer that is gone."""
+        """Remove a peer that has left."""
         self._peers.pop(address, None)
         self._look = 0.0
 
@@ -140,7 +140,7 @@ class Peers:
         return peer is not None and time.monotonic() - peer.genuine < TIMEOUT
 
     def answered(self) -> list[Peer]:
-        """Return those to send to, in the order in which to send."""
+        """Return the receivers in the order of sending."""
         now = time.monotonic()
         if now < self._look:
             return self._answered

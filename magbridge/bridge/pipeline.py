@@ -382,7 +382,7 @@ class Pipeline:
         stream.correction.notices.clear()
 
     def _field_of(self, stream: SensorStream) -> str:
-        """Return what messages call the field of a sensor."""
+        """Return the name of a sensor's field in messages."""
         return f"field of {stream.sensor.label}" if len(self.streams) > 1 else "field"
 
     def _report_no_anomaly(self, reason: str) -> None:
@@ -413,7 +413,7 @@ class Pipeline:
         return beginning(self._config, self._start, self._calibration_id, parameters)
 
     def _status(self) -> Condition:
-        """Return what MAG_STATUS says of the sensor, the samples and the log."""
+        """Return the state of sensor, samples and log for MAG_STATUS."""
         now_us, main = self.component.codec.now_us, self.streams[0]
         tracks = self._correction.aligner.by_name
         stale = sum(

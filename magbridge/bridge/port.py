@@ -1,4 +1,4 @@
-"""A port: bytes in, messages out, never blocking, and a clear error when it is gone.
+"""A port: read bytes and write messages without blocking; raise an error when it is lost.
 
 A port that is gone raises :class:`PortError` once and is closed; :meth:`Port.open` may then be tried again.
 Writing never blocks: what a slow reader does not take waits while it is new, then is dropped and counted.
@@ -36,7 +36,7 @@ HEADER, CHECKSUM = 10, 2
 
 
 class Port(ABC):
-    """What the bridge needs of a port."""
+    """Interface of a port."""
 
     def __init__(self, name: str, peers: Peers | None = None) -> None:
         self.name = name
@@ -56,7 +56,7 @@ class Port(ABC):
         """Open it; raises :class:`PortError`."""
 
     def tend(self) -> None:  # noqa: B027 - most ports need nothing
-        """Do now and then, while it is open, what may take long; called by the thread that opens it."""
+        """Do periodic slow work while the port is open; called by the thread that opens it."""
 
     @abstractmethod
     def fds(self) -> list[int]:
@@ -90,12 +90,12 @@ class Port(ABC):
         return []
 
     def credit(self, frames: Iterable[bytes]) -> None:
-        """Answer, from now on, the peers who sent these frames: they are signed with the key."""
+        """Accept the peers that sent these frames as receivers: the frames are signed with the key."""
         if self._peers is not None:
             self._peers.credit(frames)
 
     def notice(self) -> str:
-        """Return something to tell about the peers, once; empty where there is nothing."""
+        """Return a new notice about the peers; empty without one."""
         return self._peers.notices.popleft() if self._peers is not None and self._peers.notices else ""
 
     def write_all(self, data: bytes) -> None:
@@ -104,7 +104,7 @@ class Port(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close it; harmless when it is closed."""
+        """Close the port; no effect on a closed port."""
 
     def overran(self, data: bytes) -> None:
         """Count `data` as dropped because the line is too slow."""
@@ -118,7 +118,7 @@ class Port(ABC):
 
 
 class PacedPort(Port):
-    """A port whose line may carry less than is to be sent.
+    """A port whose line may be slower than the data to send.
 
     What the line has no room for waits here, where it can still be dropped, and not in the system's buffers,
     which would send it seconds late. The order is kept, since signatures and sequence numbers depend on it.
@@ -182,7 +182,7 @@ class PacedPort(Port):
         return bool(self._begun or self._waiting)
 
     def flush(self) -> None:
-        """Send of what waits as much as there is room for."""
+        """Send as much pending data as the line accepts."""
         while self.waiting and self._room():
             if not self._begun:
                 self._begin()
@@ -206,7 +206,7 @@ class PacedPort(Port):
             raise self.lost(error.strerror) from error
 
     def _forget(self) -> None:
-        """Forget what waits: the line is gone."""
+        """Discard the pending data of a lost line."""
         self._waiting.clear()
         self._begun.clear()
 

@@ -34,7 +34,7 @@ MIN_RECOGNISED = 3
 
 
 class Recognised(NamedTuple):
-    """What a line sends."""
+    """Sender recognised on a line."""
 
     who: str
     """``mavlink``, ``nmea``, the name of a driver, ``text``, ``bytes``; empty where nothing came."""
@@ -51,7 +51,7 @@ class SerialDevice(NamedTuple):
 
 
 def ports() -> list[SerialDevice]:
-    """Return the serial ports that there are, those without hardware left out."""
+    """Return the serial ports with hardware."""
     found = [one for one in list_ports.comports() if one.hwid != "n/a" or one.vid is not None]
     return [SerialDevice(one.device, _described(one)) for one in sorted(found)]
 
@@ -124,7 +124,7 @@ def _read(device: str, baudrate: int, seconds: float) -> bytes:
 
 
 def recognise(data: bytes, seconds: float) -> Recognised:
-    """Return what sent these bytes within `seconds`."""
+    """Return the sender of these bytes, received within `seconds`."""
     if not data:
         return Recognised("", "silent")
     for known in (_mavlink(data), _nmea(data), *_drivers(data, seconds)):
@@ -169,7 +169,7 @@ def _checked(sentence: bytes) -> bool:
 
 
 def _drivers(data: bytes, seconds: float) -> Iterator[Recognised | None]:
-    """Yield what our own drivers make of the bytes: those that need no more than that."""
+    """Yield the built-in drivers that recognise the bytes without a request."""
     for name in DRIVERS:
         for options in OPTIONS.get(name, ({},)):
             kind = driver_class(name, "ports")

@@ -1,4 +1,4 @@
-"""Where the vehicle says it is, and what the Earth's main field is there."""
+"""Position of the vehicle as reported, and the Earth's main field there."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ ALTITUDE_M: Final = -15_000.0, 100_000.0
 
 
 class Position:
-    """The vehicle's last position; the field model is loaded when the first one comes.
+    """Last position of the vehicle; the first one loads the field model.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""All inputs and outputs of the bridge, as records for the log: a replay needs nothing else."""
+"""Record all inputs and outputs of the bridge for the log; a replay needs nothing else."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SENT, LINK, SENSOR, STATE = Channel
 
 
 class Recorder:
-    """Collects records until :meth:`drain`.
+    """Collect records until :meth:`drain`.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Recorder:
         self._add(time_us, STATE, frame)
 
     def raw(self, time_us: int, payload: bytes) -> None:
-        """Record a MAG_RAW in the log only: a calibration from the log needs that of every sample."""
+        """Record a MAG_RAW in the log only, because a calibration needs every sample."""
         self._add(time_us, STATE, self._scribe.frame(RAW, payload))
 
     def drain(self) -> list[tuple[int, Channel, bytes]]:

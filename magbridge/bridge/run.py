@@ -141,7 +141,7 @@ def _stop_on_signals(edge: LiveEdge) -> None:
 
 
 def _print_statustexts(texts: deque[tuple[MAV_SEVERITY, str]]) -> None:
-    """Print texts on stderr; on its own thread, because a terminal that hangs must not hold up the bridge.
+    """Print texts on stderr in a thread, because a blocked terminal must not stop the bridge.
 
     Nor may it hold up the exit, where Python waits for a file object that is in use: hence ``os.write``.
     The journal takes a syslog level, which a MAVLink severity is, from ``<N>`` before a line (sd-daemon(3)).
@@ -170,7 +170,7 @@ def _open_log(config: Config, edge: LiveEdge, pipeline: Pipeline) -> TlogWriter 
 
 
 class LogWatch:
-    """Reports when the log fails, recovers or loses records; keeps the log's `beginning` up to date."""
+    """Report failures, recoveries and losses of the log; keep the log's `beginning` up to date."""
 
     def __init__(self, log: TlogWriter | None, edge: LiveEdge, pipeline: Pipeline) -> None:
         self._log, self._edge, self._pipeline = log, edge, pipeline

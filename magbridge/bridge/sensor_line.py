@@ -1,4 +1,4 @@
-"""The sensor's line: whether readings come, and the commands that the sensor needs."""
+"""State of the sensor's line, and the commands that the sensor needs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LINE_CHECK_INTERVAL_US = 1_000_000
 
 
 class SensorLine:
-    """Watches the line, and sends the start-up commands whenever the sensor may have lost them.
+    """Watch the line; send the start-up commands whenever the sensor may have lost them.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class SensorLine:
             self._announcer.state(self.timer, f"{self._name} speaks")
 
     def read(self, field: Vector, time_us: int) -> None:
-        """Check the values of a reading (nT); one that stays the same for long is announced."""
+        """Check the values of a reading (nT); announce one that stays the same for long."""
         if field != self._field:
             self._field, self._repeats, self._since_us = field, 0, time_us
             if self._hangs:
@@ -126,12 +126,12 @@ class SensorLine:
             self._timers.cancel(self._command_timer)
 
     def opened(self, time_us: int) -> None:
-        """Begin to send the start-up commands: it may have been without power. SILENT until it sends."""
+        """Send the start-up commands, because the sensor may have lost power; SILENT until it sends."""
         self._commands, self._known, self._tail = self._start(), False, b""
         self._wake(time_us, self._listen_us)
 
     def lost(self, reason: str) -> None:
-        """Record that the port is gone."""
+        """Record that the port is lost."""
         self.state = MAG_PORT_STATE.LOST
         self._timers.cancel(self._command_timer)
         self._announcer.state(self.timer, f"{self._name} lost: {reason}", MAV_SEVERITY.ERROR)

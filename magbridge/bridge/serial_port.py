@@ -68,7 +68,7 @@ class SerialPort(PacedPort):
         raise PortError(self.name, str(reason))
 
     def move_on(self) -> None:
-        """Close the device if the pattern finds others, too: the next one will be opened."""
+        """Close the device if the pattern finds others; the next one is opened then."""
         if len(self._names()) > 1:
             self._passed = self._last
             self.close()
@@ -101,7 +101,7 @@ class SerialPort(PacedPort):
         return data
 
     def blocked(self) -> list[int]:
-        """Return the descriptor, but not of a line that we pace: it is writable all the time."""
+        """Return the descriptor, except that of a paced line, which is always writable."""
         return super().blocked() if self._idle_at == -inf else []
 
     def _room(self) -> bool:
@@ -176,7 +176,7 @@ def serial_line(name: str, baudrate: int, source: str, key: str) -> SerialPort:
 
 
 def may_be_device(name: str) -> bool:
-    """Return True if a device has this name, or may get it later: a word, a file or a folder never does."""
+    """Return True if a serial device has this name or could get it later."""
     path = Path(name)
     if path.exists():
         return not (path.is_file() or path.is_dir())
@@ -192,7 +192,7 @@ def _reason(error: Exception) -> str:
 
 
 class _Pump:
-    """Moves bytes from a port that cannot be waited for into a pipe that can."""
+    """Move bytes from a port without a file descriptor into a pipe."""
 
     def __init__(self, source: Any) -> None:
         self._source = source

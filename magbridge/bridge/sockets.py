@@ -83,7 +83,7 @@ class _Connection(PacedPort):
         self._connection.setblocking(False)
 
     def adopt(self, connection: socket.socket) -> None:
-        """Make `connection` the one to use."""
+        """Use `connection`."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT)
@@ -99,7 +99,7 @@ class _Connection(PacedPort):
 
 
 class TcpClient(_Connection):
-    """``tcp``: connects to a server."""
+    """``tcp``: connection to a server."""
 
     def __init__(self, name: str, address: tuple[str, int]) -> None:
         super().__init__(name)
@@ -114,7 +114,7 @@ class TcpClient(_Connection):
 
 
 class _Client(_Connection):
-    """One client of a server: when it goes, the server is well."""
+    """One client of a server; the server continues when it leaves."""
 
     def __init__(self, name: str, connection: socket.socket) -> None:
         super().__init__(name)
@@ -122,12 +122,12 @@ class _Client(_Connection):
         self.adopt(connection)
 
     def open(self) -> None:
-        """Raise :class:`PortError`: a client comes by itself."""
+        """Raise :class:`PortError`, because only a client can open the connection."""
         raise PortError(self.name, "not connected")
 
 
 class TcpServer(Port):
-    """``tcpin``: waits for clients, and answers those that :class:`Peers` lets it answer.
+    """``tcpin``: server that answers the clients which :class:`Peers` accepts.
 
     On a link without signatures a client is answered at once, because it may only want to listen, and its
     address cannot be forged. A client that has sent something valid is never disconnected for another.
@@ -142,7 +142,7 @@ class TcpServer(Port):
 
     @property
     def is_open(self) -> bool:
-        """Return True if it listens."""
+        """Return True if the server listens."""
         return self._listener is not None
 
     def open(self) -> None:
@@ -175,7 +175,7 @@ class TcpServer(Port):
         return self._peers.drain()
 
     def write(self, data: bytes) -> None:
-        """Send to those clients that are to be answered; without one, `data` are dropped."""
+        """Send to the accepted clients; drop `data` without one."""
         peers = self._chosen()
         chosen = [fd for fd, peer in peers.items() if self._peers.affords(peer, len(data))]
         for fd in chosen:
@@ -238,7 +238,7 @@ class TcpServer(Port):
         self._listener = None
 
     def _accept(self, connection: socket.socket) -> None:
-        """Take a client, if need be for one that has had its time and said nothing valid."""
+        """Accept a client; if necessary, in place of one that has sent nothing valid for some time."""
         if len(self._clients) >= CONNECTIONS:
             late = time.monotonic() - GREETING
             mute = (fd for fd, one in self._clients.items() if not self._peers.is_known(fd))

@@ -1,4 +1,4 @@
-"""The model of a vehicle's own magnetism: fit it, keep it, correct with it, simulate with it.
+"""The model of a vehicle's magnetism: fit, store, correct, simulate.
 
 ::
 

@@ -29,7 +29,7 @@ RANGE_MARGIN_FRACTION = 0.02
 
 
 class Corrector:
-    """Corrects sample after sample, as the bridge does.
+    """Correct one sample after the other, as the bridge does.
 
     Notes
     -----
@@ -63,7 +63,7 @@ class Corrector:
         return self._last
 
     def replace(self, calibration: Calibration, values: Sequence[float] = ()) -> float:
-        """Go on with other coefficients of the same terms, or with effects more or fewer at the end.
+        """Continue with other coefficients of the same terms, or with effects added or removed at the end.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Corrector:
     def changes(
         self, field: tuple[float, float, float], values: tuple[float, ...], spans: Sequence[Span]
     ) -> list[float]:
-        """Return by how much (nT) the total field changes over each span of a position, without effects.
+        """Return the change (nT) of the total field over each span of a position, without effects.
 
         Parameters
         ----------

@@ -42,7 +42,7 @@ def powers(x: Any, order: int) -> tuple[Any, ...]:
 
 
 def held(values: FloatArray, before: float) -> FloatArray:
-    """(n,) values with each NaN replaced by the last that is known, or by `before` where none is."""
+    """Return values (n,) with each NaN replaced by the last known value, or by `before`."""
     known = ~np.isnan(values)
     if known.all():
         return values
@@ -80,7 +80,7 @@ def _filtered(values: FloatArray, share: float) -> FloatArray:
 
 
 def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
-    """(n,) the same with a share for each step, by doubling: the steps of 2, 4, 8 ... rows are one."""
+    """Return the same (n,) with a fraction for each step, by doubling over 2, 4, 8 ... rows."""
     y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
     step = 1
     while step < len(y):

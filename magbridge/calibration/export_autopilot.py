@@ -1,4 +1,4 @@
-"""A calibration as the compass parameters of ArduPilot and PX4, as far as their model can hold it.
+"""Export a calibration as compass parameters of ArduPilot and PX4, as far as their models allow.
 
 Both correct by a symmetric matrix and an offset, and by a vector times the battery's current::
 
@@ -37,7 +37,7 @@ MAX_OFFSET_MG = 1_800.0
 
 @dataclass(frozen=True)
 class Compass:
-    """What an autopilot's compass model holds of a calibration."""
+    """The part of a calibration that an autopilot's compass model can represent."""
 
     matrix: FloatArray
     """(3, 3): Symmetric."""
@@ -50,7 +50,7 @@ class Compass:
 
 
 def compass_of(calibration: Calibration) -> Compass:
-    """Return what an autopilot's compass model holds of a calibration."""
+    """Return the part of a calibration that an autopilot's compass model can represent."""
     kernel = calibration.kernel
     currents = [k for k, one in enumerate(calibration.parameters) if usual(one.unit) == "A"][:1]
     middle = np.array([0.5 * (one.low + one.high) for one in calibration.parameters])

@@ -1,4 +1,4 @@
-"""A calibration as C99 for a microcontroller: one header, one source, no allocation, float or double.
+"""Export a calibration as C99 for a microcontroller: one header and one source, without allocation.
 
 The source is the table of :class:`~magbridge.calibration.kernel.Kernel` and the arithmetic of that module,
 in the same order: in double it gives the field to the last bits that the sum's order keeps (1e-8 nT), in

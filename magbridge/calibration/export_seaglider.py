@@ -40,7 +40,7 @@ HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
 
 @dataclass(frozen=True)
 class HeadingCost:
-    """The heading error that a part of the calibration makes where it is left out, deg."""
+    """Heading error (deg) that omitting a part of the calibration causes."""
 
     name: str
     """The parameter; empty for all together."""
@@ -78,7 +78,7 @@ def seaglider(calibration: Calibration, nT_per_count: float) -> str:
 
 
 def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
-    """Return what the moving masses cost that one offset and one matrix leave out.
+    """Return the heading error due to the moving masses if only one offset and one matrix are used.
 
     Parameters
     ----------

@@ -98,7 +98,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 
 def _format(calibration: Calibration) -> int:
-    """Return the oldest format that holds all that a calibration has."""
+    """Return the oldest format that can represent a calibration."""
     if calibration.conditions:
         return 6
     if calibration.sensors:
@@ -187,7 +187,7 @@ def _term_in(raw: dict[str, Any], file: str | Path) -> Term:
 
 
 def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...]) -> Calibration:
-    """Build the calibration, refusing numbers that cannot belong together."""
+    """Build the calibration; refuse inconsistent numbers."""
     coefficients = np.array(content.coefficients, float)
     rows = {len(row) for row in content.covariance}
     if rows != {coefficients.size} or len(content.covariance) != coefficients.size:
@@ -214,7 +214,7 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
 
 
 def _check_settings(content: _File) -> None:
-    """Refuse parameters, a reference or a noise that no fit can have had."""
+    """Refuse impossible parameters, references or noise."""
     names = [parameter.name for parameter in content.parameters]
     if twice := [name for name in names if names.count(name) > 1]:
         raise CalibrationError(f"parameter {twice[0]!r} is named twice")
@@ -237,7 +237,7 @@ def _check_settings(content: _File) -> None:
 
 
 def _check_scalar(sensor: ScalarSensor) -> None:
-    """Refuse a scalar sensor whose numbers do not belong together."""
+    """Refuse a scalar sensor with inconsistent numbers."""
     size = PLATFORM_TERMS + 3 * len(sensor.channels) + len(sensor.power_cycles)
     where = f"sensor {sensor.column!r}: "
     if not len(sensor.coefficients) == len(sensor.prior_sigma) == len(sensor.covariance) == size:

@@ -1,4 +1,4 @@
-"""The model forwards: from the true field to what the sensor reads.
+"""Forward model: from the true field to the readings.
 
 Notes
 -----
@@ -30,7 +30,7 @@ def _coefficients_at(
 def forward(
     calibration: Calibration, field_body: FloatArray, channels: FloatArray, time: FloatArray
 ) -> FloatArray:
-    """Return what the sensor reads in a true field, without noise.
+    """Return the noiseless readings in a true field.
 
     Parameters
     ----------

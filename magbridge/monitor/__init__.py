@@ -1,4 +1,4 @@
-"""The ground station's page: what a person who watches a vehicle wants to see of its bridge.
+"""The ground station's page of a vehicle and its bridge.
 
 ::
 

@@ -1,4 +1,4 @@
-"""The panel of alarms, by cause: when each began, a button to acknowledge it, and a sound until then."""
+"""Panel of alarms by cause: start, acknowledge button, and a sound until acknowledged."""
 
 from __future__ import annotations
 

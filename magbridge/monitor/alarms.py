@@ -1,4 +1,4 @@
-"""What a person should look at: conditions that began, and whether somebody has seen them."""
+"""Alarms: conditions with their start and whether they were acknowledged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bug report in one file: what a person who was not there has to see."""
+"""A bug report in one file."""
 
 from __future__ import annotations
 

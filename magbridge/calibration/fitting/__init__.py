@@ -1,1 +1,1 @@
-"""From logs of calibration runs to a calibration; :func:`~magbridge.calibration.fitting.fit.fit` does it."""
+"""Fit a calibration to logs; start at :func:`~magbridge.calibration.fitting.fit.fit`."""

@@ -46,7 +46,7 @@ MIN_OUTLIER_FRACTION = 0.7
 
 
 def flown(residual: FloatArray) -> BoolArray:
-    """Return which samples (n,) are not part of an end of the log that the others contradict.
+    """Return a mask (n,) without samples at an end of the log that contradict the others.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def _may_gain(data: Observations, order: int, known: Known | None) -> bool:
 
 
 def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
-    """Log evidence that one more order gains, on as many samples as choose a start; none if it has no fit."""
+    """Return the gain in log evidence of one more order; none if it has no fit."""
     scores = []
     for n in (order, order + 1):
         posed = pose(data, n, vehicle)
@@ -194,7 +194,7 @@ def _best(samples: Samples, family: PriorFamily) -> Climbed:
 
 
 def _remembering(samples: Samples, answer: Climbed) -> Climbed:
-    """Return the answer whose noise is a slow part and a white one, where the residuals are of that kind."""
+    """Return the answer with slow and white noise if the residuals have both."""
     for _ in range(2):
         e = residuals_of(samples, answer.family.at(answer.widths.eta).coefficients(answer.solution.z))
         noise = fit_slow_and_white(e, samples.steps, answer.noise)

@@ -1,4 +1,4 @@
-"""What the data of a fit determine and what not: rank, estimable combinations, warnings for a pilot."""
+"""Determine what the data of a fit determine: rank, estimable combinations, and warnings."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def expected_ratio(calibration: Calibration, data: Observations) -> float:
 
 
 def warnings_for(calibration: Calibration, data: Observations) -> tuple[str, ...]:
-    """Return warnings, in a pilot's words: what the runs left undetermined."""
+    """Return warnings about quantities that the runs leave undetermined."""
     return tuple(text for check in CHECKS for text in check(calibration, data))
 
 
@@ -212,7 +212,7 @@ MAX_HEADING_GAP_DEG = 270.0
 
 
 def judged(found: Fit, data: Observations) -> Fit:
-    """Return the fit with its boresight, and with warnings of what the data could not determine."""
+    """Return the fit with its boresight and with warnings about undetermined quantities."""
     whole, mismatch = found.calibration, []
     calibration = whole.without_effects()
     if whole.effects or found.creep:  # they have been subtracted
@@ -289,7 +289,7 @@ def _noise_for_attitudes(field: FloatArray, noise: float) -> Iterator[str]:
 
 
 def _suspicions(found: Fit) -> Iterator[str]:
-    """Yield warnings that the fit itself gives about the samples or their reference."""
+    """Yield warnings about the samples or their reference that follow from the fit."""
     samples, outliers = len(found.residual), found.details.get("outliers", 0)
     if outliers > 0.02 * samples:
         yield f"{outliers} of {samples} samples are outliers and were left out of the fit"

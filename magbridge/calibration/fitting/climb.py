@@ -24,7 +24,7 @@ MAX_START_ITERATIONS = 16
 
 @dataclass(frozen=True, eq=False)
 class Climbed:
-    """Where a climb ended."""
+    """Result of a climb."""
 
     solution: Solution
     widths: Hyperparameters
@@ -43,7 +43,7 @@ def thinned_rows(n: int) -> IndexArray:
 
 
 def thinned(samples: Samples) -> Samples:
-    """Return blocks of neighbours, spread evenly over all samples: enough to choose a start by."""
+    """Return blocks of neighbours, spread evenly over all samples, to choose a start."""
     n = len(samples.field)
     if n <= ENOUGH:
         return samples
@@ -108,7 +108,7 @@ def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel
 
 
 def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
-    """Come near the answer: after each Gauss-Newton step the noise is set to the bulk of the residuals."""
+    """Approach the solution: after each Gauss-Newton step, set the noise to the bulk of the residuals."""
     apart = np.full(len(samples.field), np.inf)
     noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
     for _ in range(MAX_START_ITERATIONS):

@@ -1,4 +1,4 @@
-"""Test whether a track separates crustal field and heading: it returns to places on other courses."""
+"""Test whether a track separates crustal field and heading by returning to places on other courses."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def tells_rock(data: Observations) -> bool:
 
 
 def left_open(data: Observations, length: float) -> Iterator[str]:
-    """Yield advice, in a pilot's terms, to separate a crustal field of a `length`, m, from the vehicle's."""
+    """Yield advice for separating a crustal field of a `length`, m, from the vehicle's field."""
     if data.place is None or data.unmapped is None or not data.unmapped.all():
         return
     yield from left_open_by(data.place[:, :2], length)
@@ -124,14 +124,14 @@ def too_rough(track: FloatArray, length: float, shortest: float = 0.0) -> Iterat
 
 
 def far_off(place: FloatArray) -> BoolArray:
-    """Return which places (n, 2), m, lie so far from all others that they cannot be right: (n,)."""
+    """Return a mask (n,) of places (n, 2), m, that are too far from all others to be right."""
     distance = np.linalg.norm(place - np.nanmedian(place, axis=0), axis=1)
     usual = max(float(np.nanquantile(distance, 0.99)), NEAR)
     return np.asarray(~(distance <= FARTHEST * usual))
 
 
 def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
-    """Yield which places (n, 2), m, at times (n,), s, were left out, and whether the track jumps."""
+    """Yield notes on dropped places (n, 2), m, at times (n,), s, and on jumps of the track."""
     without = ~np.isfinite(place).all(axis=1)
     far = far_off(place) & ~without
     for left_out, why in ((without, "without a position"), (far, "far from all others (a jump in position)")):
@@ -150,7 +150,7 @@ def jumped(place: FloatArray, time: FloatArray) -> Iterator[str]:
 
 
 def jumps(place: FloatArray, time: FloatArray) -> IndexArray:
-    """Return after which of the places (n, 2), m, at times (n,), s, the track jumps farther than it moves."""
+    """Return the indices of places (n, 2), m, at times (n,), s, after which the track jumps."""
     step = np.linalg.norm(np.diff(place, axis=0), axis=1)
     usual = float(np.median(step / np.maximum(np.diff(time), 1e-3)))
     beyond = step - FARTHEST * usual * np.diff(time)
@@ -187,6 +187,6 @@ def courses(place: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _thinned(place: FloatArray) -> BoolArray:
-    """Return which places (n, 2) are at least :data:`MIN_COURSE_M` m of way after the last one: (n,)."""
+    """Return a mask (n,) of places (n, 2) at least :data:`MIN_COURSE_M` m of travel after the last one."""
     way = np.cumsum(np.hypot(*np.diff(place, axis=0, prepend=place[:1]).T))
     return np.asarray(np.diff(np.floor(way / MIN_COURSE_M), prepend=-1) > 0)

@@ -1,4 +1,4 @@
-"""The lengths that a track can tell, and the nodes on which a field of such a length is kept."""
+"""Field lengths that a track can resolve, and the nodes of a field of such a length."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ MIN_LENGTH_M = 60.0
 
 
 def fine_enough(nodes: Nodes, length: float, alpha: int) -> bool:
-    """Return whether nodes still suit a field of a `length`, m, and power alpha."""
+    """Return True if nodes are fine enough for a field of a `length`, m, and power alpha."""
     return 0.7 <= length / nodes.spacing / NODES_PER_LENGTH.get(alpha, ENOUGH) <= 1.5
 
 
 def nodes_for(place: FloatArray, length: float, alpha: int, most: int = MAX_FIELD_NODES) -> Nodes:
-    """Return the nodes on which a field is kept about places (n, 2), m; coarser where they are too many.
+    """Return the nodes of a field around places (n, 2), m; coarser if they are too many.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def about_the_middle(place: FloatArray, number: int, wide: float = 0.0) -> BoolA
 
 
 def ladder(place: FloatArray) -> FloatArray:
-    """Return the lengths to try, (7,) m: from what samples at places (n, 2), m, resolve to the area."""
+    """Return seven lengths to try, m: from the resolution of samples at places (n, 2), m, to the area."""
     known = place[np.isfinite(place).all(axis=1)]
     extent = float(np.hypot(*np.ptp(known, axis=0)))
     step = np.linalg.norm(np.diff(known, axis=0), axis=1)

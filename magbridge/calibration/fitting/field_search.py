@@ -1,4 +1,4 @@
-"""Size, length and smoothness of a field in place, and the noise's autocorrelation, by the evidence."""
+"""Amplitude, length and smoothness of a field, and the noise's autocorrelation, by the evidence."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """With what an evidence is taken: the dense unknowns' prior, at widths eta (h,), and the noise, nT."""
+    """Settings of an evidence: the dense unknowns' prior at widths eta (h,), and the noise, nT."""
 
     family: PriorFamily
     eta: FloatArray
@@ -83,7 +83,7 @@ def choose(
     effort: float = 1.0,
     most: int = MAX_FIELD_NODES,
 ) -> Choice:
-    """Choose the field from nothing: lengths from a ladder, then smoothness and all the rest about the best.
+    """Choose the field without a start: lengths from a ladder, then smoothness and the rest.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def _smoothness(best: Choice, tried: Callable[[Choice, int, bool], Choice]) -> C
 
 
 def first_guess(place: FloatArray) -> Choice:
-    """Return a field to begin with at places (n, 2), m: of the middle length, and of usual size and noise."""
+    """Return an initial field at places (n, 2), m: of the middle length, usual amplitude and noise."""
     rungs = ladder(place)
     length = float(rungs[len(rungs) // 2 + 1])
     return Choice(GaussianField(nodes_for(place, length, SMOOTH), length, SMOOTH), SIZE, 0.0)

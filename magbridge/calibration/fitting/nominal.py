@@ -214,7 +214,7 @@ def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArr
 
 
 def starts(samples: Samples) -> list[FloatArray]:
-    """Return two starts (9,), nT: no iron at all, and the sphere that fits best by linear least squares.
+    """Return two starts (9,), nT: without iron, and the best sphere by linear least squares.
 
     ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
     """

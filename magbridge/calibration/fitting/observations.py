@@ -131,7 +131,7 @@ class Observations:
         return np.column_stack([positions, self.temperature])
 
     def directed(self) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Return which samples (n,) have both attitude and the reference's direction, and those m of them.
+        """Return a mask (n,) of samples with attitude and reference direction, and those m samples.
 
         The attitude (m, 3) is in rad, the reference (m, 3) in nT, as the attributes are.
         """
@@ -142,7 +142,7 @@ class Observations:
 
     @property
     def lacks_rock(self) -> bool:
-        """Return True if the reference is, anywhere, less than the true field."""
+        """Return True if the reference lacks the crustal field at any sample."""
         return self.unmapped is not None and bool(self.unmapped.any())
 
     @property
@@ -195,7 +195,7 @@ def _enough(
     names: Sequence[str],
     reference: FloatArray,
 ) -> None:
-    """Refuse data that cannot be fitted, naming the column to blame."""
+    """Refuse data that cannot be fitted; name the responsible column."""
     if whole.sum() >= 10:
         if not (reference[whole] > 0).all():
             raise CalibrationError("reference field: expected positive numbers (nT)")
@@ -216,7 +216,7 @@ def _enough(
 
 
 def _plausible(names: Sequence[str], positions: FloatArray) -> None:
-    """Refuse a position far from all others: one -9999 for "not known" would bend the whole fit."""
+    """Refuse a position far from all others, such as an undeclared missing-value code."""
     for name, column in zip(names, positions.T, strict=True):
         low, middle, high = np.quantile(column, [COMMON, 0.5, 1.0 - COMMON])
         far = np.abs(column - middle) > FAR * (high - low)

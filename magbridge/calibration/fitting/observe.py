@@ -1,4 +1,4 @@
-"""Observe: from a deployment's columns to the observations of a fit."""
+"""Convert the columns of a deployment to the observations of a fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""What a sensor's offset follows during a survey: its temperature, at once or lagged, and time.
+r"""Dependence of a sensor's offset on temperature, with or without lag, and on time during a survey.
 
 .. math:: T(t) = T + c\,(\Theta_\tau(t) - \bar\Theta) + \sum_k d_k \cos(\pi k t / t_s)
 
@@ -34,7 +34,7 @@ PER_DEGREE, CREEPS, SPREAD = 1.0, 3.0, np.log(5.0)
 
 @dataclass(frozen=True, eq=False)
 class Creep:
-    """How the offset crept while a survey lasted."""
+    """Drift of the offset during a survey."""
 
     time: FloatArray
     """(n,), s since 1970 UTC."""
@@ -49,7 +49,7 @@ class Creep:
 
 
 def offered(data: Observations) -> tuple[OffsetBlock, ...]:
-    """Return the terms that may be in a log: the temperature at every lag, where there is any, and creep."""
+    """Return the terms that a log allows: the temperature at each lag, and drift."""
     groups = []
     if data.temperature is not None and TEMPERATURE not in data.names:
         for lag in TEMPERATURE_LAGS_S:
@@ -111,14 +111,14 @@ def with_temperature(
 
 
 def with_creep(calibration: Calibration, creep: FloatArray) -> Calibration:
-    """Return the calibration whose offset may be any of those (n, 3), nT, that it was in the survey."""
+    """Return the calibration with the spread of the offsets (n, 3), nT, of the survey."""
     covariance = calibration.covariance.copy()
     covariance[6:9, 6:9] += creep.T @ creep / len(creep)
     return replace(calibration, covariance=covariance)
 
 
 def in_words(calibration: Calibration, creep: Creep | None) -> Iterator[str]:
-    """Yield the quantities that the offset follows."""
+    """Yield the quantities that the offset depends on."""
     for effect in calibration.effects:
         if isinstance(effect, ChannelEffect):
             slope = float(np.linalg.norm(calibration.coefficients[-effect.size :]))

@@ -1,4 +1,4 @@
-"""Which columns of a log move the field: those that a fit suggests, and those worth being parameters.
+"""Columns of a log that change the field: suggestions of a fit, and useful parameters.
 
 The columns are added one by one: first the one which explains most of the residual of the fit so far, as long
 as a fit with it predicts held-out parts better, and the later parts of the log from the earlier ones. A
@@ -45,7 +45,7 @@ WORTHY = 0.5
 
 
 def undeclared(calibration: Calibration, data: Observations, columns: Mapping[str, FloatArray]) -> list[str]:
-    """Return a line for each column that explains the residual of a fit but is not a parameter of it.
+    """Return a line for each column that explains the residual of a fit without being its parameter.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def worths(
     better: float = MAX_REMAINING_FRACTION,
     conditional_on: tuple[str, ...] = (),
 ) -> dict[str, float]:
-    """Return by how many nT each column (n,) reduces a residual on held-out parts; see :func:`undeclared`.
+    """Return the reduction (nT) of a residual on held-out parts by each column (n,); see :func:`undeclared`.
 
     `columns` are (n,), at the n samples. Columns that leave more than the fraction `better` of it are left
     out, as are those that the others are `conditional_on`.
@@ -123,7 +123,7 @@ def _moved(c: FloatArray, direction: FloatArray, order: int) -> FloatArray:
 
 
 def _left_out(design: FloatArray, residual: FloatArray) -> float:
-    """Return the RMS of (n,) `residual` less what (n, m) `design` explains of it, on parts left out."""
+    """Return the RMS of `residual` (n,) after subtracting the fit of `design` (n, m), on held-out parts."""
     part = np.arange(len(residual)) * BLOCKS // len(residual) % PARTS
     rest = residual.copy()
     for k in range(PARTS):
@@ -161,7 +161,7 @@ class Offer:
 def best_parameters(
     deployment: xr.Dataset, offered: Sequence[str], *, grid: AnomalyGrid | None = None, **options: Any
 ) -> tuple[tuple[str, ...], list[Offer]]:
-    """Return the columns that are worth being parameters, and what each that was tried is worth.
+    """Return the columns to use as parameters, and the improvement of each that was tried.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def _most_promising(
     tried: set[str],
     grid: AnomalyGrid | None,
 ) -> str | None:
-    """Return the column that explains most of what a fit leaves."""
+    """Return the column that explains most of the residual of a fit."""
     data = observations(deployment, taken, grid=grid)
     rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
     columns = {name: deployment[name].to_numpy()[rows] for name in offered if name not in tried}

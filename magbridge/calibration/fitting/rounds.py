@@ -39,7 +39,7 @@ __all__ = ["FIRST_SAMPLES", "SEARCHED", "WIDE", "Answer", "Rounds", "start"]
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Where the rounds stand; `lacking` (n,) nT is what they add to the reference at every sample."""
+    """State of the rounds; `lacking` (n,), nT, is added to the reference at every sample."""
 
     z: FloatArray
     w: FloatArray
@@ -151,7 +151,7 @@ class Rounds:
         )
 
     def go_on(self, survey: SurveySamples, step: int) -> None:
-        """Go on with `survey`, of which the samples so far were every `step`-th one; nothing is searched."""
+        """Continue with `survey`, of which the samples so far were every `step`-th one, without a search."""
         self.survey, self.until = survey, -1
         self.choice = replace(self.choice, rho=self.choice.rho ** (1.0 / step))
         field = self.choice.field
@@ -185,7 +185,7 @@ class Rounds:
         return answer
 
     def _round(self, turn: int) -> Answer:
-        """Search the field where it is time to, and solve for all that is linear about the last answer."""
+        """Search the field if it is due, and solve the problem linearised about the last answer."""
         weighed = Weighed(self.family, self.eta, self.sigma, self.middle)
         if searched := self.until - SEARCHES <= turn <= self.until:
             self._search(weighed, anew=turn == self.until - SEARCHES)
@@ -232,7 +232,7 @@ class Rounds:
         return replace(choice, field=replace(field, nodes=nodes))
 
     def _weigh_offers(self, turn: int) -> None:
-        """Keep the optional terms that the log needs; the search continues without the others.
+        """Keep the optional terms that the log needs, and continue without the others.
 
         Wait until the iterations have converged with all terms: until then they fit outliers.
         """
@@ -247,7 +247,7 @@ class Rounds:
             self.until = turn + SEARCHES
 
     def _regroup(self, groups: tuple[ParameterBlock, ...]) -> None:
-        """Go on with other groups of unknowns; those that were there stay where they are."""
+        """Continue with other groups of unknowns; existing ones keep their values."""
         at, width, row, column = {}, {}, self.q, len(self.own.centre)
         for one in self.survey.groups:
             at[one.name], width[one.name] = self.z[row : row + len(one.shape)], self.eta[column : column + 1]

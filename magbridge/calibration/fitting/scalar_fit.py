@@ -78,7 +78,7 @@ OUTLIER_INNOVATION_SIGMA, OUTLIER_PAD = 8.0, 4
 
 @dataclass(frozen=True, eq=False)
 class ScalarFit:
-    """A fitted compensation and what it did to the samples."""
+    """A fitted compensation and its effect on the samples."""
 
     sensor: ScalarSensor
     rms_before: float
@@ -177,7 +177,7 @@ def fit_scalar(
 def _agreeing(
     series: ScalarSeries, valid: BoolArray, channels: tuple[ScalarChannel, ...], reference_field: float
 ) -> BoolArray:
-    """Return the samples (n,) at which the scalar is what the vector sensor makes one expect.
+    """Return a mask (n,) of samples at which the scalar agrees with the vector sensor.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""Sources: what each of several logs adds to a fit, and whether one calibration fits them all."""
+"""Contributions of several logs to a fit, and the test whether one calibration fits all of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ JUDGED = 10
 
 
 def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
-    """Return which of `logs` the sample at each `time` (n,), s, is of: (n,), -1 where of none.
+    """Return the index (n,) of the log of the sample at each `time` (n,), s; -1 for none.
 
     Of logs that have all channels at the same time it is the first, as when they are joined.
     """
@@ -38,7 +38,7 @@ def source_of(logs: Sequence[xr.Dataset], time: FloatArray) -> IndexArray:
 
 
 def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]:
-    """Yield a line for each of `logs` that adds no sample to `data`, which were made from all of them."""
+    """Yield a line for each of `logs` that adds no sample to `data`."""
     which = source_of(logs, data.time)
     for k, log in enumerate(logs):
         sampled = _sampled(log)
@@ -58,7 +58,7 @@ def unused_logs(logs: Sequence[xr.Dataset], data: Observations) -> Iterator[str]
 def heterogeneous_logs(
     logs: Sequence[xr.Dataset], data: Observations, found: Fit | None, refit: Callable[[Observations], Fit]
 ) -> str:
-    """Return why logs are not of one vehicle in one state; empty without such a reason.
+    """Return the reason why logs are not of one vehicle in one state; empty without one.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def _scatter(residual: FloatArray) -> float:
 
 
 def _moving(data: Observations) -> Observations:
-    """Return the data without the parameters that stand still in them."""
+    """Return the data without the parameters that are constant in them."""
     span = np.ptp(data.parameters, axis=0) if len(data) else np.zeros(len(data.names))
     moves = span > 1e-9 * np.abs(data.parameters).max(axis=0, initial=0.0)
     pick = np.flatnonzero(moves).tolist()

@@ -118,7 +118,7 @@ class SurveySamples:
         return few
 
     def keep(self, groups: tuple[ParameterBlock, ...]) -> None:
-        """Go on with these groups of unknowns: those that add to the reference come first, then offsets."""
+        """Continue with these groups of unknowns: those of the reference first, then offsets."""
         self.groups = groups
         self.offsets = [group for group in groups if isinstance(group, OffsetBlock)]
         self.steady = BlockColumns([group for group in groups if not isinstance(group, OffsetBlock)])
@@ -154,7 +154,7 @@ class SurveySamples:
         return in_chunks(len(self.kept), lambda rows: self.basis(field, rows) @ w)
 
     def bend(self, field: GaussianField, w: FloatArray, latent: FloatArray) -> None:
-        """Move the track to where it is with the unknowns `latent` (p,), and take the field's slope there.
+        """Move the track by the unknowns `latent` (p,), and use the field's slope there.
 
         `w` (nodes,) are the field's coefficients, nT.
         """

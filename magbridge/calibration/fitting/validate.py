@@ -1,4 +1,4 @@
-"""How well a calibration corrects a run: the total field in the sensor's own nT, and the heading in deg."""
+"""Errors of a corrected run: total field in nT of the sensor, and heading in deg."""
 
 from __future__ import annotations
 
