@@ -23,6 +23,8 @@ ROOT = Path(__file__).resolve().parents[1]
 LIMITS = ROOT / "tools" / "limits.toml"
 GENERATED = "mavlink/dialect.py", "mavlink/enums.py"
 """Modules that tools/dialect.py writes: their names are pymavlink's."""
+PLUGIN_CLASSES = {"FileWriter"}
+"""Classes that every module of a plug-in interface defines: one meaning, several implementations."""
 BARE = (
     "about after ago ahead alone among apart at back before behind below beside between beyond by down else "
     "even here inside instead near now of off often on once one other others ours out over own past since so "
@@ -43,13 +45,15 @@ def check(package: Path) -> dict[str, list[str]]:
         for name, value in _constants(tree):
             constants[name][str(path)] = value
         for node in ast.walk(tree):
-            if isinstance(node, ast.ClassDef):
+            if isinstance(node, ast.ClassDef) and node.name not in PLUGIN_CLASSES:
                 classes[node.name].append(f"{path}:{node.lineno}")
             elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 if node.name.strip("_") in BARE.split():
                     functions.append(f"{path}:{node.lineno}: function {node.name}")
                 arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
                 names = [argument.arg for argument in arguments if argument.arg.strip("_") in BARE.split()]
+                if node.name.startswith("__") and names == ["other"]:  # of an operator, as Python names it
+                    names = []
                 parameters += [f"{path}:{node.lineno}: parameter {name} of {node.name}" for name in names]
     return {
         "constants": [
