@@ -46,7 +46,7 @@ def total(position: float) -> float:
     return hypot(FIELD[0] - LINE * position, *FIELD[1:])
 
 
-def test_a_position_never_told_may_be_anywhere(calibration: Calibration) -> None:
+def test_a_position_that_was_never_sent_may_be_anywhere(calibration: Calibration) -> None:
     _, corrected = Correction(calibration).reading(Reading(FIELD), START)
     assert corrected.quality & Quality.STALE_TELEMETRY
     assert corrected.total_field == pytest.approx(total(0.0))

@@ -16,7 +16,7 @@ from magbridge.logs.draw import draw_corrected
 from magbridge.pictures import literal
 
 
-def test_a_name_is_no_mathematics() -> None:
+def test_a_name_is_not_read_as_mathematics() -> None:
     figure = Figure()
     axis = figure.subplots()
     axis.plot([1.0, 1e6], [1.0, 1e6], label=r"$\frac{$")

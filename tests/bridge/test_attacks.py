@@ -78,7 +78,7 @@ def besieged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str
 
 
 @pytest.mark.parametrize("attack", ATTACKS, ids=lambda one: one.name)
-def test_an_attack_costs_the_autopilot_nothing_or_is_told(
+def test_an_attack_costs_the_autopilot_nothing_or_is_reported(
     besieged: Callable[[str], Rig], attack: Attack
 ) -> None:
     rig = besieged(attack.link)

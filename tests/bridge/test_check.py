@@ -65,7 +65,7 @@ def test_nothing_is_wrong_with_a_good_one(config: Path) -> None:
     assert not (config.parent / "logs").exists()
 
 
-def test_everything_is_said_at_once(config: Path) -> None:
+def test_all_findings_come_at_once(config: Path) -> None:
     text = GOOD.replace(
         '"/dev/null"', '"/dev/no_such_device"\nbaudrat = 1\n[sensor.options]\nrate = 21\nspeed = 3'
     )

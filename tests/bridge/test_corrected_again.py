@@ -29,7 +29,7 @@ BATTERY = Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("suffix", ["nc", "csv", "tlog"])
-def test_what_was_set_in_the_course_of_the_log_is_told(
+def test_what_was_set_in_the_course_of_the_log_is_reported(
     tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither refused values nor the rate of a message are corrected again."""

@@ -39,7 +39,7 @@ def test_a_process_that_is_held_up_tells_no_step() -> None:
 
 
 @pytest.mark.parametrize("held", ["before", "after"])
-def test_held_up_beside_a_look_at_utc(monkeypatch: pytest.MonkeyPatch, held: str) -> None:
+def test_a_process_that_is_stopped_near_a_look_at_utc(monkeypatch: pytest.MonkeyPatch, held: str) -> None:
     clock, host, offset_us = HostClock(), time.time_ns, [0]
     waits = [1.4e-6 * HostClock.THRESHOLD_US, 0.0]
 

@@ -102,7 +102,7 @@ def test_what_an_autopilot_cannot_use_is_not_sent(kind: str, stack: int, reason:
     assert bench.texts_with("fixes") == [f"no fixes to the autopilot: {reason}"]
 
 
-def test_a_refusal_is_told_once_and_so_is_its_end() -> None:
+def test_a_refusal_is_reported_once_and_so_is_its_end() -> None:
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
     bench.receive("COMMAND_ACK", **ACK, result=2)
     assert bench.texts_with("refuses") == [], "nothing was asked of it yet"
@@ -128,7 +128,7 @@ def test_a_refusal_is_told_once_and_so_is_its_end() -> None:
     assert bench.texts_with("refuses") == ["the autopilot refuses fixes: result 77"]
 
 
-def test_an_autopilot_that_does_not_answer_is_told() -> None:
+def test_an_autopilot_that_does_not_answer_is_reported() -> None:
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")
     for k in range(3):
         bench.to(10 * k)

@@ -41,7 +41,7 @@ def first(run: Run, state: GnssState, after: float) -> float:
     return float(found[0] - after) if found.size else np.inf
 
 
-def test_an_honest_receiver_is_never_rejected() -> None:
+def test_a_consistent_receiver_is_never_rejected() -> None:
     run = fly()
     assert (run.gnss == GnssState.GOOD).all()
     assert run.sent[-1] == 0

@@ -42,7 +42,7 @@ def flown(tmp_path: Path) -> Flown:
     return tmp_path, pipeline, pipeline.learning
 
 
-def test_it_is_kept_beside_the_first(flown: Flown) -> None:
+def test_it_is_kept_next_to_the_first(flown: Flown) -> None:
     """An ordinary calibration with its provenance; only changes are written."""
     folder, _, learning = flown
     path = kept_path(load_config(folder / "bridge.toml"))

@@ -131,7 +131,7 @@ def test_strangers_never_take_the_autopilot_s_place(first: bool) -> None:
         assert port.notice() == ""
 
 
-def test_two_who_speak_as_the_autopilot_are_told() -> None:
+def test_two_senders_as_the_autopilot_are_reported() -> None:
     both = Peers(PILOT)
     for who in "ab":
         both.receive(who, beat())
@@ -212,7 +212,7 @@ def test_connections_never_turn_the_autopilot_out() -> None:
         assert autopilot.recv(9) == b"field"
 
 
-def test_a_client_that_only_listens_has_to_go_for_one_that_speaks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_only_listens_gives_way_to_one_that_sends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("magbridge.bridge.sockets.GREETING", 0.0)
     with opened("tcpin") as (port, place), ExitStack() as stack:
         mute = [stack.enter_context(socket.create_connection(place)) for _ in range(CONNECTIONS)]

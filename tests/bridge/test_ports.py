@@ -50,7 +50,7 @@ def drained(reader: socket.socket, size: int) -> bytes:
     return data
 
 
-def test_a_slow_reader_loses_whole_messages_and_stalls_nobody() -> None:
+def test_a_slow_reader_loses_whole_messages_and_stalls_no_other() -> None:
     with socket.socket() as server:
         server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         server.bind(("127.0.0.1", 0))

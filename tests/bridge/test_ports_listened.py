@@ -114,7 +114,7 @@ def test_a_busy_port_names_the_program_that_holds_it() -> None:
 
 
 @pytest.mark.parametrize("driver", driver_names())
-def test_every_option_of_a_driver_is_told(driver: str, command: Command) -> None:
+def test_every_option_of_a_driver_is_reported(driver: str, command: Command) -> None:
     output = command("drivers", driver).out
     for one in options_of(driver):
         assert one.name in output

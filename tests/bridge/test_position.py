@@ -79,7 +79,7 @@ def test_the_anomaly_follows_when_the_host_s_clock_is_set(tmp_path: Path) -> Non
     assert abs(change) > 300.0
 
 
-def test_why_there_is_no_field_is_told() -> None:
+def test_why_there_is_no_field_is_reported() -> None:
     reported: list[str] = []
     position = position_at(49.5, -57.9, 0.0, reported.append)
     assert isnan(position.main_field(START, round(datetime(2031, 1, 1, tzinfo=UTC).timestamp() * 1e6)))

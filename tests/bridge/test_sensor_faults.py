@@ -139,7 +139,7 @@ def test_second_bridge_on_the_same_sensor(rig: Rig, table: Row) -> None:
     )
 
 
-def test_sensor_back_under_another_name_and_powered_anew(rig: Rig, table: Row) -> None:
+def test_sensor_back_under_another_name_and_powered_again(rig: Rig, table: Row) -> None:
     rig.until_well()
     mark = rig.mark
     rig.fluxgate.unplug()

@@ -54,7 +54,7 @@ def bench(tmp_path: Path) -> Bench:
     return made
 
 
-def test_half_a_line_is_no_sample(bench: Bench) -> None:
+def test_half_a_line_is_not_a_sample(bench: Bench) -> None:
     """Neither the one that the bridge came into, nor two halves from before and after an unplugging."""
     whole = LINE % 1.0
     bench.receive(0.1, whole[4:])
@@ -65,7 +65,7 @@ def test_half_a_line_is_no_sample(bench: Bench) -> None:
     assert bench.raw == [12340.5, 12340.5]
 
 
-def test_an_instrument_that_sends_rarely_is_heard_each_time(bench: Bench) -> None:
+def test_an_instrument_that_sends_rarely_is_received_each_time(bench: Bench) -> None:
     """`sensor.timeout` is 10 s: a request to restart costs no reading."""
     for k in range(5):
         bench.receive(15.0 * k, LINE % (15.0 * k))
@@ -73,7 +73,7 @@ def test_an_instrument_that_sends_rarely_is_heard_each_time(bench: Bench) -> Non
     assert "ascii is silent" in bench.texts
 
 
-def test_an_instrument_that_hangs_is_told(bench: Bench) -> None:
+def test_an_instrument_that_hangs_is_reported(bench: Bench) -> None:
     """After a minute, and that it changes again; a few readings that happen to be equal are none."""
     for k in range(130):
         z = -234.5 if 5 <= k < 30 or 40 <= k < 110 else float(k)
@@ -94,7 +94,7 @@ GGA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
         (bytes(range(250, 256)) + b"\r\n", "sends, but no readings: baud rate?"),
     ],
 )
-def test_an_instrument_that_speaks_otherwise_is_not_silent(bench: Bench, line: bytes, what: str) -> None:
+def test_an_instrument_with_another_protocol_is_not_silent(bench: Bench, line: bytes, what: str) -> None:
     for k in range(41):
         bench.receive(k, line)
     assert not bench.raw

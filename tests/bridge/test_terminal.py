@@ -33,7 +33,7 @@ WANTED = ("until Ctrl-C", "no calibration: raw field", "hmr2300 lost: No such fi
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_terminal_is_told_what_the_link_is(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_terminal_gets_the_state_of_the_link(tmp_path: Path, number: signal.Signals) -> None:
     """Until it receives a signal, or the terminal is closed."""
     with on_a_terminal(tmp_path) as (process, terminal):
         read_until(terminal, WANTED)
@@ -41,7 +41,7 @@ def test_a_terminal_is_told_what_the_link_is(tmp_path: Path, number: signal.Sign
         assert process.wait(30.0) == 0
 
 
-def test_a_calibration_that_its_data_do_not_support_is_told(tmp_path: Path) -> None:
+def test_a_calibration_that_its_data_do_not_support_is_reported(tmp_path: Path) -> None:
     save(replace(identity(), method="nominal", warnings=("few headings",)), tmp_path / "cal.json")
     with on_a_terminal(tmp_path, '[calibration]\nfile = "cal.json"') as (process, terminal):
         read_until(terminal, ("calibration is not supported by its data",))
@@ -49,7 +49,7 @@ def test_a_calibration_that_its_data_do_not_support_is_told(tmp_path: Path) -> N
         assert process.wait(30.0) == 0
 
 
-def test_a_terminal_that_hangs_holds_nobody_up(tmp_path: Path) -> None:
+def test_a_terminal_that_hangs_does_not_stop_the_bridge(tmp_path: Path) -> None:
     """Ctrl-S, or a connection that is gone: the bridge runs, and ends at a signal."""
     with on_a_terminal(tmp_path, log='[log]\ndirectory = "."') as (process, terminal):
         read_until(terminal, WANTED[:1])

@@ -124,7 +124,9 @@ def later(runs: xr.Dataset, days: int) -> xr.Dataset:
     return changed(runs, **sampled).assign_coords(time=runs["time"].to_numpy() + shift)
 
 
-def test_a_log_that_adds_nothing_is_told(runs: xr.Dataset, good: tuple[Path, Path], command: Command) -> None:
+def test_a_log_that_adds_nothing_is_reported(
+    runs: xr.Dataset, good: tuple[Path, Path], command: Command
+) -> None:
     """Its samples were missing from the fit without a word."""
     write(changed(later(runs, 1), mag_x=np.nan), "no_x.csv")
     write(later(runs, 2).drop_vars("battpos"), "no_mass.csv")
@@ -142,7 +144,7 @@ def test_a_log_that_adds_nothing_is_told(runs: xr.Dataset, good: tuple[Path, Pat
     assert once == all_logs
 
 
-def test_logs_of_two_vehicles_are_told_apart(
+def test_logs_of_two_vehicles_are_distinguished(
     runs: xr.Dataset, good: tuple[Path, Path], command: Command
 ) -> None:
     """But not those of one, on two days."""

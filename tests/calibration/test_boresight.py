@@ -35,7 +35,7 @@ def test_boresight_is_found_and_makes_the_vector_right() -> None:
 
 
 @pytest.mark.parametrize(("pitch", "turn"), [(0.0, 17.4), (24.0, 7.4)])
-def test_magnetic_headings_that_are_taken_for_true_are_told(pitch: float, turn: float) -> None:
+def test_magnetic_headings_that_are_taken_for_true_are_reported(pitch: float, turn: float) -> None:
     """A level vehicle's mounting looks turned by the declination; a glider's by less than half of it."""
     rng = np.random.default_rng(2)
     n = 2000
@@ -62,7 +62,7 @@ def test_magnetic_headings_that_are_taken_for_true_are_told(pitch: float, turn: 
     assert magnetic_headings(identity(), turned) == ""
 
 
-def test_a_reversed_channel_gets_no_boresight_and_is_said() -> None:
+def test_a_reversed_channel_gets_no_boresight_and_is_reported() -> None:
     rng = np.random.default_rng(1)
     n = 400
     attitude = np.column_stack([rng.normal(0, 0.1, n), rng.normal(0, 0.4, n), rng.uniform(0, 2 * np.pi, n)])

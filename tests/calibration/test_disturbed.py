@@ -35,5 +35,5 @@ def circles(disturbed: float) -> Observations:
 
 
 @pytest.mark.parametrize(("disturbed", "methods"), [(0.0, {"survey"}), (1500.0, {"auto", "nominal"})])
-def test_what_motors_do_is_not_taken_for_rock(disturbed: float, methods: set[str]) -> None:
+def test_the_field_of_motors_is_not_taken_for_a_crustal_field(disturbed: float, methods: set[str]) -> None:
     assert fit(circles(disturbed)).calibration.method in methods

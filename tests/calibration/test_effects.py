@@ -147,7 +147,7 @@ def test_backlash_is_a_loop_of_its_width() -> None:
     np.testing.assert_allclose(small, [0.0, -0.25, 0.25, 0.25, -0.375], atol=1e-6)
 
 
-def test_steel_beside_the_path_makes_a_loop_that_closes_farther_away() -> None:
+def test_steel_next_to_the_path_makes_a_loop_that_closes_farther_away() -> None:
     near = PlayEffect(cause="", channel="fin", width=0.1, centre=0.3, scale=0.1)
     t = np.arange(float(len(SWEEP)))
     loop = np.abs(stepped(near, t, SWEEP)[:, 0])
@@ -184,7 +184,7 @@ def test_the_rate_of_a_steadily_accelerating_field_is_exact() -> None:
 
 
 @pytest.mark.parametrize("on", ["skew", "eddy"])
-def test_a_rate_moves_the_channels_that_it_is_said_to(on: str) -> None:
+def test_a_rate_moves_the_channels_that_it_names(on: str) -> None:
     size, t = {"skew": 3, "eddy": 6}[on], np.arange(4.0)
     ramp = np.outer(t, [100.0, 10.0, 1.0])
     rates = {"skew": np.diag([100.0, 10.0, 1.0]), "eddy": np.zeros((6, 3))}[on]

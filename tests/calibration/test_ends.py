@@ -26,7 +26,7 @@ def drone(crash: int, n: int = 500) -> Observations:
     )
 
 
-def test_a_crash_is_left_out_and_told() -> None:
+def test_a_crash_is_left_out_and_reported() -> None:
     found = fit(drone(60))
     error, standardised = in_sensor_units(found.calibration, drone(0))
     assert found.details["ends"] == pytest.approx(60, abs=2)

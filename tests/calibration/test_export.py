@@ -150,7 +150,7 @@ def test_autopilots_correct_as_we_do(current: bool) -> None:
     np.testing.assert_allclose(theirs * 1e5, ours, atol=0.01)
 
 
-def test_what_an_autopilot_cannot_hold_is_said(tmp_path: Path) -> None:
+def test_what_an_autopilot_cannot_hold_is_reported(tmp_path: Path) -> None:
     save(made(*TWO), tmp_path / "cal.json")
     lost = " ".join(compass_of(load(tmp_path / "cal.json")).lost)
     assert "the field of battpos, ballast: up to " in lost

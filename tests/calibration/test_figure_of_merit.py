@@ -47,7 +47,7 @@ def test_the_twelve_manoeuvres_and_their_sum() -> None:
     assert merit["improvement_ratio"] == pytest.approx(30.0, rel=0.01)
 
 
-def test_a_flight_without_manoeuvres_and_a_slow_log_are_no_box() -> None:
+def test_a_flight_without_manoeuvres_and_a_slow_log_do_not_count_as_a_box() -> None:
     time, angles, _ = box()
     assert box_flight(time, 0.1 * angles[:, 0], 0.1 * angles[:, 1], np.full(len(time), 20.0)) is None
     assert box_flight(time[::10], *angles[::10].T) is None

@@ -105,7 +105,7 @@ def test_an_older_format_is_read(cal: Calibration) -> None:
     assert encode_calibration(decode_calibration(edit(older, cal))) == encode_calibration(cal)
 
 
-def test_doubts_come_back_and_older_readers_refuse_them(cal: Calibration) -> None:
+def test_warnings_are_read_back_and_older_readers_refuse_them(cal: Calibration) -> None:
     doubtful = replace(cal, warnings=("all headings lie within 60 degrees",))
     data = encode_calibration(doubtful)
     assert json.loads(data)["format"] == 3
@@ -233,7 +233,7 @@ def test_any_damage_is_read_or_refused_in_one_line(places: list[tuple[int, int]]
         assert "\n" not in output
 
 
-def test_a_key_that_is_no_text(cal: Calibration) -> None:
+def test_a_key_that_is_not_text(cal: Calibration) -> None:
     with pytest.raises(FormatError, match="not a calibration"):
         decode_calibration(encode_calibration(cal).replace(b'"name":"', b'"\xf9ame":"'), "cal.json")
 

@@ -175,7 +175,7 @@ def test_the_paper_s_signature(glider: Gliders) -> None:
     assert rms_on_survey(by["nominal"].calibration, one) > 20.0
 
 
-def test_an_order_that_is_too_low_is_told(glider: Gliders) -> None:
+def test_an_order_that_is_too_low_is_reported(glider: Gliders) -> None:
     """Its sigmas are too small because a term is missing; with the usual order they are not."""
     two = glider(0, 2)
     low, usual = fit(two.runs, "auto", 1), fit(two.runs, "auto", 3)
@@ -325,7 +325,7 @@ def test_a_site_bias_is_in_every_sigma(glider: Gliders) -> None:
     np.testing.assert_allclose(np.sqrt(after.sigma**2 - before.sigma**2), 30.0, rtol=0.01)
 
 
-def test_least_squares_of_the_whitened_is_generalised_least_squares_beside_gaps_too() -> None:
+def test_least_squares_of_the_whitened_is_generalised_least_squares_next_to_gaps_too() -> None:
     """Against the naive oracle: the covariance of an AR(1) of which some samples are lost, inverted."""
     rng = np.random.default_rng(2)
     place = np.flatnonzero(rng.random(120) > 0.2)
@@ -337,7 +337,7 @@ def test_least_squares_of_the_whitened_is_generalised_least_squares_beside_gaps_
     np.testing.assert_allclose(white.T @ white, X.T @ np.linalg.solve(C, X), rtol=1e-9)
 
 
-def test_a_slow_part_beside_white_noise_is_whitened_in_any_blocks() -> None:
+def test_slow_and_white_noise_are_whitened_in_any_blocks() -> None:
     """Against the naive oracle, as above; and in blocks as at once."""
     rng = np.random.default_rng(3)
     place = np.flatnonzero(rng.random(150) > 0.2)

@@ -23,7 +23,7 @@ def test_table_1_sees_63_of_90_coefficients(glider: Gliders) -> None:
     assert (np.diff(seen.sigma) >= 0.0).all()
 
 
-def test_readings_that_a_fit_multiplies_are_told(glider: Gliders) -> None:
+def test_readings_that_a_fit_multiplies_are_reported(glider: Gliders) -> None:
     """Anomalies shrink with the readings: a reference that is wrong along the track can do that unnoticed."""
     runs = glider(0, 2).runs
     reported = [fit(replace(runs, field=gain * runs.field), "nominal").warnings for gain in (1.0, 1.3, 0.8)]
@@ -59,7 +59,7 @@ def test_a_fit_from_a_corner_of_the_compass_is_not_supported(glider: Gliders) ->
     assert fit(runs, "nominal").supported
 
 
-def test_a_fit_that_the_data_cannot_hold_says_so(glider: Gliders) -> None:
+def test_a_fit_that_the_data_cannot_hold_reports_it(glider: Gliders) -> None:
     runs = glider(0, 2).runs
     few = runs.part((np.asarray(runs.runs) < 2) & (np.cos(runs.attitude[:, 2]) > 0.5))
     found = fit(few, "cubic")

@@ -62,7 +62,7 @@ def test_level_is_known_as_well_as_the_reference(survey: Survey) -> None:
     assert abs(np.mean(got.total - true)) < 2.5 * level
 
 
-def test_rock_is_not_taken_for_noise(survey: Survey) -> None:
+def test_crustal_field_is_not_taken_for_noise(survey: Survey) -> None:
     """Amplitude and length are those of the crustal field, the noise is the sensor's."""
     rock = survey[2].details["rock"]
     assert 20.0 < rock["size_nT"] < 100.0
@@ -203,7 +203,7 @@ def test_steps_that_are_shortened_get_the_rounds_they_take(
     assert 0.8 < error / sigma < 1.25
 
 
-def test_a_zigzag_tells_rock_from_heading_without_a_crossing() -> None:
+def test_a_zigzag_separates_crustal_field_and_heading_without_a_crossing() -> None:
     """Rock is smooth about a turn, and what changes there is the vehicle's."""
     data, true = flown(zigzag=True)
     found = fit(data)
@@ -213,7 +213,7 @@ def test_a_zigzag_tells_rock_from_heading_without_a_crossing() -> None:
     assert 0.8 < error / sigma < 1.25
 
 
-def test_a_jump_in_position_is_left_out_and_told() -> None:
+def test_a_jump_in_position_is_left_out_and_reported() -> None:
     """A fix on the other side of the Earth must not spread the nodes there."""
     data, true = flown(legs=8)
     assert data.place is not None
@@ -226,7 +226,7 @@ def test_a_jump_in_position_is_left_out_and_told() -> None:
     assert sum(run.samples for run in found.calibration.runs) == len(data) - 3
 
 
-def test_samples_without_a_position_are_told_apart_from_a_jump() -> None:
+def test_samples_without_a_position_are_distinguished_from_a_jump() -> None:
     """A gap in the positions does not count as a jump; a fix that moves the rest of the track does."""
     data, true = flown(legs=8)
     assert data.place is not None
@@ -262,7 +262,7 @@ def over(data: Observations, length: float) -> Observations:
     return replace(data, field=data.field * (1.0 + rock / np.linalg.norm(data.field, axis=1))[:, None])
 
 
-def test_rock_rougher_than_the_tracks_is_not_supported(survey: Survey) -> None:
+def test_crustal_field_rougher_than_the_tracks_is_not_supported(survey: Survey) -> None:
     """A crustal field of 35 m between tracks at 90 m: one message reports it, and the sigma is consistent."""
     smooth, true = flown(legs=2)
     data, every_second = over(smooth, 35.0), np.arange(len(smooth)) % 2 == 0
@@ -276,7 +276,7 @@ def test_rock_rougher_than_the_tracks_is_not_supported(survey: Survey) -> None:
     assert survey[2].supported
 
 
-def test_rock_is_rough_beside_the_distance_of_tracks_or_at_the_shortest_length() -> None:
+def test_a_field_is_rough_given_the_distance_of_tracks_or_at_the_shortest_length() -> None:
     """Lines 400 m apart; a straight line has no distance between tracks."""
     along = np.arange(0.0, 4_000.0, 20.0)
     turned = [along[:: 1 if line % 2 else -1] for line in range(11)]
@@ -287,13 +287,13 @@ def test_rock_is_rough_beside_the_distance_of_tracks_or_at_the_shortest_length()
     assert not list(too_rough(lines[:200], 10.0))
 
 
-def test_an_hour_is_fitted_with_an_honest_sigma() -> None:
+def test_an_hour_is_fitted_with_a_consistent_sigma() -> None:
     data, true = flown(legs=8)
     error, sigma = error_of(fit(data, "survey"), data, true)
     assert 0.5 < error / sigma < 1.25
 
 
-def test_a_track_that_drifts_is_bent_to_where_the_rock_repeats() -> None:
+def test_a_track_that_drifts_is_bent_to_where_the_crustal_field_repeats() -> None:
     """Positions that are slowly off by 150 m: as exact ones, where the fit knows that they may be."""
     data, true = flown()
     t = (data.time - data.time[0]) / np.ptp(data.time)
@@ -312,7 +312,7 @@ def slowly(data: Observations) -> Observations:
     return replace(data, time=1e9 + 3.0 * (data.time - data.time[0]))
 
 
-def test_a_mass_that_begins_to_move_unseen_is_no_creep_of_the_offset() -> None:
+def test_a_mass_that_begins_to_move_unseen_is_not_a_creep_of_the_offset() -> None:
     """A motion may begin between two reports: samples near it are neither field nor drift."""
     data, true = flown(legs=14)
     leg, within = np.divmod(np.arange(len(data)), 110)
@@ -360,7 +360,7 @@ def test_temperature_that_moves_nothing_is_left_out(survey: Survey) -> None:
     assert error_of(found, data, true)[0] < 1.05 * error_of(plain, data, true)[0]
 
 
-def test_a_creep_that_shaped_the_rock_for_itself_goes_where_a_search_without_does_better(
+def test_a_creep_that_distorted_the_field_goes_where_a_search_without_it_is_better(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """All offered terms are kept at first, as in a search in which the crustal field needs them."""
@@ -375,7 +375,7 @@ def test_a_creep_that_shaped_the_rock_for_itself_goes_where_a_search_without_doe
     assert error_of(found, data, true)[0] < 1.15 * NOISE
 
 
-def test_creep_of_the_offset_goes_neither_into_rock_nor_into_the_map() -> None:
+def test_creep_of_the_offset_goes_neither_into_the_field_nor_into_the_map() -> None:
     """20 nT in 6 h: the map is as without it; the calibration holds the mean, its sigma the rest."""
     data, true = flown()
     data = slowly(data)

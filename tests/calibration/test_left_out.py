@@ -42,7 +42,7 @@ def predicted(data: Observations, runs: np.ndarray) -> float:
     return refitted(nominal_samples(data), one.prior, one.z, fitted, runs)
 
 
-def test_a_run_that_is_most_of_the_log_is_no_part() -> None:
+def test_a_run_that_is_most_of_the_log_is_not_a_part() -> None:
     """What the rest says of it would judge how far a fit can be carried, not how well it fits."""
     data = copter(1)
     quarters = np.zeros(600)

@@ -64,7 +64,7 @@ def test_convert_there_and_back_keeps_every_number(deployment: Path, command: Co
         np.testing.assert_array_equal(before[name], after[name], err_msg=str(name))
 
 
-def test_what_was_passed_over_is_told(deployment: Path, command: Command) -> None:
+def test_what_was_passed_over_is_reported(deployment: Path, command: Command) -> None:
     """Messages about damaged and overlapping logs come once, not again for derived files."""
     rows = read(deployment).isel(time=slice(0, 200))
     log = Path("log.tlog")
@@ -135,7 +135,7 @@ def test_what_correct_writes_is_netcdf_that_others_read(
     np.testing.assert_array_equal(flags % 1, 0.0)
 
 
-def test_a_field_that_the_earth_does_not_have_is_said(
+def test_a_field_that_the_earth_does_not_have_is_reported(
     deployment: Path, calibration: Path, command: Command
 ) -> None:
     """As with another vehicle's calibration: the magnets that it knows of are not those of this one."""
@@ -194,7 +194,7 @@ def test_a_column_that_the_calibration_needs_is_missed_aloud(deployment: Path, c
     assert "extrapolated " in output.out
 
 
-def test_a_grid_that_is_not_used_is_told(deployment: Path, calibration: Path, command: Command) -> None:
+def test_a_grid_that_is_not_used_is_reported(deployment: Path, calibration: Path, command: Command) -> None:
     """It is added to the IGRF, and a log with a reference of its own does without either."""
     command(
         "simulate",
@@ -218,7 +218,7 @@ def test_a_grid_that_is_not_used_is_told(deployment: Path, calibration: Path, co
     assert words in command("calibrate", deployment, "--grid", "grid.nc", "-o", "x.json").err
 
 
-def test_numbers_that_may_say_not_known_are_told(
+def test_numbers_that_may_say_not_known_are_reported(
     deployment: Path, calibration: Path, command: Command
 ) -> None:
     rows = read(deployment).isel(time=slice(0, FEW))
@@ -236,7 +236,7 @@ def test_numbers_that_may_say_not_known_are_told(
     assert np.isnan(read(declared)["pump_current"]).sum() == 2
 
 
-def test_a_log_that_the_calibration_was_made_from_is_told(deployment: Path, command: Command) -> None:
+def test_a_log_that_the_calibration_was_made_from_is_reported(deployment: Path, command: Command) -> None:
     write(read(deployment).isel(time=slice(0, FEW)), "log.csv")
     command("calibrate", "log.csv", "--method", "nominal", "-o", "cal.json", "--force")
     output = command("diagnose", "log.csv", "--calibration", "cal.json", "-o", "doubt", code=1)

@@ -67,7 +67,7 @@ def test_a_field_that_is_the_earths_in_no_unit() -> None:
     assert hint == "the vector's length is 1.178e+05 nT (median)"
 
 
-def test_a_depth_that_counts_upwards_is_doubted() -> None:
+def test_a_depth_that_counts_upwards_is_questioned() -> None:
     hints = info(made("log", [START, START + 1], {"depth": np.array([-12.0, np.nan])}))["hints"]
     assert "depth is -12 m (median): if it counts upwards, scale = -1 in columns.toml" in hints
 
@@ -77,7 +77,7 @@ def test_a_vector_that_is_never_known_has_no_length() -> None:
     assert not any("length" in hint for hint in info(made("log", [START, START + 1], unknown))["hints"])
 
 
-def test_what_moves_the_field_is_no_state_of_the_vehicle() -> None:
+def test_what_moves_the_field_is_not_a_state_of_the_vehicle() -> None:
     """Nor a counter, nor a statement that a value is valid."""
     names = {"pump": "A", "water": "degC", "supply": "V", "mast": "1", "speed": "m/s", "still": "A"}
     names |= {"MagValid": "1", "Counter": "1"}
@@ -123,7 +123,7 @@ TAKE_LOGS = "calibrate convert correct diagnose info navigate plan replay simula
 
 
 @pytest.mark.parametrize("name", TAKE_LOGS.split())
-def test_every_command_that_takes_a_log_is_told_how_to_read_it(name: str, command: Command) -> None:
+def test_every_command_that_takes_a_log_has_the_reading_options(name: str, command: Command) -> None:
     output = command(name, "--help").out
     for option in ("--column ", "--columns", "--compass", "--date", "--strict"):
         assert option in output, option

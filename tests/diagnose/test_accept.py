@@ -74,7 +74,7 @@ def test_dives_left_out_overrule_a_name_that_fits() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_only_what_stands_without_slow_noise_is_searched_for_beside_it(
+def test_only_effects_found_without_slow_noise_are_searched_given_it(
     share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, rng = right(ROWS), np.random.default_rng(10)

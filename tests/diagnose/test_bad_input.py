@@ -84,12 +84,12 @@ def test_a_full_disk_names_the_file_that_has_no_room(
         assert not list(tmp_path.iterdir())
 
 
-def test_a_number_beyond_all_measure_is_no_reading(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_a_number_beyond_all_measure_is_not_a_reading(plain: tuple[xr.Dataset, Calibration]) -> None:
     wild = plain[0].assign(mag_x=plain[0]["mag_x"].where(some(plain[0], 10), 1e300))
     assert diagnose([wild], plain[1]).diagnosis.verdict == "nothing_found"
 
 
-def test_how_old_a_parameter_was_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_how_old_a_parameter_was_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     """The log of a bridge says it; nothing can follow it."""
     aged = plain[0].assign(age_battpos=plain[0]["time"] % 3.0)
     assert load_survey([aged], plain[1]).channels.keys() == load_survey([plain[0]], plain[1]).channels.keys()
@@ -133,7 +133,7 @@ def test_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_an_effects_channel_that_holds_nothing_is_said_to_be_empty(
+def test_an_effects_channel_that_holds_nothing_is_reported_to_be_empty(
     plain: tuple[xr.Dataset, Calibration],
 ) -> None:
     ds, calibration = plain
@@ -157,7 +157,7 @@ def test_a_hundred_samples_are_few_but_enough(plain: tuple[xr.Dataset, Calibrati
     assert diagnose([plain[0].isel(time=slice(0, 100))], plain[1]).diagnosis.verdict == "nothing_found"
 
 
-def test_telemetry_that_stands_still_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_telemetry_that_stands_still_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     ds = plain[0]
     still = ds.assign({name: 0.0 * ds[name] + ds[name].mean() for name in ("sensor_temperature", "depth")})
     found = diagnose([still], plain[1]).diagnosis
@@ -200,7 +200,7 @@ def test_a_place_is_in_metres_on_the_ellipsoid(plain: tuple[xr.Dataset, Calibrat
     np.testing.assert_allclose(survey.place[:, :2], track - np.median(track, axis=0), atol=0.1)
 
 
-def test_where_there_are_no_dives_it_is_not_said_that_dives_were_left_out(
+def test_without_dives_no_dives_are_reported_as_held_out(
     plain: tuple[xr.Dataset, Calibration],
 ) -> None:
     ds, calibration = plain
@@ -208,7 +208,7 @@ def test_where_there_are_no_dives_it_is_not_said_that_dives_were_left_out(
     assert load_survey([ds.drop_vars(["depth", "run"])], calibration).parts == "eighths of the log"
 
 
-def test_another_magnetometer_is_no_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
+def test_another_magnetometer_is_not_telemetry(plain: tuple[xr.Dataset, Calibration]) -> None:
     """It would explain whatever the Earth's field does."""
     ds, calibration = plain
     both = ds.assign(second=ds["mag_x"].assign_attrs(units="nT"))

@@ -152,7 +152,7 @@ def test_what_is_written(warm: tuple[xr.Dataset, Calibration], written: tuple[Pa
     assert "http" not in page.replace("http-equiv", "")
 
 
-def test_a_maps_error_is_told_by_its_size(short: None) -> None:
+def test_a_maps_error_is_reported_by_its_size(short: None) -> None:
     """A hundred functions of the place say nothing to anyone; their RMS does."""
     here = deployment.Background.of(deployment.vehicle(0), 24, "white")
     hidden = here.hide("map_error", 40.0, 24)

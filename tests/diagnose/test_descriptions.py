@@ -146,7 +146,7 @@ def test_turns_and_the_surface_are_among_the_descriptions(
     assert min(left_of(warm, X) for X in columns if X.shape[1] == 24) < 0.01
 
 
-def test_a_sensitivity_that_follows_a_channel_is_no_offset_that_does(
+def test_a_sensitivity_that_follows_a_channel_is_not_an_offset(
     problem: Problem, listed: list[Description]
 ) -> None:
     offset, scale = (
@@ -159,7 +159,7 @@ def test_a_sensitivity_that_follows_a_channel_is_no_offset_that_does(
     assert [one.covers([scale]) for one in of_channel] == [False, False, True]
 
 
-def test_where_a_channel_has_one_cause_its_sensitivity_is_no_alternative(
+def test_where_a_channel_has_one_cause_its_sensitivity_is_not_an_alternative(
     problem: Problem, listed: list[Description]
 ) -> None:
     """In a vehicle that turns little, a current's field looks like a sensitivity that follows the current."""

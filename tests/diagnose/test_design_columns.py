@@ -32,12 +32,12 @@ def test_what_is_shared_is_there_once(table: FloatArray) -> None:
     np.testing.assert_allclose(origins[0].times(np.array([2.0, 7.0]))(ROWS), each[0] * [2.0, 7.0])
 
 
-def test_columns_that_are_no_mixture_are_their_own_part(table: FloatArray) -> None:
+def test_columns_without_a_mixture_are_their_own_part(table: FloatArray) -> None:
     ((own, M),) = parts(table.__getitem__)
     np.testing.assert_array_equal(own(ROWS) @ M, table[ROWS])
 
 
-def test_blocks_beside_each_other_are_stored_column_by_column(table: FloatArray) -> None:
+def test_blocks_next_to_each_other_are_stored_column_by_column(table: FloatArray) -> None:
     whole = side_by_side([table[:, :1], np.asfortranarray(table[:, 1:])])
     np.testing.assert_array_equal(whole, table)
     assert whole.flags.f_contiguous

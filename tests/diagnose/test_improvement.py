@@ -74,7 +74,7 @@ def test_what_the_calibration_would_have_to_become_counts_against_it(problem: Pr
     assert scores[0] > scores[1] + 10.0
 
 
-def test_what_acts_in_one_dive_only_is_no_surprise_that_counts_against_it(problem: Problem) -> None:
+def test_what_acts_in_one_dive_only_is_not_a_surprise_that_counts_against_it(problem: Problem) -> None:
     """Its own dive is predicted with the prior's uncertainty, not with a zero that it contradicts."""
     once = (problem.survey.dive == 2).astype(float)[:, None]
     columns = [lambda rows: 10.0 * once[rows]]

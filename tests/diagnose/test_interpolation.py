@@ -64,7 +64,7 @@ def test_the_delays_are_found() -> None:
     np.testing.assert_allclose(late.later, found[1:], atol=1e-9)
 
 
-def test_the_delays_stay_where_the_comparison_is_linearised_anew() -> None:
+def test_the_delays_stay_where_the_comparison_is_linearised_again() -> None:
     """A calibration that is extended by another cause has no delays."""
     whole = right(3000)
     time = whole.survey.time

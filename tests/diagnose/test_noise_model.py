@@ -124,7 +124,7 @@ def test_least_squares_of_the_filtered_is_generalised_least_squares(
 
 
 @pytest.mark.parametrize("lost", ["every 24th", "one in twelve", "76 of 100"])
-def test_what_says_how_much_a_constant_pulls_is_right_beside_gaps(lost: str) -> None:
+def test_the_information_about_a_constant_is_right_next_to_gaps(lost: str) -> None:
     """Under white noise upon one that remembers 40 samples, fitted with 8 coefficients."""
     pulls = []
     for seed in range(60):

@@ -57,7 +57,7 @@ def judged(residual: np.ndarray, order: int) -> Outliers | None:
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6])
-def test_isolated_samples_are_told_from_a_passage(rho: float) -> None:
+def test_isolated_samples_are_distinguished_from_a_passage(rho: float) -> None:
     """Also where the noise's correlation spreads a wrong sample over the innovations after it."""
     rows = np.arange(400, N, 700)
     for seed in range(5):
@@ -71,7 +71,7 @@ def test_isolated_samples_are_told_from_a_passage(rho: float) -> None:
 
 @pytest.mark.parametrize("nu", [3.0, 50.0])
 @pytest.mark.parametrize("rho", [0.0, 0.6])
-def test_good_neighbours_are_rarely_doubted(nu: float, rho: float) -> None:
+def test_good_neighbours_are_rarely_questioned(nu: float, rho: float) -> None:
     """Nor those of the noise's own large innovations, which its correlation carries on."""
     rows = np.arange(300, N, 500)
     reported = [one.neighbours for seed in range(25) if (one := found(3.0 * SPIKE, rows, rho, seed, nu))]
@@ -82,7 +82,7 @@ def test_good_neighbours_are_rarely_doubted(nu: float, rho: float) -> None:
 
 @pytest.mark.parametrize("order", [2, 13])
 @pytest.mark.parametrize("rho", [0.0, 0.95])
-def test_what_switches_is_no_wrong_sample(rho: float, order: int) -> None:
+def test_a_switching_source_is_not_a_wrong_sample(rho: float, order: int) -> None:
     """Noise of a long memory absorbs a relay except its switching, which was reported as outliers."""
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -96,7 +96,7 @@ def test_what_switches_is_no_wrong_sample(rho: float, order: int) -> None:
         assert (spikes.lasting, spikes.isolated) == (False, True)
 
 
-def test_beside_a_gap_there_is_none_to_ask() -> None:
+def test_next_to_a_gap_a_sample_has_no_neighbour() -> None:
     alone = found(3.0 * SPIKE, np.array([N // 3 + 1]), 0.0, 3)
     assert alone is not None
     assert alone.neighbours == 1.0

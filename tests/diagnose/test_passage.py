@@ -12,7 +12,7 @@ from magbridge.diagnose.packets import passage
 from magbridge.diagnose.problem import Problem
 
 
-def test_a_dipole_that_passes_is_told_by_three_numbers(problem: Problem) -> None:
+def test_a_dipole_that_passes_is_reported_by_three_numbers(problem: Problem) -> None:
     """Against a dipole's field on a straight course, along the Earth's: Anderson's functions hold it."""
     t = problem.survey.time - problem.survey.time[0]
     speed, nearest = 900.0 / (0.02 * t[-1]), 0.6 * t[-1]

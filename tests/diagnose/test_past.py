@@ -38,7 +38,7 @@ def test_nothing_is_known_before_a_log_and_where_another_begins() -> None:
     assert s.past(3) is s.past(3)
 
 
-def test_samples_beside_a_gap_have_the_lags_of_those_that_are_there() -> None:
+def test_samples_next_to_a_gap_have_the_lags_of_those_that_are_there() -> None:
     past = Past(np.array([MAX_LAG, 1, 1, 3, 1, 1, MAX_LAG, 1]), 2)
     lags = {
         int(row): past.lags[pattern].tolist() for row, pattern in zip(past.rows, past.pattern, strict=True)

@@ -146,7 +146,7 @@ def test_sizes_of_one_unit_name_it_once() -> None:
     assert sizes({"x": (np.inf, "nT")}) == "no plausible size reaches it"
 
 
-def test_a_cause_that_is_larger_than_such_causes_are_is_doubted() -> None:
+def test_a_cause_of_unusual_size_is_questioned() -> None:
     """A constant of 1,200 nT where main-field models are 100 nT off."""
     bias = candidate("reference_bias", np.ones(1), width=np.array([100.0]))
     assert times_usual(bias, np.array([-12.0])) == 12.0 > IMPLAUSIBLE_MULTIPLE
@@ -203,7 +203,7 @@ def test_a_channel_without_a_unit_shows_none(unit: str) -> None:
     assert not any(unit.endswith((" 1)", "/1", ".3 1")) for unit in units)
 
 
-def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
+def test_a_shift_of_the_whole_field_with_a_wrong_reference_is_reported() -> None:
     """A constant may belong to either; with a true reference it is the vehicle's."""
     problem = right(100)
     grown = problem.calibration.coefficients + np.repeat([20.0, 0.0], [3, 6])
@@ -221,7 +221,7 @@ def test_a_shift_of_the_whole_field_beside_a_wrong_reference_is_told() -> None:
     assert level(problem, [bias], problem.calibration) is None
 
 
-def test_a_rival_on_another_channel_is_no_other_cause() -> None:
+def test_a_rival_on_another_channel_is_the_same_cause() -> None:
     """A second thermometer that fits as well does not weaken the name."""
     own, twin, other = (
         candidate(cause, np.ones(1), channel=channel)

@@ -135,7 +135,7 @@ def test_a_cause_that_cannot_be_seen_has_no_row(clear: Diagnosis) -> None:
     assert "Not to be found at any plausible size" not in whole
 
 
-def test_predicted_and_remaining_residual_stand_beside_each_other(clear: Diagnosis) -> None:
+def test_predicted_and_remaining_residual_stand_next_to_each_other(clear: Diagnosis) -> None:
     output = section(clear, "What is left")
     assert output.count("<tr><td>") == 5
     assert "times worse than fitted ones" not in output

@@ -112,7 +112,7 @@ def logged(hidden: str, track: str) -> xr.Dataset:
         ("offset_step", "there and back"),
     ],
 )
-def test_one_hidden_cause_gets_one_name_and_a_doubt_where_the_track_cannot_tell(
+def test_one_hidden_cause_gets_one_name_and_alternatives_where_the_track_cannot_decide(
     hidden: str, track: str
 ) -> None:
     """A small step, a map's error, and a daily variation under autoregressive noise."""

@@ -97,7 +97,7 @@ def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
 
 
 @pytest.mark.parametrize("alike", [True, False])
-def test_of_two_alike_one_that_gains_nothing_on_new_dives_is_dropped(alike: bool) -> None:
+def test_of_two_similar_causes_one_without_gain_on_new_dives_is_dropped(alike: bool) -> None:
     """Where it is like none, its own test decides. By chance what does nothing may gain, in one of six."""
     rng, n, dropped = np.random.default_rng(3), 600, 0
     for _ in range(10):
@@ -114,7 +114,7 @@ def test_of_two_alike_one_that_gains_nothing_on_new_dives_is_dropped(alike: bool
     assert dropped >= 6 if alike else dropped == 0
 
 
-def test_one_cause_gives_way_to_two_beside_a_third() -> None:
+def test_one_cause_gives_way_to_two_given_a_third() -> None:
     """It was found first since it resembles their sum; neither of the two alone is better."""
     rng = np.random.default_rng(1)
     n = 600
@@ -159,7 +159,7 @@ def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
 
 
 @pytest.mark.parametrize("walks", [True, False])
-def test_a_slow_cause_is_told_from_a_random_walk_only_where_it_is_clear(walks: bool) -> None:
+def test_a_slow_cause_is_separated_from_a_random_walk_only_where_it_is_clear(walks: bool) -> None:
     """A walk that passes for a drift may be noise; a step of S/N 40 in white noise is none."""
     n, rng = 3000, np.random.default_rng(0)
     turn, t = np.linspace(0.0, 6.0 * np.pi, n), np.linspace(0.0, 1.0, n)

@@ -40,7 +40,7 @@ def flown() -> Problem:
 
 
 @pytest.mark.parametrize(("lag", "axis"), [(0.0, "z"), (30.0, "x"), (8.0, "field")])
-def test_series_lag_axis_and_size_of_a_signal_are_told(flown: Problem, lag: float, axis: str) -> None:
+def test_series_lag_axis_and_size_of_a_signal_are_reported(flown: Problem, lag: float, axis: str) -> None:
     survey = flown.survey
     q = lagged(survey.time, survey.channels["throttle"].values, lag)
     u = (
@@ -73,7 +73,7 @@ def test_how_far_from_white_a_residual_is(flown: Problem, rho: float, slow: floa
 
 
 @pytest.mark.parametrize("axis", ["x", "z", "field"])
-def test_the_axis_of_what_is_slow_is_told_though_it_follows_nothing(axis: str) -> None:
+def test_the_axis_of_what_is_slow_is_reported_though_it_follows_nothing(axis: str) -> None:
     """A slow signal correlates with any slow channel, so this is not reported. Turns show the axis."""
     turned = np.random.default_rng(5).normal(size=(N // 30, 3)).repeat(30, axis=0)
     survey = surveyed(turned, np.sin(np.arange(N) / 30.0))
@@ -97,7 +97,7 @@ def test_a_slow_series_that_explains_all_is_followed(flown: Problem) -> None:
     assert seen(replace(flown, survey=survey), signal)[:2] == ("warmth", 0.0)
 
 
-def test_a_cause_does_not_follow_what_only_the_rest_beside_it_does(flown: Problem) -> None:
+def test_a_cause_does_not_follow_a_channel_of_the_other_causes(flown: Problem) -> None:
     warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
     survey = replace(flown.survey, channels={"warmth": Channel(warmth, "degC", ("temperature",))})
     problem, own = replace(flown, survey=survey), 4.0 * np.random.default_rng(6).normal(size=N)

@@ -51,7 +51,7 @@ def test_a_table_of_figures_stands_on_a_page_that_says_how_they_are_measured(pag
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/results/index.md"])
-def test_a_page_of_many_tools_names_one_beside_every_table(page: str) -> None:
+def test_a_page_of_many_tools_names_one_next_to_every_table(page: str) -> None:
     """A row that names none is of the tool before it, in its table or in what stands above that."""
     text = (ROOT / page).read_text(encoding="utf-8")
     tables = [one for one in TABLE.finditer(text) if len(FIGURE.findall(one[0])) >= SOME]

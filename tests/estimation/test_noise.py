@@ -45,14 +45,14 @@ def test_memory_is_believed_from_three_standard_errors_on() -> None:
     assert estimate_noise(weak, STEPS, 0.0).autocorrelation == pytest.approx(rho, abs=0.01)
 
 
-def test_a_few_pairs_of_wrong_samples_are_no_memory() -> None:
+def test_a_few_pairs_of_wrong_samples_do_not_count_as_memory() -> None:
     e = drawn(0.0)
     for k in range(100, 100 + 200 * 10, 200):
         e[k : k + 2] += 400.0
     assert estimate_noise(e, STEPS, 0.0).autocorrelation == 0.0
 
 
-def test_neighbours_across_a_gap_are_no_neighbours() -> None:
+def test_neighbours_across_a_gap_are_not_neighbours() -> None:
     """Two interleaved halves, each of which turns its sign at every gap."""
     e = drawn(0.95)
     steps = np.where(np.arange(N) % 2 == 0, np.inf, 1.0)

@@ -96,7 +96,7 @@ def test_without_names_only_the_range_tells(tmp_path: Path) -> None:
         (lambda p: grid(p, np.radians(LON), np.radians(LAT), units=("rad", "rad")), "found radians"),
     ],
 )
-def test_what_is_no_degree_is_not_taken_for_one(
+def test_other_units_are_not_taken_for_degrees(
     tmp_path: Path, write: Callable[[Path], object], words: str
 ) -> None:
     write(tmp_path / "a.nc")

@@ -148,7 +148,7 @@ def test_roughness_of_a_known_map() -> None:
         (LON, LAT, np.nan, "nothing but holes"),
     ],
 )
-def test_refuses_what_is_no_map(lon: np.ndarray, lat: np.ndarray, values: float, message: str) -> None:
+def test_refuses_what_is_not_a_map(lon: np.ndarray, lat: np.ndarray, values: float, message: str) -> None:
     with pytest.raises(FormatError, match=message):
         AnomalyGrid(lon, lat, np.full((len(lat), len(lon)), values).astype(float))
 
@@ -178,7 +178,7 @@ def test_the_worse_axis_is_the_larger_eigenvalue() -> None:
 
 
 @pytest.mark.parametrize("depth", [0.5, 1.0, 1.5])
-def test_what_lies_between_the_nodes_is_foretold(depth: float) -> None:
+def test_what_lies_between_the_nodes_is_predicted(depth: float) -> None:
     """Sources `depth` spacings below, every fourth node given: the spline's error at the others, within 2."""
     rng, n = np.random.default_rng(7), 241
     k = 2.0 * np.pi * np.hypot(np.fft.fftfreq(n)[:, None], np.fft.fftfreq(n))

@@ -45,7 +45,7 @@ def test_continuation_keeps_a_constant_and_the_holes() -> None:
 
 
 @pytest.mark.parametrize("depth", [0.0, 60.0, 150.0])
-def test_below_a_map_the_error_is_told(depth: float) -> None:
+def test_below_a_map_the_error_is_reported(depth: float) -> None:
     """Continuation restores half of the lost amplitude, and sigma predicts the remainder within a third."""
     low = AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0)
     there = continued(low, depth)
@@ -81,7 +81,7 @@ def test_nothing_is_prepared_downward() -> None:
         prepare([AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0, name="a.grd")], altitude=60.0)
 
 
-def test_a_survey_of_unknown_height_is_not_continued_until_it_is_told() -> None:
+def test_a_survey_of_unknown_height_is_not_continued_until_it_is_declared() -> None:
     """It stayed as it was, without a word, while the map claimed the altitude that was asked for."""
     silent = AnomalyGrid(LON, LAT, monopole(60.0), name="a.grd")
     known = AnomalyGrid(LON, LAT, monopole(90.0), altitude=90.0, name="b.nc")
@@ -119,7 +119,7 @@ def test_surveys_that_disagree_are_not_exact() -> None:
     assert sigma == pytest.approx([10.0 / np.sqrt(2.0), 5.0, 8.0])
 
 
-def test_it_is_told_how_far_surveys_are_apart() -> None:
+def test_the_difference_of_surveys_is_reported() -> None:
     """Two maps are compared by their difference, three by each pair; distance in space does not count."""
 
     def merged(*surveys: AnomalyGrid) -> str:
@@ -174,7 +174,7 @@ def test_smoothing_is_by_wavelength_and_what_goes_becomes_sigma() -> None:
         assert np.sqrt(np.mean(less.sigma[middle] ** 2)) == pytest.approx(np.hypot(3.0, gone), rel=0.1)
 
 
-def test_what_was_smoothed_away_is_alike_over_a_quarter_of_its_wavelength_in_the_file_too(
+def test_a_smoothing_error_is_correlated_over_a_quarter_of_its_wavelength_in_the_file_too(
     tmp_path: Path,
 ) -> None:
     rough = AnomalyGrid(LON, LAT, np.random.default_rng(0).normal(size=(61, 81)))
@@ -218,6 +218,6 @@ def test_the_whole_preparation_and_its_pictures(tmp_path: Path) -> None:
     assert (tmp_path / "steps.png").stat().st_size > 20_000
 
 
-def test_a_mask_beside_the_map_is_refused() -> None:
+def test_a_mask_next_to_the_map_is_refused() -> None:
     with pytest.raises(OutOfRange, match="no node of"):
         prepare([AnomalyGrid(LON, LAT, monopole(60.0))], mask=[(0, 0), (1, 0), (1, 1)])

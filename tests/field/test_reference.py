@@ -92,7 +92,7 @@ def test_says_what_is_missing() -> None:
         reference_field(deployment(**PLACE).assign_coords(time=TIME + 3e9))
 
 
-def test_a_hole_in_the_positions_is_no_track_and_surfacings_are_one() -> None:
+def test_a_hole_in_the_positions_is_not_a_track_and_surfacings_are_one() -> None:
     time = np.arange(0.0, 4000.0, 4.0)
     latitude = np.linspace(49.0, 49.1, len(time))
     latitude[300:500] = np.nan

@@ -76,7 +76,7 @@ def test_the_variances_are_those_that_it_was_drawn_from() -> None:
     assert (np.abs(np.log(found / sigmas)) < 0.35).all()
 
 
-def test_refits_that_move_coefficients_together_are_told_from_those_that_do_not() -> None:
+def test_refits_that_move_coefficients_together_are_separated_from_those_that_do_not() -> None:
     rng = np.random.default_rng(5)
     K, u, size = 4, 0.5, 0.03
     D = {str(v): rng.normal(size=(K, 2)) for v in range(10)}
@@ -102,7 +102,7 @@ def test_refits_that_move_coefficients_together_are_told_from_those_that_do_not(
     assert left[0] < 0.3 * left[1]
 
 
-def test_the_next_deployment_is_where_it_is_expected_as_often_as_said() -> None:
+def test_the_next_deployment_is_where_it_is_expected_as_often_as_predicted() -> None:
     sigmas = 1.0, 0.3, 0.1
     rng = np.random.default_rng(3)
     squares = []

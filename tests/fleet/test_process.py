@@ -149,7 +149,9 @@ def test_a_full_disk_is_a_line_and_nothing_is_on_record(flown: Path, tmp_path: P
     assert len(new_jobs(catalogue, jobs(catalogue))) == 3
 
 
-def test_a_change_is_dated_and_told(flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_change_is_dated_and_reported(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     catalogue = Catalogue(tmp_path / "fleet", create=True)
     add_vehicle(catalogue, "comet", Vehicle(parameters=("battpos",)))
     for number in range(5):

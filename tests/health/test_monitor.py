@@ -122,7 +122,7 @@ def test_a_jump_that_comes_back_soon_is_forgotten_and_one_that_stays_is_not() ->
     assert (sigma[2000:] == SIGMA).all(), "after an hour at the latest"
 
 
-def test_a_mass_that_moves_is_no_jump_if_the_field_stays_and_one_if_it_does_not() -> None:
+def test_a_mass_that_moves_is_not_a_jump_if_the_field_stays_and_one_if_it_does_not() -> None:
     flight = Flight()
     flight.quality[695:705] = MOVING
     flight.raw[695:700] += along(flight.raw[695:700], 300.0)  # while it moves, nothing is known
@@ -143,7 +143,7 @@ def test_a_wrong_mass_is_seen_if_it_moves_with_the_very_second_sample() -> None:
     assert any("as a mass moves" in line for line in reported)
 
 
-def test_a_spike_that_a_mass_s_move_makes_acceptable_is_no_new_level() -> None:
+def test_a_spike_that_a_mass_s_move_makes_acceptable_is_not_a_new_level() -> None:
     """After 40 s of motion the crustal field may differ by 80 nT; equal samples show that it does not."""
     flight = Flight()
     flight.quality[690:700] = MOVING
@@ -183,9 +183,7 @@ def test_more_noise_than_the_calibration_s_widens_sigma_within_a_hundred_samples
 
 @pytest.mark.parametrize("period", [13.0, 25.0, 37.0, 60.0, 150.0])
 @pytest.mark.parametrize("size", [12.0, 40.0])
-def test_a_hum_widens_sigma_or_is_flagged_where_rock_is_passed_more_slowly(
-    period: float, size: float
-) -> None:
+def test_interference_widens_sigma_or_is_flagged_at_low_speed(period: float, size: float) -> None:
     """At 0.35 m/s a crustal field of 500 m takes 24 min; second differences of samples do not show it."""
     flight = Flight(n=3000)
     before = np.linalg.norm(flight.raw, axis=1)
@@ -199,7 +197,7 @@ def test_a_hum_widens_sigma_or_is_flagged_where_rock_is_passed_more_slowly(
 
 
 @pytest.mark.parametrize("speed", [0.35, 2.0, 20.0])
-def test_rock_of_half_a_kilometre_is_no_noise_at_any_speed(speed: float) -> None:
+def test_a_crustal_field_of_half_a_kilometre_is_not_noise_at_any_speed(speed: float) -> None:
     flight = Flight(n=3000)
     way = speed * 4.0 * np.arange(3000)
     flight.raw += along(flight.raw, 1.0) * (145.0 * 2.0**0.5 * np.sin(2.0 * np.pi * way / 500.0))[:, None]
@@ -238,7 +236,7 @@ def test_a_field_that_is_far_off_from_the_first_on_has_that_as_its_sigma(sigmas:
     assert [line for line in reported if "sigma is widened" in line] == reported[:1]
 
 
-def test_rock_that_is_come_upon_little_by_little_is_no_fault() -> None:
+def test_a_slowly_changing_crustal_field_is_not_a_fault() -> None:
     flight = Flight(n=3000)
     rise = np.interp(np.arange(3000), [200, 2000], [200.0, 600.0])
     flight.raw += rise[:, None] * flight.raw / np.linalg.norm(flight.raw, axis=1)[:, None]

@@ -140,7 +140,7 @@ def test_two_stations_and_a_vehicle_behind_a_router(
     assert rig.stop() == 0
 
 
-def test_an_autopilot_that_speaks_mavlink_1(tmp_path: Path) -> None:
+def test_an_autopilot_that_sends_mavlink_1(tmp_path: Path) -> None:
     """Its telemetry counts; what we send stays MAVLink 2."""
     rig = Rig(tmp_path, "udpin")
     station = version_1.MAVLink(None, 1, 1)

@@ -71,7 +71,7 @@ def test_a_temperature_that_does_nothing_is_not_believed() -> None:
     assert not bank.take_over(0.0)
 
 
-def test_what_a_doubt_has_found_is_believed_if_it_is_far_better() -> None:
+def test_the_result_of_an_alarm_is_accepted_if_it_is_far_better() -> None:
     """Otherwise the selected one stays."""
     warming = 12.0 * (1.0 - np.exp(-np.arange(400) / 150.0))
     bank, _ = flown(warming, PER_DEGREE)
@@ -109,7 +109,7 @@ def test_no_drift_gets_less_certain_than_the_steepest() -> None:
     assert 19.0 < np.sqrt(drifting._P[drifting.slope, drifting.slope]).max() * 3600.0 < 30.0
 
 
-def test_a_level_that_nobody_has_seen_is_kept() -> None:
+def test_an_unobserved_level_is_kept() -> None:
     """The crustal field absorbs small changes; a significant change of the level is learned."""
     bank, _ = flown(np.full(400, 4.0), PER_DEGREE)
     quiet = bank.quiet

@@ -31,7 +31,7 @@ def test_one_sample_is_the_fits_own_residual() -> None:
         np.testing.assert_allclose(one.by_nine, g[n], rtol=1e-9)
 
 
-def test_rock_and_noise_are_stationary_along_the_track() -> None:
+def test_crustal_field_and_noise_are_stationary_along_the_track() -> None:
     """Whatever the steps: the covariance stays, and far away nothing is known."""
     nuisance = Nuisance(Noise(2.0, autocorrelation=0.9, interval=4.0, white=0.25), 100.0, 50.0, 800.0)
     F, Q = nuisance.transition(70.0, 12.0)
@@ -46,7 +46,7 @@ def test_rock_and_noise_are_stationary_along_the_track() -> None:
     assert np.isfinite(whiten(np.ones(3), np.ones(3), 0.9, 0.25)).all()
 
 
-def test_it_learns_from_what_the_next_reading_settles() -> None:
+def test_it_learns_from_samples_that_the_next_reading_confirms() -> None:
     """Not from slopes that lag behind, as of channels that are sampled in turn."""
     known, n = calibration(), 400
     world = World(known, n)
@@ -99,7 +99,7 @@ def test_nothing_is_published_where_nothing_has_changed() -> None:
     assert learner.samples > 500
 
 
-def test_rock_is_not_learned_on_a_straight_track() -> None:
+def test_crustal_field_is_not_learned_on_a_straight_track() -> None:
     """The change is within a fraction of the unknown offset of this power-on."""
     known = calibration()
     learner = Learner(known)
@@ -112,7 +112,7 @@ def test_rock_is_not_learned_on_a_straight_track() -> None:
     assert doubted == []
 
 
-def test_a_step_is_doubted_named_and_ends_when_learned() -> None:
+def test_a_step_raises_an_alarm_with_a_name_that_ends_when_learned() -> None:
     """Sigma grows at once to the seen error, and is small again after it is learned."""
     known = calibration()
     learner = Learner(known)

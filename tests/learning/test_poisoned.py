@@ -27,7 +27,7 @@ def test_a_wrong_map_teaches_nothing_wrong(scale: float, shift: float) -> None:
     assert error_of(learner.calibration, world) < 1.3
 
 
-def test_a_map_that_is_wrong_by_no_more_than_rock_is_told() -> None:
+def test_a_map_that_is_wrong_by_no_more_than_the_crustal_field_is_reported() -> None:
     """Upside down, twice: the bridge goes on without it, and sigma need not grow."""
     known, doubted = calibration(), {}
     for scale in (-2.0, 1.0):
@@ -88,7 +88,7 @@ def test_a_spoofed_current_is_not_learned_from() -> None:
     assert learner.flags == 0
 
 
-def test_a_map_in_other_units_is_told() -> None:
+def test_a_map_in_other_units_is_reported() -> None:
     """Ten times too strong: the map is named, and the first calibration is published."""
     known, n = calibration(), 600
     world, learner = World(known, n), Learner(known, grid=grid_of(10.0, 1000.0), spread=20.0)
@@ -115,7 +115,7 @@ def test_a_gps_that_jumps_by_a_kilometre_teaches_nothing(*, mapped: bool) -> Non
 
 
 @pytest.mark.parametrize("lie", ["random", "frozen"])
-def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> None:
+def test_a_mass_with_wrong_telemetry_is_one_alarm_until_it_ends(lie: str) -> None:
     """It is announced once, sigma covers it from the fifth sample on, and then the first one is back."""
     known, n = calibration(), 1500
     world, rng = World(known, n), np.random.default_rng(5)
@@ -143,7 +143,7 @@ def test_a_mass_whose_telemetry_lies_is_one_doubt_until_it_ends(lie: str) -> Non
     assert error_of(learner.calibration, world) < 1.3
 
 
-def test_telemetry_that_is_late_is_told() -> None:
+def test_telemetry_that_is_late_is_reported() -> None:
     """By 8 s: before a motion is reported, two samples are outliers that fit the later report."""
     known, n = calibration(), 400
     world = World(known, n)
@@ -173,7 +173,7 @@ def test_evidence_gathered_while_a_map_was_wrong_is_not_believed_after() -> None
     assert (learner.state.better, learner.flags) == (0.0, 0)
 
 
-def test_a_motion_that_began_before_telemetry_told_of_it_is_no_doubt() -> None:
+def test_a_motion_that_began_before_its_telemetry_raises_no_alarm() -> None:
     """The last sample before each is off by 15 nT without a flag, as no telemetry could know."""
     known, n = calibration(), 1500
     world, added = World(known, n), np.zeros((n, 3))
@@ -185,7 +185,7 @@ def test_a_motion_that_began_before_telemetry_told_of_it_is_no_doubt() -> None:
     assert error_of(learner.calibration, world) < 1.1
 
 
-def test_two_outliers_are_no_doubt() -> None:
+def test_two_outliers_raise_no_alarm() -> None:
     """Three that agree are."""
     known, n = calibration(), 400
     added = np.zeros((n, 3))

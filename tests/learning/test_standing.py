@@ -69,7 +69,7 @@ def relapsed() -> Standing:
     return one
 
 
-def test_what_was_learned_and_is_doubted_again_was_mistaken() -> None:
+def test_a_learned_change_with_another_alarm_was_mistaken() -> None:
     """The alarm stays the same, sigma includes the seen error, and the next threshold is higher."""
     one = relapsed()
     assert (one.relapses, one.alarm and one.alarm.since) == (1, 0.0)
@@ -80,7 +80,7 @@ def test_what_was_learned_and_is_doubted_again_was_mistaken() -> None:
     assert one.ripe
 
 
-def test_a_relapsed_doubt_ends_when_what_was_learned_has_explained_many_samples() -> None:
+def test_a_relapsed_alarm_ends_when_the_learned_change_has_explained_many_samples() -> None:
     """Without a message before; a significant error restarts its count."""
     one = relapsed()
     assert not one.learned()
@@ -93,7 +93,7 @@ def test_a_relapsed_doubt_ends_when_what_was_learned_has_explained_many_samples(
     assert counted(one, QUIET + 1).gone
 
 
-def test_the_next_doubt_after_a_long_while_is_another() -> None:
+def test_the_next_alarm_after_a_long_time_is_another() -> None:
     """The learned change has explained the data, so it was not a mistake."""
     one = standing(alarm(20.0, "offset_step"))
     one.learned()

@@ -136,7 +136,7 @@ def test_a_station_that_never_asks_gets_the_parameters_twice(link: Line) -> None
     assert not values(link, 75.0)
 
 
-def test_a_crowd_of_stations_is_no_flood(link: Line) -> None:
+def test_a_crowd_of_stations_is_not_a_flood(link: Line) -> None:
     """Two thousand names in ten seconds; a station that comes then still gets its two lists."""
     for k in range(200):
         for component in range(10):

@@ -123,7 +123,7 @@ def test_the_acknowledgement_is_addressed(link: Line) -> None:
     assert frame[10 + 8 : 10 + 10] == bytes((255, 190))  # target_system, target_component
 
 
-def test_a_flood_is_rejected_and_told_once_and_costs_nobody_else(link: Line) -> None:
+def test_a_flood_is_rejected_and_reported_once_and_costs_no_other_peer(link: Line) -> None:
     """Of metadata, say: the first hundred of a second are answered."""
     results = [result(link, link.command(REQUEST, METADATA)) for _ in range(300)]
     assert results == [ACCEPTED] * 100 + [TEMPORARILY_REJECTED] * 200

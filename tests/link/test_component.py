@@ -74,7 +74,7 @@ def test_telemetry_only_of_our_vehicle(link: Line) -> None:
         assert link.telemetry == []
 
 
-def test_everything_heard_is_kept_for_the_log(link: Line) -> None:
+def test_every_received_message_is_kept_for_the_log(link: Line) -> None:
     frame = link.autopilot.pack("ATTITUDE", roll=0.5)
     inside = link.autopilot.pack("MAG_LINK_BYTES", length=1, data=b"x")
     noise = bytes(range(250)) * 2
@@ -85,7 +85,7 @@ def test_everything_heard_is_kept_for_the_log(link: Line) -> None:
     assert b"".join(message["data"][: message["length"]] for message in kept) == noise + inside
 
 
-def test_replaying_what_was_heard_gives_the_same_bytes(make_link: MakeLine) -> None:
+def test_replaying_what_was_received_gives_the_same_bytes(make_link: MakeLine) -> None:
     """Garbage, requests, time synchronisation, cut at random: the log's frames bring it all back."""
     rng = random.Random(5)
     first, second = make_link(), make_link()
@@ -186,7 +186,7 @@ def message(draw: st.DrawFn) -> bytes:
 
 
 @given(st.lists(st.one_of(message(), st.binary(max_size=30)), max_size=15))
-def test_whatever_is_said_it_goes_on(chunks: list[bytes]) -> None:
+def test_it_continues_after_any_message(chunks: list[bytes]) -> None:
     component = Component(Link("u"), {"HIGHRES_IMU": 1.0}, alignment(Align()), start_us=START)
     for i, chunk in enumerate(chunks):
         now = START + i * 300_000

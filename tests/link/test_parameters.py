@@ -70,7 +70,7 @@ def test_set(link: Line) -> None:
 
 
 @pytest.mark.parametrize("value", [0.5, -1.0, 1e6, nan, inf, -inf, 3.4e38])
-def test_out_of_range_is_refused_and_said(link: Line, value: float) -> None:
+def test_out_of_range_is_refused_and_reported(link: Line, value: float) -> None:
     received = write(link, "MB_GAP_FACTOR", value)
     assert [v.param_value for v in link.only(received, "PARAM_VALUE")] == [2.5]
     text = "".join(link.texts(received))
@@ -79,7 +79,7 @@ def test_out_of_range_is_refused_and_said(link: Line, value: float) -> None:
     assert link.component.parameters.changed() == {}
 
 
-def test_refusals_are_said_once_a_second(link: Line) -> None:
+def test_refusals_are_reported_once_a_second(link: Line) -> None:
     """Each request gets the value; a later request gets it again."""
     received = [
         message for value in (0.5, 0.5, 0.25, 0.5, 0.75) for message in write(link, "MB_GAP_FACTOR", value)

@@ -39,7 +39,7 @@ def test_all_none_and_too_fast() -> None:
     assert passed(Rate(1000), times) == times
 
 
-def test_pauses_and_steps_back_begin_anew() -> None:
+def test_pauses_and_steps_back_restart_the_estimate() -> None:
     rate = Rate(1)
     assert passed(rate, [START, START + 500_000, START + 1_000_000]) == [START, START + 1_000_000]
     assert passed(rate, [START + 3600_000_000, START + 3600_500_000]) == [START + 3600_000_000]
@@ -111,7 +111,7 @@ def test_long_text_in_pieces(talker: Talker, length: int) -> None:
     assert talker.at(0)[0].text == "5 ?T"
 
 
-def test_only_changes_are_said(talker: Talker) -> None:
+def test_only_changes_are_reported(talker: Talker) -> None:
     for second, state in enumerate(("ok", "ok", "lost", "lost", "ok")):
         talker.at(second * 2)
         talker.announcer.state("sensor", state)
@@ -119,7 +119,7 @@ def test_only_changes_are_said(talker: Talker) -> None:
     assert [m.text for m in talker.at(20)] == ["ok"]
 
 
-def test_what_flaps_is_said_once_a_second_and_its_last_word_always(talker: Talker) -> None:
+def test_a_flapping_text_is_sent_once_a_second_and_its_last_state_always(talker: Talker) -> None:
     texts = []
     for i in range(201):  # 100 Hz for 2 s, ends on "up"
         texts += talker.at(i / 100)

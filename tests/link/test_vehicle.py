@@ -41,7 +41,7 @@ def test_reboot(link: Line) -> None:
     assert link.component.vehicle.reboots == 1
 
 
-def test_stragglers_duplicates_and_the_wrap_are_no_reboot(link: Line) -> None:
+def test_late_and_repeated_messages_and_a_wrap_are_not_a_reboot(link: Line) -> None:
     end = (1 << 32) - 1000
     times = [end, end + 100, end + 100, end - 20_000, end + 200, end - 100, end + 300, *range(0, 1000, 100)]
     assert boots(link, link.autopilot, times) == []
@@ -54,7 +54,7 @@ def test_a_reboot_soon_after_a_boot(link: Line) -> None:
     ]
 
 
-def test_telemetry_that_is_sent_long_after_it_was_stamped_is_no_reboot(link: Line) -> None:
+def test_telemetry_that_is_sent_long_after_it_was_stamped_is_not_a_reboot(link: Line) -> None:
     """Three positions at once, 1.5 s old, as from a controller that sends them on; attitudes are fresh."""
     link.fly("TIMESYNC", tc1=50_000_000_000, ts1=link.only(link.to(0.6), "TIMESYNC")[0].ts1)
     texts = []
@@ -85,7 +85,7 @@ def test_two_autopilots_in_bursts(link: Line) -> None:
     assert "two autopilots send as 1:1" in boots(link, link.autopilot, times)
 
 
-def test_a_second_vehicle_is_told_once_and_ignored(link: Line) -> None:
+def test_a_second_vehicle_is_reported_once_and_ignored(link: Line) -> None:
     other = Codec(2, 1)
     texts = []
     for i in range(5):
@@ -96,7 +96,7 @@ def test_a_second_vehicle_is_told_once_and_ignored(link: Line) -> None:
     assert texts == ["vehicle 2 is on the link too: ignored"]
 
 
-def test_a_ground_station_is_no_vehicle(link: Line) -> None:
+def test_a_ground_station_is_not_a_vehicle(link: Line) -> None:
     assert link.texts(link.send_message("heartbeat", 6, 8, 0, 0, 0, 3)) == []
 
 
@@ -121,7 +121,7 @@ def test_late_frames_are_not_lost(link: Line) -> None:
     assert link.component.vehicle.frames_lost == 2
 
 
-def test_whose_frames_are_lost_is_told(link: Line) -> None:
+def test_whose_frames_are_lost_is_reported(link: Line) -> None:
     """One report for each component and occurrence, and another when it occurs again."""
     payload, tenths = Codec(1, 25), count((link.now - START) // 100_000 + 1)
 
@@ -212,7 +212,7 @@ def test_reboot_resets_the_clock(link: Line) -> None:
 
 
 @pytest.mark.parametrize("now", [12_000_000, 6_700_000])
-def test_a_clock_that_was_set_is_learned_anew_at_once(now: int) -> None:
+def test_a_clock_that_was_set_is_learned_again_at_once(now: int) -> None:
     rng, clock = random.Random(4), VehicleClock()
     for i in range(10):
         exchange(clock, rng, START + i * 1_000_000, 7_000_000)

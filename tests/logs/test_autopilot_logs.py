@@ -209,7 +209,7 @@ def test_truncated_ulg_is_read_to_its_end(
     assert capsys.readouterr().out == ""
 
 
-def test_damage_in_a_ulg_is_told(tmp_path: Path) -> None:
+def test_damage_in_a_ulg_is_reported(tmp_path: Path) -> None:
     pytest.importorskip("pyulog")
     path, data = tmp_path / "log.ulg", bytearray(ulog())
     middle = len(data) * 7 // 8

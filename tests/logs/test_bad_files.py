@@ -213,14 +213,14 @@ def test_netcdf_of_another_shape(tmp_path: Path) -> None:
     )
 
 
-def test_netcdf_that_is_cut_short_is_told_in_the_library_s_words_alone(tmp_path: Path) -> None:
+def test_netcdf_that_is_cut_short_is_reported_in_the_library_s_words_alone(tmp_path: Path) -> None:
     path = tmp_path / "log.nc"
     logs.write(deployment(path, np.arange(100.0), {"mag_x": np.ones(100)}), path)
     path.write_bytes(path.read_bytes()[:-1000])
     assert refused(path) == "expected a whole netCDF file: NetCDF: HDF error"
 
 
-def test_netcdf_whose_names_are_no_text(tmp_path: Path) -> None:
+def test_netcdf_whose_names_are_not_text(tmp_path: Path) -> None:
     path = tmp_path / "log.nc"
     with netCDF4.Dataset(path, "w", format="NETCDF3_CLASSIC") as file:
         file.createDimension("N_MEASUREMENTS", 2)

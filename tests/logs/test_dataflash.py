@@ -157,7 +157,7 @@ def test_random_bytes_hold_no_records(tmp_path: Path) -> None:
     assert ours.skipped >= len(junk)
 
 
-def test_a_kind_that_is_described_anew(tmp_path: Path) -> None:
+def test_a_kind_that_is_described_again(tmp_path: Path) -> None:
     """As after a boot with other firmware: each record is read as the description before it says."""
     first, second = Log(), Log({**KINDS, "BARO": (16, "QBffH", "TimeUS,I,Alt,Press,More")})
     for log, alt in ((first, 1.0), (second, 2.0)):

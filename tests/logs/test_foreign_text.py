@@ -172,7 +172,7 @@ def test_a_field_of_another_length_in_our_own_file_is_as_it_is(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("code", ["99999", "-9999", "1e31", "-1.0e+34", "88888.88", "-999.25", "32767"])
-def test_a_code_for_not_known_is_no_value(code: str, tmp_path: Path) -> None:
+def test_a_code_for_not_known_is_not_a_value(code: str, tmp_path: Path) -> None:
     rows = [f"{NOON + k},{500 * k},{-300 * k},{45_000 + k},{0.1 * (k % 3)}" for k in range(20)]
     rows[5] = f"{NOON + 5},{code},{code},{code},0.1"
     rows[8] = f"{NOON + 8},4000,-2400,45008,{code}"
@@ -183,7 +183,7 @@ def test_a_code_for_not_known_is_no_value(code: str, tmp_path: Path) -> None:
     assert "row 7, column 'mag_x': expected a value, or nothing where it is not known" in log.attrs["losses"]
 
 
-def test_codes_in_the_netcdf_and_parquet_of_others(tmp_path: Path) -> None:
+def test_codes_in_the_netcdf_and_parquet_of_other_programs(tmp_path: Path) -> None:
     axes = {f"mag_{axis}": ("time", [20_000.0, -9999.0, -15_000.0]) for axis in "xyz"}
     time = xr.DataArray([NOON, NOON + 1, NOON + 2], dims="time", attrs={"units": "seconds since 1970-01-01"})
     theirs = xr.Dataset(axes, {"time": time})
@@ -326,12 +326,14 @@ def test_compressed_text_is_read(name: str, packed: bytes, tmp_path: Path) -> No
         ("a.dat", bytes(range(200)), "expected text, the file is binary"),
     ],
 )
-def test_what_is_no_text_is_called_what_it_is(name: str, start: bytes, expected: str, tmp_path: Path) -> None:
+def test_a_file_that_is_not_text_is_named_by_its_kind(
+    name: str, start: bytes, expected: str, tmp_path: Path
+) -> None:
     with pytest.raises(FormatError, match=expected):
         read(tmp_path, start, name)
 
 
-def test_parquet_of_others(tmp_path: Path) -> None:
+def test_parquet_of_other_programs(tmp_path: Path) -> None:
     stamps = pd.date_range("2022-05-04T12:00", periods=3, freq="1s", tz="America/St_Johns")
     axes = {f"B{axis} [uT]": [20.5] * 3 for axis in "xyz"}
     frame = pd.DataFrame({"Timestamp": stamps, **axes, "note": "x"})
@@ -346,7 +348,9 @@ def test_parquet_of_others(tmp_path: Path) -> None:
         logs.read(tmp_path / "none.parquet")
 
 
-def test_parquet_of_others_with_letters_beside_its_places_and_a_time_in_two_columns(tmp_path: Path) -> None:
+def test_parquet_of_other_programs_with_letters_next_to_its_places_and_a_time_in_two_columns(
+    tmp_path: Path,
+) -> None:
     columns = {"date": [*["2022-05-04"] * 3, None], "time": [f"12:00:0{k}" for k in range(4)]}
     places = {"lat": 47.5, "NS": "S", "lon": 52.75, "EW": ["W", None, "E", "W"]}
     pd.DataFrame(columns | places).to_parquet(tmp_path / "a.parquet")

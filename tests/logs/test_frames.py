@@ -52,6 +52,6 @@ def test_time_as_users_have_it(time: list[object], index: bool) -> None:
     ],
     ids=["no time", "texts", "unit"],
 )
-def test_a_frame_that_is_no_log(frame: pd.DataFrame, line: str) -> None:
+def test_a_frame_that_is_not_a_log(frame: pd.DataFrame, line: str) -> None:
     with pytest.raises(mb.MagbridgeError, match=f"the data frame: {line}"):
         mb.from_frame(frame)

@@ -133,7 +133,7 @@ def test_a_file_that_breaks_off_is_read_up_to_there(tmp_path: Path) -> None:
     assert named == [f"{paths[1]}: expected text in UTF-8"]
 
 
-def test_what_was_lost_is_told_in_a_few_lines(tmp_path: Path, command: Command) -> None:
+def test_what_was_lost_is_reported_in_a_few_lines(tmp_path: Path, command: Command) -> None:
     paths = made(tmp_path, 12, tuple(range(1, 9)))
     lines = command("convert", *paths, "-o", tmp_path / "x.nc").err.splitlines()
     assert lines[0] == "magbridge: in the logs: 8 files skipped"

@@ -74,7 +74,7 @@ def test_all_that_the_format_demands(here: Path, metadata: Path, command: Comman
     np.testing.assert_array_equal(logs.read("mission.nc")["mag_x"], 20_000.0)
 
 
-def test_fixes_that_are_not_known_are_said_not_to_be(here: Path, metadata: Path, command: Command) -> None:
+def test_unknown_fixes_are_reported_as_unknown(here: Path, metadata: Path, command: Command) -> None:
     logs.write(mission(), "raw.nc")
     command("convert", "raw.nc", "-o", "mission.nc", "--metadata", metadata)
     with xr.open_dataset("mission.nc") as file:

@@ -128,7 +128,9 @@ def test_every_sample_is_as_rosbags_reads_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("unit", "per_tesla"), [("G", 1e4), ("uT", 1e6), ("mG", 1e7)])
-def test_a_driver_that_does_not_publish_tesla_is_told_of(unit: str, per_tesla: float, tmp_path: Path) -> None:
+def test_a_driver_that_does_not_publish_tesla_is_reported(
+    unit: str, per_tesla: float, tmp_path: Path
+) -> None:
     back = logs.read(bag(tmp_path / "log", scale=per_tesla))
     np.testing.assert_allclose(back["mag_x"], 1e9 * FIELD[:, 0], rtol=1e-9)
     (note,) = noted(back.attrs)
@@ -167,7 +169,7 @@ def test_an_odometry_of_the_map_is_dead_reckoning(tmp_path: Path) -> None:
     np.testing.assert_allclose(back["velocity_north"], 0.0, atol=1e-12)
 
 
-def test_an_odometry_of_its_own_frame_is_no_position(tmp_path: Path) -> None:
+def test_an_odometry_of_its_own_frame_is_not_a_position(tmp_path: Path) -> None:
     back = logs.read(bag(tmp_path / "log", frame="odom", more=_odometry))
     assert "local_east" not in back
     np.testing.assert_allclose(back["odom_x"], 0.2 * np.arange(40))

@@ -78,7 +78,7 @@ def test_a_row_holds_what_was_known_then(tmp_path: Path) -> None:
     assert not passed_over(back.attrs)
 
 
-def test_only_the_vehicle_with_the_magnetometer_speaks(tmp_path: Path) -> None:
+def test_only_the_vehicle_with_the_magnetometer_counts(tmp_path: Path) -> None:
     log = Log()
     log.write_message(0, "ATTITUDE", roll=0.1)
     log.write_message(0, "NAMED_VALUE_FLOAT", name="battpos", value=1)

@@ -89,7 +89,7 @@ def test_files_of_an_earlier_run_are_left_alone(tmp_path: Path) -> None:
     assert [path.read_bytes()[8:] for path in sorted(tmp_path.iterdir())] == [b"one", b"two"]
 
 
-def test_directory_that_cannot_be_made_is_said_and_tried_again(tmp_path: Path) -> None:
+def test_directory_that_cannot_be_made_is_reported_and_tried_again(tmp_path: Path) -> None:
     """As where a disk is there only some seconds after the bridge."""
     directory = tmp_path / "disk" / "logs"
     directory.parent.write_text("")

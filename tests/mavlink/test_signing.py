@@ -69,7 +69,7 @@ def test_radio_status_needs_no_signature() -> None:
 
 
 @pytest.mark.parametrize("before", [True, False])
-def test_a_forged_packet_from_the_future_locks_nobody_out(before: bool) -> None:
+def test_a_forged_packet_from_the_future_locks_out_no_peer(before: bool) -> None:
     listener, speaker = codec(), codec(component=1)
     if before:
         assert listener.parse(text(speaker))[0].known
@@ -137,7 +137,7 @@ def restarted(one: Codec, *, clean: bool) -> Codec:
 
 
 @pytest.mark.parametrize("clean", [True, False])
-def test_restarts_within_seconds_lock_nobody_out(clean: bool) -> None:
+def test_restarts_within_seconds_lock_out_no_peer(clean: bool) -> None:
     """Nor do our own stamps run ahead of the clock, restart by restart."""
     bridge, autopilot = codec(), codec(component=1)
     for k in range(20):

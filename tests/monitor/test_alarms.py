@@ -11,7 +11,7 @@ from magbridge.monitor.words import learned_worth
 from magbridge.records import Quality
 
 
-def test_an_alarm_stands_until_it_is_acknowledged_and_returns_when_it_begins_anew() -> None:
+def test_an_alarm_stands_until_it_is_acknowledged_and_returns_when_it_begins_again() -> None:
     alarms = Alarms()
     alarms.update({"gap": "Samples are missing"}, 1.0)
     alarms.update({"gap": "Samples are missing"}, 2.0)
@@ -37,7 +37,7 @@ def test_alarms_are_bounded_and_newest_first() -> None:
     assert alarms.unseen == 0
 
 
-def test_what_alarms_of_what_is_heard() -> None:
+def test_which_received_messages_raise_an_alarm() -> None:
     """A moving mass raises no alarm; a stale parameter, a lost sensor, an error and silence do."""
     fleet, bridge = Fleet(), Codec(1, 191)
 

@@ -48,7 +48,7 @@ def test_a_clock_that_is_set_back_costs_only_what_it_had_counted_beyond() -> Non
     assert [point.time for point in series.points("10 min")] == [100, 200, 250]
 
 
-def test_what_is_no_number_is_passed_over_and_what_is_absurd_is_kept_finite() -> None:
+def test_what_is_not_a_number_is_passed_over_and_what_is_absurd_is_kept_finite() -> None:
     series = Series()
     for value, sigma in ((nan, 1.0), (inf, 1.0), (1.0, nan), (1e308, 1.0), (-1e308, 1e308)):
         series.add(1e9, value, sigma)

@@ -88,7 +88,7 @@ def press(button: Locator, answer: Locator) -> None:
     pytest.fail("no answer")
 
 
-def test_a_doubt_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], clock: Path) -> None:
+def test_an_alarm_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], clock: Path) -> None:
     """Onset, amplitude, causes and both predictions are shown; each button acts on the bridge."""
     rig, field = flying
     with (

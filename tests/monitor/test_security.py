@@ -92,7 +92,7 @@ def test_another_site_gets_neither_a_websocket_nor_an_answer(url: str) -> None:
     assert websocket(url, Origin=own, Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="websocket") == 403
 
 
-def test_a_link_may_lead_here_but_nobody_frames_or_loads_the_page(url: str) -> None:
+def test_a_link_may_lead_here_but_no_other_page_frames_or_loads_it(url: str) -> None:
     link = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
     answer = status(url, Sec_Fetch_Dest="document", **link)
     assert answer.status == 200

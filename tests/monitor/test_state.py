@@ -72,7 +72,7 @@ def test_the_rose_shows_the_heading_with_its_band(air: Air) -> None:
     assert heading_text(air.state.field).startswith("No heading")
 
 
-def test_silence_is_told(air: Air) -> None:
+def test_silence_is_reported(air: Air) -> None:
     assert silence(air.state, NOW) == "nothing heard yet"
     assert air.state.received_at == -inf
     air.feed(NOW, "MAG_STATUS", uptime=5)
@@ -245,7 +245,7 @@ def test_the_tracks_are_kept(air: Air) -> None:
     assert air.state.reported_track.added == 1
 
 
-def test_nothing_that_is_heard_raises(air: Air) -> None:
+def test_nothing_that_is_received_raises(air: Air) -> None:
     """Whatever the payload's bytes: numbers that are none or absurd, unknown flags and states, any text."""
     extremes = (nan, inf, -inf, 1e308, -1e308, 5e-324, 0.0)
     names = ("MAG_FIELD", "MAG_RAW", "MAG_STATUS", "MAG_NAVIGATION", "STATUSTEXT")
@@ -378,7 +378,7 @@ def test_a_parameter_that_is_not_answered_is_asked_for_again(air: Air) -> None:
     assert (settle.error, settle.value) == ("", 8)
 
 
-def test_another_run_s_parameters_are_fetched_anew(air: Air) -> None:
+def test_another_run_s_parameters_are_fetched_again(air: Air) -> None:
     exchange = Exchange(air)
     exchange.run(8)
     air.feed(exchange.now, "MAG_STATUS", uptime=0)

@@ -126,14 +126,16 @@ def test_a_flat_map_is_recognised(options: Options) -> None:
     )
 
 
-def test_a_map_that_the_vehicle_leaves_is_said(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
+def test_a_map_that_the_vehicle_leaves_is_reported(
+    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+) -> None:
     edge = int(np.searchsorted(grid.longitude, float(ds["truth_longitude"].quantile(0.6))))
     west = AnomalyGrid(grid.longitude[:edge], grid.latitude, grid.anomaly[:, :edge])
     findings = navigate(ds, west, options, start=PLACE).attrs["findings"]
     assert "off the map for" in findings
 
 
-def test_of_a_map_of_elsewhere_nothing_else_is_said(
+def test_a_map_of_another_place_gives_one_message(
     ds: xr.Dataset, grid: AnomalyGrid, options: Options
 ) -> None:
     elsewhere = AnomalyGrid(grid.longitude + 5.0, grid.latitude, grid.anomaly)
@@ -152,7 +154,7 @@ def test_motion_from_what_the_log_has(ds: xr.Dataset, grid: AnomalyGrid, options
     assert rms(result) < 400.0
 
 
-def test_a_gliders_log_is_told_from_another_vehicles(
+def test_a_gliders_log_is_distinguished_from_another_vehicles(
     ds: xr.Dataset, grid: AnomalyGrid, options: Options
 ) -> None:
     """Depth, pitch and heading make a motion only where pitch makes the depth; else the log's track does."""

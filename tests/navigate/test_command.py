@@ -82,7 +82,7 @@ def test_a_map_that_cannot_be_meant_is_one_line(command: Command) -> None:
     assert "subtract the IGRF first" in command.refuses(*asked, *CALIBRATED)
 
 
-def test_a_plan_is_told_what_the_map_is_worth(command: Command) -> None:
+def test_a_plan_reports_the_value_of_the_map(command: Command) -> None:
     assert "dead reckoning alone" in command(*BOUND, "plan.csv", "--plot", "bound.png").out
     bound = read("out.nc")
     assert (bound["sigma"] <= bound["unaided"]).all()

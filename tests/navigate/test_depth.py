@@ -32,7 +32,7 @@ def test_errors_of_the_map_add_up() -> None:
 @pytest.mark.parametrize(
     ("depth", "texts"), [(60.0, "60 m below the surface"), (-60.0, "60 m above the surface")]
 )
-def test_a_level_is_said_on_its_side_of_the_surface(
+def test_a_level_is_reported_on_its_side_of_the_surface(
     depth: float, texts: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn = synthetic(Map(30, 1500), 3)

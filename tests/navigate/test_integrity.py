@@ -29,7 +29,7 @@ def alike() -> AnomalyGrid:
     )
 
 
-def test_what_nothing_can_tell_apart_is_never_valid(alike: AnomalyGrid, options: Options) -> None:
+def test_indistinguishable_places_are_never_valid(alike: AnomalyGrid, options: Options) -> None:
     """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
     claimed = replace(options, start_sigma=40.0)
     run = sail(track_over(alike, claimed, 3, hours=2.0), alike, claimed)

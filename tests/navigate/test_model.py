@@ -33,7 +33,7 @@ def test_gauss_markov_states_keep_their_variance() -> None:
     np.testing.assert_allclose((f @ P @ f.T + q)[2:, 2:], P[2:, 2:], rtol=1e-12)
 
 
-def test_no_time_is_no_motion() -> None:
+def test_no_time_is_not_motion() -> None:
     f, q = transition(Options(), 0.0, 0.0)
     np.testing.assert_array_equal(f, np.eye(6))
     np.testing.assert_array_equal(q, np.zeros((6, 6)))
@@ -53,7 +53,7 @@ def test_options_refuse_what_they_do_not_know() -> None:
     assert msgspec.convert({"gate": 9.0}, Options).gate == 9.0
 
 
-def test_a_calibration_tells_what_is_white_and_what_is_not() -> None:
+def test_a_calibration_separates_white_and_slow_noise() -> None:
     known = Options(bias_sigma=1.0)
     white = with_noise(Noise(2.0))
     assert informed(known, white, 2.0) == replace(known, noise=2.0)

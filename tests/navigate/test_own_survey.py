@@ -52,7 +52,7 @@ def test_a_track_that_comes_back_finds_its_drift() -> None:
     assert "check it against a fix" not in track.attrs["findings"]
 
 
-def test_a_straight_track_learns_nothing_and_says_so() -> None:
+def test_a_straight_track_learns_nothing_and_reports_it() -> None:
     track = localise(flown(straight=True), OPTIONS, start=START)
     sigma = (track["covariance_nn"] + track["covariance_ee"]) ** 0.5
     assert float(sigma[-1]) > 0.5 * float(track["unaided_sigma"][-1])

@@ -124,7 +124,7 @@ def test_a_number_that_no_message_holds_is_bad(line: str) -> None:
     assert reading.counts == (1, 2, 3)
 
 
-def test_a_time_that_is_no_number_is_bad() -> None:
+def test_a_time_that_is_not_a_number_is_bad() -> None:
     assert read("inf 1 2 3\nnan 1 2 3\n", columns=["time", "x", "y", "z"]) == []
 
 

@@ -95,7 +95,7 @@ def test_replies_before_the_stream_are_skipped() -> None:
     assert driver.bytes_skipped == len(replies)
 
 
-def test_halves_of_two_frames_are_no_reading() -> None:
+def test_halves_of_two_frames_give_no_reading() -> None:
     """The line was pulled out after three bytes of a frame, and opened again before the last four of one."""
     driver = open_driver("hmr2300", {})
     before, after = frame(1000, 2000, 3000), frame(-9000, -8000, -7000)

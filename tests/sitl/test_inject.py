@@ -200,7 +200,7 @@ def test_heat_soaks_in_later_than_one_lag_and_all_the_way() -> None:
     assert core[np.searchsorted(t, 0.1 * lag)] < 0.5 * (1.0 - np.exp(-0.1))
 
 
-def test_foreign_effects_are_no_ones(flight: Flight, clean: xr.Dataset) -> None:
+def test_foreign_effects_are_not_among_the_causes(flight: Flight, clean: xr.Dataset) -> None:
     assert not set(EFFECTS) & set(FOREIGN)
     relay, _ = effect(flight, clean, "relay")
     levels = np.unique(np.round(np.linalg.norm(relay, axis=1), 2))

@@ -101,7 +101,7 @@ def test_the_fluxgate_warms_up_with_its_lag_and_takes_its_offset_along() -> None
     np.testing.assert_allclose(error[:, 2], 2 * (expected - 2.0), atol=0.01)
 
 
-def test_every_power_on_settles_the_offset_elsewhere() -> None:
+def test_every_power_on_changes_the_offset() -> None:
     instrument = Instrument(noise_sigma=0.0, turn_on_sigma=50.0, power_on=(100.0, 150.0))
     samples = measure(instrument, *constant(400))
     assert set(samples.power_cycle) == {0.0, 1.0, 2.0}

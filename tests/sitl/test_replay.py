@@ -133,7 +133,7 @@ def test_a_log_that_breaks_off_is_the_same_as_far_as_it_goes_and_no_further(
         assert ("to the end of the log" in summary({"runs": [run]})) == lacks
 
 
-def test_another_configuration_is_told_apart(recorded: tuple[Path, Path], tmp_path: Path) -> None:
+def test_another_configuration_is_distinguished(recorded: tuple[Path, Path], tmp_path: Path) -> None:
     path, log = recorded
     other = tmp_path / "bridge.toml"
     other.write_text(path.read_text().replace("HIGHRES_IMU = 0", "HIGHRES_IMU = -1"))
@@ -166,7 +166,7 @@ def test_a_replay_finds_its_way_by_the_field(flown: xr.Dataset, tmp_path: Path, 
     assert "position updates" in summary(result)
 
 
-def test_a_velocity_is_told_as_a_track() -> None:
+def test_a_velocity_is_sent_as_a_track() -> None:
     """Its integral: the same, to what trapezoids lose, as the track it was taken from."""
     time = np.arange(0.0, 400.0, 4.0)
     north, east = 200 * np.sin(time / 100), 150 * np.cos(time / 80)
@@ -184,7 +184,7 @@ def test_a_velocity_is_told_as_a_track() -> None:
     assert np.isnan(integral["gps_latitude"].to_numpy()[1:]).all()
 
 
-def test_a_position_of_any_turn_and_a_depth_that_is_none_are_told(tmp_path: Path) -> None:
+def test_a_position_of_any_turn_and_a_depth_that_is_none_are_reported(tmp_path: Path) -> None:
     row = {"latitude": 49.5, "longitude": 302.0, "depth": 1e300, "water_speed": 1e300}
     texts = Codec(255, 190).parse(b"".join(Autopilot(load_config(config(tmp_path)), 0).row(4, row)))
     (sent,) = [message for message in texts if message.name == "GLOBAL_POSITION_INT"]
@@ -263,7 +263,7 @@ def test_more_than_a_pty_holds_is_read_at_once(tmp_path: Path) -> None:
     assert received.counts["MAG_FIELD"] == 4000
 
 
-def test_a_bridge_that_dies_holds_nobody_up(tmp_path: Path) -> None:
+def test_a_bridge_that_dies_does_not_block_the_replay(tmp_path: Path) -> None:
     stage = Stage(config(tmp_path, "ascii", 'columns = ["x", "y", "z"]'), bytearray().extend)
     (bridge,) = map(int, Path(f"/proc/self/task/{os.getpid()}/children").read_text().split())
 
@@ -303,7 +303,7 @@ def test_the_demonstration_shows_what_calibration_is_worth(tmp_path: Path) -> No
     assert len(texts) == 5
 
 
-def test_a_log_of_few_samples_is_no_silent_sensor(flown: xr.Dataset, tmp_path: Path) -> None:
+def test_a_log_of_few_samples_is_not_a_silent_sensor(flown: xr.Dataset, tmp_path: Path) -> None:
     """Seagliders sample every 20 s: at the bridge's 10 s their sensor would fall silent after each."""
     write(flown.isel(time=slice(0, None, 5)), tmp_path / "log.nc")
     result = replay([tmp_path / "log.nc"])

@@ -19,7 +19,7 @@ def fly_legs(*legs: Leg, motion: Motion = CALM, step: float = 0.5) -> Track:
     return fly(legs, START, step, np.random.default_rng(0), motion)
 
 
-def test_a_leg_settles_on_what_was_commanded() -> None:
+def test_a_leg_converges_to_the_command() -> None:
     track = fly_legs(Leg(duration=300, pitch=-26, roll=5), Leg(duration=300, pitch=26, roll=-5))
     assert track.pitch[590] == pytest.approx(-26, abs=0.01)
     assert track.roll[-1] == pytest.approx(-5, abs=0.01)

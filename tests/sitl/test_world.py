@@ -33,7 +33,7 @@ def test_on_its_axis_a_dipole_has_twice_the_field_of_its_equator() -> None:
     np.testing.assert_allclose(dipole_field(np.array([0.0, 2.0, 0.0]), m), -100.0 * m / 8)
 
 
-def test_rock_is_the_sum_of_its_dipoles() -> None:
+def test_crustal_field_is_the_sum_of_its_dipoles() -> None:
     rock = Rock.draw(GEOLOGY, MAIN, np.random.default_rng(2))
     points = np.random.default_rng(3).uniform([-2000, -2000, 0], [2000, 2000, 200], (50, 3))
     one_by_one = sum(dipole_field(points - s, m) for s, m in zip(rock.position, rock.moment, strict=True))
@@ -51,7 +51,7 @@ def test_rocks_field_has_neither_sources_nor_curl_where_the_vehicle_swims() -> N
     assert np.abs(gradient - gradient.T).max() < 1e-5 * largest
 
 
-def test_rock_is_as_rough_as_asked_and_rougher_below() -> None:
+def test_crustal_field_is_as_rough_as_asked_and_rougher_below() -> None:
     rock = Rock.draw(GEOLOGY, MAIN, np.random.default_rng(5))
     side = np.linspace(-1500, 1500, 40)
 
@@ -71,7 +71,7 @@ def test_upward_continuation_loses_the_fine_structure_first() -> None:
     assert np.std(high) < np.std(low)
 
 
-def test_without_rock_there_is_only_the_main_field() -> None:
+def test_without_crustal_field_there_is_only_the_main_field() -> None:
     world = World.draw((49.52, -57.87), WINTER, Geology(sources=0), Water(), np.random.default_rng(0))
     field = world.field(np.full(2, WINTER), np.array([49.52, 49.53]), np.full(2, -57.87), np.zeros(2))
     assert 52_500 < np.linalg.norm(field[0]) < 53_200  # nT, ppigrf: 52 880

@@ -67,7 +67,7 @@ def test_depth_size_and_noise_are_found(found: tuple[Rock, Samples, Kriged]) -> 
     assert one.noise == pytest.approx(NOISE, rel=0.3)
 
 
-def test_sigma_between_lines_is_honest_also_beside_one_that_went_astray(
+def test_sigma_between_lines_is_consistent_also_next_to_a_wrong_line(
     found: tuple[Rock, Samples, Kriged],
 ) -> None:
     """The other lines detect that line, and its weight is smaller."""

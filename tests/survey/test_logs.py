@@ -155,7 +155,7 @@ def test_what_correct_has_flagged_and_what_has_no_place_stay_out_of_the_map(
     assert np.std(error) < 1.5
 
 
-def test_one_straight_line_has_rock_below_it(command: Command, tmp_path: Path) -> None:
+def test_one_straight_line_has_a_crustal_field(command: Command, tmp_path: Path) -> None:
     """Distinguished or not, changes along it are neither noise nor only the vehicle's."""
     place = np.stack([np.linspace(-3000.0, 3000.0, 300), np.zeros(300)], axis=1)
     write(flown("comet", place), tmp_path / "log.nc")

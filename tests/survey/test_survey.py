@@ -153,7 +153,7 @@ def zigzag(rng: np.random.Generator, *, back: bool) -> tuple[Samples, FloatArray
     return Samples(place, np.zeros(n), time, value, zero, zero > 0, ORIGIN), rock, change
 
 
-def test_rock_along_a_track_that_never_crosses_itself_is_no_change_with_time() -> None:
+def test_a_field_along_a_track_without_crossings_is_not_a_change_with_time() -> None:
     """One is as likely as the other there: with changes of any size the map was off by 6 nT."""
     samples, rock, _ = zigzag(np.random.default_rng(4), back=False)
     done = survey(samples)
@@ -187,7 +187,9 @@ def test_where_a_track_jumps_the_map_is_as_uncertain_as_its_places() -> None:
     assert 0.4 < np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
 
 
-def test_rock_is_searched_over_more_than_the_middle_of_a_dense_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crustal_field_is_searched_over_more_than_the_middle_of_a_dense_log(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A hundred samples a kilometre: the few about the middle one are on one leg, which tells no length."""
     rng, rock = np.random.default_rng(8), Rock(8)
     corners = rng.uniform(-3000.0, 3000.0, (8, 2))

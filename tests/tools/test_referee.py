@@ -115,7 +115,7 @@ def test_px4_has_several_global_positions_and_modes() -> None:
         assert dict(autopilot.taken) == {outcome: 1}, (mode, airspeed)
 
 
-def test_px4_refuses_an_external_position_only_if_it_is_no_number() -> None:
+def test_px4_refuses_an_external_position_only_if_it_is_not_a_number() -> None:
     autopilot, now_us = flown(Px4, 0)
     now_us -= 500_000
     assert external(autopilot, now_us, param2=nan) == 1
@@ -263,7 +263,7 @@ sailed = cache(sail_again)
         ("GLOBAL_POSITION_SENSOR", "Px4", "VFR_HUD"),
     ],
 )
-def test_an_autopilot_that_obeys_leads_nobody_astray(kind: str, stack: str, stream: str) -> None:
+def test_an_autopilot_that_uses_fixes_does_not_mislead_the_bridge(kind: str, stack: str, stream: str) -> None:
     run, autopilot = sailed(kind, stack, stream)
     alone, _ = sailed(kind, stack, stream, obeys=False)
     lost = (run.seconds > LOST) & (run.seconds < BACK)
