@@ -109,6 +109,19 @@ def test_an_hour_without_gps_with_turns_at_stock_rates() -> None:
     assert np.median(run.error[run.seconds > back + 60.0]) < 5.0
 
 
+def test_the_claimed_sigma_is_that_of_a_wind_that_changes_as_the_options_state() -> None:
+    """In a steady wind, the options claim too much change, and the error is a third of sigma."""
+    standardised = []
+    for seed in (2, 4):
+        passage = flight(15.0, BEGIN, 840.0, seed=seed, changing_wind=True)
+        make = partial(ArduPilot, streams=("VFR_HUD",))
+        run = sail(passage, steep_map(), AIRCRAFT, "EXTERNAL_POSITION_ESTIMATE", make)[0]
+        alone = window(run, BEGIN, 840.0)
+        standardised += list(run.error[alone] ** 2 / 2.0 / run.sigma[alone] ** 2)
+        assert (run.error[alone] < 200.0).all()
+    assert 0.5 <= np.sqrt(np.mean(standardised)) <= 1.25
+
+
 @pytest.mark.parametrize(("jamming", "spoofing", "word"), [(1, 3, "rejected"), (3, 1, "suspect")])
 def test_the_receiver_s_own_report_counts(jamming: int, spoofing: int, word: str) -> None:
     bench = Bench("EXTERNAL_POSITION_ESTIMATE")

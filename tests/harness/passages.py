@@ -63,6 +63,17 @@ def steep_map(seed: int = 1) -> AnomalyGrid:
     return synthetic(Map(120.0, 1000.0), seed)
 
 
+def _changing_wind(rng: np.random.Generator, seconds: int) -> np.ndarray:
+    """Return a wind (n, 2) in m/s, once a second, with the statistics that the options of a plane state."""
+    sigma, kept = AIRCRAFT.current_sigma, np.exp(-1.0 / AIRCRAFT.current_time)
+    steps = sigma * np.sqrt(1.0 - kept**2) * rng.normal(size=(seconds, 2))
+    wind = np.empty((seconds, 2))
+    wind[0] = sigma * rng.normal(size=2)
+    for k in range(1, seconds):
+        wind[k] = kept * wind[k - 1] + steps[k]
+    return wind
+
+
 def flight(
     minutes: float,
     lost: float,
@@ -70,10 +81,13 @@ def flight(
     receiver: Receiver = honest,
     seed: int = 1,
     turn_every: float = 300.0,
+    *,
+    changing_wind: bool = False,
 ) -> Passage:
     """Return a plane's flight at 22 m/s in a wind of 4 m/s, with a turn of 90 degrees every 5 minutes.
 
-    A turn takes 6 s. There is no GPS between `lost` and `back`, s.
+    A turn takes 6 s. There is no GPS between `lost` and `back`, s. A changing wind is a Gauss-Markov process
+    with the statistics of :data:`AIRCRAFT`.
     """
     rng = np.random.default_rng(seed)
     time = START + np.arange(0.0, 60.0 * minutes + 1.0)
@@ -83,7 +97,7 @@ def flight(
     )
     radians = np.radians(heading)
     velocity = 22.0 * np.column_stack([np.cos(radians), np.sin(radians)])
-    wind = np.array([3.0, -2.6])
+    wind = _changing_wind(rng, time.size) if changing_wind else np.array([3.0, -2.6])
     away = np.vstack([[0.0, 0.0], np.cumsum(velocity + wind, axis=0)[:-1]])
     away -= 0.5 * (away.min(axis=0) + away.max(axis=0))  # keep it on the map
     latitude, longitude = np.array([offset(*PLACE, *row) for row in away.tolist()]).T
