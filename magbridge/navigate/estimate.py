@@ -22,6 +22,8 @@ CONTRADICTION = 25.0
 """Squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6."""
 UNINFORMED = 0.8
 """Share of the sigma of dead reckoning alone, above which the field has added no information."""
+LED_TIME_S = 60.0
+"""s, shortest time in which fixes lead the position away without being noticed."""
 MIN_SEARCH_RADIUS_M = 300.0
 """m, smallest radius in which the integrity monitor searches."""
 JOIN, SPLIT = 1.2, 1.5
@@ -142,11 +144,15 @@ class Estimate:
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def widen(self, metres: float) -> None:
-        """Add an error of `metres` (1-sigma, each axis) to the position: fixes that were fused were wrong."""
+        """Add an error of `metres` (1-sigma, each axis) to the position: fixes that were fused were wrong.
+
+        They also moved the current, by that error over :data:`LED_TIME_S` and by its prior sigma at most.
+        """
         if self._filter is None:
             return
         Q = np.zeros_like(self.P)
         Q[0, 0] = Q[1, 1] = metres**2
+        Q[2, 2] = Q[3, 3] = min(metres / LED_TIME_S, self.options.current_sigma) ** 2
         self._filter.predict(np.eye(len(Q)), Q)
         self.alone += Q[:4, :4]
         self._read()
