@@ -21,8 +21,15 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
-from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
+from magbridge.calibration.planning.plan import (
+    Limits,
+    PlannedRun,
+    evaluate_runs,
+    expected_calibration,
+    plan,
+    settled,
+    trim_of,
+)
 from magbridge.field.reference import main_field
 from sitl import load, segments, simulate
 from sitl.dataset import at_rest

@@ -1,31 +1,40 @@
-"""Effects: terms that depend on something other than the positions, some with a state.
+"""Effects of telemetry and of masses: terms that depend on something other than the present positions.
 
+Notes
+-----
 An effect names its channels, says what its coefficients do with its regressors (`columns`), and computes the
 regressors sample by sample (`begin` returns a stepper with a fresh state) or of a whole log (`batch`).
 
-Here are what they share and the effect of one telemetry channel; the others are in :mod:`.mass_effects`,
-:mod:`.memory_effects` and :mod:`.instrument_effects`.
+Effects of the instrument itself are in :mod:`.instrument_effects`.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from itertools import accumulate, repeat
-from math import exp, isnan
-from operator import mul
+from math import exp, isnan, tanh
+from operator import mul, sub
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from msgspec import Meta
+from numpy.polynomial.legendre import leg2poly
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import Effect, Power, Series, Step
+from magbridge.calibration.terms import MAX_ORDER, Effect, Exponents, Power, Series, Step, Width
+from magbridge.errors import CalibrationError
 
-__all__ = ["MAX_INTERVAL", "ChannelEffect", "SingleChannelEffect", "held", "lagged", "offsets", "powers"]
+__all__ = [
+    "MAX_INTERVAL", "ChannelEffect", "ClockEffect", "LegendreEffect", "PathEffect", "PlayEffect",
+    "PowersEffect", "SourcesEffect", "held", "lagged", "offsets", "play", "powers",
+]  # fmt: skip
 
 MAX_INTERVAL = 60_000_000
 """µs; over a longer gap no rate of change is computed."""
+Factors = list[tuple[int, float, float, list[float]]]
+"""Of each: place of the position, its centre and scale, coefficients of its polynomial, the highest first."""
 
 
 def offsets(regressors: int) -> FloatArray:
@@ -156,3 +165,283 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
         out = np.full(len(values), np.nan)
         out[known] = lagged(series.time[known], values[known], self.lag, self.stages) - self.origin
         return held(out, 0.0)[None]
+
+
+class MassEffect(SingleChannelEffect, frozen=True, kw_only=True):
+    """Offsets from a mass whose position is one telemetry channel."""
+
+    centre: float
+    scale: Width
+    """`centre`, `scale`: In the channel's unit."""
+
+    def columns(self, field: float) -> FloatArray:
+        """Offsets."""
+        return offsets(self.size // 3)
+
+
+class PathEffect(MassEffect, frozen=True, kw_only=True):
+    """Offsets that depend on nothing but where the mass is, ``x = (p - centre) / scale``."""
+
+    remembers: ClassVar[bool] = False
+
+    @abstractmethod
+    def regressors(self, x: Any) -> tuple[Any, ...]:
+        """Return the regressors at x, a number or an array."""
+
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return a stepper; while the value is missing, the last one holds."""
+        index, x = channels.index(self.channel), 0.0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
+            nonlocal x
+            if not isnan(values[index]):
+                x = (values[index] - self.centre) / self.scale
+            return self.regressors(x)
+
+        return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(r, n) regressors."""
+        return np.stack(self.regressors(held((series.values[self.channel] - self.centre) / self.scale, 0.0)))
+
+
+class PowersEffect(PathEffect, frozen=True, kw_only=True):
+    """A mass that another channel moves: ``T += sum_k c_k x^k``, ``x = (p - centre) / scale``.
+
+    A permanent moment on a mass at ``r(p)`` gives ``G(r(p)) m`` (see :mod:`.dipole`), a power series in p.
+    """
+
+    kind: ClassVar[str] = "powers"
+    order: Power = 1
+    """Highest power."""
+
+    @property
+    def size(self) -> int:
+        """Three coefficients (nT) for each power."""
+        return 3 * self.order
+
+    def regressors(self, x: Any) -> tuple[Any, ...]:
+        """Return x to x^order."""
+        return powers(x, self.order)
+
+
+class SourcesEffect(PathEffect, frozen=True, kw_only=True):
+    """Iron that a mass passes on its path: ``T += sum_k c_k (1 + x_k^2)^(-3/2)``.
+
+    Here ``x_k = (p - centre) / scale - k apart``. Iron that the mass magnetises, or that magnetises the
+    mass, makes a field that falls with the cube of their distance. Its place is unknown, but a row of
+    sources near the path can make the same field: an equivalent layer (Dampney 1969, Geophysics 34:39).
+
+    Attributes
+    ----------
+    centre, scale : float
+        Position of the first source, and distance of all of them from the path, in the channel's unit.
+    apart : float
+        Distance between neighbouring sources, in units of `scale`.
+    count : int
+        Number of sources.
+    """
+
+    kind: ClassVar[str] = "sources"
+    apart: Width
+    count: Power = 1
+
+    @property
+    def size(self) -> int:
+        """Three coefficients (nT) for each source."""
+        return 3 * self.count
+
+    def regressors(self, x: Any) -> tuple[Any, ...]:
+        """Return what each source does."""
+        near = [1.0 / (1.0 + (x - self.apart * k) ** 2) for k in range(self.count)]
+        return tuple(one * one**0.5 for one in near)
+
+
+class LegendreEffect(Effect, frozen=True, kw_only=True):
+    """What the calibration's own positions do beyond its terms: ``T += c prod_k P_e_k(x_k)``.
+
+    P_e is Legendre's polynomial of degree e: of x^e it is what a fit of all lower powers leaves, over the
+    travel that the calibration saw.
+    """
+
+    kind: ClassVar[str] = "legendre"
+    remembers: ClassVar[bool] = False
+    exponents: Exponents
+    """Degrees, one for each parameter, of positions scaled as the calibration scales them."""
+
+    @property
+    def size(self) -> int:
+        """One for each axis, nT."""
+        return 3
+
+    def check(self, parameters: tuple[str, ...]) -> None:
+        """Require one exponent for each parameter."""
+        if len(self.exponents) != len(parameters):
+            raise CalibrationError(f"legendre: expected {len(parameters)} exponents, one for each parameter")
+        if min(self.exponents, default=0) < 0 or sum(self.exponents) > MAX_ORDER:
+            raise CalibrationError(f"legendre: expected exponents >= 0, together at most {MAX_ORDER}")
+
+    def columns(self, field: float) -> FloatArray:
+        """Offsets."""
+        return offsets(1)
+
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return a stepper; it has no state."""
+        factors = self._factors(kernel)
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float]:
+            return (_product(factors, values),)
+
+        return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(1, n) regressors."""
+        values = list(series.values.values())
+        return np.reshape(_product(self._factors(series.kernel), values), (1, -1))
+
+    def _factors(self, kernel: Kernel) -> Factors:
+        return [
+            (k, centre, scale, leg2poly([0.0] * e + [1.0])[::-1].tolist())
+            for k, (centre, scale, e) in enumerate(
+                zip(kernel.centre, kernel.scale, self.exponents, strict=True)
+            )
+            if e
+        ]
+
+
+def _product(factors: Factors, values: Sequence[Any]) -> Any:
+    """Return the product of the factors' polynomials, by Horner's scheme, of numbers or arrays."""
+    product: Any = 1.0
+    for k, centre, scale, polynomial in factors:
+        x, value = (values[k] - centre) / scale, 0.0
+        for c in polynomial:
+            value = value * x + c
+        product = product * value
+    return product
+
+
+class PlayEffect(MassEffect, frozen=True, kw_only=True):
+    """Backlash or remanence: ``T += c (S(y) - S(p)) / width``, y the play operator of the channel p.
+
+    ``y = min(max(y, p - width / 2), p + width / 2)``: y lags behind p by up to half the width, on the side
+    from which the mass came. A drive's backlash makes a loop of constant width (S linear). Steel near the
+    path is remagnetised only while the mass is near (Preisach relays of one width about one place), so its
+    loop closes farther away: ``S(v) = scale tanh((v - centre) / scale)``, a generalised play (Brokate &
+    Sprekels 1996, *Hysteresis and Phase Transitions*, sec. 2.1 and 2.4).
+
+    Attributes
+    ----------
+    width : float
+        In the channel's unit.
+    centre, scale : float
+        Position of the steel, and how far its effect reaches, in the channel's unit. With a scale far beyond
+        the travel S is linear, as for backlash.
+    order : int
+        0: S as above. In older files, the highest power of a polynomial in its place:
+        ``sum_k c_k (v^k - x^k)`` with ``v = (y - centre) / scale`` and ``x = (p - centre) / scale``.
+    """
+
+    kind: ClassVar[str] = "play"
+    width: Width
+    order: Annotated[int, Meta(ge=0, le=MAX_ORDER)] = 0
+
+    @property
+    def size(self) -> int:
+        """Three coefficients (nT), one for each axis; for a polynomial, three for each power."""
+        return 3 * max(self.order, 1)
+
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return a stepper that starts in the middle of its play."""
+        index, centre, scale, width, order = (
+            channels.index(self.channel), self.centre, self.scale, self.width, self.order
+        )  # fmt: skip
+        half, y, p, first = 0.5 * width, 0.0, 0.0, True
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
+            nonlocal y, p, first
+            if not isnan(values[index]):
+                p = values[index]
+                y = p if first else min(max(y, p - half), p + half)
+                first = False
+            if order:
+                dragged, here = (powers((at - centre) / scale, order) for at in (y, p))
+                return tuple(map(sub, dragged, here))
+            return (scale * (tanh((y - centre) / scale) - tanh((p - centre) / scale)) / width,)
+
+        return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(r, n) regressors; 0 before the first value."""
+        values = series.values[self.channel]
+        known = ~np.isnan(values)
+        out = np.full((max(self.order, 1), len(values)), np.nan)
+        p = values[known]
+        dragged, here = ((at - self.centre) / self.scale for at in (play(p, self.width), p))
+        if self.order:
+            out[:, known] = np.stack(powers(dragged, self.order)) - np.stack(powers(here, self.order))
+        else:
+            out[0, known] = self.scale / self.width * (np.tanh(dragged) - np.tanh(here))
+        return np.stack([held(row, 0.0) for row in out])
+
+
+def play(values: FloatArray, width: float) -> FloatArray:
+    """(n,) play operator of values, from the middle of the play (:class:`PlayEffect`).
+
+    Each row clips the output of the row before. Two such clips in series are one clip, so they are combined
+    by doubling: over 2, 4, 8 ... rows.
+    """
+    low, high = values - 0.5 * width, values + 0.5 * width
+    low[:1] = high[:1] = values[:1]
+    step = 1
+    while step < len(values):
+        bounds = low[step:].copy(), high[step:].copy()
+        low[step:], high[step:] = (np.clip(x[:-step], *bounds) for x in (low, high))
+        step *= 2
+    return low
+
+
+class ClockEffect(Effect, frozen=True, kw_only=True):
+    """Telemetry that is late: ``theta += delay * dtheta/dp * dp/dt``, for all nine coefficients theta.
+
+    The only coefficient is the delay: the time (s) by which the telemetry lags behind the field's samples.
+    """
+
+    kind: ClassVar[str] = "clock"
+    sign: float = 1.0
+    """1; or -1 if the delay is that of the field's samples behind the telemetry, as after a filter."""
+
+    @property
+    def size(self) -> int:
+        """One delay."""
+        return 1
+
+    def columns(self, field: float) -> FloatArray:
+        """One coefficient for nine regressors: the rates of change of the nine coefficients, nT/s."""
+        return self.sign * np.eye(9)[None]
+
+    def begin(self, channels: tuple[str, ...], kernel: Kernel) -> Step:
+        """Return a stepper; rates are differences from the previous sample over the time between."""
+        last: list[float] = []
+        still, weights, then = (0.0,) * 9, kernel.rate_weights.T.tolist(), 0
+
+        def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
+            nonlocal last, then
+            now, before, apart = kernel.monomials(values, 1.0), last, time_us - then
+            last, then = now, time_us
+            if now == before or not before or not 0 < apart < MAX_INTERVAL:
+                return still
+            rates = [(a - b) / (1e-6 * apart) for a, b in zip(now, before, strict=True)]
+            return tuple(
+                sum(rate * weight for rate, weight in zip(rates, column, strict=True)) for column in weights
+            )
+
+        return step
+
+    def batch(self, series: Series) -> FloatArray:
+        """(9, n) regressors."""
+        monomials = np.stack(series.kernel.monomials([*series.values.values()], np.ones(len(series.time))))
+        apart = 1e-6 * np.diff(series.time_us)
+        joined = (apart > 0.0) & (apart < 1e-6 * MAX_INTERVAL)
+        rates = np.zeros_like(monomials)
+        rates[:, 1:] = np.where(joined, np.diff(monomials) / np.where(joined, apart, 1.0), 0.0)
+        return np.asarray(series.kernel.rate_weights.T @ rates)

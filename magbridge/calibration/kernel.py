@@ -18,7 +18,7 @@ of the corrected vector::
 
 :func:`prepare` and :func:`apply` accept floats (one sample, :mod:`.corrector`) and arrays (a log,
 :mod:`.correct`). The two differ only in the order in which the product with the table is summed: by less
-than 1e-12 of the field. The table is made by :mod:`.compilation`.
+than 1e-12 of the field. The table is made by :mod:`.model`.
 """
 
 from __future__ import annotations

@@ -15,10 +15,17 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.effects import ChannelEffect, lagged, powers
+from magbridge.calibration.effects import (
+    ChannelEffect,
+    ClockEffect,
+    LegendreEffect,
+    PathEffect,
+    PlayEffect,
+    lagged,
+    play,
+    powers,
+)
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect
-from magbridge.calibration.mass_effects import LegendreEffect, PathEffect
-from magbridge.calibration.memory_effects import ClockEffect, PlayEffect, play
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.columns import Candidate, Columns, effect_columns, size_of

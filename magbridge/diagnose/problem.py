@@ -51,10 +51,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from magbridge.arrays import FloatArray
-from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.effects import powers
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.model import Calibration, coefficient_tensor
 from magbridge.calibration.terms import Effect, Polynomial, Series
 from magbridge.diagnose.survey import Survey
 from magbridge.estimation.noise import whiten

@@ -17,7 +17,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
-from magbridge.diagnose.causes.time_dependent import interference_tone
+from magbridge.diagnose.causes.instrument import InterferenceTone
 from magbridge.diagnose.columns import Candidate, Columns, Group, since, slices
 from magbridge.diagnose.diagnosis import MIN_RMS_REDUCTION, Diagnosis, Finding, counted, small, verdict_of
 from magbridge.diagnose.evidence import (
@@ -279,7 +279,7 @@ def _examine(
     negligible = bool(named) and wrong is None and beyond.ratio > 1.0 - MIN_RMS_REDUCTION
     return Diagnosis(
         problem=problem, outcome=outcome,
-        findings=_findings(problem, named, competing, extension, refit, counts, outcome),
+        findings=_findings(problem, named, competing, extension, refit, counts, outcome, causes),
         wrong=wrong, unexplained=rest and rest._replace(fitted=()),
         calibration=extension.calibration if stands else calibration, fit=fit,
         refused=extension.refused if model else "",
@@ -342,7 +342,7 @@ def _whenever(candidates: Sequence[Candidate], learned: BoolArray) -> list[Candi
 def _strongest_tone(problem: Problem, candidates: Sequence[Candidate]) -> Candidate | None:
     """Return the strongest tone, to describe the remainder, if tones are not among the candidates."""
     known = any(isinstance(e, TimeEffect) and e.shape == "tone" for c in candidates for e in c.effects)
-    return None if known else next(iter(interference_tone(problem)), None)
+    return None if known else next(iter(InterferenceTone().candidates(problem)), None)
 
 
 def _off(outcome: Outcome, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
@@ -361,11 +361,12 @@ def _findings(
     refit: Extension,
     counts: BoolArray,
     outcome: Outcome,
+    causes: Mapping[str, Cause],
 ) -> tuple[Finding, ...]:
     """Collect the results of each cause; its improvement is that over an extension by the others alone."""
     found, fit, model = [], extension.fit, [h.candidate for h in named]
     after, places = extension.error - extension.reference_error, slices(model)
-    for group in _families(named):
+    for group in _families(named, causes):
         first, *further = group
         without = refit.error
         if len(group) < len(named):
@@ -383,12 +384,11 @@ def _findings(
     return tuple(found)
 
 
-def _families(named: Sequence[Hypothesis]) -> list[list[int]]:
+def _families(named: Sequence[Hypothesis], causes: Mapping[str, Cause]) -> list[list[int]]:
     """Return the places of the named causes, those of one family together, the strongest of each first."""
-    rows, groups = known(), dict[str, list[int]]()
+    groups: dict[str, list[int]] = {}
     for k in sorted(range(len(named)), key=lambda n: -named[n].signal_to_noise):
-        row = rows.get(named[k].candidate.cause)
-        groups.setdefault((row.family if row else "") or str(k), []).append(k)
+        groups.setdefault(causes[named[k].candidate.cause].family or str(k), []).append(k)
     return sorted(groups.values(), key=lambda group: group[0])
 
 

@@ -14,9 +14,8 @@ from math import isnan, nan
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.calibration.compilation import coefficient_tensor
 from magbridge.calibration.effects import ChannelEffect
-from magbridge.calibration.model import Calibration
+from magbridge.calibration.model import Calibration, coefficient_tensor
 from magbridge.errors import CalibrationError
 
 __all__ = ["TEMPERATURE", "Model"]

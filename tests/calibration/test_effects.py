@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 from magbridge.calibration.correct import correct
-from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.effects import (
+    ChannelEffect,
+    ClockEffect,
+    LegendreEffect,
+    PlayEffect,
+    PowersEffect,
+    SourcesEffect,
+)
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
-from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
-from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import MAX_ORDER, TERMS, Effect, Polynomial, Series, term_class
 from magbridge.errors import CalibrationError

@@ -13,8 +13,15 @@ from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.mission import Mission, expected_error
 from magbridge.calibration.model import identity
-from magbridge.calibration.planning.limits import Limits, PlannedRun, settled, trim_of
-from magbridge.calibration.planning.plan import evaluate_runs, expected_calibration, plan
+from magbridge.calibration.planning.plan import (
+    Limits,
+    PlannedRun,
+    evaluate_runs,
+    expected_calibration,
+    plan,
+    settled,
+    trim_of,
+)
 from magbridge.calibration.planning.survey_patterns import propose
 from magbridge.errors import CalibrationError
 from sitl.mission import TABLE_1

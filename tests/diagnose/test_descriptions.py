@@ -13,7 +13,7 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
 from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.masses import actuator_order, hysteresis
+from magbridge.diagnose.causes.masses import ActuatorOrder, Hysteresis
 from magbridge.diagnose.descriptions import (
     Description,
     bends,
@@ -196,8 +196,8 @@ def test_functions_of_the_direction_and_of_the_reading_hold_a_bend(
 def test_a_curve_through_a_mass_position_covers_its_order_and_its_past_the_hysteresis(
     problem: Problem, listed: list[Description]
 ) -> None:
-    order = actuator_order(problem)[0]
-    back = next(one for one in hysteresis(problem) if one.channel == "battpos")
+    order = ActuatorOrder().candidates(problem)[0]
+    back = next(one for one in Hysteresis().candidates(problem) if one.channel == "battpos")
     curve, past, *late = (one for one in listed if one.channel == "battpos")
     assert (curve.covers([order]), curve.covers([back])) == (True, False)
     assert (past.covers([order]), past.covers([back])) == (False, True)

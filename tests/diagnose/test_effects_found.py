@@ -11,11 +11,16 @@ from posed import FIELD, T0, calibrated, regressors_of, surveyed, walk
 
 from magbridge.calibration.correct import correct
 from magbridge.calibration.corrector import Corrector
-from magbridge.calibration.effects import ChannelEffect
+from magbridge.calibration.effects import (
+    ChannelEffect,
+    ClockEffect,
+    LegendreEffect,
+    PlayEffect,
+    PowersEffect,
+    SourcesEffect,
+)
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
-from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
-from magbridge.calibration.memory_effects import ClockEffect, PlayEffect
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.columns import effect_columns

@@ -8,8 +8,8 @@ import numpy as np
 from posed import right
 
 from magbridge.diagnose.assessment import delays
-from magbridge.diagnose.causes.time_dependent import offset_drift
-from magbridge.diagnose.causes.timing import channel_skew
+from magbridge.diagnose.causes.instrument import OffsetDrift
+from magbridge.diagnose.causes.timing import ChannelSkew
 from magbridge.diagnose.evidence import information
 from magbridge.diagnose.extend import relinearised
 from magbridge.diagnose.joint import fit_joint
@@ -69,7 +69,7 @@ def test_the_delays_stay_where_the_comparison_is_linearised_again() -> None:
     whole = right(3000)
     time = whole.survey.time
     problem = pose(made(whole, interpolated(time), 1), whole.calibration)
-    drift = offset_drift(problem)[0]
+    drift = OffsetDrift().candidates(problem)[0]
     _, _, fit = relinearised(problem, [drift], fit_joint(problem, [drift.columns], 1))
     np.testing.assert_allclose(AXIS_DELAY_SIGMA_S * (fit.z[DELAYS] - fit.z[DELAYS][0]), TAKEN, atol=0.03)
 
@@ -89,7 +89,7 @@ def test_delays_that_are_not_there_leave_a_skew_its_power() -> None:
     whole = right(3000)
 
     def power(of: Problem) -> float:
-        fit, (skew,) = fit_joint(of, [], 1), channel_skew(of)
+        fit, (skew,) = fit_joint(of, [], 1), ChannelSkew().candidates(of)
         return float(np.trace(information(of, fit.noise, fit, [skew.columns]).matrix))
 
     shares = []

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from posed import right
 
-from magbridge.diagnose.causes.reference import diurnal_variation, map_error, reference_bias
-from magbridge.diagnose.causes.time_dependent import offset_drift, offset_step
+from magbridge.diagnose.causes.instrument import OffsetDrift, OffsetStep
+from magbridge.diagnose.causes.reference import DiurnalVariation, MapError, ReferenceBias
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.joint import Joint, fit_joint
 from magbridge.diagnose.problem import Problem
@@ -48,7 +48,7 @@ def test_what_a_map_as_flown_lacks_grows_with_depth() -> None:
     missing, residual = flown(90.0), []
     for down in (DOWN, np.zeros(N)):
         problem = drawn(right(N), missing, down)
-        residual.append(float(np.std(fitted(problem, map_error(problem)[0]).residual)))
+        residual.append(float(np.std(fitted(problem, MapError().candidates(problem)[0]).residual)))
     assert residual[0] < 0.1 * np.std(missing) < 0.2 * np.std(missing) < residual[1], residual
 
 
@@ -57,8 +57,8 @@ def test_the_mean_of_what_a_map_lacks_is_known(altitude: float) -> None:
     """The growth with depth distinguishes it from a constant."""
     missing = flown(altitude)
     problem = drawn(right(N), missing + 40.0, DOWN)
-    chart, _ = map_error(problem)
-    [constant] = reference_bias(problem)
+    chart, _ = MapError().candidates(problem)
+    [constant] = ReferenceBias().candidates(problem)
     fit = fit_joint(problem, [chart.columns, constant.columns], 1, spectra=[chart.spectra, None])
     error = chart.columns(slice(None)) @ fit.coefficients[: chart.size] / problem.reference_jacobian
     assert abs(error.mean() - missing.mean()) < 0.2 * np.sqrt(np.mean(missing**2))
@@ -67,7 +67,7 @@ def test_the_mean_of_what_a_map_lacks_is_known(altitude: float) -> None:
 def test_what_is_drawn_wrong_is_the_same_at_every_depth() -> None:
     wrong = 30.0 * np.exp(-0.5 * ((NORTH - 900.0) / 400.0) ** 2)
     problem = drawn(right(N), wrong, DOWN)
-    _, chart = map_error(problem)
+    _, chart = MapError().candidates(problem)
     fit = fitted(problem, chart)
     assert np.std(fit.residual) < 0.1 * np.std(wrong)
     error = chart.columns(slice(None)) @ fit.coefficients / problem.reference_jacobian
@@ -81,6 +81,7 @@ def test_a_gradient_over_the_whole_region_is_the_maps_error_alone() -> None:
     survey = replace(whole.survey, time=whole.survey.time[0] + 16.0 * np.arange(N))
     wrong = 0.01 * (NORTH - 1000.0) + rng.normal(size=N)
     problem = drawn(replace(whole, survey=survey), wrong, DOWN)
-    every = [c for cause in (map_error, diurnal_variation, offset_drift, offset_step) for c in cause(problem)]
+    causes = MapError(), DiurnalVariation(), OffsetDrift(), OffsetStep()
+    every = [candidate for cause in causes for candidate in cause.candidates(problem)]
     found = beside_slow_noise(search(problem, every, 4), every, 4)
     assert [h.candidate.cause for h in found.chosen] == ["map_error"]

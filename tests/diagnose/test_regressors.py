@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 from posed import calibrated, missed, regressors_of, right, surveyed, thinned, walk
 
-from magbridge.calibration.effects import ChannelEffect, lagged
-from magbridge.calibration.mass_effects import LegendreEffect, PowersEffect, SourcesEffect
-from magbridge.calibration.memory_effects import PlayEffect
+from magbridge.calibration.effects import (
+    ChannelEffect,
+    LegendreEffect,
+    PlayEffect,
+    PowersEffect,
+    SourcesEffect,
+    lagged,
+)
 from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Polynomial
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.causes.masses import actuator_order
-from magbridge.diagnose.causes.response import BENT
-from magbridge.diagnose.causes.time_dependent import offset_step
+from magbridge.diagnose.causes.instrument import MAX_BEND_NT, OffsetStep
+from magbridge.diagnose.causes.masses import ActuatorOrder
 from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.columns import effect_columns
 from magbridge.diagnose.joint import Statistic
@@ -192,13 +196,13 @@ def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Pro
     """Between the calibration's own logs and these there has been one, too."""
     t = problem.survey.time
     learned = replace(problem.survey, learned=np.arange(len(t)) < 100, cycles=t[[300]])
-    grid = offset_step(replace(problem, survey=learned))
+    grid = OffsetStep().candidates(replace(problem, survey=learned))
     odds = {candidate.point.shape["onset"][0]: np.exp(candidate.point.likelier) for candidate in grid}
     assert odds[t[100] - 1.0] + odds[t[300]] == pytest.approx(0.5 * len(grid))
     assert sum(odds.values()) == pytest.approx(len(grid))
     assert grid[0].point.rebuild is not None
     assert [grid[0].point.rebuild(t[at]).point.likelier > 0.0 for at in (99, 101, 300)] == [True, False, True]
-    assert {candidate.point.likelier for candidate in offset_step(problem)} == {0.0}
+    assert {candidate.point.likelier for candidate in OffsetStep().candidates(problem)} == {0.0}
 
 
 def test_a_cause_found_twice_is_one(problem: Problem) -> None:
@@ -258,7 +262,9 @@ def test_sources_along_its_way_hold_the_field_of_iron_that_a_mass_passes(problem
     problem = replace(problem, survey=replace(problem.survey, channels=channels))
     p, jacobian = channels["p"].values, problem.jacobian[:, 6:]
     powers = (p[:, None, None] ** np.arange(4)[:, None] * jacobian[:, None, :]).reshape(len(p), -1)
-    listed = [c.columns(slice(0, len(p))) for c in actuator_order(problem) if c.spectra is not None]
+    listed = [
+        c.columns(slice(0, len(p))) for c in ActuatorOrder().candidates(problem) if c.spectra is not None
+    ]
 
     def beyond(columns: np.ndarray, field: np.ndarray) -> float:
         return missed(field, np.hstack([powers, columns])) / missed(field, powers)
@@ -279,7 +285,7 @@ def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Proble
     values = own.centre + own.scale * x
     channels = problem.survey.channels | {"p": problem.survey.channels["p"]._replace(values=values)}
     problem = replace(problem, survey=replace(problem.survey, channels=channels))
-    term, changed, *_ = (c.columns(slice(0, len(x))) for c in actuator_order(problem))
+    term, changed, *_ = (c.columns(slice(0, len(x))) for c in ActuatorOrder().candidates(problem))
     jacobian = problem.jacobian[:, 6:]
     residual = x**3 - np.polyval(np.polyfit(x, x**3, 2), x)
     np.testing.assert_allclose(
@@ -296,7 +302,7 @@ def test_the_next_order_is_what_a_fit_of_the_lower_ones_has_left(problem: Proble
 def test_a_response_bends_by_no_more_than_is_plausible(problem: Problem) -> None:
     """For any common size: a reference error of 140 nT does not count as a bend."""
     bend = CAUSES["nonlinearity"].candidates(problem)[-1]
-    for size, sigma in ((20.0, 20.0), (140.0, BENT)):
+    for size, sigma in ((20.0, 20.0), (140.0, MAX_BEND_NT)):
         coefficients = size / bend.width
         best = Statistic(1e6 * np.eye(9), bend.spectra).best(1e6 * coefficients)
         np.testing.assert_allclose(np.sqrt(best.variance) * bend.width, sigma, rtol=0.2)

@@ -20,7 +20,7 @@ from magbridge.diagnose.joint import Improvement
 from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.problem import Problem, isotropic
 from magbridge.diagnose.report import figures
-from magbridge.diagnose.report.page import physics
+from magbridge.diagnose.report.page import marked_up
 from magbridge.diagnose.survey import Channel, _channels
 from magbridge.diagnose.texts import chance, measured, number, sizes
 
@@ -28,7 +28,7 @@ from magbridge.diagnose.texts import chance, measured, number, sizes
 @pytest.mark.parametrize("cause", CAUSES)
 def test_a_causes_physics_is_a_sentence(cause: str) -> None:
     """One sentence of prose and formulas, without the markup of a docstring."""
-    line = physics(CAUSES[cause])
+    line = marked_up(CAUSES[cause].physics)
     assert line.endswith(".")
     assert "`" not in line
     assert ":mod:" not in line

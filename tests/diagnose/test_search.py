@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 
 from magbridge.calibration.instrument_effects import TimeEffect
 from magbridge.diagnose.alternatives import exchanged
-from magbridge.diagnose.causes.reference import reference_bias
+from magbridge.diagnose.causes.reference import ReferenceBias
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.evidence import ODDS, Hypothesis
 from magbridge.diagnose.problem import pose
@@ -148,7 +148,7 @@ def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
     rng = np.random.default_rng(1)
     problem = right(600)
     noise = rng.normal(size=600)
-    [bias] = reference_bias(problem)
+    [bias] = ReferenceBias().candidates(problem)
     small, large = (
         State(replace(problem, residual=noise + size * problem.reference_jacobian), [bias], 1, 1)
         .fit([bias])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from posed import right
 
-from magbridge.diagnose.causes.time_dependent import interference_tone
+from magbridge.diagnose.causes.instrument import InterferenceTone
 
 
 @pytest.mark.parametrize("place", [700.0, 700.5, 2048.0])
@@ -19,5 +19,5 @@ def test_a_tone_between_two_frequencies_is_found_there(place: float) -> None:
     f = place / 4096 / 4.0
     noise = np.random.default_rng(3).normal(size=len(t))
     residual = 10.0 * quiet.jacobian[:, 6] * np.cos(2.0 * np.pi * f * (t - t[0])) + 0.1 * noise
-    first = interference_tone(replace(quiet, residual=residual))[0]
+    first = InterferenceTone().candidates(replace(quiet, residual=residual))[0]
     assert 1.0 / first.point.shape["period"][0] == pytest.approx(f, abs=0.1 / 4096 / 4.0)

@@ -10,8 +10,7 @@ from magbridge.calibration.fitting.mission import Mission
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.planning.limits import Limits, settled, trim_of
-from magbridge.calibration.planning.plan import Plan, expected_calibration, plan
+from magbridge.calibration.planning.plan import Limits, Plan, expected_calibration, plan, settled, trim_of
 from magbridge.calibration.planning.survey_patterns import Proposal, propose
 from magbridge.columns import require_units
 from magbridge.errors import CalibrationError

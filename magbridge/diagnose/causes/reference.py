@@ -10,10 +10,11 @@ from scipy.sparse import csr_array, diags_array
 from scipy.spatial.distance import cdist
 
 from magbridge.arrays import FloatArray, IndexArray
+from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import Candidate, Interpolated, of_reference
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["diurnal_variation", "map_error", "reference_bias"]
+__all__ = ["DiurnalVariation", "MapError", "ReferenceBias"]
 
 MAX_MAP_ERROR_CELLS = 300
 """Most cells at which a map's error is described."""
@@ -31,7 +32,7 @@ ERROR = 20.0
 """nT, a plausible error of a map (1-sigma)."""
 
 
-def map_error(problem: Problem) -> list[Candidate]:
+class MapError(Cause):
     r"""The anomaly map is wrong: it holds at another height than the vehicle's, or is drawn wrong.
 
     *Another height* (least-squares collocation). Rock below has the field T. The map gives it at an altitude
@@ -50,25 +51,37 @@ def map_error(problem: Problem) -> list[Candidate]:
     *Drawn wrong*: a smooth function of the position that is the same at every depth (Matern 3/2). A constant
     is another cause.
     """
-    place = problem.survey.place
-    if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
-        return []
-    Z, cell = _cells(place)
-    weights, corners = _between(place, cell)
-    seen = diags_array(problem.reference_jacobian) @ weights
-    depths, lengths = place[:, 2].max() + cell * SCALES, 2.0 * cell * SCALES
-    lacking = _expanded([partial(_lacking, d=d) for d in depths], Z, corners)
-    drawn = _expanded([partial(_matern, length=length) for length in lengths], Z, corners)
-    drawn[0][:] -= weights.mean(axis=0) @ drawn[0]
-    made = []
-    for functions, variances, spectra in (lacking, drawn):
-        width = ERROR * np.sqrt(variances)
-        columns = Interpolated(seen, functions * width)
-        names, units = tuple(f"function {k + 1}" for k in range(len(width))), ("nT",) * len(width)
-        made.append(
-            Candidate("map_error", None, columns, width, names, units, spectra=spectra, about="place")
-        )
-    return made
+
+    name = "map_error"
+    meaning = "the map or field model that served as the truth is wrong from place to place"
+    needs = "positions over some hundred metres"
+    disambiguation = (
+        "cross the track again, at another depth too: an error of the map is the same on every pass at one "
+        "depth"
+    )
+    family = "reference"
+
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return the map at another height, and the map drawn wrong, each as a Gaussian process."""
+        place = problem.survey.place
+        if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
+            return []
+        Z, cell = _cells(place)
+        weights, corners = _between(place, cell)
+        seen = diags_array(problem.reference_jacobian) @ weights
+        depths, lengths = place[:, 2].max() + cell * SCALES, 2.0 * cell * SCALES
+        lacking = _expanded([partial(_lacking, d=d) for d in depths], Z, corners)
+        drawn = _expanded([partial(_matern, length=length) for length in lengths], Z, corners)
+        drawn[0][:] -= weights.mean(axis=0) @ drawn[0]
+        made = []
+        for functions, variances, spectra in (lacking, drawn):
+            width = ERROR * np.sqrt(variances)
+            columns = Interpolated(seen, functions * width)
+            names, units = tuple(f"function {k + 1}" for k in range(len(width))), ("nT",) * len(width)
+            made.append(
+                Candidate(self.name, None, columns, width, names, units, spectra=spectra, about="place")
+            )
+        return made
 
 
 def _expanded(
@@ -140,32 +153,47 @@ def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
     return found
 
 
-def diurnal_variation(problem: Problem) -> list[Candidate]:
+class DiurnalVariation(Cause):
     """The Earth's field itself varies: harmonics of the day along the field (Chulliat et al. 2016)."""
-    t = problem.survey.time
-    span = float(t[-1] - t[0])
-    harmonics = [h for h in (1, 2, 3) if 86400.0 / h < 4.0 * span]
-    made = []
-    for some in (harmonics[k:] for k in range(len(harmonics))):
 
-        def basis(rows: slice, some: list[int] = some) -> FloatArray:
-            angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(some)
-            return np.hstack([np.cos(angle), np.sin(angle)])
+    name = "diurnal_variation"
+    meaning = "the Earth's field itself changed during the day"
+    needs = "at least two hours"
+    disambiguation = "a base station ashore"
+    family = "reference"
 
-        names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in some)
-        width = np.tile(20.0 / np.array(some), 2)
-        made.append(of_reference(problem, "diurnal_variation", basis, width, names, "time"))
-    return made
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return all harmonics of a day of which the log has a quarter, and those without the slowest."""
+        t = problem.survey.time
+        span = float(t[-1] - t[0])
+        harmonics = [h for h in (1, 2, 3) if 86400.0 / h < 4.0 * span]
+        made = []
+        for some in (harmonics[k:] for k in range(len(harmonics))):
+
+            def basis(rows: slice, some: list[int] = some) -> FloatArray:
+                angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(some)
+                return np.hstack([np.cos(angle), np.sin(angle)])
+
+            names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in some)
+            width = np.tile(20.0 / np.array(some), 2)
+            made.append(of_reference(problem, self.name, basis, width, names, "time"))
+        return made
 
 
-def reference_bias(problem: Problem) -> list[Candidate]:
-    """Return candidates for a constant error of the reference: a main-field model lacks the crustal field.
+class ReferenceBias(Cause):
+    """The reference is off by a constant: a main-field model lacks the crustal field.
 
     At 68 % of sites each component is within 73 to 114 nT (Beggan 2022, Earth Planets Space 74:17).
     """
-    ones = (~problem.survey.learned[:, None]).astype(np.float64)
-    return [
-        of_reference(
-            problem, "reference_bias", lambda rows: ones[rows], np.array([100.0]), ("bias",), "constant"
-        )
-    ]
+
+    name = "reference_bias"
+    meaning = "the map or field model that served as the truth is wrong by a constant"
+    needs = "a reference"
+    disambiguation = "calibrate and survey at one place, next to a proton magnetometer"
+    family = "reference"
+
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return the constant, absent from the calibration's own logs."""
+        ones = (~problem.survey.learned[:, None]).astype(np.float64)
+        width = np.array([100.0])
+        return [of_reference(problem, self.name, ones.__getitem__, width, ("bias",), "constant")]

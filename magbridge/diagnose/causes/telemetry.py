@@ -2,37 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, reduce
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, lagged
+from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.problem import Problem, once
 
-__all__ = ["current_field", "pressure_offset", "temperature_offset", "temperature_scale"]
+__all__ = ["CurrentField", "PressureOffset", "TemperatureOffset", "TemperatureScale"]
 
 TELEMETRY_LAGS_S = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, spaced so closely that any lag between two of them is matched to within a fifth (RMS)."""
 STAGES = 2
 """Equal lags in series, because conducted heat passes the hull before it reaches the core. One lag misses 10
 to 30 % of the temperature in the centre of a slab, two in series miss 4 to 9 %."""
-
 MAX_JOINT_CURRENTS = 12
 """Most currents that are also tried together."""
-
-
-def _origins(problem: Problem, name: str) -> list[float]:
-    """Return values that the channel may have had when the vehicle was calibrated."""
-    low, high = problem.survey.channels[name].extent
-    middle = float(np.mean(problem.survey.channels[name].values))
-    if problem.survey.fitted.any():  # the values during the calibration are in the data
-        return [middle]
-    return [middle, 2 * low - high, 2 * high - low]
 
 
 @once
@@ -48,32 +39,45 @@ def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatA
     return level
 
 
-def _thermal(problem: Problem, on: Literal["offset", "scale"]) -> list[Candidate]:
-    longest = 2.0 * float(np.ptp(problem.survey.time))
-    lags = [lag for lag in TELEMETRY_LAGS_S if lag <= longest]
-    return [c for name in problem.channels_of("temperature") for c in _warmed(problem, on, name, lags)]
+class _Thermal(Cause):
+    """An effect in proportion to a temperature that follows the logged one, late."""
 
+    needs = "a temperature that varies"
+    family = "temperature"
+    on: ClassVar[Literal["offset", "scale"]]
 
-def _warmed(
-    problem: Problem, on: Literal["offset", "scale"], name: str, lags: Sequence[float]
-) -> list[Candidate]:
-    """Return the candidates for one temperature."""
-    field = problem.calibration.reference.field
-    unit = "nT/degC" if on == "offset" else f"nT/degC per {field:.0f} nT"
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return each temperature with each lag, from each value that it may have had when calibrated."""
+        longest, made = 2.0 * float(np.ptp(problem.survey.time)), []
+        for name in problem.channels_of("temperature"):
+            values = problem.survey.channels[name].values
+            low, high = problem.survey.channels[name].extent
+            origins = [float(np.mean(values)), 2 * low - high, 2 * high - low]
+            if problem.survey.fitted.any():  # the values during the calibration are in the data
+                origins = origins[:1]
+            for origin in origins:
+                lags = [lag for lag in TELEMETRY_LAGS_S if lag <= longest]
+                made += [self._lagged(problem, name, origin, lag) for lag in lags]
+        return made
 
-    def rebuild(origin: float, lag: float) -> Candidate:
-        lag = max(lag, 0.0)
+    def _lagged(self, problem: Problem, name: str, origin: float, lag: float) -> Candidate:
+        """Return the candidate of one temperature with one lag."""
+        lag, field = max(lag, 0.0), problem.calibration.reference.field
         effect = ChannelEffect(
-            cause=f"temperature_{on}", channel=name, origin=origin, lag=lag, stages=STAGES, on=on
+            cause=self.name, channel=name, origin=origin, lag=lag, stages=STAGES, on=self.on
         )
-        point = GridPoint({"origin": (origin, "degC"), "lag": (lag, "s")}, rebuild)
-        levels = _levels(problem)(name, lag)
-        return of_effect(problem, effect, 5.0, unit, channel=name, point=point, phi=levels, origin=origin)
+        point = GridPoint(
+            {"origin": (origin, "degC"), "lag": (lag, "s")},
+            lambda origin, lag: self._lagged(problem, name, origin, lag),
+        )
+        unit = "nT/degC" if self.on == "offset" else f"nT/degC per {field:.0f} nT"
+        return of_effect(
+            problem, effect, 5.0, unit, channel=name, point=point, phi=_levels(problem)(name, lag),
+            origin=origin,
+        )  # fmt: skip
 
-    return [rebuild(origin, lag) for origin in _origins(problem, name) for lag in lags]
 
-
-def temperature_offset(problem: Problem) -> list[Candidate]:
+class TemperatureOffset(_Thermal):
     """Core and electronics have an offset that follows temperature: ``T += b (theta_2 - origin)``.
 
     The core's temperature theta_2 follows through the heat capacity of the hull:
@@ -81,41 +85,75 @@ def temperature_offset(problem: Problem) -> list[Candidate]:
     0.1 nT/degC for a good fluxgate, several for a low-power one (Primdahl 1979, J. Phys. E 12:241). Separated
     from depth by the thermal hysteresis of dive and climb.
     """
-    return _thermal(problem, "offset")
+
+    name = "temperature_offset"
+    meaning = "the sensor's zero shifts with temperature"
+    disambiguation = (
+        "pass one depth at two temperatures of the sensor, diving and climbing; or hold one depth for an "
+        "hour after launch"
+    )
+    on = "offset"
 
 
-def temperature_scale(problem: Problem) -> list[Candidate]:
+class TemperatureScale(_Thermal):
     """Coil and resistances follow temperature: ``A += diag(b) (theta_2 - origin)``, 10-100 ppm/degC."""
-    return _thermal(problem, "scale")
+
+    name = "temperature_scale"
+    meaning = "the sensor's sensitivity changes with temperature"
+    disambiguation = (
+        "roll about the field at two temperatures: a scale follows the axis' reading, an offset does not"
+    )
+    on = "scale"
 
 
-def current_field(problem: Problem) -> list[Candidate]:
-    """A current loop is a fixed source: ``T += sum_k b_k I_k(t)`` (Biot and Savart), zero when they are.
+class _Proportional(Cause):
+    """An offset in proportion to a channel."""
 
-    Each current by itself, and all together: motors that are driven as one (throttle, speed controllers,
-    battery) leave the field of currents at several places, which have one common size.
-    """
-    alone = _proportional(problem, "current_field", "current", 100.0)
-    if not 2 <= len(alone) <= MAX_JOINT_CURRENTS:
-        return alone
-    names = tuple(f"{axis} {one.channel}" for one in alone for axis in AXES)
-    every = replace(reduce(Candidate.with_, alone), channel=None, names=names, parts=())
-    return [*alone, replace(every, spectra=np.ones((1, every.size)))]
+    kind: ClassVar[str]
+    """Kind of the channels."""
+    largest: ClassVar[float]
+    """Plausible offset at the channel's extreme, nT."""
+
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return ``T += b c(t)`` for every channel c of the kind."""
+        made = []
+        for name in problem.channels_of(self.kind):
+            channel = problem.survey.channels[name]
+            unit = f"nT/{channel.unit}" if channel.unit else "nT per 1"
+            width = self.largest / max(map(abs, channel.extent))
+            effect = ChannelEffect(cause=self.name, channel=name)
+            made.append(of_effect(problem, effect, width, unit, channel=name))
+        return made
 
 
-def pressure_offset(problem: Problem) -> list[Candidate]:
+class CurrentField(_Proportional):
+    """A current loop is a fixed source: ``T += sum_k b_k I_k(t)`` (Biot and Savart), zero when they are."""
+
+    name = "current_field"
+    meaning = "an electric current makes a field of its own"
+    needs = "a current"
+    disambiguation = "run the motor with its mass held, and hold the motor with its mass moved"
+    kind, largest = "current", 100.0
+
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return each current by itself, and all together.
+
+        Motors that are driven as one (throttle, speed controllers, battery) leave the field of currents at
+        several places, which have one common size.
+        """
+        alone = super().candidates(problem)
+        if not 2 <= len(alone) <= MAX_JOINT_CURRENTS:
+            return alone
+        names = tuple(f"{axis} {one.channel}" for one in alone for axis in AXES)
+        every = replace(reduce(Candidate.with_, alone), channel=None, names=names, parts=())
+        return [*alone, replace(every, spectra=np.ones((1, every.size)))]
+
+
+class PressureOffset(_Proportional):
     """Pressure strains the hull and its magnetisation (Villari effect), and the mount: ``T += b p``."""
-    return _proportional(problem, "pressure_offset", "pressure", 50.0)
 
-
-def _proportional(problem: Problem, cause: str, kind: str, largest: float) -> list[Candidate]:
-    """``T += b c(t)`` for every channel c of a kind; plausible are `largest` nT at the channel's extreme."""
-    made = []
-    for name in problem.channels_of(kind):
-        low, high = problem.survey.channels[name].extent
-        effect = ChannelEffect(cause=cause, channel=name)
-        of = problem.survey.channels[name].unit
-        unit = f"nT/{of}" if of else "nT per 1"
-        width = largest / max(abs(low), abs(high))
-        made.append(of_effect(problem, effect, width, unit, channel=name))
-    return made
+    name = "pressure_offset"
+    meaning = "the sensor's zero shifts with depth or pressure"
+    needs = "depth or pressure that varies"
+    disambiguation = "hold one depth for an hour: the temperature becomes constant, the pressure effect stays"
+    kind, largest = "pressure", 50.0

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.calibration.effects import ClockEffect
 from magbridge.calibration.instrument_effects import RateEffect
-from magbridge.calibration.memory_effects import ClockEffect
+from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, once, rates
 
-__all__ = ["channel_skew", "clock_offset", "eddy_current", "field_rates", "filter_lag", "mass_rates"]
+__all__ = ["ChannelSkew", "ClockOffset", "EddyCurrent", "FilterLag", "field_rates", "mass_rates"]
 
 SHIFTS_S = (0.5, 2.0, 6.0, 20.0, 60.0)
 """Shifts of the telemetry that are tried, s: those between half an interval and a fiftieth of the log."""
@@ -24,7 +26,7 @@ CENTRAL_STEP_S = 0.01
 
 @once
 def field_rates(problem: Problem) -> FloatArray:
-    """(3, n) dH_r/dt, nT/s (:func:`~.problem.rates`)."""
+    """(3, n) dH_r/dt, nT/s (:func:`~magbridge.diagnose.problem.rates`)."""
     return rates(problem.survey, problem.survey.field.T)
 
 
@@ -49,60 +51,44 @@ def mass_rates(problem: Problem) -> FloatArray:
     return np.asarray(theta / (2.0 * CENTRAL_STEP_S))
 
 
-def eddy_current(problem: Problem) -> list[Candidate]:
+class _Rate(Cause):
+    """Offsets in proportion to the rate of change of the reading."""
+
+    needs = "turns"
+    on: ClassVar[Literal["skew", "eddy"]]
+    width_s: ClassVar[float]
+    """Plausible coefficient, s."""
+    axes: ClassVar[tuple[str, ...]] = AXES
+    """Names of the coefficients."""
+
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return the one candidate, by central differences: the live ones contain their sample's noise."""
+        effect, phi = RateEffect(cause=self.name, on=self.on), field_rates(problem)
+        return [
+            of_effect(
+                problem, effect, self.width_s, "s", names=self.axes, phi=phi,
+                regressors=lambda rows: phi[:, rows],
+            )
+        ]  # fmt: skip
+
+
+class EddyCurrent(_Rate):
     """A turning conductor carries currents: ``T_i += k_ij dH_j/dt``, i != j (Tolles & Lawson 1950)."""
-    names = tuple(i + j for i in AXES for j in AXES if i != j)
-    effect = RateEffect(cause="eddy_current", on="eddy")
-    phi = field_rates(problem)
-    return [of_effect(problem, effect, 0.3, "s", names=names, phi=phi, regressors=lambda rows: phi[:, rows])]
+
+    name = "eddy_current"
+    meaning = "currents that are induced while the vehicle turns make a field"
+    disambiguation = "reverse the turn"
+    on, width_s = "eddy", 0.3
+    axes = tuple(i + j for i in AXES for j in AXES if i != j)
 
 
-def channel_skew(problem: Problem) -> list[Candidate]:
+class ChannelSkew(_Rate):
     """One digitiser takes the sensor's axes in turn: ``T_i += tau_i dH_i/dt``."""
-    effect = RateEffect(cause="channel_skew", on="skew")
-    phi = field_rates(problem)
-    return [of_effect(problem, effect, 0.5, "s", phi=phi, regressors=lambda rows: phi[:, rows])]
 
-
-def filter_lag(problem: Problem) -> list[Candidate]:
-    """The anti-alias filter: ``T += -tau dH/dt + (variance / 2) d^2H/dt^2``.
-
-    It holds the field back, not the telemetry. In a uniform field ``|H|`` shows the delay only where masses
-    move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, theta the nine coefficients. That is the signature of a
-    clock offset of the opposite sign, and the same correction removes it. The only difference is that a
-    filter's delay cannot be negative.
-
-    It also shortens a field that turns. From turning calibration runs that has gone into the calibration, so
-    it shows where these are compared with a survey that turns less.
-    """
-    delayed = _delay(problem, ClockEffect(cause="filter_lag", sign=-1.0), 2.0, positive=True)
-    return [*delayed, _shortened(problem)] if problem.survey.fitted.any() else delayed
-
-
-def _shortened(problem: Problem) -> Candidate:
-    r"""Return the attenuation of a field that turns.
-
-    Notes
-    -----
-    A filter whose impulse response has the variance sigma^2 about its mean, the delay, passes on
-
-    .. math:: H + \tfrac12 \sigma^2 \ddot H + \dots
-
-    For an RC filter sigma is its time constant. A field that turns with omega is shortened by
-    ``sigma^2 omega^2 / 2`` of its turning part. As with ``calibrate --filter-cutoff``, the calibration is
-    fitted without it, and nothing is added to a field that turns live. The second derivative is that of
-    :attr:`~.problem.Problem.reading`, because it would correlate with the noise of its own sample.
-    """
-    bend = rates(problem.survey, problem.reading.T, 2).T
-    columns = -0.5 * np.einsum("ij,ij->i", problem.jacobian[:, 6:], bend)[:, None]
-    return Candidate(
-        "filter_lag", None, columns.__getitem__, np.ones(1), ("variance",), ("s^2",), positive=True
-    )
-
-
-def clock_offset(problem: Problem) -> list[Candidate]:
-    """Telemetry stamped by another clock: ``T += tau dT/dp dp/dt``, and the same for A."""
-    return _delay(problem, ClockEffect(cause="clock_offset"), 5.0)
+    name = "channel_skew"
+    meaning = "the sensor's three axes were not read when the log says"
+    disambiguation = "reverse the turn; roll about the axis that all delays share"
+    on, width_s = "skew", 0.5
 
 
 def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
@@ -134,24 +120,89 @@ def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
     return rows_of
 
 
-def _delay(problem: Problem, effect: ClockEffect, width: float, *, positive: bool = False) -> list[Candidate]:
-    """Return the candidates of a delay: by the rates of the masses, and by shifts of their telemetry."""
-    if not problem.calibration.parameters:
-        return []
-    rates, interval = mass_rates(problem), problem.survey.interval
+class _Delay(Cause):
+    """A delay between the field and the positions of the masses."""
 
-    longest = 0.02 * float(np.ptp(problem.survey.time))
-    shifts = [shift for shift in SHIFTS_S if 0.5 * interval <= shift <= longest]
-    both = [-shift for shift in shifts] if positive else [sign * x for x in shifts for sign in (-1.0, 1.0)]
+    family = "mass"
+    sign: ClassVar[float] = 1.0
+    """-1 if the field is late, 1 if the telemetry is."""
+    width_s: ClassVar[float]
+    """Plausible delay, s."""
 
-    def rebuild(shift: float) -> Candidate:
-        by_rates = abs(shift) <= MIN_SHIFT * interval
-        phi = (lambda rows: rates[:, rows]) if by_rates else _averaged(problem, shift)
-        # The rates are as likely beforehand as all shifts together
-        likelier = float(np.log(0.5 * (len(both) + 1) / (1 if by_rates else len(both)))) if both else 0.0
-        return of_effect(
-            problem, effect, width, "s", names=("delay",), phi=phi, positive=positive, regressors=phi,
-            point=GridPoint({"shift": (shift, "s")}, rebuild, likelier),
-        )  # fmt: skip
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return the delay by the rates of the masses, and by shifts of their telemetry."""
+        if not problem.calibration.parameters:
+            return []
+        interval, longest = problem.survey.interval, 0.02 * float(np.ptp(problem.survey.time))
+        shifts = [shift for shift in SHIFTS_S if 0.5 * interval <= shift <= longest]
+        late = self.sign < 0.0
+        both = [-shift for shift in shifts] if late else [sign * x for x in shifts for sign in (-1.0, 1.0)]
 
-    return [rebuild(shift) for shift in (0.0, *both)]
+        def rebuild(shift: float) -> Candidate:
+            effect, rate = ClockEffect(cause=self.name, sign=self.sign), mass_rates(problem)
+            by_rates = abs(shift) <= MIN_SHIFT * interval
+            phi = (lambda rows: rate[:, rows]) if by_rates else _averaged(problem, shift)
+            # The rates are as likely beforehand as all shifts together
+            likelier = float(np.log(0.5 * (len(both) + 1) / (1 if by_rates else len(both)))) if both else 0.0
+            return of_effect(
+                problem, effect, self.width_s, "s", names=("delay",), phi=phi, positive=late, regressors=phi,
+                point=GridPoint({"shift": (shift, "s")}, rebuild, likelier),
+            )  # fmt: skip
+
+        return [rebuild(shift) for shift in (0.0, *both)]
+
+
+class ClockOffset(_Delay):
+    """Telemetry stamped by another clock: ``T += tau dT/dp dp/dt``, and the same for A."""
+
+    name = "clock_offset"
+    meaning = "the clocks of sensor and telemetry differ"
+    needs = "a calibration with parameters that move while sampled"
+    disambiguation = "move an actuator at constant attitude"
+    delays_telemetry = True
+    width_s = 5.0
+
+
+class FilterLag(_Delay):
+    """The anti-alias filter: ``T += -tau dH/dt + (variance / 2) d^2H/dt^2``.
+
+    It holds the field back, not the telemetry. In a uniform field ``|H|`` shows the delay only where masses
+    move: ``u^T A dH_r/dt = -dF/dtheta dtheta/dt``, theta the nine coefficients. That is the signature of a
+    clock offset of the opposite sign, and the same correction removes it. The only difference is that a
+    filter's delay cannot be negative.
+
+    It also shortens a field that turns. From turning calibration runs that has gone into the calibration, so
+    it shows where these are compared with a survey that turns less.
+    """
+
+    name = "filter_lag"
+    meaning = "a filter delays the sensor's readings against the telemetry"
+    needs = "masses that move while sampled, or the calibration's own runs"
+    disambiguation = "change the corner of the filter, or step an actuator"
+    sign, width_s = -1.0, 2.0
+
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return the delay and, beside the calibration's own runs, the attenuation."""
+        delayed = super().candidates(problem)
+        return [*delayed, _shortened(problem)] if problem.survey.fitted.any() else delayed
+
+
+def _shortened(problem: Problem) -> Candidate:
+    r"""Return the attenuation of a field that turns.
+
+    Notes
+    -----
+    A filter whose impulse response has the variance sigma^2 about its mean, the delay, passes on
+
+    .. math:: H + \tfrac12 \sigma^2 \ddot H + \dots
+
+    For an RC filter sigma is its time constant. A field that turns with omega is shortened by
+    ``sigma^2 omega^2 / 2`` of its turning part. As with ``calibrate --filter-cutoff``, the calibration is
+    fitted without it, and nothing is added to a field that turns live. The second derivative is that of
+    :attr:`.Problem.reading`, because it would correlate with the noise of its own sample.
+    """
+    bend = rates(problem.survey, problem.reading.T, 2).T
+    columns = -0.5 * np.einsum("ij,ij->i", problem.jacobian[:, 6:], bend)[:, None]
+    return Candidate(
+        "filter_lag", None, columns.__getitem__, np.ones(1), ("variance",), ("s^2",), positive=True
+    )

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from functools import cache, partial
-from inspect import getdoc
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from markupsafe import Markup, escape
 from magbridge.calibration.file import encode_calibration
 from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import DiagnosisResult, Fitness, separation
-from magbridge.diagnose.causes import Cause
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.evidence import CONFOUNDED, Visible
 from magbridge.diagnose.report import figures
@@ -42,7 +40,7 @@ from magbridge.estimation.residual import rms
 from magbridge.files import atomic_path, new_folder
 from magbridge.wording import counted
 
-__all__ = ["physics", "report_html", "write"]
+__all__ = ["marked_up", "report_html", "write"]
 
 MARKS: dict[Fitness, str] = {"yes": "good", "conditional": "doubt", "no": "none"}
 """How an answer is marked."""
@@ -139,15 +137,15 @@ def _rows(result: DiagnosisResult) -> list[dict[str, Any]]:
                 "finding": finding, "notes": notes, "numbers": numbers, "clear": sum(sure),
                 "seen": finding.follows(diagnosis.problem, diagnosis.fit),
                 "rms": rms(finding.field(diagnosis.problem)),
-                "physics": physics(diagnosis.causes[finding.candidate.cause]),
+                "physics": marked_up(diagnosis.causes[finding.candidate.cause].physics),
             }
         )  # fmt: skip
     return rows
 
 
-def physics(cause: Cause) -> Markup:
-    """Return the first line of the cause's docstring, with its formulas marked up."""
-    parts = str(escape((getdoc(cause.candidates) or "").splitlines()[0])).split("``")
+def marked_up(line: str) -> Markup:
+    """Return a line of a docstring with its formulas marked up."""
+    parts = str(escape(line)).split("``")
     # formulas are escaped above; the only markup is that of the code
     return Markup("".join(f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts)))  # noqa: S704
 

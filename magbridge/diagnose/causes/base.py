@@ -1,0 +1,79 @@
+"""The interface of a cause, with a numerical check of its derivatives."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from inspect import getdoc
+from typing import ClassVar
+
+import numpy as np
+
+from magbridge.diagnose.columns import Candidate
+from magbridge.diagnose.problem import Problem, samples_of
+from magbridge.estimation.residual import residuals_of
+
+__all__ = ["Cause"]
+
+STEP_WIDTHS = 1e-3
+"""Change of a coefficient for a numerical derivative, in plausible sizes."""
+
+
+class Cause(ABC):
+    """A fault that a diagnosis looks for; the first line of its docstring is its physics."""
+
+    name: ClassVar[str]
+    """Name in ``findings.json``."""
+    meaning: ClassVar[str]
+    """Meaning of the cause, as a clause."""
+    needs: ClassVar[str]
+    """What a log must contain for it to be tested."""
+    disambiguation: ClassVar[str]
+    """Manoeuvre that distinguishes the cause from its competing hypotheses."""
+    family: ClassVar[str] = ""
+    """Causes of one family describe each other's remnants: they are one finding."""
+    delays_telemetry: ClassVar[bool] = False
+    """Whether the effect is a delay of the telemetry, which ``[telemetry.NAME] delay`` corrects."""
+
+    @abstractmethod
+    def candidates(self, problem: Problem) -> list[Candidate]:
+        """Return the hypotheses: columns of the problem over a grid of nonlinear parameters.
+
+        Their widths are plausible sizes (1-sigma of a Gaussian prior). They set Occam's factor, not what can
+        be found. The list is empty for a log that cannot show the cause.
+        """
+
+    @property
+    def physics(self) -> str:
+        """First line of the docstring: the physics with its equation."""
+        return (getdoc(type(self)) or "").splitlines()[0]
+
+    def jacobian_error(self, problem: Problem, candidate: Candidate) -> float:
+        """Return the largest error of a candidate's columns, as a fraction of their largest number.
+
+        The columns are compared with differences of the residual of the nonlinear model, for which the
+        calibration is extended by the candidate's effects. Readings are those of :attr:`.Problem.reading`,
+        whose residual is zero, because there the columns are derivatives. An effect whose regressors the
+        search computes differently from the live correction, and an error of the reference, cannot be
+        compared in this way: 0 is returned.
+        """
+        if not candidate.effects or candidate.regressors is not None or candidate.since:
+            return 0.0
+        calibration, K = problem.calibration, problem.calibration.coefficients.size
+        size = K + candidate.size
+        survey = replace(problem.survey, field=problem.reading)
+        columns, worst = candidate.columns(slice(0, len(problem))), 0.0
+        for k in range(candidate.size):
+            sides = []
+            for step in (-STEP_WIDTHS, STEP_WIDTHS):
+                coefficients = np.append(calibration.coefficients, np.zeros(candidate.size))
+                coefficients[K + k] = step * candidate.width[k]
+                extended = replace(
+                    calibration, effects=(*calibration.effects, *candidate.effects),
+                    coefficients=coefficients, covariance=np.zeros((size, size)),
+                )  # fmt: skip
+                sides.append(residuals_of(*samples_of(survey, extended)))
+            # a coefficient that the calibration lacks adds minus its derivative to the residual
+            difference = -(sides[1] - sides[0]) / (2.0 * STEP_WIDTHS)
+            worst = max(worst, float(np.abs(difference - columns[:, k]).max()))
+        return worst / max(float(np.abs(columns).max()), 1e-300)
