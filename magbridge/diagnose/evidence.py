@@ -55,7 +55,7 @@ from magbridge.diagnose.columns import (
 )
 from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statistic, normal, volume_of
 from magbridge.diagnose.noise import Noise
-from magbridge.diagnose.problem import Problem, side_by_side
+from magbridge.diagnose.problem import DERIVATIVE_ROWS, Problem, side_by_side
 
 __all__ = [
     "CONFOUNDED", "FALSE_ALARM_RATE", "IDEAL", "MOST_REMAINING", "ODDS", "REMNANT", "SMOOTH", "Best",
@@ -318,8 +318,12 @@ def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) ->
     rows = np.flatnonzero(noise.past.whole)
     if len(rows) <= 2 * p:
         return [float(n)] * len(columns)
-    before = np.array([residual[rows - k] for k in range(1, p + 1)]) / noise.scale[rows]
-    C = np.linalg.pinv(before @ before.T)
+    information = np.zeros((p, p))
+    for start in range(0, len(rows), DERIVATIVE_ROWS):
+        some = rows[start : start + DERIVATIVE_ROWS]
+        before = np.array([residual[some - k] for k in range(1, p + 1)]) / noise.scale[some]
+        information += before @ before.T
+    C = np.linalg.pinv(information)
     pieces = range(0, max(n - PIECE, 0) + 1, max(PIECE, n // PIECES))
     found = []
     for column in columns:

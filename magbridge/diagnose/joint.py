@@ -86,7 +86,8 @@ CONFIDENCE_LEVEL = QUANTILES[1] - QUANTILES[0]
 
 def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return the columns of n rows precomputed, or unchanged where that would fill the memory."""
-    if n * sum(map(size_of, columns)) > MAX_STORED_NUMBERS:
+    # the fits of a long log are made by two threads, each with columns of its own
+    if n * sum(map(size_of, columns)) > MAX_STORED_NUMBERS / (THREADS if n > LONG else 1):
         return list(columns)
 
     def whole(column: Columns) -> FloatArray:
@@ -286,6 +287,7 @@ def fit_joint(
     ridge: float | FloatArray = RIDGE,
     rounds: int = 5,
     brief: bool = False,
+    stride: int = 1,
 ) -> Joint:
     """Maximise the joint likelihood of calibration, effects and noise.
 
@@ -312,6 +314,8 @@ def fit_joint(
         Prior precision of the effects, in units of their widths.
     rounds : int
         At most.
+    stride : int
+        Pieces of the log of which one counts in the normal equations; the noise is that of every sample.
     """
     X = Design(problem, precomputed(len(problem), columns))
     q, k = X.q, X.effects
@@ -335,14 +339,14 @@ def fit_joint(
     # fitted as if the noise were white
     first = [*(starts or [centre])]
     if plain:
-        first.append(_plain(X, problem.residual, prior, centre))
+        first.append(_plain(X, problem.residual, prior, centre, stride))
     for own, _ in common:
         prior[own] = FLAT_PRECISION  # no size is known yet
     tries = in_threads(len(problem), lambda c: (c, *at(c)), first)
     c, residual, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
     del tries  # of a month each is 15 MB
     for step in range(rounds + 1):
-        P, b = normal(X.rows, noise.response(residual), noise)
+        P, b = normal(X.rows, noise.response(residual), noise, stride=stride)
         for own, spectrum in common:
             prior[own] = _sized(P, b + P @ c + prior * centre, prior, own, spectrum)
         P += np.diag(prior)
@@ -376,15 +380,15 @@ def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra:
     return np.asarray(1.0 / Statistic(S, spectra).best(b).variance)
 
 
-def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray) -> FloatArray:
+def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray, stride: int) -> FloatArray:
     """Least squares as if the noise were white, outliers cut off."""
     level = robust_scale(residual - np.median(residual)) + 1e-12
-    P, b = normal(X.rows, residual)
+    P, b = normal(X.rows, residual, stride=stride)
     c = centre + np.linalg.solve(P / level**2 + np.diag(prior), (b - P @ centre) / level**2)
     residual = residual - X.times(c)
     level = robust_scale(residual) + 1e-12
     cut = np.clip(residual, *(np.median(residual) + np.array([-8.0, 8.0]) * level))
-    b = normal(X.rows, cut, asked=())[1]
+    b = normal(X.rows, cut, asked=(), stride=stride)[1]
     return np.asarray(c + np.linalg.solve(P / level**2 + np.diag(prior), b / level**2 - prior * (c - centre)))
 
 

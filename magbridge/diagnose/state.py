@@ -177,6 +177,7 @@ class State:
             ridge=1.0,
             rounds=1,
             brief=self.brief,
+            stride=stride,
         )
         if not model:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
