@@ -16,6 +16,7 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Condition, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
+from magbridge.filter_lag import FilterLag
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
 from magbridge.health.consistency import MASS_FRACTION
 from magbridge.learning import Learner
@@ -86,6 +87,8 @@ class Correction:
         self._was_moving = False
         self._conditions = _unmodelled_conditions(calibration)
         self.stated_sigma = nan
+        cutoff_hz = calibration.sensor.filter_cutoff
+        self._filter_lag = FilterLag(cutoff_hz) if cutoff_hz else None
 
     @property
     def calibration(self) -> Calibration:
@@ -144,16 +147,20 @@ class Correction:
             sample.time_us, sample.field, sample.values, sample.quality
         )
         parts = self.parts
-        vector = (x, y, z)
+        vector, turned = (x, y, z), 0.0
+        if self._filter_lag is not None:
+            delay_s = self.aligner.settings.filter_delay
+            vector = self._filter_lag.undo(sample.time_us, vector, delay_s)
+            turned = self._filter_lag.variance
         judged = 0.0
         if self.health is not None:
             arguments = (self.health, sample, reading, (F, sigma), vector, quality, main_field, where)
             judged, flags = parts.call("plausibility check", (0.0, 0), self._check_field, *arguments)
             quality |= flags
-        turned = 0.0
         if self.direction is not None:
-            turned, flags = parts.call("direction check", (0.0, 0), self._check_direction, sample, vector)
+            more, flags = parts.call("direction check", (0.0, 0), self._check_direction, sample, vector)
             quality |= flags
+            turned += more
         if self.learner is not None:
             flags, variance = parts.call(
                 "learning", (0, 0.0), self._learn, sample, quality, main_field, where, restarted
@@ -174,7 +181,7 @@ class Correction:
             sigma = sqrt(sigma * sigma + more)
             more += turned
             sx, sy, sz = sqrt(sx * sx + more), sqrt(sy * sy + more), sqrt(sz * sz + more)
-        return sample, Corrected(F, sigma, (x, y, z), (sx, sy, sz), quality)
+        return sample, Corrected(F, sigma, vector, (sx, sy, sz), quality)
 
     def _check_field(
         self,

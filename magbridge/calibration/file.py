@@ -32,14 +32,17 @@ from magbridge.files import atomic_path, contents
 
 __all__ = ["CALIBRATION_FORMAT", "calibration_id", "decode_calibration", "encode_calibration", "load", "save"]
 
-CALIBRATION_FORMAT = 6
+CALIBRATION_FORMAT = 7
 """Version of the layout; a reader takes this one and all before it. In 1, the noise's
 ``autocorrelation`` was called ``memory``; 3 adds ``doubts``, 4 the noise's
-``white`` share, ``level`` and the reference's ``level_sigma``, 5 ``sensors``, 6 ``conditions``: each is
-written only where there is any."""
+``white`` share, ``level`` and the reference's ``level_sigma``, 5 ``sensors``, 6 ``conditions``, 7 the
+sensor's ``filter_cutoff``: each is written only where there is any."""
 
 MAX_STATED_SIGMA = 1e15
 """The largest noise (nT) or standard deviation of a coefficient that is accepted: its square is a float32."""
+
+MAX_FILTER_CUTOFF_HZ = 1e6
+"""Largest cutoff frequency of an anti-alias filter, Hz."""
 
 AS_IN_MEMORY = (
     "software", "method", "sensor", "parameters", "noise", "reference", "boresight", "runs", "inputs",
@@ -90,7 +93,7 @@ def encode_calibration(calibration: Calibration) -> bytes:
     optional = "doubts", "level", "sensors", "conditions"
     names = [name for name in _File.__struct_fields__ if name not in optional or getattr(content, name)]
     values = {name: getattr(content, name) for name in names}
-    for key, lately in (("noise", "white"), ("reference", "level_sigma")):
+    for key, lately in (("noise", "white"), ("reference", "level_sigma"), ("sensor", "filter_cutoff")):
         known = msgspec.structs.asdict(values[key])
         values[key] = {name: value for name, value in known.items() if name != lately or value}
     lines = [encode(name) + b": " + encode(value) for name, value in values.items()]
@@ -99,6 +102,8 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 def _format(calibration: Calibration) -> int:
     """Return the oldest format that can represent a calibration."""
+    if calibration.sensor.filter_cutoff:
+        return 7
     if calibration.conditions:
         return 6
     if calibration.sensors:
@@ -228,6 +233,8 @@ def _check_settings(content: _File) -> None:
             )
     for sensor in content.sensors:
         _check_scalar(sensor)
+    if not 0.0 <= content.sensor.filter_cutoff <= MAX_FILTER_CUTOFF_HZ:
+        raise CalibrationError(f"sensor: filter_cutoff: expected Hz from 0 to {MAX_FILTER_CUTOFF_HZ:g}")
     if not content.reference.field > 0.0:
         raise CalibrationError("reference: field: expected nT, > 0")
     if not 0.0 <= content.noise.sensor <= MAX_STATED_SIGMA:

@@ -170,6 +170,8 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str = ""
     power_cycle: int | None = None
+    filter_cutoff: float = 0.0
+    """Cutoff frequency of the anti-alias filter that correcting undoes, Hz; 0: none."""
 
     def may_be(self, name: str) -> bool:
         """Return True if this may be the sensor of that name; either may be unknown (empty)."""

@@ -114,8 +114,8 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
         1-sigma in m by which dead-reckoned positions slowly drift, where the crustal field is estimated with
         the calibration: the track is corrected to where the field repeats itself; 0: positions are exact.
     filter_cutoff
-        Cut-off frequency in Hz of the sensor's first-order anti-alias filter, whose attenuation in turns is
-        undone; 0: no filter.
+        Cut-off frequency in Hz of the sensor's first-order anti-alias filter; 0: no filter. The fit undoes
+        its attenuation in turns; correct and the bridge then undo its lag in the vector and the heading.
     fleet
         A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from the prediction
         of the vehicle's earlier deployments and its fleet, and the command prints the gain (method auto). Two

@@ -72,7 +72,7 @@ def export(
     from magbridge.files import atomic_path, new_folder
 
     known = load(calibration)
-    for doubt in warnings_of(known, calibration):
+    for doubt in [*warnings_of(known, calibration), *_filter_lag(known, calibration)]:
         complain(doubt)
     texts: dict[Path, str] = {}
     try:
@@ -100,6 +100,12 @@ def export(
         with new_folder(file.parent), atomic_path(file) as path:
             path.write_text(text, encoding="utf-8")
         print(f"{file}: written")
+
+
+def _filter_lag(known: Calibration, file: Path) -> list[str]:
+    """Return what the exported files lack of the sensor's filter."""
+    cutoff = known.sensor.filter_cutoff
+    return [f"{file}: no export undoes the sensor's filter of {cutoff:g} Hz"] if cutoff else []
 
 
 def _seaglider(file: Path, known: Calibration, nt_per_count: float, dip: float) -> str:

@@ -7,6 +7,9 @@ An RC filter of corner f_c gives y with :math:`\mathbf y + τ \dot{\mathbf y} = 
 
     |y| = |x| - tau^2 |dx/dt|^2 / (2 |x|)
 
+The calibration keeps the corner, so that correcting undoes the filter, too (:mod:`magbridge.filter_lag`):
+there without samples that are still to come.
+
 With the paper's 0.33 Hz, in a spiral of four minutes a turn, that is 0.7 nT: little, but all of it goes into
 the gain, and from there into every sample of a straight survey.
 """
@@ -61,4 +64,4 @@ def unfiltered(data: Observations, corner: float) -> Observations:
     apart = data.time[ahead] - data.time[behind]
     rise: FloatArray = data.field[ahead] - data.field[behind]
     slope = np.divide(rise, apart[:, None], out=np.zeros_like(rise), where=apart[:, None] > 0.0)
-    return replace(data, field=data.field + tau * slope)
+    return replace(data, field=data.field + tau * slope, filter_cutoff=corner)

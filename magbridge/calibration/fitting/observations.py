@@ -73,6 +73,8 @@ class Observations:
     origin: tuple[float, float] = (0.0, 0.0)
     """deg, latitude and longitude of the origin of `place`."""
     sensor: str = ""
+    filter_cutoff: float = 0.0
+    """Cutoff frequency of the anti-alias filter that is undone in `field`, Hz; 0: none."""
     inputs: dict[str, str] = attribute(default_factory=dict)
     """File -> SHA-256."""
     model: str = ""

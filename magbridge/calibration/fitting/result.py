@@ -129,7 +129,7 @@ def assemble(
             noise.white,
         ),
         reference=Reference(samples.F_0, data.model),
-        sensor=Sensor(data.sensor),
+        sensor=Sensor(data.sensor, filter_cutoff=data.filter_cutoff),
         runs=_runs(data, e),
         method=method,
         inputs=dict(data.inputs),

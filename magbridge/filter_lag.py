@@ -1,0 +1,146 @@
+r"""Undo the lag of a sensor's anti-alias filter in the direction of the vector, sample after sample.
+
+A first-order filter of cutoff frequency :math:`f_c` gives y with
+:math:`\mathbf y + \tau \dot{\mathbf y} = \mathbf x`, :math:`\tau = 1 / (2 \pi f_c)`. A calibration is linear
+in the reading, so the corrected vector lags behind the field in the same way. In a turn of the rate
+:math:`\omega` the heading is late by :math:`\omega \tau`; the length of the vector is not, to first order.
+So the vector is turned by :math:`\tau \dot{\mathbf y}_\perp`, the part across it, and keeps its length and
+its noise along the field.
+
+The derivative is that of a parabola at its end, fitted by weighted least squares to the means of blocks of
+samples over the last :data:`SPAN_TIME_CONSTANTS` time constants, or over three samples where these are fewer.
+The weights are the numbers of samples in the blocks: :math:`W_i = n_i (N^{-1} a_i)_1`,
+:math:`a_i = (1, t_i, t_i^2)`, with the normal matrix N of the parabola about the last sample. After an abrupt
+change of attitude the parabola overshoots; so the derivative d counts by
+:math:`k = 1 - |\Delta \mathbf d|^2 / |\mathbf d|^2` at least 0, with its change since the last sample, and
+what that leaves out counts in sigma.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf, pi, sqrt
+from typing import Final
+
+from magbridge.records import Vector
+
+__all__ = ["FilterLag"]
+
+SPAN_TIME_CONSTANTS: Final = 4.0
+"""Time constants that the parabola spans: over shorter spans the derivative would be noise."""
+BLOCKS: Final = 12
+"""Blocks of samples in that span."""
+MIN_BLOCKS: Final = 3
+"""Blocks of a parabola, also where one sample lasts longer than a block."""
+MAX_INTERVAL_RATIO: Final = 10.0
+"""Interval over the one before it, beyond which it is a gap: no derivative is taken across it."""
+
+
+class FilterLag:
+    """Undo the lag of a first-order filter.
+
+    Parameters
+    ----------
+    cutoff_hz : float
+        Cutoff frequency of the filter, Hz.
+
+    Attributes
+    ----------
+    time_constant : float
+        Time constant of the filter, s.
+    variance : float
+        Variance of each component of the last vector from what is not known of the lag, nT².
+    """
+
+    def __init__(self, cutoff_hz: float) -> None:
+        self.time_constant = 1.0 / (2.0 * pi * cutoff_hz)
+        self.variance = 0.0
+        self._block_s = SPAN_TIME_CONSTANTS * self.time_constant / BLOCKS
+        # of each block: number of samples, the sums of time (s) and field (nT), and its first time (s)
+        self._blocks: deque[list[float]] = deque()
+        self._begin_us = self._last_us = 0
+        self._step_s = 0.0
+        self._rate: Vector = (0.0, 0.0, 0.0)
+
+    def undo(self, time_us: int, field: Vector, delay_s: float = 0.0) -> Vector:
+        """Return the vector (nT) at `time_us` (µs) without lag; `field` itself if it is not finite.
+
+        Parameters
+        ----------
+        time_us : int
+            Time of the sample, µs.
+        field : tuple of 3 float
+            Corrected vector, nT.
+        delay_s : float
+            Part of the filter's delay that `time_us` is corrected for already, s.
+        """
+        x, y, z = field
+        length2 = x * x + y * y + z * z
+        self.variance = 0.0
+        if not 0.0 < length2 < inf:
+            return field
+        step_s = (time_us - self._last_us) * 1e-6
+        if not 0.0 < step_s <= MAX_INTERVAL_RATIO * max(self._step_s or step_s, self.time_constant):
+            self._blocks.clear()
+            self._begin_us, step_s, self._rate = time_us, 0.0, (0.0, 0.0, 0.0)
+        self._last_us, self._step_s = time_us, step_s
+        self._add((time_us - self._begin_us) * 1e-6, field)
+        p, q, r = self._derivative()
+        along = (p * x + q * y + r * z) / length2
+        p, q, r = p - along * x, q - along * y, r - along * z
+        before, self._rate = self._rate, (p, q, r)
+        squared = p * p + q * q + r * r
+        if squared == 0.0:
+            return field
+        changed = (p - before[0]) ** 2 + (q - before[1]) ** 2 + (r - before[2]) ** 2
+        weight = max(1.0 - changed / squared, 0.0)
+        lag_s = self.time_constant - delay_s
+        error = lag_s * ((1.0 - weight) * sqrt(squared) + 0.5 * weight * sqrt(changed))
+        self.variance = 0.5 * error * error
+        turn = weight * lag_s
+        x, y, z = x + turn * p, y + turn * q, z + turn * r
+        scale = sqrt(length2 / (x * x + y * y + z * z))
+        return x * scale, y * scale, z * scale
+
+    def _add(self, time_s: float, field: Vector) -> None:
+        """Add a sample to its block, and drop the blocks that are too old."""
+        blocks = self._blocks
+        if blocks and time_s - blocks[-1][5] < self._block_s:
+            last = blocks[-1]
+            last[0] += 1.0
+            last[1] += time_s
+            for axis in range(3):
+                last[2 + axis] += field[axis]
+        else:
+            blocks.append([1.0, time_s, *field, time_s])
+        span_s = SPAN_TIME_CONSTANTS * self.time_constant
+        while len(blocks) > MIN_BLOCKS and time_s - blocks[0][5] > span_s:
+            blocks.popleft()
+
+    def _derivative(self) -> Vector:
+        """Return the derivative (nT/s) of the parabola at the last sample."""
+        blocks, now = self._blocks, (self._last_us - self._begin_us) * 1e-6
+        weights = _weights([block[1] / block[0] - now for block in blocks], [block[0] for block in blocks])
+        rate = [0.0, 0.0, 0.0]
+        for weight, block in zip(weights, blocks, strict=True):
+            for axis in range(3):
+                rate[axis] += weight * block[2 + axis] / block[0]
+        return rate[0], rate[1], rate[2]
+
+
+def _weights(times: list[float], counts: list[float]) -> list[float]:
+    """Return the weight (1/s) of each block's mean, of `counts` samples, in the derivative at the time 0."""
+    if len(times) < 2:
+        return [0.0] * len(times)
+    if len(times) == 2:
+        slope = 1.0 / (times[1] - times[0])
+        return [-slope, slope]
+    s0 = s1 = s2 = s3 = s4 = 0.0
+    for t, n in zip(times, counts, strict=True):
+        s0, s1, s2, s3, s4 = s0 + n, s1 + n * t, s2 + n * t * t, s3 + n * t**3, s4 + n * t**4
+    # the second row of the inverse of [[s0, s1, s2], [s1, s2, s3], [s2, s3, s4]]
+    a, b, c = s2 * s3 - s1 * s4, s0 * s4 - s2 * s2, s1 * s2 - s0 * s3
+    determinant = s1 * a + s2 * b + s3 * c
+    if determinant == 0.0:
+        return [0.0] * len(times)
+    return [n * (a + b * t + c * t * t) / determinant for t, n in zip(times, counts, strict=True)]
