@@ -7,7 +7,8 @@ from types import ModuleType
 from typing import Any
 
 from magbridge.config import Align, Link, Telemetry
-from magbridge.link import Component, alignment, telemetry_ages
+from magbridge.link.component import Component
+from magbridge.link.parameters import alignment, telemetry_ages
 from magbridge.mavlink import Codec
 
 START = 1_700_000_000_000_000

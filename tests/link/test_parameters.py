@@ -14,9 +14,8 @@ from line import Line, MakeLine
 
 from magbridge.config import Align, Telemetry
 from magbridge.errors import FormatError
-from magbridge.link import Parameters, alignment, telemetry_ages
 from magbridge.link.message_rates import LIMITS
-from magbridge.link.parameters import Tunable, rates, real32
+from magbridge.link.parameters import Parameters, Tunable, alignment, rates, real32, telemetry_ages
 from magbridge.link.store import StoredState, load, save
 
 

@@ -12,7 +12,8 @@ from zipfile import ZipFile
 import pytest
 
 from magbridge.config import Align, Link
-from magbridge.link import Component, alignment
+from magbridge.link.component import Component
+from magbridge.link.parameters import alignment
 from magbridge.mavlink import Codec, spec
 from magbridge.monitor.bundle import bundle
 from magbridge.monitor.chart import drawn
