@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from magbridge.arrays import FloatArray
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.learning.causes import NO_COEFFICIENT, Alarm, named
 from magbridge.learning.intake import Sample
+from magbridge.learning.judge import BEYOND_CHANCE, FIRST
 from magbridge.learning.knowledge import Knowledge
+from magbridge.learning.observation import Observation
 from magbridge.learning.publication import Publication
 from magbridge.learning.standing import Standing
 
@@ -41,6 +44,8 @@ class Decision:
     ) -> None:
         self._publication, self._standing, self._notify = publication, standing, notify
         self.samples = 0
+        self._unconfirmed = False  # a cause was learned, and nothing was published since
+        self._refuted = False  # another alarm came before later samples confirmed it
 
     def learned(self, knowledge: Knowledge) -> Calibration:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
@@ -48,12 +53,17 @@ class Decision:
 
     def doubt(self, alarm: Alarm | None) -> None:
         """Pass an alarm, if there is one, to the alarm's state, and send the notification that results."""
-        if alarm is not None and (news := self._standing.raised(alarm)):
+        if alarm is None:
+            return
+        pending = self._standing.pending
+        if news := self._standing.raised(alarm):
             self._notify(news, True)
+        self._refuted = self._refuted or (pending and not self._standing.pending)
 
     def publish(self, knowledge: Knowledge, how: str) -> None:
         """Publish the learned calibration; `how` is the reason in the notification."""
         self._notify(self._publication.publish(self.learned(knowledge), how), False)
+        self._unconfirmed = False
 
     def settle(self, knowledge: Knowledge, how: str) -> None:
         """Close the alarm, if there is one; `how` is the reason in the notification."""
@@ -75,17 +85,12 @@ class Decision:
         `way` is the distance (m) and time (s) since the previous sample. Return True if learning has to
         restart from the first calibration.
         """
-        publication = self._publication
         now, signs = knowledge.predict(sample, *way)
         best = knowledge.bank.best
         if knowledge.outlying(learnable=self._standing.learnable):
             self._standing.count(best.residual, best.variance, telling=False)
             return False
-        first, published = (
-            knowledge.observe(sample.field, nine, sample.reference) for nine in publication.nine(sample.phi)
-        )
-        rock = knowledge.believed.transition(*way)
-        publication.judge.judge(*rock, first.e, first.s, best.residual, best.variance)
+        published = self._judge(knowledge, sample, way)
         apart = published.e - now.e
         if knowledge.start is None:
             self._compare(knowledge, signs.time, apart)
@@ -97,6 +102,24 @@ class Decision:
         if knowledge.start is not None and not knowledge.start.fitted:
             return False  # neither published nor judged
         return self._decide(knowledge, apart * now.s, frozen=frozen)
+
+    def _judge(self, knowledge: Knowledge, sample: Sample, way: tuple[float, float]) -> Observation:
+        """Let the calibrations predict a sample; return the published one's observation."""
+        publication, judge = self._publication, self._publication.judge
+
+        def observe(nine: FloatArray) -> Observation:
+            return knowledge.observe(sample.field, nine, sample.reference)
+
+        direction = observe(publication.nine(sample.phi)[FIRST]).direction
+        if judge.is_due(*way, direction) and knowledge.start is None:
+            publication.propose(knowledge.bank.best.coefficients)
+        seen = [observe(nine) for nine in publication.nine(sample.phi)]
+        for which, nine in publication.replaced(sample.phi).items():
+            judge.replace(which, seen[which].e - observe(nine).e, seen[which].s)
+        first, published, candidate = seen
+        F = knowledge.believed.transition(*way)[0]
+        judge.judge(F, (first.e, published.e, candidate.e), first.s)
+        return published
 
     def _compare(self, knowledge: Knowledge, time: float, apart: float) -> None:
         """Select the best estimator; `apart` (nT) is the published calibration's residual less the best's."""
@@ -113,6 +136,7 @@ class Decision:
         if not knowledge.begin(sample, *way):
             self._count(learned=True)
             return
+        self._publication.propose(knowledge.bank.quiet.coefficients)
         self._publication.judge.restart(knowledge.nuisance)
         if self._publication.learned:
             self._publication.renew(self.learned(knowledge))
@@ -126,43 +150,81 @@ class Decision:
     def _decide(self, knowledge: Knowledge, apart: float, *, frozen: bool) -> bool:
         """Publish or roll back; `apart` is the difference of learned and published total field, nT."""
         publication = self._publication
-        if not frozen:
-            self._end(knowledge)
-        if publication.judge.roll_back:
-            if publication.learned:
+        if not frozen and (self._refuted or self._end(knowledge)):
+            publication.judge.restart()
+            self._standing.restart()
+            self._unconfirmed = self._refuted = False
+            return True
+        worse, relapsed = publication.judge.roll_back, self._standing.relapses > 0
+        if worse and not publication.learned and self._standing.alarm is None:
+            publication.judge.discard()  # what is learned may get better yet
+        elif worse or (relapsed and publication.judge.improves < -BEYOND_CHANCE):
+            self._standing.mistaken()
+            if worse and publication.learned:
                 self._notify(publication.roll_back(), False)
             publication.judge.restart()
-            self._standing.mistaken()
+            self._unconfirmed = self._refuted = False
             return True
         if frozen or not self._trusted(knowledge):
             return False
-        if not publication.learned and publication.judge.adopt:
-            for one in knowledge.bank.all:
-                one.keep_level(publication.coefficients)
-            self.publish(knowledge, "learned")
+        pending = self._standing.pending
+        if pending or not publication.learned:
+            if self._holds(knowledge):
+                self._publish_learned(knowledge)
         elif publication.stale(apart):
             publication.renew(self.learned(knowledge))
         return False
 
+    def _holds(self, knowledge: Knowledge) -> bool:
+        """Return True if what is learned predicts better, and differs from what is published everywhere."""
+        publication, best = self._publication, knowledge.bank.best
+        if knowledge.start is not None and not publication.learned:  # no calibration is published
+            return publication.judge.better > BEYOND_CHANCE
+        change = best.coefficients - publication.coefficients
+        return publication.judge.adopt and knowledge.coverage.is_significant(change, best.covariance)
+
+    def _publish_learned(self, knowledge: Knowledge) -> None:
+        """Publish what is learned; close the alarm that it explains."""
+        if not self._standing.pending:
+            for one in knowledge.bank.all:
+                one.keep_level(self._publication.coefficients)
+            self.publish(knowledge, "learned")
+            return
+        self._publication.publish(self.learned(knowledge), "learned")
+        self._unconfirmed = False
+        how = self._explained
+        if self._standing.confirmed():
+            self._notify(f"explained again: {how}", False)
+
     def _trusted(self, knowledge: Knowledge) -> bool:
         """Return True without an alarm, or if the best estimator's hypothesis explains the alarm."""
         standing, bank = self._standing, knowledge.bank
-        if standing.alarm is None or standing.mapless:
+        if standing.alarm is None or standing.mapless or standing.tried:
             return True
         return standing.learnable and not standing.relapses and bank.best is not bank.quiet
 
-    def _end(self, knowledge: Knowledge) -> None:
-        """Close an alarm that has been silent for long, or learn the cause of one that is certain enough."""
+    def _end(self, knowledge: Knowledge) -> bool:
+        """Close an alarm that has been silent for long, or learn the cause of one that is certain enough.
+
+        Return True if learning has to restart, because no later samples confirmed what was learned.
+        """
         standing, publication = self._standing, self._publication
+        if standing.pending and publication.judge.improves > 0.0:
+            return False
         if not standing.gone:
             if standing.ripe:
                 self._take_up(knowledge)
-        elif not standing.tried:
+            return False
+        restart = self._unconfirmed or (standing.relapses > 0 and not standing.tried)
+        if not standing.tried:
             self.gone(knowledge)
-        elif publication.learned:
+        elif publication.learned and not standing.pending:
             self.settle(knowledge, self._explained)
         else:
-            self.settle(knowledge, f"the first calibration holds, {calibration_id(publication.first):08x}")
+            name = "learned" if publication.learned else "first"
+            which = calibration_id(publication.calibration)
+            self.settle(knowledge, f"the {name} calibration holds, {which:08x}")
+        return restart
 
     @property
     def _explained(self) -> str:
@@ -171,7 +233,7 @@ class Decision:
         return f"{causes}, learned {calibration_id(self._publication.calibration):08x}"
 
     def _take_up(self, knowledge: Knowledge) -> None:
-        """Learn the cause of the alarm, if coefficients can represent it."""
+        """Learn the cause of the alarm, if coefficients can represent it, on trial."""
         bank, alarm = knowledge.bank, self._standing.alarm
         strength = float(knowledge.doubt.statistic.max())
         if strength < GONE:
@@ -183,8 +245,7 @@ class Decision:
             if moved is None:
                 return
             bank.explained(*moved, strength)
-        self._publication.publish(self.learned(knowledge), "learned")
-        how = self._explained
         knowledge.doubt.restart()
-        if self._standing.learned():
-            self._notify(f"explained again: {how}", False)
+        self._publication.judge.discard()
+        self._standing.take_up()
+        self._unconfirmed = True

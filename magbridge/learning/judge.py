@@ -1,116 +1,301 @@
-r"""Compare the first and the learned calibration by their predictions of each sample before the update.
+r"""Compare the first calibration with what is learned, by samples that nothing was learned from yet.
 
-Both predict the residual of the next sample and its variance. The first calibration has a filter of its own
-for the nuisance (:mod:`.nuisance`); the learned calibration has its estimator's
-(:mod:`.estimator`). With errors v and variances S of these predictions,
+Time is divided into blocks, each longer than the crustal field is correlated along the track (10 minutes
+suffice), with a turn of the vehicle in it. The coefficients learned before a block are its *candidate*: they
+stay fixed within the block, so that all of its samples test them, most of them at another attitude and
+position. Both calibrations are filtered with the same model of the reference's error (:mod:`.nuisance`), with
+the standard deviation of the crustal field under which the better of them predicts best. With innovations v
+of the first calibration and v + d of the candidate, of variance S, the share of the candidate's change that
+the samples confirm is
 
-.. math:: 2 L = \sum \left( \frac{v_a^2}{c^2 S_a} - \frac{v_b^2}{c^2 S_b} + \log \frac{S_a}{S_b} \right)
+.. math:: \beta = -\frac{\sum v d / S}{\sum d^2 / S}
 
-is the log-likelihood ratio of b over a (Dawid 1984, J. R. Statist. Soc. A 147:278). Where a holds,
-:math:`e^L` has the mean 1, and by Ville's inequality it exceeds :math:`e^h` at any time with probability
-:math:`e^{-h}` at most. L is kept from falling below 0 (Page 1954): a mistaken change then comes once in
-:math:`e^h` samples at most. c is how much noisier the better of them is than its sigma.
+This is the generalised least-squares coefficient of the first calibration's error on the change: 1 if the
+change is right, 0 if the first calibration is. From :math:`\beta > 1/2` on, the candidate has the smaller
+error; the log-likelihood ratio of both is :math:`(\beta - 1/2) \sum d^2 / S`. The standard error of the share
+is the larger of that by the model and that by the differences between the blocks, which includes errors that
+neither calibration explains (Liang & Zeger 1986, Biometrika 73:13).
+
+A change that holds where it was tested may still be wrong at other attitudes. :class:`Coverage` compares it
+with its uncertainty at all attitudes so far.
 """
 
 from __future__ import annotations
 
-from math import log
+from collections import deque
+from math import sqrt
 from typing import Final
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.learning.nuisance import STATES, Nuisance
+from magbridge.learning.nuisance import LENGTH, STATES, Nuisance
 
-__all__ = ["BEYOND_CHANCE", "FIRST", "LEARNED", "Judge"]
+__all__ = ["BEYOND_CHANCE", "CANDIDATE", "FIRST", "PUBLISHED", "Coverage", "Judge"]
 
-FIRST, LEARNED = range(2)
+FIRST, PUBLISHED, CANDIDATE = range(3)
 BEYOND_CHANCE: Final = 13.5
-"""h: once in 30 days of 0.25 Hz."""
-MAX_JUDGE_SQUARE: Final = 4.0
-"""Largest contribution of one sample: an outlier does not distinguish the calibrations."""
-MIN_ADVANTAGE: Final = 0.01
-"""Least advantage of the learned calibration for each sample: an error of 0.14 sigma that only the first
-calibration makes. No calibration is exact. A smaller advantage becomes significant over thousands of similar
-samples, but does not hold for different ones, and quantities that predictions do not show, as the level, may
-get worse."""
+"""Log-likelihood ratio that is exceeded by chance once in 30 days of 0.25 Hz (Ville's inequality)."""
+MAX_JUDGE_SQUARE: Final = 25.0
+"""Normalised square of the smaller innovation above which a sample has a larger variance: an outlier of both
+calibrations does not distinguish them."""
 JUDGE_MEMORY_SAMPLES: Final = 500
 """Samples over which mean squares are followed."""
+MIN_BLOCK_S: Final = 60.0
+MAX_BLOCK_S: Final = 600.0
+"""Shortest and longest duration after which a block may end, s; in between the time in which the vehicle
+travels the crustal field's correlation length."""
+STEADY_TIME_S: Final = 60.0
+"""Time after a turn for which a block does not end, s, so that it contains the whole turn; a vehicle that
+turns all the time ends it after twice the duration."""
+TURN: Final = 0.4
+"""Change of the field's direction in sensor axes that is another attitude, rad."""
+MIN_BLOCKS: Final = 3
+MAX_BLOCKS: Final = 12
+"""Number of last blocks that are compared."""
+SIGNIFICANCE_SIGMA: Final = 2.0
+"""Normal quantile (2.3 %) at which a share differs from 1/2. Few blocks need more, as Student's t does."""
+MIN_DIRECTIONS: Final = 4
+"""Number of directions of the field, :data:`TURN` apart, from which on a change is known at all attitudes."""
+MIN_CHANGE_RATIO: Final = 3.0
+"""Least ratio of a change's mean square to its variance, at all attitudes so far."""
+MAX_ROWS: Final = 64
+CRUST_FACTORS: Final = np.array([1.0, 0.3, 0.1, 0.03])
+"""Standard deviations of the crustal field that are compared, as fractions of the nuisance's."""
+CRUST_MEMORY_SAMPLES: Final = 2000.0
+"""Samples over which their likelihoods are compared."""
+
+
+def student_quantile(dof: int) -> float:
+    """Return Student's quantile of :data:`SIGNIFICANCE_SIGMA` (Abramowitz & Stegun 1964, eq. 26.7.5)."""
+    z = SIGNIFICANCE_SIGMA
+    return z + (z**3 + z) / (4.0 * dof) + (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / (96.0 * dof**2)
+
+
+class Blocks:
+    """Compare the candidates of the last blocks with one calibration."""
+
+    def __init__(self) -> None:
+        self._ended: deque[FloatArray] = deque(maxlen=MAX_BLOCKS)
+        self._sums = np.zeros((len(CRUST_FACTORS), 2))
+
+    def add(self, v: FloatArray, d: FloatArray, S: FloatArray) -> None:
+        """Add a sample: innovations v and those of the candidate, v + d, of variance S, by each crust."""
+        self._sums += np.stack([d * d / S, -v * d / S], axis=1)
+
+    def end(self) -> None:
+        """End the present block."""
+        self._ended.append(self._sums)
+        self._sums = np.zeros_like(self._sums)
+
+    def log_ratio(self, crust: int) -> float:
+        """Return the log-likelihood ratio of the candidates over the calibration, by one of the crusts."""
+        information, confirmed = sum(self._ended, self._sums)[crust].tolist()
+        return float(confirmed - 0.5 * information)
+
+    def significance(self, crust: int) -> float:
+        """Return by how many times its bound the share of the last blocks differs from 1/2."""
+        largest = 0.0
+        for count in range(MIN_BLOCKS, len(self._ended) + 1):
+            information, confirmed = np.array(list(self._ended)[-count:])[:, crust].T
+            total = float(information.sum())
+            if total <= 0.0:
+                continue
+            share = float(confirmed.sum()) / total
+            # what a block confirms more or less than the common share
+            excess = confirmed - share * information
+            by_blocks = float(excess @ excess) / total**2 * count / (count - 1)
+            sigma = sqrt(max(1.0 / total, by_blocks))
+            significance = (share - 0.5) / (student_quantile(count - 1) * sigma)
+            if abs(significance) > abs(largest):
+                largest = significance
+        return largest
 
 
 class Judge:
-    """Follows the predictions of the first and of the learned calibration.
+    """Follow the predictions of the first and the published calibration and of the candidates.
+
+    Parameters
+    ----------
+    nuisance : Nuisance
+        Dynamics of the reference's error.
 
     Attributes
     ----------
-    better, worse : float
-        Log-likelihood ratio of the learned calibration over the first one, less the margin; and of the first
-        over the learned one.
-    mean_square : (2,) array
-        Recent mean square of the prediction errors of the first and the learned calibration, nT².
+    mean_square : (3,) array
+        Recent mean square of the prediction errors of the first and the published calibration and the
+        candidate, nT².
     last : tuple of 2 float
-        Error of the first calibration's last prediction (nT), and its predicted variance (nT²).
+        Error of the published calibration's last prediction (nT), and its predicted variance (nT²).
     """
 
     def __init__(self, nuisance: Nuisance) -> None:
         self._nuisance = nuisance
-        self.mean_square = np.zeros(2)
-        self._noisier = np.ones(2)
-        self._judged = 0
+        self.mean_square = np.zeros(3)
+        self._noisier, self._judged = 1.0, 0
         self.last = 0.0, 1.0
         self.restart()
 
     def restart(self, nuisance: Nuisance | None = None) -> None:
-        """Restart the comparison, for another first calibration or another nuisance."""
+        """Discard all blocks, for another first calibration, candidate or nuisance."""
         self._nuisance = nuisance or self._nuisance
-        self._P = self._nuisance.initial.copy()
-        self._m = np.zeros(STATES)
-        self.better = self.worse = 0.0
+        scale = np.ones((len(CRUST_FACTORS), STATES))
+        scale[:, :2] = CRUST_FACTORS[:, None]
+        self._initial = scale[:, :, None] * self._nuisance.initial * scale[:, None, :]
+        self._P = self._initial.copy()
+        self._states = np.zeros((len(CRUST_FACTORS), STATES, 3))
+        self._likelihoods = np.zeros((len(CRUST_FACTORS), 3))
         self._fresh = True
+        self.discard()
 
-    def judge(
-        self, F: FloatArray, Q: FloatArray, e: float, s: float, innovation: float, variance: float
-    ) -> None:
-        """Compare one sample, after the states moved by F and Q.
+    def discard(self) -> None:
+        """Discard all blocks: other candidates follow."""
+        self._to_first, self._to_published = Blocks(), Blocks()
+        self._begin_block()
+
+    def _begin_block(self) -> None:
+        self._seconds = self._metres = self._steady = 0.0
+        self._turned = False
+        self._direction: FloatArray | None = None
+
+    def is_due(self, metres: float, seconds: float, direction: FloatArray) -> bool:
+        """Return True if a sample begins a block, so that it needs a new candidate.
 
         Parameters
         ----------
-        F, Q : (4, 4) arrays
-            Transition and process noise of :meth:`.Nuisance.transition`.
-        e, s : float
-            Residual of the first calibration (nT), and its scale.
-        innovation, variance : float
-            Innovation of the learned calibration (nT), and its variance (nT²).
+        metres, seconds : float
+            Distance and time since the previous sample.
+        direction : (3,) array
+            Direction of the field in sensor axes.
         """
-        h = self._nuisance.row(s)
-        self._P = F @ self._P @ F.T + Q
-        self._m = F @ self._m
+        if self._direction is None:
+            self._direction = direction
+            return True
+        self._seconds += seconds
+        self._metres += metres
+        self._steady += seconds
+        change = direction - self._direction
+        if float(change @ change) > TURN * TURN:
+            self._turned, self._direction, self._steady = True, direction, 0.0
+        long = self._seconds >= MAX_BLOCK_S or (self._seconds >= MIN_BLOCK_S and self._metres >= LENGTH)
+        over = self._steady >= STEADY_TIME_S or self._seconds >= 2.0 * MAX_BLOCK_S
+        if not (long and over and self._turned):
+            return False
+        self._to_first.end()
+        self._to_published.end()
+        self._begin_block()
+        self._direction = direction
+        return True
+
+    def replace(self, which: int, change: float, scale: float) -> None:
+        """Keep the level of a calibration that is replaced, which changes the present residual, nT."""
+        self._states[:, 3, which] += scale * change
+
+    def judge(self, F: FloatArray, residuals: tuple[float, float, float], scale: float) -> None:
+        """Compare one sample, after the reference's error moved by F.
+
+        Parameters
+        ----------
+        F : (4, 4) array
+            Transition of :meth:`.Nuisance.transition`.
+        residuals : tuple of 3 float
+            Residuals of the first and the published calibration and of the candidate, nT.
+        scale : float
+            Scale of the first calibration's residual.
+        """
+        h = self._nuisance.row(scale)
+        self._P = self._initial + F @ (self._P - self._initial) @ F.T
         Ph = self._P @ h
-        S = float(h @ Ph) + self._nuisance.white_variance
-        v = e + float(h @ self._m)
-        self.last = v, S
-        self._m -= Ph * (v / S)
-        self._P -= np.outer(Ph / S, Ph)
+        S = Ph @ h + self._nuisance.white_variance
+        states = F @ self._states
+        v = np.array(residuals) + np.tensordot(h, states, axes=(0, 1))
+        gain = Ph / S[:, None]
+        self._states = states - gain[:, :, None] * v[:, None, :]
+        self._P -= gain[:, :, None] * Ph[:, None, :]
+        self.last = float(v[0, PUBLISHED]), float(S[0])
         if self._fresh:  # the first sample only determines the level of the crustal field
             self._fresh = False
             return
         self._judged += 1
         share = 1.0 / min(self._judged, JUDGE_MEMORY_SAMPLES)
-        square = np.array([v * v, innovation * innovation])
-        self.mean_square += share * (square - self.mean_square)
-        square /= (S, variance)
-        self._noisier += share * (np.minimum(square, 25.0) - self._noisier)
-        first, learned = (square / max(1.0, float(self._noisier.min()))).tolist()
-        won = min(max(0.5 * (first - learned + log(S / variance)), -MAX_JUDGE_SQUARE), MAX_JUDGE_SQUARE)
-        self.better = max(0.0, self.better + won - MIN_ADVANTAGE)
-        self.worse = max(0.0, self.worse - won)
+        self.mean_square += share * (v[0] * v[0] - self.mean_square)
+        squares = v * v / S[:, None]
+        self._likelihoods *= 1.0 - 1.0 / CRUST_MEMORY_SAMPLES
+        self._likelihoods -= 0.5 * (np.minimum(squares, MAX_JUDGE_SQUARE) + np.log(S)[:, None])
+        smaller = squares.min(axis=1)
+        self._noisier += share * (min(float(smaller[0]), MAX_JUDGE_SQUARE) - self._noisier)
+        S = S * np.maximum(max(1.0, self._noisier), smaller / MAX_JUDGE_SQUARE)
+        for blocks, which in ((self._to_first, FIRST), (self._to_published, PUBLISHED)):
+            blocks.add(v[:, which], v[:, CANDIDATE] - v[:, which], S)
+
+    @property
+    def _crust(self) -> int:
+        """Index of the crustal field's standard deviation with which the best calibration predicts best."""
+        return int(self._likelihoods.max(axis=1).argmax())
+
+    @property
+    def better(self) -> float:
+        """Log-likelihood ratio of the candidates over the first calibration, in the last blocks."""
+        return self._to_first.log_ratio(self._crust)
+
+    @property
+    def improves(self) -> float:
+        """Log-likelihood ratio of the candidates over the published calibration, in the last blocks."""
+        return self._to_published.log_ratio(self._crust)
 
     @property
     def adopt(self) -> bool:
-        """Return True if the learned calibration predicts significantly better, by its log ratio."""
-        return self.better > BEYOND_CHANCE
+        """Return True if the candidates have significantly smaller errors than the published calibration."""
+        return self._to_published.significance(self._crust) > 1.0
 
     @property
     def roll_back(self) -> bool:
-        """Return True if the first calibration predicts significantly better (log ratio above the bound)."""
-        return self.worse > BEYOND_CHANCE
+        """Return True if the first calibration has significantly smaller errors than the candidates."""
+        return self._to_first.significance(self._crust) < -1.0
+
+
+class Coverage:
+    """Attitudes, positions of masses and temperatures at which a change of the coefficients is evaluated.
+
+    Parameters
+    ----------
+    size : int
+        Number of coefficients K.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._rows = np.zeros((2 * MAX_ROWS, size))
+        self._stored, self._step, self._samples = 0, 1, 0
+        self._directions: list[FloatArray] = []
+
+    def add(self, row: FloatArray, direction: FloatArray) -> None:
+        """Add a sample's derivatives of the total field (K,), and the field's direction in sensor axes."""
+        nearest = min((float(np.sum((direction - one) ** 2)) for one in self._directions), default=np.inf)
+        if nearest > TURN * TURN:
+            self._directions.append(direction)
+        self._samples += 1
+        if self._samples % self._step:
+            return
+        if self._stored == len(self._rows):  # keep every second row
+            self._stored //= 2
+            self._rows[: self._stored] = self._rows[::2]
+            self._step *= 2
+        self._rows[self._stored] = row
+        self._stored += 1
+
+    def is_significant(self, change: FloatArray, covariance: FloatArray) -> bool:
+        """Return True if a change of the coefficients is larger than its uncertainty at all attitudes.
+
+        Parameters
+        ----------
+        change : (K,) array
+            Change of the coefficients.
+        covariance : (K, K) array
+            Its covariance. The level, the mean over all rows, does not count.
+        """
+        if len(self._directions) < MIN_DIRECTIONS:
+            return False
+        rows = self._rows[: self._stored] - self._rows[: self._stored].mean(axis=0)
+        by_change = rows @ change
+        variance = float(np.einsum("ij,jk,ik->", rows, covariance, rows))
+        return float(by_change @ by_change) > MIN_CHANGE_RATIO * variance

@@ -16,6 +16,7 @@ from magbridge.learning.doubt import Doubt
 from magbridge.learning.estimator import Estimator
 from magbridge.learning.hindsight import Hindsight, Kept
 from magbridge.learning.intake import Sample
+from magbridge.learning.judge import Coverage
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
 from magbridge.learning.observation import Observation, observe
@@ -54,6 +55,8 @@ class Knowledge:
         Estimators.
     doubt : Doubt
         Change detector of the baseline estimator.
+    coverage : Coverage
+        Attitudes so far.
     start : Start or None
         Batch fit, until a filter can continue without it.
     nuisance, noise
@@ -70,6 +73,7 @@ class Knowledge:
         quiet.open(turn_on**2)
         self.bank, self.doubt = Bank(model, quiet, mapless), Doubt(model, quiet)
         self.hindsight, self._outliers = Hindsight(), 0
+        self.coverage = Coverage(model.size)
         self._before: FloatArray | None = None
         self.start: Start | None = None
         if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * LINEAR**2:
@@ -124,13 +128,15 @@ class Knowledge:
             other.propagate(metres, seconds)
         self.doubt.propagate(quiet, quiet.propagate(metres, seconds), seconds)
         live = {id(one): self._predict(one, sample) for one in self.bank.all}
+        best = live[id(self.bank.best)]
+        self.coverage.add(best.s * self._model.derivative(sample.phi, best.by_nine), best.direction)
         self.keep(sample, quiet.residual)
         now, clock = live[id(quiet)], 0.0
         if before is not None and 0.0 < seconds < 30.0:  # the residual if telemetry were a second late
             clock = (self._by(quiet)(sample.field, before, sample.reference).e - now.e) / seconds
         offset, level = now.by_nine[6:], -1.0 / now.s
         signs = Signs(sample.time_us * 1e-6, offset, tuple(sample.positions), sample.watched, clock, level)
-        return live[id(self.bank.best)], signs
+        return best, signs
 
     def _predict(self, one: Estimator, sample: Sample) -> Observation:
         live = self._by(one)(sample.field, sample.phi, sample.reference)

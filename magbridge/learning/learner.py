@@ -11,7 +11,6 @@ import numpy as np
 from magbridge.calibration.model import Calibration
 from magbridge.learning.decision import Decision
 from magbridge.learning.intake import Intake, Sample
-from magbridge.learning.judge import FIRST, LEARNED
 from magbridge.learning.knowledge import Knowledge
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
@@ -122,13 +121,11 @@ class Learner:
     @property
     def state(self) -> State:
         """How learning stands."""
-        publication, alarm = self._publication, self._standing.alarm
-        judge, published = publication.judge, publication.learned
-        rms = np.sqrt(judge.mean_square).tolist()
+        judge, alarm = self._publication.judge, self._standing.alarm
+        first, published, learned = np.sqrt(judge.mean_square).tolist()
         causes = alarm.causes if alarm else ()
         since, size = (round(alarm.since * 1e6), alarm.size) if alarm else (0, 0.0)
-        better = -judge.worse if published else judge.better
-        return State(self.samples, (rms[FIRST], rms[published], rms[LEARNED]), better, causes, since, size)
+        return State(self.samples, (first, published, learned), judge.better, causes, since, size)
 
     def learned(self) -> Calibration:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
@@ -154,9 +151,10 @@ class Learner:
         self._intake = Intake(self._max_rate)
 
     def _restart(self, nuisance: Nuisance) -> None:
-        """Begin to learn from the first calibration, whose offsets may have changed at this power-on."""
-        mapless = Nuisance(self.first.noise, MAPLESS, MAPLESS) if self._grid is not None else None
-        self._knowledge = Knowledge(self._model, self.first, nuisance, mapless, self._turn_on)
+        """Begin to learn from the published calibration; offsets may have changed at this power-on."""
+        published = self.calibration
+        mapless = Nuisance(published.noise, MAPLESS, MAPLESS) if self._grid is not None else None
+        self._knowledge = Knowledge(self._model, published, nuisance, mapless, self._turn_on)
 
     def _notify(self, text: str, grave: bool = False) -> None:
         self.notices.append(Notice(text, self._now_us * 1e-6, grave))

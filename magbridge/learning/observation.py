@@ -24,6 +24,11 @@ class Observation(NamedTuple):
     s: float
     by_nine: FloatArray
 
+    @property
+    def direction(self) -> FloatArray:
+        """Direction of the field in sensor axes (3,), up to the soft iron."""
+        return -self.s * self.by_nine[6:]
+
 
 def observe(field: Vector, nine: FloatArray, F_0: float, reference: float, kappa: float = 0.0) -> Observation:
     """Compare one sample with its reference.

@@ -12,7 +12,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration, Noise
 from magbridge.learning.estimator import Estimator
-from magbridge.learning.judge import FIRST, LEARNED, Judge
+from magbridge.learning.judge import CANDIDATE, FIRST, PUBLISHED, Judge
 from magbridge.learning.model import Model
 from magbridge.learning.nuisance import Nuisance
 
@@ -59,16 +59,30 @@ class Publication:
         """Go back to the first, as if nothing had been judged."""
         self.calibration, self.judge, self.age = self.first, Judge(nuisance), 0
         self.coefficients = self._model.coefficients(self.first)[0]
-        self._weights = [self._model.weights(self.coefficients)] * 2
+        self._weights = [self._model.weights(self.coefficients)] * 3
+        self._replaced: dict[int, FloatArray] = {}
 
     @property
     def learned(self) -> bool:
         """Return True if the learned calibration is published."""
         return self.calibration is not self.first
 
-    def nine(self, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the nine coefficients (9,) of the first and of the published one at regressors (m,)."""
-        return phi @ self._weights[FIRST], phi @ self._weights[LEARNED]
+    def nine(self, phi: FloatArray) -> list[FloatArray]:
+        """Return the nine coefficients (9,) at `phi` (m,): first, published one and candidate."""
+        return [phi @ weights for weights in self._weights]
+
+    def replaced(self, phi: FloatArray) -> dict[int, FloatArray]:
+        """Return the nine coefficients (9,), at `phi` (m,), of what was replaced since the last call."""
+        replaced, self._replaced = self._replaced, {}
+        return {which: phi @ weights for which, weights in replaced.items()}
+
+    def propose(self, coefficients: FloatArray) -> None:
+        """Set the candidate's coefficients (K,)."""
+        self._replace(CANDIDATE, self._model.weights(coefficients))
+
+    def _replace(self, which: int, weights: FloatArray) -> None:
+        self._replaced.setdefault(which, self._weights[which])
+        self._weights[which] = weights
 
     def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
         """Return the calibration that an estimator has learned from so many samples, with its origin."""
@@ -102,29 +116,28 @@ class Publication:
         """Update the published calibration with the learned one, without a notification."""
         self.calibration = calibration
         self.coefficients = self._model.coefficients(calibration)[0]
-        self._weights[LEARNED] = self._model.weights(self.coefficients)
+        self._replace(PUBLISHED, self._model.weights(self.coefficients))
         self.age, self.renewed = 0, True
 
     def publish(self, calibration: Calibration, how: str) -> str:
         """Publish it for a reason of its own; return what to say of that."""
-        before = LEARNED if self.learned else FIRST
+        before = PUBLISHED if self.learned else FIRST
         self.renew(calibration)
-        self.judge.worse = 0.0
-        return self._change(how, before, LEARNED)
+        return self._change(how, before, CANDIDATE)
 
     def accept(self) -> None:
         """Make the published calibration the first one, so that no rollback undoes it."""
         self.first = self.calibration
-        self._weights[FIRST] = self._weights[LEARNED]
-        self.judge.mean_square[FIRST] = self.judge.mean_square[LEARNED]
+        self._weights[FIRST] = self._weights[PUBLISHED]
+        self.judge.mean_square[FIRST] = self.judge.mean_square[PUBLISHED]
         self.judge.restart()
 
     def roll_back(self) -> str:
         """Publish the first again; return what to say of that."""
         self.calibration, self.age = self.first, 0
         self.coefficients = self._model.coefficients(self.first)[0]
-        self._weights[LEARNED] = self._weights[FIRST]
-        return self._change("rolled back: the first calibration predicts better", LEARNED, FIRST)
+        self._replace(PUBLISHED, self._weights[FIRST])
+        return self._change("rolled back: the first calibration predicts better", PUBLISHED, FIRST)
 
     def _change(self, how: str, before: int, after: int) -> str:
         self.renewed = False

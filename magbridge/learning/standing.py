@@ -46,7 +46,9 @@ class Standing:
     relapses : int
         Number of relapses.
     tried : bool
-        True if the cause was learned after a relapse and no relapse has followed.
+        True if the cause was learned and no alarm has followed.
+    pending : bool
+        True if, in addition, later samples have not confirmed what was learned, so that it is not published.
     """
 
     def __init__(self, *, mapped: bool = False) -> None:
@@ -57,7 +59,8 @@ class Standing:
     def end(self) -> None:
         """Close the alarm."""
         self.alarm: Alarm | None = None
-        self.flags, self.variance, self.relapses, self.tried = 0, 0.0, 0, False
+        self.flags, self.variance, self.relapses = 0, 0.0, 0
+        self.tried = self.pending = False
         self._sure = 0.0
         self._doubted = self._quiet = 0
         self._explained = QUIET + 1
@@ -79,7 +82,8 @@ class Standing:
         if anew and self._explained <= QUIET:
             self.relapses += 1
         self._since = self._since if self.relapses else alarm.since
-        self.alarm, self.tried, self._quiet = alarm._replace(since=self._since), False, 0
+        self.alarm, self._quiet = alarm._replace(since=self._since), 0
+        self.tried = self.pending = False
         self.flags = int(Quality.UNEXPLAINED)
         self._cover()
         if anew:
@@ -88,18 +92,32 @@ class Standing:
             return ""
         return f"unexplained{' still' * bool(self.relapses)}: {alarm.size:.0f} nT, {named(alarm.causes)}"
 
-    def learned(self) -> bool:
-        """Record that the alarm's cause was learned; return True if the alarm is closed."""
-        self.tried, self._quiet = self.relapses > 0, 0
-        if not self.tried:
-            self.end()
+    def take_up(self) -> None:
+        """Record that the alarm's cause was learned, but is not published until it is confirmed."""
+        self.tried = self.pending = True
+        self._quiet = self._explained = 0
+        self._cover()
+
+    def restart(self) -> None:
+        """Require new evidence to learn the alarm's cause, because learning restarts."""
+        if self.alarm is not None:
+            self.alarm = self.alarm._replace(strength=0.0)
+        self._sure, self._doubted = self._slower * SURE, 0
+
+    def confirmed(self) -> bool:
+        """Record that what was learned is published; return True if the alarm is closed."""
+        self.pending, self._quiet = False, 0
+        if self.relapses:
+            self._cover()
+            return False
+        self.end()
         self._explained = 0
-        return not self.tried
+        return True
 
     def mistaken(self) -> None:
         """Record that the learned calibration was rolled back."""
-        if self.alarm is not None:
-            self.relapses, self.tried = max(1, self.relapses), True
+        if self.alarm is not None and not self.mapless:
+            self.relapses, self.tried, self.pending = max(1, self.relapses), True, False
             self._explained = self._quiet = 0
 
     def count(self, error: float, variance: float, *, telling: bool) -> None:
@@ -117,9 +135,10 @@ class Standing:
         self._cover()
 
     def _cover(self) -> None:
-        """Set the variance to the likeliest cause's and, after a relapse, at least to the errors observed."""
-        size = 0.0 if self.alarm is None or self.tried or self.mapless else self.alarm.size
-        self.variance = max(size * size, self._peak if self.relapses else 0.0)
+        """Set the variance to that of the likeliest cause, and of the errors once a cause was learned."""
+        learned = self.tried and not self.pending
+        size = 0.0 if self.alarm is None or learned or self.mapless else self.alarm.size
+        self.variance = max(size * size, self._peak if self.relapses or self.pending else 0.0)
 
     @property
     def mapless(self) -> bool:

@@ -1,41 +1,74 @@
-"""The comparison of predictions: a learned calibration must be better by more than a calibration error."""
+"""Which calibration predicts better: only samples that come after what was learned decide."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from magbridge.calibration.model import Noise
-from magbridge.learning.judge import FIRST, LEARNED, Judge
+from magbridge.learning.judge import CANDIDATE, FIRST, PUBLISHED, Coverage, Judge
 from magbridge.learning.nuisance import Nuisance
 
+LEG_SAMPLES = 200
+STEP_M, STEP_S = 1.4, 4.0
 
-def judged(error: float, samples: int) -> Judge:
-    """Return it after so many samples that the first predicts by ± `error` (sigmas) worse than the other."""
+
+def judged(hours: float, first: float, candidate: float, pulses: float = 0.0) -> Judge:
+    """Return it after a glider's legs, each with errors (nT) that change sign at every dive and climb.
+
+    `pulses` (nT) are added in two of every ten minutes, for both calibrations.
+    """
     rng = np.random.default_rng(5)
-    nuisance = Nuisance(Noise(1.0), 1e-3)
-    judge, still = Judge(nuisance), nuisance.transition(0.0, 0.0)
-    for k in range(samples):
-        noise = float(rng.normal())
-        judge.judge(*still, noise + error * (-1) ** k, 1.0, noise, nuisance.white_variance)
+    nuisance = Nuisance(Noise(1.0), 145.0)
+    judge, F = Judge(nuisance), nuisance.transition(STEP_M, STEP_S)[0]
+    for k in range(int(hours * 3600.0 / STEP_S)):
+        sign = (-1.0) ** (k // LEG_SAMPLES)
+        crust = 7.0 * np.sin(STEP_M * k / 500.0)
+        seen = crust + rng.normal() + pulses * (k * STEP_S % 600.0 < 120.0)
+        judge.is_due(STEP_M, STEP_S, np.array([0.4 * sign, 0.0, 0.9]))
+        residuals = seen + first * sign, seen + first * sign, seen + candidate * sign
+        judge.judge(F, residuals, 1.0)
     return judge
 
 
-def test_a_small_advantage_is_none_however_long_it_lasts() -> None:
-    """0.1 sigma is 50 log units in 10,000 samples, of which the margin leaves nothing; 0.2 sigma counts."""
-    assert not judged(0.1, 10_000).adopt
-    assert judged(0.2, 10_000).adopt
+def test_a_candidate_with_smaller_errors_is_adopted_after_some_turns() -> None:
+    assert not judged(0.5, 3.0, 0.0).adopt
+    assert judged(2.0, 3.0, 0.0).adopt
+    assert not judged(2.0, 3.0, 0.0).roll_back
 
 
-def test_it_is_rolled_back_without_a_margin() -> None:
-    """The first calibration need only predict significantly better, and not in a few samples."""
-    rng = np.random.default_rng(6)
-    nuisance = Nuisance(Noise(1.0), 1e-3)
-    judge, still = Judge(nuisance), nuisance.transition(0.0, 0.0)
-    for k in range(10_000):
-        noise = float(rng.normal())
-        judge.judge(*still, noise, 1.0, noise + 0.1 * (-1) ** k, nuisance.white_variance)
-        if k == 100:
-            assert not judge.roll_back
-    assert judge.roll_back
-    assert not judge.adopt
-    assert judge.mean_square[FIRST] < judge.mean_square[LEARNED]
+def test_a_candidate_with_errors_of_its_own_is_not_adopted() -> None:
+    """Not if its errors are as large as those of the first, and it is rolled back if they are larger."""
+    equal = judged(3.0, 1.0, -1.0)
+    assert (equal.adopt, equal.roll_back) == (False, False)
+    worse = judged(3.0, 0.0, 3.0)
+    assert (worse.adopt, worse.roll_back) == (False, True)
+    assert worse.mean_square[FIRST] == worse.mean_square[PUBLISHED] < worse.mean_square[CANDIDATE]
+
+
+def test_pulses_that_no_calibration_explains_decide_nothing() -> None:
+    judge = judged(3.0, 0.3, -0.3, pulses=20.0)
+    assert (judge.adopt, judge.roll_back) == (False, False)
+
+
+def test_a_new_candidate_begins_with_the_level_of_the_last() -> None:
+    judge = judged(2.0, 3.0, 0.0)
+    better = judge.better
+    judge.replace(CANDIDATE, 50.0, 1.0)
+    F = np.eye(4)
+    judge.judge(F, (0.0, 0.0, 50.0), 1.0)
+    assert abs(judge.better - better) < 20.0  # 2,500 if the level counted
+
+
+def test_a_change_is_significant_only_if_it_is_known_at_all_attitudes() -> None:
+    """Of an offset that is known along two axes, but not along the third."""
+    coverage, covariance = Coverage(3), np.diag([1.0, 1.0, 400.0])
+    change = np.array([10.0, 10.0, 0.0])
+    for direction in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)):
+        unit = np.array(direction)
+        assert not coverage.is_significant(change, covariance)
+        coverage.add(unit, unit)
+    assert coverage.is_significant(change, covariance)
+    assert not coverage.is_significant(0.1 * change, covariance)
+    for direction in ((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)):
+        coverage.add(np.array(direction), np.array(direction))
+    assert not coverage.is_significant(change, covariance)

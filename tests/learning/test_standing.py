@@ -63,7 +63,9 @@ def test_an_alarm_that_is_not_news_for_long_is_gone() -> None:
 def relapsed() -> Standing:
     """Return one whose cause was learned, and mistaken: errors of 30 nT were seen."""
     one = standing(alarm(20.0, "offset_step"))
-    assert one.learned()
+    one.take_up()
+    assert one.variance == 25.0  # until it is confirmed
+    assert one.confirmed()
     counted(one, QUIET - 1, 30.0)
     assert one.raised(alarm(19.0, "offset_drift")) == "unexplained still: 5 nT, offset drift"
     return one
@@ -83,7 +85,8 @@ def test_a_learned_change_with_another_alarm_was_mistaken() -> None:
 def test_a_relapsed_alarm_ends_when_the_learned_change_has_explained_many_samples() -> None:
     """Without a message before; a significant error restarts its count."""
     one = relapsed()
-    assert not one.learned()
+    one.take_up()
+    assert not one.confirmed()
     assert one.tried
     assert not one.ripe
     counted(one, QUIET, 0.0)
@@ -96,7 +99,8 @@ def test_a_relapsed_alarm_ends_when_the_learned_change_has_explained_many_sample
 def test_the_next_alarm_after_a_long_time_is_another() -> None:
     """The learned change has explained the data, so it was not a mistake."""
     one = standing(alarm(20.0, "offset_step"))
-    one.learned()
+    one.take_up()
+    one.confirmed()
     counted(one, QUIET + 1)
     assert one.raised(alarm(19.0, "offset_drift")) == "unexplained: 5 nT, offset drift"
     assert one.relapses == 0
