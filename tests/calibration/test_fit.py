@@ -388,3 +388,15 @@ def test_how_long_before_a_sample_the_last_one_came() -> None:
         runs=np.repeat([0, 1], 6), time=np.concatenate([time, time + 28.0]),
     )  # fmt: skip
     assert data.steps.tolist() == [np.inf, 1.0, 1.0, 2.0, 1.0, 1.0] * 2
+
+
+def test_a_long_log_is_fitted_with_a_part_of_its_samples() -> None:
+    """Every second one of 300,000: as good as with all, and the runs' labels stay."""
+    rng, n = np.random.default_rng(8), 300_000
+    u = rng.normal(size=(n, 3))
+    truth = 5e4 * u / np.linalg.norm(u, axis=1)[:, None]
+    offset = np.array([300.0, -200.0, 500.0])
+    data = Observations(truth + offset + rng.normal(0.0, 2.0, (n, 3)), np.full(n, 5e4), np.empty((n, 0)))
+    found = fit(data, "nominal")
+    assert len(found.residual) == n // 2
+    np.testing.assert_allclose(found.calibration.coefficients[6:9], offset, atol=0.1)

@@ -71,19 +71,22 @@ def test_crustal_field_is_not_taken_for_noise(survey: Survey) -> None:
 
 
 def test_a_level_that_the_reference_contradicts_is_not_believed(survey: Survey) -> None:
-    """Its sigma includes the found error; independent parts stay."""
+    """The level is the reference's, with its sigma; independent parts stay."""
     data, _, found = survey
     samples = pose(data, 3, None, None).samples
     doubted, believed = (
         with_level(found.calibration, samples, bias, MAIN_FIELD_SIGMA_NT) for bias in (400.0, 200.0)
     )
-    assert doubted.reference.level_sigma == 400.0
+    assert doubted.reference.level_sigma == pytest.approx(MAIN_FIELD_SIGMA_NT, rel=0.1)
+    assert doubted.reference.bias == 0.0
+    totals = [correct(one, data.field, data.channels(one), data.time).total for one in (doubted, believed)]
+    assert np.mean(totals[0] - totals[1]) == pytest.approx(-400.0, rel=0.02)
     assert believed.reference.level_sigma == pytest.approx(found.calibration.reference.level_sigma, rel=0.01)
     apart = apart_from_level(believed).covariance
     tiny = 1e-6 * float(np.abs(believed.covariance).max())
     np.testing.assert_allclose(apart_from_level(doubted).covariance, apart, atol=tiny)
     got = correct(doubted, data.field, np.empty((len(data), 0)), data.time)
-    assert got.sigma.min() > 390.0
+    assert got.sigma.min() > 0.9 * MAIN_FIELD_SIGMA_NT
 
 
 def test_a_slope_of_the_crust_is_not_taken_for_a_level() -> None:

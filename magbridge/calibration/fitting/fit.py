@@ -45,6 +45,8 @@ UNKNOWN_LENGTH = 500.0
 MAIN_FIELD_SIGMA_NT = 145.0
 """nT, 1-sigma by which the total field at a site differs from a main-field model's: what its degrees do not
 reach, the crust above all (error model of the World Magnetic Model 2020, Chulliat et al. 2020)."""
+MAX_FIT_SAMPLES = 250_000
+"""Samples at most that are fitted: more only cost time, because the model's error does not average out."""
 ROCK, JUDGED = 3.0 * MAIN_FIELD_SIGMA_NT, 3000
 """RMS that an unmapped crustal field never exceeds over a whole track, nT; samples that suffice to see it."""
 
@@ -85,7 +87,9 @@ def fit(
     Notes
     -----
     If ``auto`` is ``survey`` and that fit has no solution, the fit is one without a field in place. If
-    ``auto`` has no solution, it is ``nominal``, and conversely. The calibration warns of either.
+    ``auto`` has no solution, it is ``nominal``, and conversely. The calibration warns of either. Of a log
+    of more than :data:`MAX_FIT_SAMPLES` samples every second, third ... sample is fitted, except by
+    ``survey``, which needs all passes over a place.
     """
     if method not in METHODS:
         raise CalibrationError(f"method: {one_of(method, METHODS)}")
@@ -93,6 +97,8 @@ def fit(
     in_place = method == "auto" and data.lacks_rock and tells_rock(data) and _rock_may_show(data, order)
     if in_place:
         method = "survey"
+    if method != "survey" and len(data) > MAX_FIT_SAMPLES:
+        data = data.part(np.arange(len(data)) % -(-len(data) // MAX_FIT_SAMPLES) == 0)
     if method != "survey" and options.get("position_sigma"):
         raise CalibrationError(
             "position_sigma: the log does not show the crustal field, so its positions do not matter"

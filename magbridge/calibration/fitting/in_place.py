@@ -31,7 +31,7 @@ from magbridge.calibration.fitting.crossings import left_open
 from magbridge.calibration.fitting.field_nodes import about_the_middle, ladder
 from magbridge.calibration.fitting.known import Known
 from magbridge.calibration.fitting.left_out import leave_out
-from magbridge.calibration.fitting.level import with_level
+from magbridge.calibration.fitting.level import contradicts, with_level
 from magbridge.calibration.fitting.nominal import check_scales
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep, offered, with_creep, with_temperature
@@ -118,7 +118,13 @@ def fit_in_place(
     calibration = with_temperature(fit.calibration, data, survey.groups, (z, covariance, prior.E))
     if level:
         calibration = with_level(calibration, lifted, float(z[q]), level)
-    fit = replace(fit, calibration=calibration, open=tuple(left_open(data, found.choice.field.length)))
+    unclear = [*left_open(data, found.choice.field.length)]
+    if level and contradicts(bias := float(z[q]), level):
+        unclear.append(
+            f"the level of the field is the reference's, to {level:.0f} nT: the fit's own, {bias:+.0f} nT "
+            "from it, is not plausible (an effect is missing in the model)"
+        )
+    fit = replace(fit, calibration=calibration, open=tuple(unclear))
     if not creep.any():
         return fit
     return replace(

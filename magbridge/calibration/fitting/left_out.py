@@ -63,6 +63,8 @@ class LeftOut:
     ratio: float
     """Root mean square of the errors over their claimed sigmas; 1 where it is less, or not more than chance.
     The larger one, where groups of like attitude are left out, too."""
+    carried: float
+    """nT, the RMS with later parts of the log predicted from the earlier ones among the parts."""
 
 
 def leave_out(
@@ -135,9 +137,11 @@ def _left_out(
         J = jacobian(tested.phi, g) @ prior.E
         e.append(off + J @ (P @ lacking / weighted.sigma**2))
         s2.append(noise.sigma**2 + ((J @ P) * J).sum(axis=1))
-    return _judged(
-        np.concatenate(e), np.concatenate(s2), len(samples.field) * effective_fraction(*noise.shape)
-    )
+    count = len(samples.field) * effective_fraction(*noise.shape)
+    among = _judged(np.concatenate(e[: len(parts)]), np.concatenate(s2[: len(parts)]), count)
+    if not forward:
+        return among
+    return replace(_judged(np.concatenate(e), np.concatenate(s2), count), rms=among.rms)
 
 
 def refitted(
@@ -193,7 +197,7 @@ def _judged(e: FloatArray, s2: FloatArray, count: float) -> LeftOut:
             break
     rms = float(np.sqrt(np.minimum(e * e, OUTLIER_SIGMA**2 * ratio2 * s2).mean()))
     chance = 1.0 + CHANCE * np.sqrt(2.0 / max(count, 1.0))
-    return LeftOut(rms, float(np.sqrt(ratio2)) if ratio2 > chance else 1.0)
+    return LeftOut(rms, float(np.sqrt(ratio2)) if ratio2 > chance else 1.0, rms)
 
 
 def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:

@@ -17,7 +17,7 @@ from magbridge.calibration.correct import correct
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Reference
 from magbridge.estimation.residual import Samples, jacobian, residuals, symmetric
 
-__all__ = ["apart_from_level", "level_of", "sizes", "with_level"]
+__all__ = ["apart_from_level", "contradicts", "level_of", "sizes", "with_level"]
 
 CONTRADICTS = 2.0
 """Largest departure of an estimated level from the reference's, in its 1-sigma, that is accepted."""
@@ -28,8 +28,9 @@ LEVEL_ROWS = 5_000
 def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sigma: float) -> Calibration:
     """Compute how much of a calibration's covariance is level.
 
-    A level beyond :data:`CONTRADICTS` sigmas of its prior is uncertain as a whole: a fit that claims to
-    determine it has absorbed another effect, such as crustal anomalies that a long log's nodes leave out.
+    A level beyond :data:`CONTRADICTS` sigmas of its prior does not come from the log: a fit that claims to
+    determine it has absorbed another effect, such as crustal anomalies that a long log's nodes leave out. The
+    level is then the reference's, with the sigma of its prior: the coefficients move back by as much.
 
     Parameters
     ----------
@@ -48,13 +49,24 @@ def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sig
     Pj = calibration.covariance @ j
     sigma = float(np.sqrt(max(float(j @ Pj), 0.0)))
     w, covariance = Pj / max(sigma, 1e-300), calibration.covariance
-    if sigma and abs(bias) > max(CONTRADICTS * bias_sigma, sigma):
-        wider = abs(bias) / sigma
+    coefficients = calibration.coefficients
+    if sigma and contradicts(bias, bias_sigma):
+        # a step of w changes the mean of the corrected field by sigma
+        coefficients = coefficients - w * (bias / sigma)
+        wider = max(bias_sigma / sigma, 1.0)
         covariance = covariance + (wider**2 - 1.0) * np.outer(w, w)
-        w, sigma = w * wider, abs(bias)
+        w, sigma, bias = w * wider, sigma * wider, 0.0
     known = calibration.reference
     reference = Reference(known.field, known.model, bias, bias_sigma, sigma)
-    return replace(calibration, reference=reference, covariance=covariance, level=tuple(w.tolist()))
+    return replace(
+        calibration, coefficients=coefficients, reference=reference, covariance=covariance,
+        level=tuple(w.tolist()),
+    )  # fmt: skip
+
+
+def contradicts(bias: float, bias_sigma: float) -> bool:
+    """Return True if a level found by a fit (nT) contradicts the reference's prior, of `bias_sigma` nT."""
+    return abs(bias) > CONTRADICTS * bias_sigma
 
 
 def apart_from_level(calibration: Calibration) -> Calibration:

@@ -134,7 +134,7 @@ def _chosen(
             failure = failure or error
             continue
         left = leave_out(few, prior, one.z, one.noise, data.runs[::step], weighted=one.weighted)
-        if best is None or left.rms < WORTHWHILE * best[1].rms:
+        if best is None or left.carried < WORTHWHILE * best[1].carried:
             best = one, left
     if best is None:
         assert failure is not None

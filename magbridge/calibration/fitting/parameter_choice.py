@@ -196,8 +196,10 @@ def best_parameters(
             continue
         left = float(further.details["left_out_nT"])
         worth_it = left < MAX_HELD_OUT_ERROR_RATIO * without and bool(further.calibration.channels)
+        # a parameter must carry to later parts of the log as well
         if {"forward_nT"} <= found.details.keys() & further.details.keys():
-            worth_it = worth_it and further.details["forward_nT"] < found.details["forward_nT"]
+            forward = further.details["forward_nT"] / found.details["forward_nT"]
+            worth_it = worth_it and forward < MAX_HELD_OUT_ERROR_RATIO
         offers.append(Offer(name, without, left, worth_it))
         if worth_it:
             found, taken, failures = further, (*taken, name), 0
