@@ -53,7 +53,7 @@ from msgspec import Meta
 
 from magbridge.columns import NT_PER_UNIT
 from magbridge.records import MAX_DEVICE_TIME_S, MAX_MEASURED_NT, Reading
-from magbridge.sensors.framing import Framer, nmea_checksum, saturated
+from magbridge.sensors.framing import FramedDriver, nmea_checksum, saturated
 
 __all__ = ["CHECKSUMS", "Ascii", "AsciiOptions", "strip_checksum"]
 
@@ -169,12 +169,13 @@ class AsciiOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
             raise ValueError(f"keys: expected one for each of the {len(self.columns)} columns, without *")
 
 
-class Ascii:
+class Ascii(FramedDriver):
     """Parser of a line protocol."""
 
     Options: ClassVar = AsciiOptions
 
     def __init__(self, options: AsciiOptions) -> None:
+        super().__init__(options.terminator.encode(), MAX_LINE_BYTES)
         self._options = options
         columns = options.columns
         self._more = columns[-1] == "*"
@@ -196,13 +197,6 @@ class Ascii:
         self.sequence_modulo = options.sequence_modulo
         self.time_modulo = options.time_modulo
         self.period = 1.0 / options.rate if options.rate else 0.0
-        self._framer = Framer(options.terminator.encode(), MAX_LINE_BYTES)
-        self.frames_bad = 0
-
-    @property
-    def bytes_skipped(self) -> int:
-        """Bytes that belonged to no valid line."""
-        return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
         """Discard half a line, and skip the next one if it might be incomplete.
@@ -212,16 +206,9 @@ class Ascii:
         self._framer.begin(inside=not (self._prefix or self._options.checksum))
         return tuple(command.encode(ENCODING) for command in self._options.start)
 
-    def feed(self, data: bytes) -> list[Reading]:
-        """Parse bytes in any chunks; return the readings that they complete."""
-        readings = []
-        for line in self._framer.split(data):
-            try:
-                readings.append(self._reading(line))
-            except ValueError:
-                self._framer.skipped += len(line)
-                self.frames_bad += line != b"\r"
-        return readings
+    def is_bad(self, frame: bytes) -> bool:
+        """Return False for an empty line."""
+        return frame != b"\r"
 
     def _cells(self, text: bytes) -> list[bytes]:
         """Return the cells of a line, in the order of the columns."""
@@ -230,9 +217,9 @@ class Ascii:
         found = dict(NAMED_VALUE_PATTERN.findall(text))
         return [found[key] for key in self._keys if key in found]
 
-    def _reading(self, line: bytes) -> Reading:
+    def read_frame(self, frame: bytes) -> Reading:
         """Return the reading in a line; raise ValueError where the line does not hold one."""
-        line = line.rstrip(b"\r")
+        line = frame.rstrip(b"\r")
         if self._options.checksum:
             line = strip_checksum(line, self._options.checksum)
         if not line.startswith(self._prefix):

@@ -51,7 +51,7 @@ import msgspec
 from msgspec import Meta
 
 from magbridge.records import Reading
-from magbridge.sensors.framing import CRC32_RESIDUE, Framer, cobs_decode, saturated
+from magbridge.sensors.framing import CRC32_RESIDUE, FramedDriver, cobs_decode, saturated
 
 __all__ = ["EXAMPLE", "FULL_SCALE", "Digitizer", "DigitizerOptions"]
 
@@ -94,43 +94,31 @@ BODY: Final = Struct("<BBHHIIIhHBHbHbHb")
 """A reading's body; a channel's 24 bits are in two parts (:func:`_count`)."""
 
 
-class Digitizer:
+class Digitizer(FramedDriver):
     """Parser of the digitizer's frames."""
 
     Options: ClassVar = DigitizerOptions
-    sequence_modulo: ClassVar = 1 << 16
-    time_modulo: ClassVar = WRAP_US * 1e-6
-    period: ClassVar = 0.0
+    sequence_modulo = 1 << 16
+    time_modulo = WRAP_US * 1e-6
 
     def __init__(self, options: DigitizerOptions) -> None:
+        super().__init__(b"\0", 254)
         self.nt_per_count = options.nt_per_count
         self._limit = FULL_SCALE - 1
         if options.full_scale is not None:
             self._limit = min(self._limit, int(options.full_scale / self.nt_per_count))
         self.range_nt = self._limit * self.nt_per_count
-        self._framer = Framer(b"\0", 254)
-        self.frames_bad = 0
-
-    @property
-    def bytes_skipped(self) -> int:
-        """Bytes that belonged to no valid frame."""
-        return self._framer.skipped
 
     def start(self) -> tuple[bytes, ...]:
-        """Return no commands: the instrument sends by itself."""
+        """Return no commands: the instrument sends by itself, and a zero ends half a frame."""
         return ()
 
-    def feed(self, data: bytes) -> list[Reading]:
-        """Process received bytes; return the readings that they complete."""
-        readings = []
-        for frame in self._framer.split(data):
-            message = cobs_decode(frame)
-            if len(message) < LENGTH or message[1] != len(message) or crc32(message) != CRC32_RESIDUE:
-                self.frames_bad += 1
-                self._framer.skipped += len(frame)
-            elif message[0] == READING:
-                readings.append(self._reading(message))
-        return readings
+    def read_frame(self, frame: bytes) -> Reading | None:
+        """Return the reading in a frame; None for another kind of message."""
+        message = cobs_decode(frame)
+        if len(message) < LENGTH or message[1] != len(message) or crc32(message) != CRC32_RESIDUE:
+            raise ValueError
+        return self._reading(message) if message[0] == READING else None
 
     def _reading(self, message: bytes) -> Reading:
         (

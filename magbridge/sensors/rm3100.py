@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from magbridge.records import MAX_DEVICE_TIME_S, Reading
 from magbridge.sensors.ascii import strip_checksum
-from magbridge.sensors.framing import Framer, nmea_checksum, saturated
+from magbridge.sensors.framing import FramedDriver, nmea_checksum, saturated
 
 __all__ = ["Bus", "Rm3100", "Rm3100Options", "nt_per_count"]
 
@@ -62,20 +62,18 @@ class Rm3100Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             raise ValueError(f"rate: expected at most {fastest:.0f} with cycle_count {self.cycle_count}")
 
 
-class Rm3100:
+class Rm3100(FramedDriver):
     """Reads the registers, and parses the lines in which the readings are logged."""
 
     Options: ClassVar = Rm3100Options
-    sequence_modulo, time_modulo = 0, 0.0
 
     def __init__(self, options: Rm3100Options) -> None:
+        super().__init__(b"\n", 64)
         self._options = options
         self._step = max(0, round(log2(FASTEST_HZ / options.rate)))
         self.period = 2**self._step / FASTEST_HZ
         self.nt_per_count = nt_per_count(options.cycle_count)
         self.range_nt = MAX_COUNT * self.nt_per_count
-        self.frames_bad = 0
-        self._lines = Framer(b"\n", 64)
 
     def configure(self, bus: Bus) -> None:
         """Stop the part, write all registers, test it and start it; OSError: no RM3100, or a broken one."""
@@ -111,29 +109,9 @@ class Rm3100:
         self.start_measurement(bus)
         return line
 
-    @property
-    def bytes_skipped(self) -> int:
-        """Bytes that belonged to no valid line."""
-        return self._lines.skipped
-
-    def start(self) -> tuple[bytes, ...]:
-        """Forget half a line; the bus port configures the part."""
-        self._lines.begin(inside=False)
-        return ()
-
-    def feed(self, data: bytes) -> list[Reading]:
-        """Take bytes as they came; return the readings that they complete."""
-        readings = []
-        for line in self._lines.split(data):
-            try:
-                readings.append(self._reading(strip_checksum(line, "nmea")))
-            except ValueError:
-                self._lines.skipped += len(line)
-                self.frames_bad += 1
-        return readings
-
-    def _reading(self, text: bytes) -> Reading:
+    def read_frame(self, frame: bytes) -> Reading:
         """Return the reading in a line; ValueError: it does not hold one."""
+        text = strip_checksum(frame, "nmea")
         time_text, digits = text.removeprefix(PREFIX).split(b",")
         data, time = bytes.fromhex(digits.decode("ascii")), float(time_text)
         if not text.startswith(PREFIX) or len(data) != 9 or not abs(time) < MAX_DEVICE_TIME_S:
