@@ -34,7 +34,7 @@ from magbridge.diagnose.evidence import (
     score,
 )
 from magbridge.diagnose.joint import Joint, Statistic
-from magbridge.diagnose.state import State, refined
+from magbridge.diagnose.state import SearchState, refined
 
 __all__ = ["CompetingHypothesis", "exchanged", "pairs_of", "sets_of"]
 
@@ -61,10 +61,14 @@ class _Stack:
     """Candidates with the same number of free coefficients, scored all at once."""
 
     def __init__(
-        self, places: Sequence[int], at: Sequence[slice], candidates: Sequence[Candidate], info: Information
+        self,
+        places: Sequence[int],
+        slots: Sequence[slice],
+        candidates: Sequence[Candidate],
+        info: Information,
     ) -> None:
         self.places = np.array(places)
-        self.index = np.array([np.r_[at[k]] for k in places])
+        self.index = np.array([np.r_[slots[k]] for k in places])
         self.positive = np.array([candidates[k].positive for k in places])
         self.likelier = np.array([candidates[k].point.likelier for k in places])
         self.S = info.matrix[self.index[:, :, None], self.index[:, None, :]]
@@ -93,12 +97,12 @@ class _Stack:
 
 
 def pairs_of(
-    state: State, info: Information, model: Sequence[Candidate], base: Joint, *places: int
+    state: SearchState, info: Information, model: Sequence[Candidate], base: Joint, *places: int
 ) -> list[Pair]:
     """Return the pairs that could replace the causes of `model` at one or two places, the likeliest first.
 
     `info` is that of all candidates and of `model`, whose columns are the last
-    (:meth:`~.state.State.conditional_on`), and `base` the model's fit.
+    (:meth:`~.state.SearchState.conditional_on`), and `base` the model's fit.
     """
     table = _Table(state, info, model, base, places)
     groups = list(table.members)
@@ -110,11 +114,16 @@ class _Table:
     """Log evidences of all pairs in the place of one or two causes of a model."""
 
     def __init__(
-        self, state: State, info: Information, model: Sequence[Candidate], base: Joint, places: Sequence[int]
+        self,
+        state: SearchState,
+        info: Information,
+        model: Sequence[Candidate],
+        base: Joint,
+        places: Sequence[int],
     ) -> None:
         first = state.at[-1].stop
         here = [slices(model, first)[n] for n in places]
-        self.info = info.instead(base, *here)
+        self.info = info.released(base, *here)
         self.signals = [self.info.matrix[:, at] @ base.coefficients[np.r_[at] - first] for at in here]
         self.state, self.base, self.standing = state, base, [model[n] for n in places]
         self.candidates = [*state.candidates, *self.standing]
@@ -181,7 +190,9 @@ class _Table:
         found = []
         for a, b in ((m, m + 1), (m + 1, m)):
             first = self.scores[a]
-            second = score(self.info.without(np.r_[self.at[a]], first.prior), self.at[b], self.candidates[b])
+            second = score(
+                self.info.projected_out(np.r_[self.at[a]], first.prior), self.at[b], self.candidates[b]
+            )
             found.append((first.evidence + second.evidence, first.ratio + second.ratio))
         best, ratio = max(found)
         return best + self._price(*groups), bayes_factor_threshold(min(ratio, whole))
@@ -264,11 +275,11 @@ class CompetingHypothesis:
 
 
 def competing_hypotheses(
-    state: State, info: Information, model: list[Candidate], base: Joint, k: int
+    state: SearchState, info: Information, model: list[Candidate], base: Joint, k: int
 ) -> tuple[CompetingHypothesis, ...]:
     """Return the competing hypotheses of the k-th cause of `model`, whose columns are the last of `info`."""
     own = slices(model, state.at[-1].stop)[k]
-    alone = info.instead(base, own)
+    alone = info.released(base, own)
     standing = score(alone, own, model[k])
     competing, best = [], state.best(alone)
     paid = best[model[k].group].price if model[k].group in best else 0.0
@@ -287,7 +298,7 @@ def competing_hypotheses(
 
 
 def sets_of(
-    state: State, info: Information, model: list[Candidate], base: Joint
+    state: SearchState, info: Information, model: list[Candidate], base: Joint
 ) -> tuple[tuple[CompetingHypothesis, ...], ...]:
     """Return the competing hypotheses of each of `model`, also those that need another cause replaced."""
     pieces = [(piece, place) for place, candidate in enumerate(model) for piece in candidate.pieces]
@@ -312,7 +323,7 @@ def sets_of(
     return tuple(tuple(sorted(some.values(), key=lambda hypothesis: hypothesis.behind)) for some in found)
 
 
-def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+def exchanged(state: SearchState, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
     """Replace one regressor or two by others, or drop one, while the evidence of the whole model grows."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
     for _ in range(MAX_EXCHANGES):
@@ -328,7 +339,9 @@ def exchanged(state: State, model: list[Candidate], base: Joint) -> tuple[list[C
     return _gathered(state, pieces, base)
 
 
-def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[list[Candidate], list[int]]]:
+def _changes(
+    state: SearchState, pieces: list[Candidate], base: Joint
+) -> list[tuple[list[Candidate], list[int]]]:
     """List replacements and the places they would take: first none in each place, then the likeliest."""
     info = state.conditional_on(pieces, base)
     found = []
@@ -347,14 +360,14 @@ def _changes(state: State, pieces: list[Candidate], base: Joint) -> list[tuple[l
     return [*(([], [n]) for n in needless), *(entry[1:] for entry in found)]
 
 
-def _separate(new: list[Candidate], pieces: list[Candidate], at: list[int]) -> bool:
+def _separate(new: list[Candidate], pieces: list[Candidate], replaced: list[int]) -> bool:
     """Return True if each candidate of one common size would be the only one of its cause."""
-    changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in at)]
+    changed = [*new, *(piece for n, piece in enumerate(pieces) if n not in replaced)]
     causes = [candidate.cause for candidate in changed]
     return all(candidate.spectra is None or causes.count(candidate.cause) == 1 for candidate in changed)
 
 
-def _gathered(state: State, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
+def _gathered(state: SearchState, pieces: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
     """Join the pieces of each cause into one candidate."""
     causes = list(dict.fromkeys(piece.cause for piece in pieces))
     if len(causes) == len(pieces):
@@ -362,5 +375,5 @@ def _gathered(state: State, pieces: list[Candidate], base: Joint) -> tuple[list[
     at = slices(pieces)
     order = sorted(range(len(pieces)), key=lambda n: causes.index(pieces[n].cause))
     c = base.coefficients[np.r_[*(at[n] for n in order)]]
-    model = [reduce(Candidate.with_, [p for p in pieces if p.cause == cause]) for cause in causes]
+    model = [reduce(Candidate.joined_with, [p for p in pieces if p.cause == cause]) for cause in causes]
     return model, state.fit(model, np.append(base.z, c), plain=False, like=base, rounds=1)

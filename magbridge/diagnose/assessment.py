@@ -89,7 +89,7 @@ class TelemetryDelay(NamedTuple):
     """RMS error with the telemetry moved by the delay and the calibration as given, nT."""
 
 
-class Motion(NamedTuple):
+class MotionShare(NamedTuple):
     """Fraction of a cause's power next to moving masses, fraction of such samples, and the interval, s."""
 
     share: float
@@ -139,7 +139,7 @@ def delays(problem: Problem, fit: Joint) -> Delays | None:
     return Delays(later, np.sqrt(np.diag(covariance)), taken)
 
 
-def motion(problem: Problem, finding: Finding) -> Motion | None:
+def motion(problem: Problem, finding: Finding) -> MotionShare | None:
     """Return how far a cause acts only while masses move: one that moved unseen between rows looks so."""
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
@@ -148,7 +148,7 @@ def motion(problem: Problem, finding: Finding) -> Motion | None:
     power = (finding.candidate.columns(slice(0, len(survey))) @ finding.coefficients) ** 2
     share, usual = float(power[moving].sum() / power.sum()), float(moving.mean())
     interval = float(np.median(np.diff(survey.time)))
-    return None if usual > 0.5 or share < 0.8 else Motion(share, usual, interval)
+    return None if usual > 0.5 or share < 0.8 else MotionShare(share, usual, interval)
 
 
 def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | None:

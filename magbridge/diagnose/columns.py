@@ -15,8 +15,9 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.problem import Problem
 
 __all__ = [
-    "AXES", "Candidate", "Columns", "GridPoint", "Group", "Interpolated", "Mixture", "effect_columns",
-    "of_effect", "of_reference", "parts", "per", "places", "since", "size_of", "slices", "times", "together",
+    "AXES", "Candidate", "Columns", "GridPoint", "Group", "Interpolated", "Mixture", "absent_before",
+    "effect_columns", "join_columns", "of_effect", "of_reference", "parts", "per", "places", "size_of",
+    "slices", "times",
 ]  # fmt: skip
 
 Columns = Callable[[slice], FloatArray]
@@ -100,7 +101,7 @@ def times(columns: Columns, rows: slice, c: FloatArray) -> FloatArray:
     return np.asarray(columns(rows) @ c)
 
 
-def together(columns: Sequence[Columns]) -> Mixture:
+def join_columns(columns: Sequence[Columns]) -> Mixture:
     """Return all columns side by side as one mixture, in which shared parts occur once."""
     listed = [parts(one) for one in columns]
     sizes = [blocks[0][1].shape[1] for blocks in listed]
@@ -246,26 +247,26 @@ class Candidate:
         """Its parts, or itself."""
         return self.parts or (self,)
 
-    def with_(self, other: Candidate) -> Candidate:
+    def joined_with(self, candidate: Candidate) -> Candidate:
         """Return both as one: a cause that takes more than one regressor to describe."""
-        parts, one, two = (self, other), self.point, other.point
+        parts, one, two = (self, candidate), self.point, candidate.point
         taken = self.names + tuple(one.shape)
-        number = 2 + sum(name.startswith(f"{other.names[0]} (") for name in taken)
-        mark = "" if set(taken).isdisjoint(other.names) else f" ({number})"
+        number = 2 + sum(name.startswith(f"{candidate.names[0]} (") for name in taken)
+        mark = "" if set(taken).isdisjoint(candidate.names) else f" ({number})"
         return replace(
             self,
-            columns=together([part.columns for part in parts]),
+            columns=join_columns([part.columns for part in parts]),
             width=np.concatenate([part.width for part in parts]),
-            names=self.names + tuple(name + mark for name in other.names),
-            units=self.units + other.units,
-            effects=self.effects + other.effects,
+            names=self.names + tuple(name + mark for name in candidate.names),
+            units=self.units + candidate.units,
+            effects=self.effects + candidate.effects,
             point=GridPoint(
                 {**one.shape, **{name + mark: value for name, value in two.shape.items()}},
                 likelier=one.likelier + two.likelier,
                 narrow=one.narrow + two.narrow,
                 cells=one.cells,
             ),
-            parts=(*self.pieces, *other.pieces),
+            parts=(*self.pieces, *candidate.pieces),
         )
 
 
@@ -274,13 +275,15 @@ def slices(candidates: Sequence[Candidate], first: int = 0) -> list[slice]:
     return places((candidate.size for candidate in candidates), first)
 
 
-def since(candidate: Candidate, learned: BoolArray) -> Candidate:
+def absent_before(candidate: Candidate, learned: BoolArray) -> Candidate:
     """Return the same cause, absent from the samples (n,) that the calibration has `learned` from."""
     rebuild, fresh = candidate.point.rebuild, ~learned
     return replace(
         candidate,
         columns=Mixture(tuple((Since(X, fresh), M) for X, M in parts(candidate.columns))),
-        point=replace(candidate.point, rebuild=rebuild and (lambda *shape: since(rebuild(*shape), learned))),
+        point=replace(
+            candidate.point, rebuild=rebuild and (lambda *shape: absent_before(rebuild(*shape), learned))
+        ),
         since=True,
     )
 
@@ -325,11 +328,11 @@ def of_reference(
     basis: Callable[[slice], FloatArray],
     width: FloatArray,
     names: tuple[str, ...],
-    about: About,
+    kind: About,
 ) -> Candidate:
     """Make a candidate of an error in the reference: the field is ``H_e + sum_k b_k basis_k(t)``, nT.
 
     `basis` gives (m, k) of m rows; `width` (k,) is the usual size of each coefficient, nT.
     """
     columns = lambda rows: problem.reference_jacobian[rows, None] * basis(rows) * width  # noqa: E731 - a regressor is one line
-    return Candidate(cause, None, columns, width, names, ("nT",) * len(width), about=about)
+    return Candidate(cause, None, columns, width, names, ("nT",) * len(width), about=kind)

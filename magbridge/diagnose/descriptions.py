@@ -171,17 +171,17 @@ def repeated(problem: Problem) -> Columns:
     return _centred(lambda rows: np.stack(powers(np.exp(1j * np.pi * u[rows]), REPEATED)).real.T, len(u))
 
 
-def lower_end(down: FloatArray) -> Columns:
+def lower_end(tilt: FloatArray) -> Columns:
     """Return the end of the hull at which a loose object lies: the lower one, once tilted by so much.
 
-    `down` (n,) is the sine of the tilt; :data:`JACOBIAN` are those at which it starts to slide.
+    `tilt` (n,) is the sine of the tilt; :data:`JACOBIAN` are those at which it starts to slide.
     """
-    place = np.arange(len(down))
+    place = np.arange(len(tilt))
     sides = []
     for slope in JACOBIAN:
-        last = np.maximum.accumulate(np.where(np.abs(down) > slope, place, 0))
-        sides.append(np.sign(down[last]).astype(np.int8))
-    return _centred(lambda rows: np.stack([side[rows] for side in sides]).T.astype(float), len(down))
+        last = np.maximum.accumulate(np.where(np.abs(tilt) > slope, place, 0))
+        sides.append(np.sign(tilt[last]).astype(np.int8))
+    return _centred(lambda rows: np.stack([side[rows] for side in sides]).T.astype(float), len(tilt))
 
 
 def _followed(time: FloatArray, values: FloatArray, lags: Sequence[float]) -> Columns:
@@ -258,10 +258,10 @@ def _soaks(*, scales: bool) -> Callable[[Candidate], bool]:
     return lambda candidate: _heat(candidate) == ("scale" if scales else "offset")
 
 
-def _moves(own: set[str]) -> Callable[[Candidate], bool]:
-    """Return the question whether a candidate adds to what the calibration's `own` masses do."""
+def _moves(masses: set[str]) -> Callable[[Candidate], bool]:
+    """Return the question whether a candidate adds to what the calibration's `masses` masses do."""
     return lambda candidate: any(
-        isinstance(effect, LegendreEffect) or (isinstance(effect, PathEffect) and effect.channel in own)
+        isinstance(effect, LegendreEffect) or (isinstance(effect, PathEffect) and effect.channel in masses)
         for effect in candidate.effects
     )
 
@@ -303,8 +303,10 @@ def _in_time(problem: Problem, fit: Joint) -> list[Description]:
             lambda rows: problem.reference_jacobian[rows, None] * waves(EARTH)(rows),
             (*spectra(EARTH, 1), ("transient", np.full(EARTH, 10.0))),
         ),
-        _of("drift", lambda rows: constant[rows, None], 1.0, holds=lambda one: one.about == "constant"),
-        _of("transient", passing, look_elsewhere=times),
+        _description(
+            "drift", lambda rows: constant[rows, None], 1.0, holds=lambda one: one.about == "constant"
+        ),
+        _description("transient", passing, look_elsewhere=times),
     ]
 
 
@@ -316,19 +318,19 @@ def _of_reading(problem: Problem) -> list[Description]:
         return -problem.jacobian[rows, 6:]
 
     listed = [
-        _of("broadband", direction(body), holds=_bends, wider=True),
-        _of(
+        _description("broadband", direction(body), holds=_bends, wider=True),
+        _description(
             "broadband", _along_axes(problem, lambda rows: rates[:, rows].T), 1.0,
             holds=_is(RateEffect), turned=True,
         ),
         Description(
             response(problem.reading, body), bends(), holds=_bends, wider=True
         ),
-        _of("broadband", crossing(problem.reading, body)),
+        _description("broadband", crossing(problem.reading, body)),
     ]  # fmt: skip
     if problem.calibration.parameters:
         late = effect_columns(problem, ClockEffect(), mass_rates(problem))
-        listed.append(_of("broadband", late, 1.0, holds=_is(ClockEffect)))
+        listed.append(_description("broadband", late, 1.0, holds=_is(ClockEffect)))
     return listed
 
 
@@ -344,14 +346,18 @@ def _of_channels(problem: Problem) -> list[Description]:
             held = _moves(own) if name in own else _is()
             now, before = curve(channel.values), hysteresis(channel.values)
             listed += [
-                _of("broadband", _along_axes(problem, now), channel=name, turned=True, holds=held),
-                _of("broadband", _along_axes(problem, before), channel=name, turned=True, remembers=True),
+                _description("broadband", _along_axes(problem, now), channel=name, turned=True, holds=held),
+                _description(
+                    "broadband", _along_axes(problem, before), channel=name, turned=True, remembers=True
+                ),
             ]
             late = delayed(problem.survey.time, channel.values)
             for scales in (False, True):
                 columns = _along_axes(problem, late, scales=scales)
                 held = _soaks(scales=scales) if "temperature" in channel.kinds else _is()
-                more = _of("broadband", columns, channel=name, turned=True, scales=scales, holds=held)
+                more = _description(
+                    "broadband", columns, channel=name, turned=True, scales=scales, holds=held
+                )
                 listed.append(more)
     return listed
 
@@ -365,12 +371,12 @@ def _of_attitude(problem: Problem) -> list[Description]:
     roll, pitch = angles[:2]
     for down in (-np.sin(pitch), np.sin(roll) * np.cos(pitch)):
         listed += [
-            _of("broadband", _along_axes(problem, curve(down)), turned=True),
-            _of("switching", _along_axes(problem, lower_end(down)), turned=True),
+            _description("broadband", _along_axes(problem, curve(down)), turned=True),
+            _description("switching", _along_axes(problem, lower_end(down)), turned=True),
         ]
     for angle in angles:
         swung = swings(time, rates(problem.survey, angle[None])[0])
-        listed.append(_of("broadband", _along_axes(problem, swung), turned=True))
+        listed.append(_description("broadband", _along_axes(problem, swung), turned=True))
     return listed
 
 
@@ -379,15 +385,19 @@ def _repeating(problem: Problem, fit: Joint, tone: Candidate | None) -> list[Des
     survey, listed = problem.survey, []
     if "depth" in survey.channels and "depth" not in survey.still:
         above = near_surface(survey.time, survey.channels["depth"].values)
-        listed.append(_of("broadband", _along_axes(problem, above), turned=True))
+        listed.append(_description("broadband", _along_axes(problem, above), turned=True))
     if np.ptp(survey.dive):
-        listed.append(_of("broadband", _along_axes(problem, repeated(problem)), turned=True))
+        listed.append(_description("broadband", _along_axes(problem, repeated(problem)), turned=True))
     rings = packets(problem, fit)
     if rings is not None:
-        listed.append(_of("tone", rings.columns, look_elsewhere=rings.look_elsewhere, period=rings.period))
+        listed.append(
+            _description("tone", rings.columns, look_elsewhere=rings.look_elsewhere, period=rings.period)
+        )
     if tone is not None:
         period = tone.point.shape["period"][0]
-        listed.append(_of("tone", tone.columns, 1.0, look_elsewhere=tone.look_elsewhere, period=period))
+        listed.append(
+            _description("tone", tone.columns, 1.0, look_elsewhere=tone.look_elsewhere, period=period)
+        )
     return listed
 
 
@@ -404,5 +414,5 @@ def _along_axes(problem: Problem, basis: Columns, *, scales: bool = False) -> Co
     return columns
 
 
-def _of(kind: str, columns: Columns, width: float = 30.0, **more: Any) -> Description:
+def _description(kind: str, columns: Columns, width: float = 30.0, **more: Any) -> Description:
     return Description(columns, ((kind, np.full(size_of(columns), width)),), **more)

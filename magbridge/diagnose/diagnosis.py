@@ -18,7 +18,7 @@ from magbridge.diagnose.joint import Improvement, Joint
 from magbridge.diagnose.leftover import Leftover, far_from_white
 from magbridge.diagnose.observed import Seen, memory, seen
 from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.search import Outcome, Outliers
+from magbridge.diagnose.search import Outliers, SearchOutcome
 from magbridge.estimation.residual import rms
 
 __all__ = ["MIN_RMS_REDUCTION", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
@@ -92,7 +92,7 @@ class Diagnosis:
     """Everything that was found out."""
 
     problem: Problem
-    outcome: Outcome
+    outcome: SearchOutcome
     findings: tuple[Finding, ...]
     """The causes that are named."""
     wrong: Outliers | None

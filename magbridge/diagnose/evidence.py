@@ -48,10 +48,10 @@ from magbridge.diagnose.columns import (
     Candidate,
     Columns,
     Group,
+    join_columns,
     parts,
     places,
     slices,
-    together,
 )
 from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statistic, normal, volume_of
 from magbridge.diagnose.noise import Noise
@@ -105,11 +105,11 @@ class Information:
     shift: FloatArray
     """(q + k, m) by how much calibration and model decrease for one unit of each coefficient."""
 
-    def moved(self, base: Joint, at: slice | IndexArray, taken: FloatArray) -> FloatArray:
-        """Return the likeliest calibration and model (q + k,) if the coefficients `at` these are `taken`."""
-        return np.append(base.z, base.coefficients) - self.shift[:, at] @ taken
+    def moved(self, base: Joint, places: slice | IndexArray, taken: FloatArray) -> FloatArray:
+        """Return the likeliest calibration and model (q + k,) if the coefficients at `places` are `taken`."""
+        return np.append(base.z, base.coefficients) - self.shift[:, places] @ taken
 
-    def without(self, index: IndexArray, prior: FloatArray) -> Information:
+    def projected_out(self, index: IndexArray, prior: FloatArray) -> Information:
         """Project out the coefficients at `index` as well, with their prior precision (i,)."""
         S = self.matrix[np.ix_(index, index)] + np.diag(prior)
         K = np.linalg.solve(S, self.matrix[index])
@@ -130,7 +130,7 @@ class Information:
             np.vstack([self.shift[:, :m] - self.shift[:, m:] @ K, K]),
         )
 
-    def instead(self, base: Joint, *places: slice) -> Information:
+    def released(self, base: Joint, *places: slice) -> Information:
         """Remove the coefficients at these places from the model of `base`, and project out its others.
 
         The model's columns are the last. The scores are those of what `base` leaves and of what the
@@ -138,7 +138,7 @@ class Information:
         """
         first, own = len(self.score) - base.coefficients.size, np.r_[*places]
         others = np.setdiff1d(np.arange(first, len(self.score)), own)
-        alone = self.without(others, base.prior[len(base.z) + others - first])
+        alone = self.projected_out(others, base.prior[len(base.z) + others - first])
         return replace(alone, score=alone.score + alone.matrix[:, own] @ base.coefficients[own - first])
 
 
@@ -155,7 +155,7 @@ def information(
     The first `unshared` of them share no parts with any other, and their products with each other are not
     computed. With a `stride`, only every so many pieces of the log count.
     """
-    q, shared = len(problem.centre), together(columns).parts
+    q, shared = len(problem.centre), join_columns(columns).parts
     alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:unshared]), q)
     others = slice(alone[-1].stop if alone else q, None)
     asked = [(slice(q), slice(None)), *zip(alone, alone, strict=True), (others, slice(q, None))]
@@ -185,9 +185,9 @@ class Score:
     prior: FloatArray
 
 
-def score(info: Information, at: slice, candidate: Candidate) -> Score:
-    """Score the candidate whose columns stand at `at`; one of the wrong sign scores zero."""
-    b, statistic = info.score[at], Statistic(info.matrix[at, at], candidate.spectra)
+def score(info: Information, place: slice, candidate: Candidate) -> Score:
+    """Score the candidate whose columns stand at `place`; one of the wrong sign scores zero."""
+    b, statistic = info.score[place], Statistic(info.matrix[place, place], candidate.spectra)
     freedom = int(statistic.freedom)
     if not freedom or (candidate.positive and b.min() < 0.0):
         return Score(0.0, freedom, 0.0, np.zeros(len(b)), np.ones(len(b)))
@@ -233,14 +233,14 @@ def regressor_error(ratio: float) -> float:
 
 
 def look_elsewhere_factors(
-    info: Information, candidates: Sequence[Candidate], at: Sequence[slice]
+    info: Information, candidates: Sequence[Candidate], places: Sequence[slice]
 ) -> dict[str, float]:
     """Return the number of independent hypotheses behind each cause."""
     causes = dict.fromkeys(candidate.cause for candidate in candidates)
     found = {}
     for cause in causes:
         members = [k for k, candidate in enumerate(candidates) if candidate.cause == cause]
-        index, own = np.r_[*(at[k] for k in members)], slices([candidates[k] for k in members])
+        index, own = np.r_[*(places[k] for k in members)], slices([candidates[k] for k in members])
         free = [place for k, place in zip(members, own, strict=True) if candidates[k].spectra is None]
         count = _independent(info.matrix[np.ix_(index, index)], free, FALSE_ALARM_RATE / len(causes))
         # candidates of one common size count as independent: an upper bound
@@ -433,21 +433,21 @@ def isolability(
     return Isolability(tuple(visible), tuple(alike), dict(untestable))
 
 
-def most_visible(candidates: Sequence[Candidate], info: Information, at: Sequence[slice]) -> list[int]:
+def most_visible(candidates: Sequence[Candidate], info: Information, places: Sequence[slice]) -> list[int]:
     """Return the place of the candidate of each cause and channel that the log shows best."""
     best: dict[Group, tuple[float, int]] = {}
     for k, candidate in enumerate(candidates):
-        total = float(np.trace(info.matrix[at[k], at[k]])) / candidate.size
+        total = float(np.trace(info.matrix[places[k], places[k]])) / candidate.size
         if total > best.get(candidate.group, (-1.0, 0))[0]:
             best[candidate.group] = (total, k)
     return [k for _, k in best.values()]
 
 
-def _visible(candidate: Candidate, info: Information, own: slice, hypotheses: float) -> Visible:
+def _visible(candidate: Candidate, info: Information, place: slice, hypotheses: float) -> Visible:
     """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
-    freedom = max(score(info, own, candidate).freedom, 1)
+    freedom = max(score(info, place, candidate).freedom, 1)
     sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))
-    power = np.diag(info.matrix[own, own])
+    power = np.diag(info.matrix[place, place])
     if candidate.spectra is not None:  # what counts is what all of them do together
         x = sure / float(np.sqrt(max(power.sum(), 1e-300)))
         sizes = {"size": (_plausible(x), "times the usual one")}
@@ -465,10 +465,10 @@ def _plausible(size: float) -> float:
     return size if size < MAX_PLAUSIBLE_MULTIPLE else float("inf")
 
 
-def likeness(info: Information, one: Candidate, a: slice, other: Candidate, b: slice) -> float:
+def likeness(info: Information, first: Candidate, a: slice, second: Candidate, b: slice) -> float:
     """Correlation of two signatures: root of the mean share that one can imitate of the other, the larger."""
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
-    p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (one, other))
+    p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (first, second))
     M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)
     N = C.T @ np.linalg.solve(A + p * np.eye(len(A)), C)
     shares = [float(np.trace(X) / (np.trace(Y) + 1e-12)) for X, Y in ((M, A), (N, B))]

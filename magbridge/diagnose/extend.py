@@ -35,7 +35,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.columns import Candidate, Columns, slices
 from magbridge.diagnose.evidence import IDEAL, Information, information, score
-from magbridge.diagnose.joint import Design, Joint, fit_joint, normal
+from magbridge.diagnose.joint import Joint, JointDesign, fit_joint, normal
 from magbridge.diagnose.problem import Problem, derivatives, isotropic, linearised, samples_of
 from magbridge.diagnose.survey import Survey
 from magbridge.estimation.residual import residuals_of, robust_scale
@@ -85,11 +85,11 @@ def loosened(
     pieces = [piece for candidate in model for piece in candidate.pieces]
     if all(piece.point.rebuild is None for piece in pieces):
         return fit
-    more = _within(problem, pieces, columns, fit) + _beyond(problem, pieces, columns, fit, grid)
+    more = _own_cell(problem, pieces, columns, fit) + _other_cells(problem, pieces, columns, fit, grid)
     return replace(fit, covariance=fit.covariance + 0.5 * (more + more.T))
 
 
-def _within(
+def _own_cell(
     problem: Problem, pieces: Sequence[Candidate], columns: Sequence[Columns], fit: Joint
 ) -> FloatArray:
     """(q + k, q + k) covariance added by the parameters' uncertainty within their cells."""
@@ -120,7 +120,7 @@ def _jacobian(piece: Candidate, b: FloatArray) -> Iterator[Columns]:
         yield columns
 
 
-def _beyond(
+def _other_cells(
     problem: Problem,
     pieces: Sequence[Candidate],
     columns: Sequence[Columns],
@@ -152,7 +152,7 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
     rest = np.setdiff1d(np.arange(first, len(info.score)), np.r_[own])
     prior = np.diag(fit.prior[q + rest - first])
     K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + prior, info.matrix[rest])
-    alone = info.instead(fit, own)
+    alone = info.released(fit, own)
 
     def moments(candidate: Candidate, place: slice) -> tuple[float, FloatArray, FloatArray]:
         """Return evidence, all coefficients and their covariance, each up to a part common to all points."""
@@ -309,8 +309,10 @@ def relinearised(
     last, last_cost = origin, _cost(problem.residual, origin, problem)
     for _ in range(MAX_STEPS):
         for _ in range(MAX_HALVINGS):
-            settled, columns = _about(problem, model, fit)
-            actual = settled.residual - Design(settled, columns).times(np.append(fit.z, fit.coefficients))
+            settled, columns = _linearised_at(problem, model, fit)
+            actual = settled.residual - JointDesign(settled, columns).times(
+                np.append(fit.z, fit.coefficients)
+            )
             cost = _cost(actual, fit, problem)
             if cost <= last_cost:
                 break
@@ -358,7 +360,7 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
     return replace(fit, covariance=0.5 * (C + C.T))
 
 
-def _about(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:
+def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:
     """Return the problem and a column block for each piece of the model, linearised at `fit`."""
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)

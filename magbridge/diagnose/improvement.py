@@ -187,14 +187,14 @@ def _attempt(
 
 
 def _held_out_error(
-    problem: Problem, model: Sequence[Candidate], fit: Joint, out: HeldOut, dropped: Sequence[int]
+    problem: Problem, model: Sequence[Candidate], fit: Joint, held: HeldOut, dropped: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
     """Return held-out errors (n,), nT: of the corrected field, and as predicted for the reference."""
     q, survey = len(fit.z), problem.survey
     error, reference_error = np.zeros(len(problem)), np.zeros(len(problem))
     wrong = [(c, place) for c, place in zip(model, slices(model), strict=True) if c.about != "vehicle"]
-    for k, c in enumerate(out.coefficients):
-        fold = out.fold == k
+    for k, c in enumerate(held.coefficients):
+        fold = held.fold == k
         part = replace(fit, z=c[:q], coefficients=c[q:])
         calibration = without_effects_at(extend(problem, model, part), dropped)
         error[fold] = (corrected(survey, calibration).total - survey.reference)[fold]
@@ -205,12 +205,12 @@ def _held_out_error(
 
 
 def _refusal(
-    problem: Problem, extension: Extension, out: HeldOut, counts: BoolArray, dropped: bool
+    problem: Problem, extension: Extension, held: HeldOut, counts: BoolArray, dropped: bool
 ) -> tuple[str, tuple[float, float]]:
     """Return the code of the reason why an extension is refused, empty if it is not, and the two values."""
     noise = float(np.median(extension.fit.noise.scale))
     # The corrector cannot undo the axes' delays, which the linear model takes out
-    linear = out.residual + extension.problem.delay_jacobian @ extension.fit.z[DELAYS]
+    linear = held.residual + extension.problem.delay_jacobian @ extension.fit.z[DELAYS]
     promised = rms((linear / problem.reference_jacobian)[counts])
     found = rms((extension.error - extension.reference_error)[counts])
     # A rate of change that was dropped is in the linear prediction alone

@@ -51,9 +51,9 @@ from magbridge.diagnose.problem import DELAYS, Problem, pieces, side_by_side
 from magbridge.estimation.residual import robust_scale
 
 __all__ = [
-    "ALL_PRODUCTS", "CONFIDENCE_LEVEL", "FLAT_PRECISION", "LONG", "PRIOR_SIZES", "RIDGE", "Design", "HeldOut",
-    "Improvement", "Joint", "Ridge", "Statistic", "fit_joint", "held_out", "in_threads", "normal", "paired",
-    "precomputed", "volume_of",
+    "ALL_PRODUCTS", "CONFIDENCE_LEVEL", "FLAT_PRECISION", "LONG", "PRIOR_SIZES", "RIDGE", "HeldOut",
+    "Improvement", "Joint", "JointDesign", "Ridge", "Statistic", "fit_joint", "held_out", "in_threads",
+    "normal", "paired", "precomputed", "volume_of",
 ]  # fmt: skip
 
 S = TypeVar("S")
@@ -90,13 +90,13 @@ def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
     if n * sum(map(size_of, columns)) > MAX_STORED_NUMBERS / (THREADS if n > LONG else 1):
         return list(columns)
 
-    def whole(column: Columns) -> FloatArray:
+    def stored(column: Columns) -> FloatArray:
         return np.concatenate([column(rows).T for rows in pieces(n)], axis=1).T
 
-    return [made.__getitem__ for made in in_threads(n, whole, columns)]
+    return [made.__getitem__ for made in in_threads(n, stored, columns)]
 
 
-class Design:
+class JointDesign:
     """The columns of a hypothesis, the calibration's and the effects'.
 
     Parameters
@@ -144,9 +144,9 @@ def normal(
     """
     k = size_of(X)
 
-    def share(some: Sequence[slice]) -> tuple[FloatArray, FloatArray]:
+    def share(part: Sequence[slice]) -> tuple[FloatArray, FloatArray]:
         P, b = np.zeros((k, k)), np.zeros(k)
-        for rows in some:
+        for rows in part:
             A = X(rows) if noise is None else noise.whitened(X, rows)
             for own, others in asked:
                 P[own, others] += A[:, own].T @ A[:, others]
@@ -269,10 +269,10 @@ class Joint:
         """(k, k) of the effects' coefficients."""
         return self.covariance[len(self.z) :, len(self.z) :]
 
-    def wald(self, at: slice | IndexArray) -> float:
-        """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) `at` these places."""
-        b = self.coefficients[at]
-        return float(b @ np.linalg.solve(self.effects_covariance[at][:, at], b))
+    def wald(self, places: slice | IndexArray) -> float:
+        """Wald's statistic ``b^T C_bb^-1 b`` of the effects' coefficients b (k,) at `places`."""
+        b = self.coefficients[places]
+        return float(b @ np.linalg.solve(self.effects_covariance[places][:, places], b))
 
 
 def fit_joint(
@@ -317,7 +317,7 @@ def fit_joint(
     stride : int
         Pieces of the log of which one counts in the normal equations; the noise is that of every sample.
     """
-    X = Design(problem, precomputed(len(problem), columns))
+    X = JointDesign(problem, precomputed(len(problem), columns))
     q, k = X.q, X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
     common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]
@@ -325,9 +325,9 @@ def fit_joint(
         common.append((problem.slow, 1.0 / problem.waves[None]))
     common += [(own, spectrum) for own, spectrum in zip(X.at, spectra, strict=False) if spectrum is not None]
     centre = np.append(problem.centre, np.zeros(k))
-    past = problem.survey.past(order)
+    past = problem.survey.history(order)
 
-    def at(c: FloatArray) -> tuple[FloatArray, Noise]:
+    def evaluated(c: FloatArray) -> tuple[FloatArray, Noise]:
         residual = problem.residual - X.times(c)
         known = None if like is None else like.noise
         return residual, fit_noise(residual, past, blocks=blocks, like=known, brief=brief)
@@ -342,7 +342,7 @@ def fit_joint(
         first.append(_plain(X, problem.residual, prior, centre, stride))
     for own, _ in common:
         prior[own] = FLAT_PRECISION  # no size is known yet
-    tries = in_threads(len(problem), lambda c: (c, *at(c)), first)
+    tries = in_threads(len(problem), lambda c: (c, *evaluated(c)), first)
     c, residual, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
     del tries  # of a month each is 15 MB
     for step in range(rounds + 1):
@@ -353,7 +353,7 @@ def fit_joint(
         if step == rounds:
             break
         moved = c + np.linalg.solve(P, b - prior * (c - centre))
-        tried = at(moved)
+        tried = evaluated(moved)
         gained = value(moved, tried[1]) - value(c, noise)
         if gained > 0.0:
             c, (residual, noise) = moved, tried
@@ -372,15 +372,17 @@ def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
     return -0.5 * float(np.linalg.slogdet(covariance)[1] + np.log(prior).sum())
 
 
-def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, own: slice, spectra: FloatArray) -> FloatArray:
-    """Prior precision of the coefficients at `own`, by their likeliest common size and spectrum."""
-    others = np.delete(np.arange(len(h)), own)
-    K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, own])
-    S, b = P[own, own] - P[own, others] @ K, h[own] - K.T @ h[others]
+def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, place: slice, spectra: FloatArray) -> FloatArray:
+    """Prior precision of the coefficients at `place`, by their likeliest common size and spectrum."""
+    others = np.delete(np.arange(len(h)), place)
+    K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, place])
+    S, b = P[place, place] - P[place, others] @ K, h[place] - K.T @ h[others]
     return np.asarray(1.0 / Statistic(S, spectra).best(b).variance)
 
 
-def _plain(X: Design, residual: FloatArray, prior: FloatArray, centre: FloatArray, stride: int) -> FloatArray:
+def _plain(
+    X: JointDesign, residual: FloatArray, prior: FloatArray, centre: FloatArray, stride: int
+) -> FloatArray:
     """Least squares as if the noise were white, outliers cut off."""
     level = robust_scale(residual - np.median(residual)) + 1e-12
     P, b = normal(X.rows, residual, stride=stride)
@@ -419,7 +421,7 @@ def held_out(
     the fold. Folds are stretches of dives, so that a slow change is extrapolated; or, `interleaved`, every
     eighth dive, so that it is only interpolated. `groups` (n,) takes the place of the dives' numbers.
     """
-    X, noise, prior = Design(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
+    X, noise, prior = JointDesign(problem, precomputed(len(problem), columns)), fit.noise, fit.prior
     centre = np.append(problem.centre, np.zeros(X.effects))
     c = np.append(fit.z, fit.coefficients)
     y = noise.response(problem.residual - X.times(c))
@@ -463,14 +465,16 @@ class Improvement:
         return self.interval[1] < 1.0
 
 
-def paired(before: FloatArray, after: FloatArray, dive: IntArray, counts: BoolArray) -> Improvement:
+def paired(
+    error_before: FloatArray, error_after: FloatArray, dive: IntArray, counts: BoolArray
+) -> Improvement:
     """Compare two residuals on the same samples.
 
     The interval comes from a bootstrap of whole dives, so correlation within a dive does no harm.
 
     Parameters
     ----------
-    before, after : (n,) array
+    error_before, error_after : (n,) array
         nT.
     dive : (n,) int array
         Number of the dive that each sample belongs to.
@@ -478,7 +482,7 @@ def paired(before: FloatArray, after: FloatArray, dive: IntArray, counts: BoolAr
         Samples that count.
     """
     number = np.unique(dive[counts], return_inverse=True)[1]
-    b, a = np.bincount(number, before[counts] ** 2), np.bincount(number, after[counts] ** 2)
+    b, a = np.bincount(number, error_before[counts] ** 2), np.bincount(number, error_after[counts] ** 2)
     rng = np.random.default_rng(20131213)  # the same answer every time
     drawn = rng.integers(0, b.size, (DRAWS, b.size))
     ratios = np.sqrt(a[drawn].sum(axis=1) / (b[drawn].sum(axis=1) + 1e-300))

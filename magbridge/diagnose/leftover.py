@@ -22,7 +22,7 @@ from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.columns import Candidate, Columns, places, times
 from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, information
-from magbridge.diagnose.joint import Design, Joint, Ridge, Statistic, in_threads, precomputed
+from magbridge.diagnose.joint import Joint, JointDesign, Ridge, Statistic, in_threads, precomputed
 from magbridge.diagnose.noise import Noise, fit_noise
 from magbridge.diagnose.observed import Memory, memory
 from magbridge.diagnose.problem import Problem, pieces
@@ -87,10 +87,10 @@ def varying(
     )  # fmt: skip
 
 
-def _followed(problem: Problem, own: str | None) -> list[FloatArray]:
-    """List what a size might follow, (n,) each: time, telemetry except the cause's `own`, attitude."""
+def _followed(problem: Problem, channel: str | None) -> list[FloatArray]:
+    """List what a size might follow, (n,) each: time, telemetry except the cause's `channel`, attitude."""
     survey = problem.survey
-    channels = [c.values for name, c in survey.channels.items() if name not in (own, *survey.still)]
+    channels = [c.values for name, c in survey.channels.items() if name not in (channel, *survey.still)]
     if survey.attitude is None:
         return [survey.time, *channels]
     roll, pitch, heading = survey.attitude.T
@@ -111,7 +111,7 @@ class Scored(NamedTuple):
     shift: FloatArray
 
 
-class Fitted(NamedTuple):
+class FittedDescription(NamedTuple):
     """A description fitted with its noise: the log evidence, its columns, the fit, and its trials."""
 
     evidence: float
@@ -139,7 +139,7 @@ class Leftover(NamedTuple):
     """Number of descriptions that it was chosen from."""
     within: tuple[CompetingHypothesis, ...] = ()
     """The causes that remain possible: it is likelier than they are, but by less than their margin."""
-    fitted: tuple[Fitted, ...] = ()
+    fitted: tuple[FittedDescription, ...] = ()
     """The likeliest descriptions."""
     size: float | None = None
     """RMS, nT, of the description."""
@@ -147,20 +147,20 @@ class Leftover(NamedTuple):
     """Samples from which on the level is shifted, of what switches."""
 
     @property
-    def among(self) -> float:
+    def evidence_of_choice(self) -> float:
         """Log evidence, with the price of the choice."""
         return self.evidence - float(np.log(self.choice))
 
 
-def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, whole: Ridge) -> Ridge:
+def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, free: Ridge) -> Ridge:
     """Estimate one curve along one direction of the body, ``c = f d^T``, instead of one curve for each axis.
 
     In turn f is estimated along d, and d by least squares given f, beginning with the direction of the
-    `whole` estimate. The two free numbers of the direction pay as in
+    `free` estimate. The two free numbers of the direction pay as in
     :func:`~.evidence.log_bayes`.
     """
     count = len(width) // 3
-    direction = np.linalg.svd(whole.estimate.reshape(count, 3), full_matrices=False)[2][0]
+    direction = np.linalg.svd(free.estimate.reshape(count, 3), full_matrices=False)[2][0]
     for _ in range(TURNS):
         along = np.kron(np.eye(count), direction[:, None])
         best = Statistic(along.T @ S @ along, width[None, ::3] ** 2).best(along.T @ b)
@@ -199,7 +199,7 @@ def leftover(
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
-    found: list[tuple[Fitted, Scored]] = []
+    found: list[tuple[FittedDescription, Scored]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
         tried = sorted(scored, key=lambda one: -one.evidence)[:COMPARED_DESCRIPTIONS]
@@ -249,18 +249,18 @@ def _calm(problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence
     for _ in range(CALM):
         info = information(problem, noise, fit, [*(one.columns for one in slow), *model]).fitted(fit)
         c = Statistic(info.matrix, width[None] ** 2).best(info.score).estimate
-        X = Design(problem, [*model, *(one.columns for one in slow)])
+        X = JointDesign(problem, [*model, *(one.columns for one in slow)])
         residual = fit.residual - X.times(np.append(-info.shift @ c, c))
         noise = fit_noise(residual, fit.noise.past, blocks=fit.noise.uneven)
     return noise
 
 
-def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Scored) -> Fitted:
+def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Scored) -> FittedDescription:
     """Fit a description with the model and the noise; its log evidence by Laplace's approximation."""
     one, best, q = scored.description, scored.best, len(fit.z)
     c, columns = best.estimate, one.columns
     moved = -scored.shift @ c
-    residual = fit.residual - Design(problem, [*model, columns]).times(np.append(moved, c))
+    residual = fit.residual - JointDesign(problem, [*model, columns]).times(np.append(moved, c))
     noise = fit_noise(residual, fit.noise.past, blocks=fit.noise.uneven, like=fit.noise)
     z = fit.z + moved[:q]
     pull = float(fit.prior[:q] @ ((z - problem.centre) ** 2 - (fit.z - problem.centre) ** 2))
@@ -277,7 +277,7 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
         fit, log_likelihood=fit.log_likelihood + gained, z=z, coefficients=coefficients, prior=prior,
         noise=noise, residual=residual,
     )  # fmt: skip
-    return Fitted(evidence, columns, made, one.look_elsewhere)
+    return FittedDescription(evidence, columns, made, one.look_elsewhere)
 
 
 def _along(part: FloatArray, direction: FloatArray) -> FloatArray:
@@ -289,47 +289,50 @@ def unlisted(
     problem: Problem,
     fit: Joint,
     named: Sequence[Hypothesis],
-    off: Outliers | None,
-    after: FloatArray,
+    wrong: Outliers | None,
+    error: FloatArray,
     counts: BoolArray,
 ) -> Leftover | None:
     """Return the part that the `named` causes leave unexplained, or None.
 
-    `off` are wrong samples, `after` (n,) is the residual on parts left out, nT, of which `counts` (n,) count.
+    `wrong` are wrong samples, `error` (n,) is the residual on parts left out, nT, of which `counts` (n,)
+    count.
     """
-    return _passing(off) or _slow(problem, fit, named) or _loud(problem, after, counts)
+    return _passing(wrong) or _slow(problem, fit, named) or _loud(problem, error, counts)
 
 
 def switching(
-    problem: Problem, fit: Joint, named: Sequence[Hypothesis], off: Outliers | None, *, ended: bool
+    problem: Problem, fit: Joint, named: Sequence[Hypothesis], wrong: Outliers | None, *, ended: bool
 ) -> Leftover | None:
     """Describe a switching signal if it is stronger than all `named` causes, or has ended the search.
 
     Else return None. The noise's memory has absorbed the signal except for its level shifts, and the names
     describe that rest; after a search that ended, competing names were not tried.
     """
-    if off is None or not off.lasting:
+    if wrong is None or not wrong.lasting:
         return None
     slow = _slow(problem, fit, named)
     if not ended and (slow is None or any(one.signal_to_noise >= slow.signal_to_noise for one in named)):
         return None
     within = tuple(CompetingHypothesis(one.candidate, 0.0) for one in named)
-    rest = slow or _passing(off)
-    return rest and rest._replace(kind="switching", within=within, shifts=tuple(off.rows.tolist()))
+    rest = slow or _passing(wrong)
+    return rest and rest._replace(kind="switching", within=within, shifts=tuple(wrong.rows.tolist()))
 
 
-def _passing(off: Outliers | None) -> Leftover | None:
+def _passing(wrong: Outliers | None) -> Leftover | None:
     """Describe wrong samples that are not isolated: something passed by, rang for a few samples, switched."""
-    if off is None or off.isolated:
+    if wrong is None or wrong.isolated:
         return None
-    kind = "switching" if off.lasting else "transient"
-    shifts = tuple(off.rows.tolist()) if off.lasting else ()
-    return Leftover(kind, float(np.sqrt(off.ratio)), off.p_value, 0.5 * off.ratio, None, None, shifts=shifts)
+    kind = "switching" if wrong.lasting else "transient"
+    shifts = tuple(wrong.rows.tolist()) if wrong.lasting else ()
+    return Leftover(
+        kind, float(np.sqrt(wrong.ratio)), wrong.p_value, 0.5 * wrong.ratio, None, None, shifts=shifts
+    )
 
 
-def _loud(problem: Problem, after: FloatArray, counts: BoolArray) -> Leftover | None:
+def _loud(problem: Problem, error: FloatArray, counts: BoolArray) -> Leftover | None:
     """Describe a structureless residual beyond the calibration's stated noise and coefficient errors."""
-    power = float(np.sum(after[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
+    power = float(np.sum(error[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())
     if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:
         return None

@@ -165,7 +165,7 @@ class Noise:
         """(n,) whitened y (n,): :meth:`filter` of a single whole column."""
         return np.asarray(np.sqrt(self.kappa) * self.near_gaps.innovations(y) / self.scale)
 
-    def back(self, y: FloatArray) -> FloatArray:
+    def filter_back(self, y: FloatArray) -> FloatArray:
         """(n,) y (n,) filtered backwards: the product with the transpose of :meth:`filter`'s matrix."""
         y = np.sqrt(self.kappa) * y / self.scale
         early, gaps = self.past.rows, self.near_gaps
@@ -203,8 +203,8 @@ class Predictors:
         Of a sample, f, and of those before it, ``-f a``.
     """
 
-    def __init__(self, past: Past, ar: FloatArray) -> None:
-        self.past, self.ar, lags = past, ar, past.lags
+    def __init__(self, history: Past, ar: FloatArray) -> None:
+        self.past, self.ar, lags = history, ar, history.lags
         here = lags < MAX_LAG
         C = autocovariance(ar, int(lags[here].max(initial=0)))
         self.a, self.f = np.zeros(lags.shape), np.ones(len(lags))
@@ -288,7 +288,7 @@ def _product(r: FloatArray, slots: IntArray, lag: int) -> float:
 
 def fit_noise(
     residual: FloatArray,
-    past: Past,
+    history: Past,
     *,
     blocks: bool | None = None,
     like: Noise | None = None,
@@ -300,7 +300,7 @@ def fit_noise(
     ----------
     residual : (n,) array
         nT.
-    past : Past
+    history : Past
         The samples before each one; its order is that of the autoregression.
     blocks : bool, optional
         Let the level change from block to block; decided by the data if not given.
@@ -309,7 +309,7 @@ def fit_noise(
     brief : bool
         Allow no longer time constant than :data:`BRIEFEST`.
     """
-    n, order, whole = len(residual), past.order, past.whole
+    n, order, whole = len(residual), history.order, history.whole
     count = _counts(n)
     # a view of the p samples before each, which takes no memory
     lags = sliding_window_view(np.append(np.zeros(order), residual), order)[:n, ::-1]
@@ -323,17 +323,17 @@ def fit_noise(
     for _ in range(NOISE_ITERATIONS):
         if whole.sum() > 2 * order:
             ar = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
-        near_gaps = Predictors(past, ar)
+        near_gaps = Predictors(history, ar)
         v = near_gaps.innovations(residual)
         if blocks is None:
             blocks = _uneven(v, count)
         before = log_likelihood
         nu, scale, log_likelihood = _tails(v, count if blocks else np.array([n]), nu)
-        log_likelihood += float(np.log(near_gaps.f)[past.pattern].sum())
+        log_likelihood += float(np.log(near_gaps.f)[history.pattern].sum())
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
         if abs(log_likelihood - before) < MIN_GAIN:
             break
-    return Noise(ar, scale, nu, past, log_likelihood, v / scale)
+    return Noise(ar, scale, nu, history, log_likelihood, v / scale)
 
 
 def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:

@@ -101,10 +101,10 @@ class Memory(NamedTuple):
         return self.white < WHITE * self.rms
 
 
-def seen(problem: Problem, signal: FloatArray, of: FloatArray | None = None) -> Seen:
+def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = None) -> Seen:
     """Return the series that a signal (n,), nT of the total field, follows.
 
-    If only its part `of` (n,) is of interest, this part must follow the series, too.
+    If only its part `component` (n,) is of interest, this part must follow the series, too.
     """
     part = slice(None, None, -(-len(signal) // CORRELATION_ROWS))
     u = -(problem.jacobian[:, 6:] / problem.reference_jacobian[:, None])[part]
@@ -115,22 +115,23 @@ def seen(problem: Problem, signal: FloatArray, of: FloatArray | None = None) -> 
     if not total:
         return Seen(None, 0.0, None, size, 0.0)
     base = np.linalg.qr(axes)[0]
-    y, own = (x - base @ (base.T @ x) for x in (y, signal[part] if of is None else of[part]))
+    y, own = (x - base @ (base.T @ x) for x in (y, signal[part] if component is None else component[part]))
 
-    def fitted(q: FloatArray, some: slice, y: FloatArray = y) -> FloatArray:
-        X = (q[:, :, None] * axes[:, None, some]).reshape(len(q), -1)
+    def fitted(q: FloatArray, columns: slice, y: FloatArray = y) -> FloatArray:
+        X = (q[:, :, None] * axes[:, None, columns]).reshape(len(q), -1)
         X -= base @ (base.T @ X)
         G = X.T @ X
         G += 1e-9 * np.trace(G) / len(G) * np.eye(len(G)) + 1e-300 * np.eye(len(G))
         return np.asarray(X @ np.linalg.solve(G, X.T @ y))
 
-    def explained(q: FloatArray, some: slice = EVERY) -> float:
-        return float(y @ fitted(q, some)) / total
+    def explained(q: FloatArray, columns: slice = EVERY) -> float:
+        return float(y @ fitted(q, columns)) / total
 
-    def axis(q: FloatArray, whole: float) -> str | None:
+    def axis(q: FloatArray, total_share: float) -> str | None:
         alone = [explained(q, slice(k, k + 1)) for k in range(len(FIELD_AND_AXES))]
         *_, second, k = np.argsort(alone)
-        clear = alone[k] >= MIN_AXIS_FRACTION * whole and alone[k] - alone[second] >= CLEARLY * (1.0 - whole)
+        margin = CLEARLY * (1.0 - total_share)
+        clear = alone[k] >= MIN_AXIS_FRACTION * total_share and alone[k] - alone[second] >= margin
         return FIELD_AND_AXES[k] if clear else None
 
     found = [(explained(q), name, lag, q) for name, lag, q in _series(problem, part)]

@@ -128,7 +128,7 @@ def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
 
     f = np.fft.rfftfreq(FINER * length)
     asked = (f * length >= CYCLES[0]) & (f * length <= CYCLES[1]) & (f <= 1.0 / SHORTEST)
-    B = np.fft.rfft(windows(slope * noise.back(noise.response(fit.residual))) * window, FINER * length)
+    B = np.fft.rfft(windows(slope * noise.filter_back(noise.response(fit.residual))) * window, FINER * length)
     h = slope**2 * noise.kappa / noise.scale**2
     parts = noise.past.whole, ~noise.past.whole
     power = np.stack([windows(h * some) @ window**2 for some in parts], axis=1)

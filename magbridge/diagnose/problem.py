@@ -62,8 +62,8 @@ from magbridge.estimation.residual import Samples, jacobian, residuals, robust_s
 
 __all__ = [
     "AXIS_DELAY_SIGMA_S", "DELAYS", "DERIVATIVE_ROWS", "FALL", "MAX_MISSING_SAMPLES", "Problem",
-    "derivatives", "floor", "interpolation_error", "isotropic", "linearised", "once", "pieces", "pose",
-    "rates", "samples_of", "side_by_side", "with_slow_noise",
+    "cached_per_problem", "derivatives", "floor", "interpolation_error", "isotropic", "linearised", "pieces",
+    "pose", "rates", "samples_of", "side_by_side", "with_slow_noise",
 ]  # fmt: skip
 
 EACH, LAST = 16, 64
@@ -367,17 +367,17 @@ class Problem:
         return np.asarray(self.residual - self.delay_jacobian @ z[DELAYS])
 
 
-def once(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
+def cached_per_problem(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
     """Cache a function's result for each problem: causes share regressors, of 50 MB for a month."""
     known: WeakKeyDictionary[Problem, T] = WeakKeyDictionary()
 
     @wraps(made)
-    def of(problem: Problem) -> T:
+    def cached(problem: Problem) -> T:
         if problem not in known:
             known[problem] = made(problem)
         return known[problem]
 
-    return of
+    return cached
 
 
 def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, FloatArray]:
@@ -453,11 +453,14 @@ def with_slow_noise(problem: Problem, power: int = 1) -> Problem:
     Its coefficients are places of z that move no calibration.
     """
     if problem.waves.size:
-        return replace(problem, waves=waves() ** power)
-    at, more = problem.known.stop, np.zeros(waves().size)
-    return replace(
-        problem,
-        directions=np.insert(problem.directions, at, more[:, None], axis=1),
-        centre=np.insert(problem.centre, at, more),
-        waves=waves() ** power,
-    )
+        made = replace(problem, waves=waves() ** power)
+    else:
+        place, more = problem.known.stop, np.zeros(waves().size)
+        made = replace(
+            problem,
+            directions=np.insert(problem.directions, place, more[:, None], axis=1),
+            centre=np.insert(problem.centre, place, more),
+            waves=waves() ** power,
+        )
+    made.__dict__["coefficient_jacobian"] = problem.coefficient_jacobian  # the same array: 200 MB for a month
+    return made

@@ -18,7 +18,7 @@ from magbridge.diagnose.alternatives import CompetingHypothesis
 from magbridge.diagnose.assessment import DiagnosisResult, assess
 from magbridge.diagnose.causes import Cause, known
 from magbridge.diagnose.causes.instrument import InterferenceTone
-from magbridge.diagnose.columns import Candidate, Columns, Group, since, slices
+from magbridge.diagnose.columns import Candidate, Columns, Group, absent_before, slices
 from magbridge.diagnose.diagnosis import MIN_RMS_REDUCTION, Diagnosis, Finding, counted, small, verdict_of
 from magbridge.diagnose.evidence import (
     ODDS,
@@ -35,7 +35,7 @@ from magbridge.diagnose.leftover import Leftover, leftover, switching, unlisted,
 from magbridge.diagnose.noise import autoregressive_order
 from magbridge.diagnose.observed import memory
 from magbridge.diagnose.problem import Problem, pose, with_slow_noise
-from magbridge.diagnose.search import Outcome, Outliers, beside_slow_noise, outliers, search
+from magbridge.diagnose.search import Outliers, SearchOutcome, beside_slow_noise, outliers, search
 from magbridge.diagnose.survey import Survey, days_of, load_survey
 from magbridge.errors import DataError
 from magbridge.field.grid import AnomalyGrid
@@ -54,7 +54,7 @@ MIN_SLOW_FRACTION = 0.5
 """Share of a cause's power that is left in means over 64 samples, from which on it is slow."""
 
 
-def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
+def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> tuple[bool, Leftover | None]:
     """Decide whether the names are asserted, and describe the remaining signal, or else the whole signal.
 
     Names and free descriptions both pay for the number of alternatives they were chosen from. The evidence of
@@ -77,7 +77,7 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
         np.log(len(outcome.look_elsewhere))
     )
     if rest is not None:
-        names += rest.among
+        names += rest.evidence_of_choice
         if rest.signal_to_noise < REMNANT * max(h.signal_to_noise for h in outcome.chosen):
             rest = None
     # a description that contains the names' own regressors and nothing else is not an alternative
@@ -89,15 +89,15 @@ def accept(problem: Problem, outcome: Outcome, tone: Candidate | None) -> tuple[
     if free is None:
         return True, rest
     ours = _foretold(problem, [candidate.columns for candidate in model], outcome.fit, residual)
-    behind = max(free.among - names, _foretold(problem, [], outcome.null, free) - ours - AGAINST)
+    behind = max(free.evidence_of_choice - names, _foretold(problem, [], outcome.null, free) - ours - AGAINST)
     if behind <= 0.0:
         return True, rest
-    return False, free._replace(within=_within(outcome, behind))
+    return False, free._replace(within=_possible_names(outcome, behind))
 
 
 def settle(
     problem: Problem, candidates: Sequence[Candidate], causes: int, tone: Candidate | None
-) -> tuple[Outcome, bool, Leftover | None]:
+) -> tuple[SearchOutcome, bool, Leftover | None]:
     """Search, and return the selected outcome with the result of :func:`accept`.
 
     Slow noise absorbs part of the signal that descriptions represent, and so makes names look better. So if
@@ -131,10 +131,10 @@ def _same(chosen: Sequence[Hypothesis], rest: Leftover) -> bool:
     return any(description.covers([h.candidate]) and h.signal_to_noise > rest.signal_to_noise for h in chosen)
 
 
-def _within(outcome: Outcome, behind: float) -> tuple[CompetingHypothesis, ...]:
+def _possible_names(outcome: SearchOutcome, deficit: float) -> tuple[CompetingHypothesis, ...]:
     """Return the names, and their competing hypotheses, the likeliest first.
 
-    A description beats the names by `behind`; those that it does not beat by their threshold stay. Its
+    A description beats the names by `deficit`; those that it does not beat by their threshold stay. Its
     shape follows the data, whereas the regressors of all causes are idealised.
     """
     found: dict[Group, CompetingHypothesis] = {}
@@ -142,12 +142,12 @@ def _within(outcome: Outcome, behind: float) -> tuple[CompetingHypothesis, ...]:
         limit = bayes_factor_threshold(hypothesis.ratio)
         for one in (CompetingHypothesis(hypothesis.candidate, 0.0), *competing):
             known = found.get(one.candidate.group)
-            if one.behind + behind < limit and (known is None or one.behind + behind < known.behind):
-                found[one.candidate.group] = replace(one, behind=one.behind + behind)
+            if one.behind + deficit < limit and (known is None or one.behind + deficit < known.behind):
+                found[one.candidate.group] = replace(one, behind=one.behind + deficit)
     return tuple(sorted(found.values(), key=lambda one: one.behind))
 
 
-def odds_over_random_walk(outcome: Outcome, own: Hypothesis) -> float:
+def odds_over_random_walk(outcome: SearchOutcome, hypothesis: Hypothesis) -> float:
     """Return the log odds of one cause that was chosen over offsets that wander in its place.
 
     Notes
@@ -158,7 +158,7 @@ def odds_over_random_walk(outcome: Outcome, own: Hypothesis) -> float:
     evidence, each autoregression at Akaike's price: with a walk it is shorter.
     """
     slots, noise = outcome.problem.survey.slots, outcome.null.noise
-    others = [one.candidate for one in outcome.chosen if one is not own]
+    others = [one.candidate for one in outcome.chosen if one is not hypothesis]
     columns, spectra = [one.columns for one in others], [one.spectra for one in others]
     walking = with_slow_noise(outcome.problem, 2)
     rough = fit_joint(walking, columns, 1, spectra=spectra, rounds=2)
@@ -167,8 +167,8 @@ def odds_over_random_walk(outcome: Outcome, own: Hypothesis) -> float:
     without = fit_joint(outcome.problem, columns, noise.past.order, spectra=spectra, blocks=noise.uneven)
     # coefficients that the remainder does not need have each gained half a log-likelihood unit by chance
     price = 0.5 * (noise.past.order + autoregressive_order(outcome.fit.residual, slots))
-    price += float(np.log(outcome.look_elsewhere[own.candidate.cause]))
-    return own.evidence - price + without.log_likelihood - (walk.log_likelihood - order)
+    price += float(np.log(outcome.look_elsewhere[hypothesis.candidate.cause]))
+    return hypothesis.evidence - price + without.log_likelihood - (walk.log_likelihood - order)
 
 
 def diagnose(
@@ -247,7 +247,7 @@ def _examine(
     problem = outcome.problem
     found = outcome.chosen, outcome.competing, outcome.fit
     named, competing, fit = found if stand else ((), (), outcome.null)
-    off = _off(outcome, named, len(causes))
+    off = _wrong_samples(outcome, named, len(causes))
     if switched := switching(problem, outcome.fit, named, off, ended=outcome.switches):
         rest, named, competing, fit = switched, (), (), outcome.null
     model = [h.candidate for h in named]
@@ -336,7 +336,7 @@ def _whenever(candidates: Sequence[Candidate], learned: BoolArray) -> list[Candi
     if not learned.any():
         return list(candidates)
     lasting = [c for c in candidates if c.effects and not any(isinstance(e, TimeEffect) for e in c.effects)]
-    return [*candidates, *(since(candidate, learned) for candidate in lasting)]
+    return [*candidates, *(absent_before(candidate, learned) for candidate in lasting)]
 
 
 def _strongest_tone(problem: Problem, candidates: Sequence[Candidate]) -> Candidate | None:
@@ -345,7 +345,7 @@ def _strongest_tone(problem: Problem, candidates: Sequence[Candidate]) -> Candid
     return None if known else next(iter(InterferenceTone().candidates(problem)), None)
 
 
-def _off(outcome: Outcome, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
+def _wrong_samples(outcome: SearchOutcome, named: Sequence[Hypothesis], causes: int) -> Outliers | None:
     """Return the wrong samples, unless they may be a remnant of the strongest cause and nothing switches."""
     off = outliers(outcome.fit, causes)
     strongest = max((h.signal_to_noise for h in named), default=0.0)
@@ -360,7 +360,7 @@ def _findings(
     extension: Extension,
     refit: Extension,
     counts: BoolArray,
-    outcome: Outcome,
+    outcome: SearchOutcome,
     causes: Mapping[str, Cause],
 ) -> tuple[Finding, ...]:
     """Collect the results of each cause; its improvement is that over an extension by the others alone."""
@@ -392,7 +392,9 @@ def _families(named: Sequence[Hypothesis], causes: Mapping[str, Cause]) -> list[
     return sorted(groups.values(), key=lambda group: group[0])
 
 
-def _is_slow(problem: Problem, one: Hypothesis) -> bool:
+def _is_slow(problem: Problem, hypothesis: Hypothesis) -> bool:
     """Return True for a slow cause: most of its power is left in means over many samples."""
-    added = one.candidate.columns(slice(0, len(problem))) @ one.fit.coefficients[-one.candidate.size :]
+    candidate = hypothesis.candidate
+    b = hypothesis.fit.coefficients[-candidate.size :]
+    added = candidate.columns(slice(0, len(problem))) @ b
     return memory(problem, added).slow >= MIN_SLOW_FRACTION

@@ -53,10 +53,10 @@ from magbridge.diagnose.evidence import (
 from magbridge.diagnose.joint import Joint, fit_joint, held_out
 from magbridge.diagnose.noise import BRIEFEST, TAILS, autoregressive_order
 from magbridge.diagnose.problem import Problem, with_slow_noise
-from magbridge.diagnose.state import State, refined, sharpen
+from magbridge.diagnose.state import SearchState, refined, sharpen
 from magbridge.estimation.residual import robust_scale
 
-__all__ = ["LOST", "Outcome", "Outliers", "beside_slow_noise", "outliers", "search", "switches"]
+__all__ = ["LOST", "Outliers", "SearchOutcome", "beside_slow_noise", "outliers", "search", "switches"]
 
 LOST, PLACES = 2, 6
 """Regressors of a model, and shifts of the level from which on the table has no cause for the signal."""
@@ -152,7 +152,7 @@ def _neighbours(fit: Joint, rows: IndexArray) -> float:
     h = np.concatenate([[1.0], -noise.ar, np.zeros(2)])
     b, v = (
         sliding_window_view(x, 3).T
-        for x in (noise.back(noise.whiten(fit.residual)) * noise.scale, noise.innovations)
+        for x in (noise.filter_back(noise.whiten(fit.residual)) * noise.scale, noise.innovations)
     )
     c = solve_toeplitz([float(h[: len(h) - k] @ h[k:]) for k in range(3)], b)
     before = np.arange(b.shape[1])
@@ -189,7 +189,7 @@ def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class SearchOutcome:
     """The result of a search."""
 
     problem: Problem
@@ -216,14 +216,14 @@ class Outcome:
 
 def search(
     problem: Problem, candidates: Sequence[Candidate], causes: int, plain: Joint | None = None
-) -> Outcome:
+) -> SearchOutcome:
     """Find the causes that the data support, among the candidates of so many `causes`, under one noise.
 
     `plain` is the null without slow noise, where the problem has such.
     """
     rough = fit_joint(problem, [], 1, rounds=2)
     order = autoregressive_order(rough.residual, problem.survey.slots)
-    state = State(problem, candidates, order, causes)
+    state = SearchState(problem, candidates, order, causes)
     first = state.round([], state.null) if candidates else []
     p_value = min((h.p_value for h in first), default=1.0)
     model, base = _likeliest(state, first) if first else ([], state.null)
@@ -236,13 +236,13 @@ def search(
     # no longer needs, for example after a step, have each gained only half a unit of log-likelihood by chance
     needed = autoregressive_order(base.residual, problem.survey.slots)
     evidence = state.value(model, base, plain) - 0.5 * (order + needed)
-    return Outcome(
+    return SearchOutcome(
         problem, tuple(chosen), competing, state.null, base, p_value, info, state.look_elsewhere, evidence,
         ended,
     )  # fmt: skip
 
 
-def beside_slow_noise(found: Outcome, candidates: Sequence[Candidate], causes: int) -> Outcome:
+def beside_slow_noise(found: SearchOutcome, candidates: Sequence[Candidate], causes: int) -> SearchOutcome:
     """Repeat the search of the causes found, with slow noise; return the likelier outcome."""
     noisy, null = with_slow_noise(found.problem), found.null
     slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
@@ -251,7 +251,7 @@ def beside_slow_noise(found: Outcome, candidates: Sequence[Candidate], causes: i
     return max(found, search(noisy, candidates, causes, null), key=lambda outcome: outcome.evidence)
 
 
-def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+def _likeliest(state: SearchState, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Return the likeliest of the models found with any noise, and with a short-lived one if need be."""
     model, base = _forward_selection(state, first)
     if switches(base, model, state.causes):
@@ -267,7 +267,7 @@ def _likeliest(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], 
     return model, base
 
 
-def _forward_selection(state: State, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
+def _forward_selection(state: SearchState, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
     """Add cause after cause while one passes the test, beginning with the best of `first`."""
     model: list[Candidate] = []
     base, found = state.null, first
@@ -315,12 +315,12 @@ def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float)
     return min(as_likely, key=lambda h: h.candidate.size, default=None)
 
 
-def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
+def _added(state: SearchState, model: list[Candidate], best: Hypothesis) -> tuple[list[Candidate], Joint]:
     """Add a candidate to the model, or to its cause's own if that is in it already."""
     new = best.candidate
     for k, own in enumerate(model):
         if own.cause == new.cause:
-            grown = [*model[:k], own.with_(new), *model[k + 1 :]]
+            grown = [*model[:k], own.joined_with(new), *model[k + 1 :]]
             at = sum(candidate.size for candidate in model[: k + 1])
             c = best.fit.coefficients
             c = np.concatenate([c[:at], c[-new.size :], c[at : -new.size]])
@@ -329,7 +329,7 @@ def _added(state: State, model: list[Candidate], best: Hypothesis) -> tuple[list
 
 
 def _backward_elimination(
-    state: State, model: list[Candidate], base: Joint
+    state: SearchState, model: list[Candidate], base: Joint
 ) -> tuple[list[Hypothesis], Joint]:
     """Drop causes without which the model is likelier, or which fail their test given the others.
 
@@ -358,7 +358,7 @@ def _backward_elimination(
     return chosen, base
 
 
-def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | None:
+def _surplus(state: SearchState, chosen: Sequence[Hypothesis], base: Joint) -> int | None:
     """Return the place of the weakest cause if it is redundant given a Gaussian process or a similar cause.
 
     A process represents part of every slow shape, and its remnant of a map's error passes for a second one.
@@ -380,7 +380,7 @@ def _surplus(state: State, chosen: Sequence[Hypothesis], base: Joint) -> int | N
     return k if power[0] < power[1] else None
 
 
-def _like_another(state: State, model: Sequence[Candidate], base: Joint, k: int) -> bool:
+def _like_another(state: SearchState, model: Sequence[Candidate], base: Joint, k: int) -> bool:
     """Return True if in this log the k-th cause is strongly correlated with another of the model."""
     info = state.conditional_on(model, base)
     every = {state.candidates[n].group: n for n in most_visible(state.candidates, info, state.at)}

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from magbridge.arrays import FloatArray
-from magbridge.diagnose.columns import Candidate, Columns, Group, Mixture, parts, slices, together
+from magbridge.diagnose.columns import Candidate, Columns, Group, Mixture, join_columns, parts, slices
 from magbridge.diagnose.evidence import (
     Best,
     Hypothesis,
@@ -37,7 +37,7 @@ from magbridge.diagnose.joint import RIDGE, Joint, fit_joint, in_threads, precom
 from magbridge.diagnose.noise import Noise
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["State", "refined", "sharpen"]
+__all__ = ["SearchState", "refined", "sharpen"]
 
 MAX_SCREENED_SAMPLES = 65_536
 """Samples of a long log, in pieces spread evenly over it, by which a round chooses what it fits to all."""
@@ -48,7 +48,7 @@ COLUMNS, STAGES = 144, 2
 stages: after each the bracket is narrowed to the neighbours of the best value."""
 
 
-class State:
+class SearchState:
     """The problem of one search, its candidates, and quantities of the log.
 
     Attributes
@@ -80,7 +80,7 @@ class State:
         self.null = self.fit([])
         self.blocks = self.null.noise.uneven
 
-    def with_brief_noise(self) -> State:
+    def with_brief_noise(self) -> SearchState:
         """Return the same search, with noise whose correlation is too short to pass for a slow cause."""
         brief = copy(self)
         brief.brief, brief.last = True, (None, None)
@@ -136,7 +136,7 @@ class State:
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Fit the best causes given `model`, each on its own, and list them, the likeliest first."""
         stride = max(len(self.problem) // MAX_SCREENED_SAMPLES, 1)
-        screened = self._under(base.noise, model, base, stride) if stride > 1 else None
+        screened = self._information_under(base.noise, model, base, stride) if stride > 1 else None
         as_fitted = (screened or self.conditional_on(model, base)).fitted(base)
         if not self.look_elsewhere:
             self.look_elsewhere = look_elsewhere_factors(as_fitted, self.candidates, self.at)
@@ -154,7 +154,7 @@ class State:
         """Information of all candidates, then of `model`, under its noise, the calibration projected out."""
         known, info = self.last
         if known is not base:
-            info = self._under(base.noise, model, base)
+            info = self._information_under(base.noise, model, base)
             self.last = base, info
         assert info is not None
         return info
@@ -183,9 +183,11 @@ class State:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
             certain = certainty(everything.residual, everything.noise, middle)
             self.certain = dict(zip(self.groups, certain, strict=True))
-        return self._under(everything.noise, model, base, stride).fitted(base)
+        return self._information_under(everything.noise, model, base, stride).fitted(base)
 
-    def _under(self, noise: Noise, model: Sequence[Candidate], base: Joint, stride: int = 1) -> Information:
+    def _information_under(
+        self, noise: Noise, model: Sequence[Candidate], base: Joint, stride: int = 1
+    ) -> Information:
         """Information of all candidates and of `model` under a noise, in every `stride`-th piece."""
         columns = [*self.columns, *(candidate.columns for candidate in model)]
         return information(self.problem, noise, base, columns, stride=stride)
@@ -227,7 +229,7 @@ class State:
 
 def _made_once(n: int, columns: Sequence[Columns]) -> list[Columns]:
     """Return `columns` with their shared parts precomputed."""
-    shared = [X for X, _ in together(columns).parts]
+    shared = [X for X, _ in join_columns(columns).parts]
     known = dict(zip(shared, precomputed(n, shared), strict=True))
     return [Mixture(tuple((known[X], M) for X, M in parts(column))) for column in columns]
 
@@ -238,7 +240,7 @@ def _ridge(model: Sequence[Candidate]) -> FloatArray:
     return np.repeat(np.where(natural, 1.0, RIDGE), [c.size for c in model])
 
 
-def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
+def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, base: Joint) -> Hypothesis:
     """Profile the nonlinear parameters of a cause given `model`, whose fit is `base`, one after the other.
 
     Many values are scored at once under the present noise, because the likelihood of an onset has several
@@ -262,7 +264,7 @@ def sharpen(state: State, model: list[Candidate], hypothesis: Hypothesis, base: 
 
 
 def _profiled(
-    state: State, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
+    state: SearchState, model: list[Candidate], best: Hypothesis, base: Joint, position: int, name: str
 ) -> tuple[Candidate, FloatArray, float]:
     """Return the best value's candidate, coefficients to begin from, and its share of the bracket."""
     rebuild = best.candidate.point.rebuild
@@ -293,7 +295,7 @@ def _profiled(
     return made[k], np.append(info.moved(base, at[k], there), there), narrower
 
 
-def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, float]:
+def _bracket(state: SearchState, candidate: Candidate, name: str) -> tuple[float, float]:
     """Return the values of one nonlinear parameter's grid between which a candidate stands."""
     here = candidate.point.shape[name][0]
     if name == "period":  # a resolved line is a thousandth wide, the grid is one of peaks
@@ -309,7 +311,7 @@ def _bracket(state: State, candidate: Candidate, name: str) -> tuple[float, floa
 
 
 def refined(
-    state: State, model: list[Candidate], base: Joint, members: int | None = None
+    state: SearchState, model: list[Candidate], base: Joint, members: int | None = None
 ) -> tuple[list[Candidate], Joint]:
     """Profile the nonlinear parameters of the first `members`, each given the others; they end up last."""
     for _ in range(len(model) if members is None else members):

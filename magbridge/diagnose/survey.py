@@ -31,7 +31,9 @@ from magbridge.wording import counted
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["ANY", "MAX_LAG", "Channel", "Past", "Survey", "assemble", "days_of", "kinds_of", "load_survey"]
+__all__ = [
+    "ANY", "MAX_LAG", "Past", "Survey", "TelemetryChannel", "assemble", "days_of", "kinds_of", "load_survey",
+]  # fmt: skip
 
 ANY = ("temperature", "current", "pressure", "position")
 DRIVE = ("current", "position")
@@ -100,7 +102,7 @@ def kinds_of(name: str, unit: str) -> tuple[str, ...]:
     if unit in UNIT_KINDS:
         return UNIT_KINDS[unit]
     parts = [part.lower() for part in PART.findall(name)]
-    named = next((kinds for words, kinds in NAME_KINDS if any(_among(part, words) for part in parts)), ())
+    named = next((kinds for words, kinds in NAME_KINDS if any(_is_among(part, words) for part in parts)), ())
     if unit not in VAGUE:
         # of a temperature or a pressure we know the units; anything else may be what drives, or moves
         return DRIVE if named == DRIVE else ("position",)
@@ -109,7 +111,7 @@ def kinds_of(name: str, unit: str) -> tuple[str, ...]:
     return named or ANY
 
 
-def _among(part: str, words: str) -> bool:
+def _is_among(part: str, words: str) -> bool:
     return any(
         part == word
         or (len(word) >= BEGINNING and part.startswith(word))
@@ -226,7 +228,7 @@ class Past:
         self.pattern: IntArray = inverse.ravel()
 
 
-class Channel(NamedTuple):
+class TelemetryChannel(NamedTuple):
     """A telemetry series, as a channel is throughout a diagnosis: values (n,), unit, kinds that it may be."""
 
     values: FloatArray
@@ -249,7 +251,7 @@ class Survey:
     """(n, 3) nT, the sensor's raw axes at `time`."""
     reference: FloatArray
     """(n,) nT."""
-    channels: dict[str, Channel]
+    channels: dict[str, TelemetryChannel]
     """All telemetry that varies, and what the calibration needs."""
     still: tuple[str, ...]
     """Telemetry that never changes."""
@@ -295,7 +297,7 @@ class Survey:
         """The units of cross-validation, in words."""
         return "eighths of the log" if np.array_equal(self.dive, eighths(len(self))) else "dives"
 
-    def past(self, order: int) -> Past:
+    def history(self, order: int) -> Past:
         """Return the samples before each one that autoregressive noise of this order depends on."""
         if order not in self._pasts:
             self._pasts[order] = Past(self.steps, order)
@@ -369,7 +371,7 @@ def assemble(
 
 def _channels(
     table: dict[str, FloatArray], units: dict[str, str], needed: Sequence[str]
-) -> tuple[dict[str, Channel], tuple[str, ...]]:
+) -> tuple[dict[str, TelemetryChannel], tuple[str, ...]]:
     """Return the telemetry that varies or is needed, and the names of the channels that never change."""
     channels, still = {}, []
     for name in sorted(table):
@@ -383,9 +385,9 @@ def _channels(
         if known.size < MIN_SURVEY_SAMPLES or np.ptp(known) <= 1e-9 * (np.abs(known).max() + 1e-30):
             still.append(name)
             if name in needed and known.size:  # the correction takes it, but nothing can be learned from it
-                channels[name] = Channel(held(values), unit, ())
+                channels[name] = TelemetryChannel(held(values), unit, ())
             continue
-        channels[name] = Channel(held(values), unit, kinds_of(name, unit))
+        channels[name] = TelemetryChannel(held(values), unit, kinds_of(name, unit))
     return channels, tuple(still)
 
 

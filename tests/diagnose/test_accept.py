@@ -14,8 +14,8 @@ from magbridge.diagnose.columns import GridPoint
 from magbridge.diagnose.evidence import ODDS, bayes_factor_threshold
 from magbridge.diagnose.leftover import varying
 from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.run import _within, accept
-from magbridge.diagnose.search import Outcome, search
+from magbridge.diagnose.run import _possible_names, accept
+from magbridge.diagnose.search import SearchOutcome, search
 
 ROWS = 300
 
@@ -31,7 +31,7 @@ def test_names_stay_until_a_description_beats_them_by_their_margin() -> None:
     assert limit > ODDS
     steps = np.linspace(0.0, limit, 30)
     sets = [
-        {competitor.candidate.cause: competitor.behind for competitor in _within(outcome, behind)}
+        {competitor.candidate.cause: competitor.behind for competitor in _possible_names(outcome, behind)}
         for behind in steps
     ]
     assert sets[0].keys() == {"a", "like a"}
@@ -78,9 +78,9 @@ def test_only_effects_found_without_slow_noise_are_searched_given_it(
     share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem, rng = right(ROWS), np.random.default_rng(10)
-    beside: list[Outcome] = []
+    beside: list[SearchOutcome] = []
 
-    def spied(found: Outcome, *_: object) -> Outcome:
+    def spied(found: SearchOutcome, *_: object) -> SearchOutcome:
         beside.append(found)
         return found
 

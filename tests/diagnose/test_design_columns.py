@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 
 from magbridge.arrays import FloatArray
 from magbridge.diagnose import joint as design
-from magbridge.diagnose.columns import Columns, Interpolated, Mixture, parts, times, together
+from magbridge.diagnose.columns import Columns, Interpolated, Mixture, join_columns, parts, times
 from magbridge.diagnose.evidence import information
 from magbridge.diagnose.joint import fit_joint
 from magbridge.diagnose.problem import side_by_side
@@ -25,7 +25,7 @@ def table() -> FloatArray:
 def test_what_is_shared_is_there_once(table: FloatArray) -> None:
     warm, one = table[:, :2].__getitem__, table[:, 2:].__getitem__
     origins = [Mixture(((warm, np.eye(2)), (one, -origin * np.eye(2)))) for origin in (3.0, 5.0)]
-    whole = together([*origins, warm, together(origins)])
+    whole = join_columns([*origins, warm, join_columns(origins)])
     assert [X for X, _ in whole.parts] == [warm, one]
     each = [table[ROWS, :2] - origin * table[ROWS, 2:] for origin in (3.0, 5.0)]
     np.testing.assert_allclose(whole(ROWS), np.hstack([*each, table[ROWS, :2], *each]))

@@ -25,7 +25,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.columns import effect_columns
 from magbridge.diagnose.problem import pose, samples_of
-from magbridge.diagnose.survey import Channel, Survey
+from magbridge.diagnose.survey import Survey, TelemetryChannel
 from magbridge.errors import FormatError
 from magbridge.estimation.residual import residuals
 
@@ -54,7 +54,7 @@ def survey() -> Survey:
     rng = np.random.default_rng(5)
     n = 300
     plain = surveyed(walk(n, rng), np.sin(np.arange(n) / 20.0))
-    heat = Channel(3.0 + rng.normal(size=n).cumsum() * 0.1, "degC", ("temperature",))
+    heat = TelemetryChannel(3.0 + rng.normal(size=n).cumsum() * 0.1, "degC", ("temperature",))
     return replace(
         plain, field=plain.field + np.array([300.0, -200.0, 500.0]), channels=plain.channels | {"heat": heat}
     )

@@ -14,7 +14,7 @@ from magbridge.calibration.instrument_effects import RateEffect, TimeEffect
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.assessment import level
 from magbridge.diagnose.causes import CAUSES
-from magbridge.diagnose.columns import Candidate, of_effect, since
+from magbridge.diagnose.columns import Candidate, absent_before, of_effect
 from magbridge.diagnose.evidence import IDEAL
 from magbridge.diagnose.extend import MODES, extend, flyable, relinearised, with_map_error, with_misfit
 from magbridge.diagnose.joint import Joint, fit_joint
@@ -99,7 +99,9 @@ def test_a_calibration_from_turns_is_freed_of_a_filters_attenuation() -> None:
     assert level(problem, [attenuated], extended) is None  # the reference is right
     problem.let_go()
     delay = ClockEffect(cause="filter_lag", sign=-1.0)
-    both = of_effect(problem, delay, 2.0, "s", names=("delay",), phi=np.ones((9, 1600))).with_(attenuated)
+    both = of_effect(problem, delay, 2.0, "s", names=("delay",), phi=np.ones((9, 1600))).joined_with(
+        attenuated
+    )
     assert extend(problem, [both], fit_joint(problem, [both.columns], 1)).effects == (delay,)
 
 
@@ -157,7 +159,7 @@ def test_what_has_come_since_is_not_in_the_calibrations_logs() -> None:
     effect = PowersEffect(cause="unmodelled_actuator", channel="p", centre=-1e9, scale=1e9, order=1)
     phi = regressors_of(survey, whole.calibration, effect)
     lasting = of_effect(problem, effect, 100.0, "nT", channel="p", phi=phi)
-    late = since(lasting, learned)
+    late = absent_before(lasting, learned)
     assert not late.columns(slice(0, 150)).any()
     np.testing.assert_array_equal(late.columns(slice(150, 300)), lasting.columns(slice(150, 300)))
     fit = fit_joint(problem, [late.columns], 1)

@@ -15,7 +15,7 @@ from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.problem import pose
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.survey import ANY, Channel, kinds_of
+from magbridge.diagnose.survey import ANY, TelemetryChannel, kinds_of
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_no_cause_is_put_forward_for_a_series_whose_kind_contradicts_it() -> Non
     motors = {name: rng.uniform(size=n) for name in ("throttle", "esc1_current")}
     survey = surveyed(walk(n, rng), np.sin(np.arange(n) / 30.0))
     channels = survey.channels | {
-        name: Channel(values, "", kinds_of(name, "")) for name, values in motors.items()
+        name: TelemetryChannel(values, "", kinds_of(name, "")) for name, values in motors.items()
     }
     problem = pose(replace(survey, channels=channels), calibrated(np.zeros(18)))
     made = {cause: {one.channel for one in row.candidates(problem)} for cause, row in CAUSES.items()}

@@ -120,7 +120,7 @@ def test_least_squares_of_the_filtered_is_generalised_least_squares(
     A = noise.filter(X)
     np.testing.assert_allclose(A.T @ A, X.T @ np.linalg.solve(C, X), rtol=1e-5)
     y = rng.normal(size=n)
-    np.testing.assert_allclose(X.T @ noise.back(y), A.T @ y)
+    np.testing.assert_allclose(X.T @ noise.filter_back(y), A.T @ y)
 
 
 @pytest.mark.parametrize("lost", ["every 24th", "one in twelve", "76 of 100"])

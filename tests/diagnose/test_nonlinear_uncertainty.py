@@ -57,7 +57,7 @@ def test_what_has_no_nonlinear_parameter_is_as_well_known_as_before(problem: Pro
 
 
 def test_parts_of_one_cause_have_each_their_own(problem: Problem) -> None:
-    both = decay(LAG).with_(decay(5.0))
+    both = decay(LAG).joined_with(decay(5.0))
     fit = fitted(problem, both)
     free = loosened(problem, [both], [both.columns], fit)
     assert np.all(np.diag(free.covariance)[-2:] > np.diag(fit.covariance)[-2:])

@@ -14,13 +14,13 @@ from magbridge.diagnose.alternatives import _separate, exchanged, pairs_of, sets
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE, score
 from magbridge.diagnose.search import _backward_elimination
-from magbridge.diagnose.state import State
+from magbridge.diagnose.state import SearchState
 
 ROWS = 600
 
 
 @pytest.fixture(scope="module")
-def state() -> State:
+def state() -> SearchState:
     """Two causes that act, one that looks like both, one like the first, and a stranger."""
     rng, t = np.random.default_rng(5), np.arange(ROWS)
     a, b = np.sin(t / 7.0), np.sign(np.sin(t / 40.0))
@@ -35,12 +35,12 @@ def state() -> State:
         candidate("alike", alike), candidate("other", other.T),
         candidate("series", rng.normal(size=(4, ROWS)).T, spectra=np.ones((1, 4))),
     ]  # fmt: skip
-    found = State(problem, candidates, 1, 6)
+    found = SearchState(problem, candidates, 1, 6)
     found.round([], found.null)
     return found
 
 
-def test_all_pairs_at_once_are_one_after_the_other(state: State) -> None:
+def test_all_pairs_at_once_are_one_after_the_other(state: SearchState) -> None:
     """A single name loses to each pair by the evidence of both, the second given the first."""
     model = [state.candidates[2], state.candidates[4]]
     base = state.fit(model)
@@ -52,7 +52,7 @@ def test_all_pairs_at_once_are_one_after_the_other(state: State) -> None:
 
     def together(a: slice, one: Candidate, b: slice, two: Candidate) -> float:
         first = score(alone, a, one)
-        return first.evidence + score(alone.without(np.r_[a], first.prior), b, two).evidence
+        return first.evidence + score(alone.projected_out(np.r_[a], first.prior), b, two).evidence
 
     places = [slice(int(x), int(y)) for x, y in pairwise(ends)]
     standing = max(together(places[n], model[n], places[1 - n], model[1 - n]) for n in (0, 1))
@@ -64,14 +64,14 @@ def test_all_pairs_at_once_are_one_after_the_other(state: State) -> None:
         assert pair.behind == pytest.approx(standing - there, abs=1e-6)
 
 
-def test_two_take_the_place_of_one_that_had_swallowed_both(state: State) -> None:
+def test_two_take_the_place_of_one_that_had_swallowed_both(state: SearchState) -> None:
     alone = [state.candidates[2]]
     model, base = exchanged(state, alone, state.fit(alone))
     assert {one.cause for one in model} == {"a", "b"}
     assert state.value(model, base) > state.value(alone, state.fit(alone))
 
 
-def test_a_cause_that_is_not_worth_a_further_one_is_dropped(state: State) -> None:
+def test_a_cause_that_is_not_worth_a_further_one_is_dropped(state: SearchState) -> None:
     """It passes its test, but two others of S/N 17 and 24 may leave as much."""
     a, b, other = (state.candidates[k] for k in (0, 1, 4))
     weak = copy(state)
@@ -85,7 +85,7 @@ def test_a_cause_that_is_not_worth_a_further_one_is_dropped(state: State) -> Non
     assert [h.candidate for h in chosen] == [a, b]
 
 
-def test_the_sets_hold_whatever_a_whole_within_20_to_1_is_made_of(state: State) -> None:
+def test_the_sets_hold_whatever_a_whole_within_20_to_1_is_made_of(state: SearchState) -> None:
     model = [state.candidates[3], state.candidates[1]]
     base = state.fit(model)
     sets = sets_of(state, state.conditional_on(model, base), model, base)
@@ -93,7 +93,7 @@ def test_the_sets_hold_whatever_a_whole_within_20_to_1_is_made_of(state: State) 
     assert "other" not in {competitor.candidate.cause for some in sets for competitor in some}
 
 
-def test_numbers_of_one_common_size_stay_a_whole(state: State) -> None:
+def test_numbers_of_one_common_size_stay_a_whole(state: SearchState) -> None:
     """No exchange makes a series and a part of it one cause's regressors."""
     series, other = state.candidates[5], replace(state.candidates[4], cause="series")
     assert not _separate([other], [series, state.candidates[0]], [1])

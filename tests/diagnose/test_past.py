@@ -34,8 +34,8 @@ def test_nothing_is_known_before_a_log_and_where_another_begins() -> None:
     n = 80
     s = survey(4.0 * np.arange(n), (np.arange(n) >= 50).astype(float))
     assert np.flatnonzero(s.steps == MAX_LAG).tolist() == [0, 50]
-    assert np.flatnonzero(~s.past(3).whole).tolist() == [0, 1, 2, 50, 51, 52]
-    assert s.past(3) is s.past(3)
+    assert np.flatnonzero(~s.history(3).whole).tolist() == [0, 1, 2, 50, 51, 52]
+    assert s.history(3) is s.history(3)
 
 
 def test_samples_next_to_a_gap_have_the_lags_of_those_that_are_there() -> None:

@@ -25,7 +25,7 @@ from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.columns import effect_columns
 from magbridge.diagnose.joint import Statistic
 from magbridge.diagnose.problem import Problem, pose, rates
-from magbridge.diagnose.survey import MAX_LAG, Channel
+from magbridge.diagnose.survey import MAX_LAG, TelemetryChannel
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +42,11 @@ def problem() -> Problem:
     warm = 3.0 + rng.normal(size=n).cumsum() * 0.1
     amps = np.where(rng.uniform(size=n) > 0.7, 1.3, 0.0)
     channels = {
-        "p": Channel(p, "in", ("position",)), "fin": Channel(p[::-1].copy(), "deg", ("position",)),
-        "warm": Channel(warm, "degC", ("temperature",)), "amps": Channel(amps, "A", ("current",)),
-    }  # fmt: skip
+        "p": TelemetryChannel(p, "in", ("position",)),
+        "fin": TelemetryChannel(p[::-1].copy(), "deg", ("position",)),
+        "warm": TelemetryChannel(warm, "degC", ("temperature",)),
+        "amps": TelemetryChannel(amps, "A", ("current",)),
+    }
     steps = np.append(MAX_LAG, np.rint(np.diff(t) / 4.0).astype(int))
     survey = surveyed(directions, p, time=t, steps=steps, channels=channels)
     return pose(survey, calibrated(rng.normal(0, 50.0, 27), centre=0.1, scale=0.9))
@@ -175,7 +177,7 @@ def test_a_mass_that_moves_within_one_interval_is_seen_by_a_shift(problem: Probl
 
 
 def test_a_candidate_profiled_again_stays_its_own_channels(problem: Problem) -> None:
-    cold = Channel(problem.survey.channels["warm"].values[::-1].copy(), "degC", ("temperature",))
+    cold = TelemetryChannel(problem.survey.channels["warm"].values[::-1].copy(), "degC", ("temperature",))
     survey = replace(problem.survey, channels={**problem.survey.channels, "cold": cold})
     seen = 0
     for cause in CAUSES.values():
@@ -207,7 +209,7 @@ def test_a_step_is_as_likely_at_a_power_cycle_as_at_all_other_times(problem: Pro
 
 def test_a_cause_found_twice_is_one(problem: Problem) -> None:
     first, second = CAUSES["hysteresis"].candidates(problem)[:2]
-    both = first.with_(second).with_(second)
+    both = first.joined_with(second).joined_with(second)
     assert both.size == len(set(both.names)) == 9
     assert (len(both.point.shape), len(both.effects)) == (9, 3)
     np.testing.assert_array_equal(both.columns(slice(0, 50))[:, :3], first.columns(slice(0, 50)))
@@ -225,7 +227,7 @@ def test_a_mass_that_stops_while_another_goes_on_has_no_rate(problem: Problem) -
         terms=(Polynomial(exponents=((0, 0), (1, 0), (0, 1))),),
         coefficients=np.concatenate([np.zeros(9), np.arange(9.0), 10.0 + np.arange(9.0)]),
     )
-    channels = {name: Channel(values, "in", ("position",)) for name, values in (("a", a), ("b", b))}
+    channels = {name: TelemetryChannel(values, "in", ("position",)) for name, values in (("a", a), ("b", b))}
     survey = replace(problem.survey, channels=channels)
     rates = mass_rates(replace(problem, survey=survey, calibration=calibration))
     only_b, both = rates[:, 15], rates[:, 12]

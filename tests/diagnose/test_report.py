@@ -21,7 +21,7 @@ from magbridge.diagnose.leftover import Leftover
 from magbridge.diagnose.problem import Problem, isotropic
 from magbridge.diagnose.report import figures
 from magbridge.diagnose.report.page import marked_up
-from magbridge.diagnose.survey import Channel, _channels
+from magbridge.diagnose.survey import TelemetryChannel, _channels
 from magbridge.diagnose.texts import chance, measured, number, sizes
 
 
@@ -248,7 +248,7 @@ def test_of_many_channels_the_difference_s_own_are_drawn(
     names = [f"c{k:02}" for k in range(30)]
     values = {name: rng.normal(size=2000) for name in names}
     survey = SimpleNamespace(
-        channels={name: Channel(x, "V", ()) for name, x in values.items()}, still=(),
+        channels={name: TelemetryChannel(x, "V", ()) for name, x in values.items()}, still=(),
         attitude=rng.normal(size=(2000, 3)),
     )  # fmt: skip
     before = values["c29"] + rng.normal(size=2000)

@@ -18,7 +18,7 @@ from magbridge.diagnose.evidence import ODDS, Hypothesis
 from magbridge.diagnose.problem import pose
 from magbridge.diagnose.run import odds_over_random_walk
 from magbridge.diagnose.search import LOST, _forward_selection, _surplus, beside_slow_noise, search, switches
-from magbridge.diagnose.state import State
+from magbridge.diagnose.state import SearchState
 
 
 def fault(cause: str, x: NDArray[np.float64], width: float) -> Candidate:
@@ -77,7 +77,7 @@ def test_what_switches_is_not_searched_for_without_end() -> None:
     steps = [fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in range(100, n, 100)]
     current = fault("current_field", relay, 10.0)
     noisy = replace(right(n), residual=16.0 * relay + rng.normal(size=n))
-    brief = State(noisy, steps, 2, 2).with_brief_noise()
+    brief = SearchState(noisy, steps, 2, 2).with_brief_noise()
     model, base = _forward_selection(brief, brief.round([], brief.null))
     assert len(model[0].pieces) == LOST
     assert switches(base, model, brief.causes)
@@ -90,9 +90,9 @@ def test_a_regressor_that_later_ones_made_needless_is_dropped() -> None:
     n = 600
     early, late = (fault("offset_step", (np.arange(n) >= at).astype(float), 10.0) for at in (60, 500))
     problem = replace(right(n), residual=5.0 * (np.arange(n) >= 60) + rng.normal(size=n))
-    state = State(problem, [early, late], 1, 1)
+    state = SearchState(problem, [early, late], 1, 1)
     state.round([], state.null)
-    both = early.with_(late)
+    both = early.joined_with(late)
     assert exchanged(state, [both], state.fit([both]))[0] == [early]
 
 
@@ -104,7 +104,7 @@ def test_of_two_similar_causes_one_without_gain_on_new_dives_is_dropped(alike: b
         acts, none = (np.arange(n) > 200.0).astype(float), rng.normal(size=n)
         one = fault("offset_step", acts, 10.0)
         like = fault("offset_drift", acts + 0.1 * none if alike else none, 10.0)
-        state = State(replace(right(n), residual=5.0 * acts + rng.normal(size=n)), [one, like], 1, 2)
+        state = SearchState(replace(right(n), residual=5.0 * acts + rng.normal(size=n)), [one, like], 1, 2)
         base = state.fit([one, like])
         both = [
             Hypothesis(own, 0.0, 0.0, 0.0, state.fit([other, own]))
@@ -123,7 +123,7 @@ def test_one_cause_gives_way_to_two_given_a_third() -> None:
     both = [fault("offset_drift", one, 10.0), fault("offset_step", two, 10.0)]
     conditional_on = fault("current_field", third, 10.0)
     problem = replace(right(n), residual=5.0 * (one + two + third) + rng.normal(size=n))
-    state = State(problem, [alike, *both, conditional_on], 1, 4)
+    state = SearchState(problem, [alike, *both, conditional_on], 1, 4)
     state.round([], state.null)
     model, _ = exchanged(state, [alike, conditional_on], state.fit([alike, conditional_on]))
     assert {c.cause for c in model} == {"offset_drift", "offset_step", "current_field"}
@@ -137,7 +137,7 @@ def test_what_nature_cannot_do_is_the_vehicles() -> None:
     drifting = fault("offset_drift", x, 50.0)
     natural = replace(fault("diurnal_variation", x, 20.0), effects=())
     problem = replace(right(n), residual=150.0 * x + rng.normal(size=n))
-    fit = State(problem, [drifting, natural], 1, 2).fit([drifting, natural])
+    fit = SearchState(problem, [drifting, natural], 1, 2).fit([drifting, natural])
     drift, daily = fit.coefficients * [50.0, 20.0]
     assert drift + daily == pytest.approx(150.0, abs=1.0)
     assert daily == pytest.approx(150.0 * 20.0**2 / (20.0**2 + 50.0**2 / 0.1), rel=0.05)
@@ -150,7 +150,7 @@ def test_a_main_field_model_may_be_off_by_140_nanotesla() -> None:
     noise = rng.normal(size=600)
     [bias] = ReferenceBias().candidates(problem)
     small, large = (
-        State(replace(problem, residual=noise + size * problem.reference_jacobian), [bias], 1, 1)
+        SearchState(replace(problem, residual=noise + size * problem.reference_jacobian), [bias], 1, 1)
         .fit([bias])
         .log_likelihood
         for size in (10.0, 140.0)

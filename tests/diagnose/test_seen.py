@@ -22,7 +22,7 @@ from magbridge.diagnose.observed import memory, seen
 from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
-from magbridge.diagnose.survey import Channel
+from magbridge.diagnose.survey import TelemetryChannel
 from sitl import load, simulate
 from sitl.dataset import segments
 from sitl.signals import correlated
@@ -35,7 +35,7 @@ def flown() -> Problem:
     rng = np.random.default_rng(5)
     survey = surveyed(walk(N, rng), np.sin(np.arange(N) / 30.0))
     throttle = (rng.uniform(size=N // 20) > 0.5).repeat(20).astype(float)
-    channels = survey.channels | {"throttle": Channel(throttle, "%", ("current", "position"))}
+    channels = survey.channels | {"throttle": TelemetryChannel(throttle, "%", ("current", "position"))}
     return pose(replace(survey, channels=channels), calibrated(np.zeros(18)))
 
 
@@ -77,7 +77,9 @@ def test_the_axis_of_what_is_slow_is_reported_though_it_follows_nothing(axis: st
     """A slow signal correlates with any slow channel, so this is not reported. Turns show the axis."""
     turned = np.random.default_rng(5).normal(size=(N // 30, 3)).repeat(30, axis=0)
     survey = surveyed(turned, np.sin(np.arange(N) / 30.0))
-    hours = Channel(correlated(np.random.default_rng(4).normal(size=(N, 1)), 0.997)[:, 0], "h", ("position",))
+    hours = TelemetryChannel(
+        correlated(np.random.default_rng(4).normal(size=(N, 1)), 0.997)[:, 0], "h", ("position",)
+    )
     problem = pose(replace(survey, channels=survey.channels | {"hours": hours}), calibrated(np.zeros(18)))
     u = (
         np.ones(N)
@@ -92,14 +94,14 @@ def test_the_axis_of_what_is_slow_is_reported_though_it_follows_nothing(axis: st
 def test_a_slow_series_that_explains_all_is_followed(flown: Problem) -> None:
     """For any slow signal the remainder is not slow."""
     warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
-    survey = replace(flown.survey, channels={"warmth": Channel(warmth, "degC", ("temperature",))})
+    survey = replace(flown.survey, channels={"warmth": TelemetryChannel(warmth, "degC", ("temperature",))})
     signal = 20.0 * warmth + np.random.default_rng(6).normal(size=N)
     assert seen(replace(flown, survey=survey), signal)[:2] == ("warmth", 0.0)
 
 
 def test_a_cause_does_not_follow_a_channel_of_the_other_causes(flown: Problem) -> None:
     warmth = correlated(np.random.default_rng(10).normal(size=(N, 1)), 0.997)[:, 0]
-    survey = replace(flown.survey, channels={"warmth": Channel(warmth, "degC", ("temperature",))})
+    survey = replace(flown.survey, channels={"warmth": TelemetryChannel(warmth, "degC", ("temperature",))})
     problem, own = replace(flown, survey=survey), 4.0 * np.random.default_rng(6).normal(size=N)
     assert seen(problem, own + 20.0 * warmth).channel == "warmth"
     assert seen(problem, own + 20.0 * warmth, own).channel is None

@@ -13,7 +13,7 @@ from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Effect, Polynomial, Series
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.problem import Problem, pose
-from magbridge.diagnose.survey import MAX_LAG, Channel, Survey
+from magbridge.diagnose.survey import MAX_LAG, Survey, TelemetryChannel
 
 __all__ = [
     "FIELD",
@@ -45,7 +45,7 @@ def surveyed(directions: FloatArray, p: FloatArray, **more: Any) -> Survey:
         "steps": np.where(np.arange(n) > 0, 1, MAX_LAG), "dive": np.arange(n) // 50, "place": None,
         "attitude": None, "fitted": np.zeros(n, bool), "learned": np.zeros(n, bool), "cycles": np.empty(0),
         "source": "made",
-        "channels": {"p": Channel(p, "in", ("position",))},
+        "channels": {"p": TelemetryChannel(p, "in", ("position",))},
     }  # fmt: skip
     return Survey(**plain | more)
 

@@ -167,7 +167,7 @@ class Nonlinearity(Cause):
         """Return the two single powers, and all three together."""
         # a common size is at most ten widths (:data:`~magbridge.diagnose.joint.PRIOR_SIZES`)
         common = [self._power(problem, power, 0.1 * MAX_BEND_NT) for power in (1, 2, 3)]
-        every = replace(reduce(Candidate.with_, common), parts=(), spectra=np.ones((1, 9)))
+        every = replace(reduce(Candidate.joined_with, common), parts=(), spectra=np.ones((1, 9)))
         return [*(self._power(problem, power, MAX_BEND_NT) for power in (2, 3)), every]
 
     def _power(self, problem: Problem, power: int, width: float) -> Candidate:

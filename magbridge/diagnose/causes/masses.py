@@ -18,7 +18,7 @@ SOURCE_DISTANCES = (0.25, 0.5)
 """Distances of sources from a mass' path that are tried, in half travels; nearer iron would be struck."""
 SOURCE_SPACING = 1.25
 """Spacing of the sources, in units of their distance from the path: closer ones make the same field."""
-PLAYS = (
+HYSTERESIS_BRANCHES = (
     *product((0.05, 0.15, 0.3), (0.0,), (4.0,)),
     *product((0.15, 0.3), (-1.0 / 3.0, 0.0, 1.0 / 3.0), (0.5,)),
 )
@@ -98,11 +98,11 @@ class ActuatorOrder(Cause):
         effect = LegendreEffect(cause=self.name, exponents=exponents)
         return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES))
 
-    def _sources(self, problem: Problem, name: str, near: float) -> Candidate:
+    def _sources(self, problem: Problem, name: str, distance: float) -> Candidate:
         """Return sources all along one mass' path, and a little beyond its ends, of one common size."""
         low, high = problem.survey.channels[name].extent
-        scale = 0.5 * near * (high - low)
-        gaps = int(np.ceil(2.0 / (SOURCE_SPACING * near)))
+        scale = 0.5 * distance * (high - low)
+        gaps = int(np.ceil(2.0 / (SOURCE_SPACING * distance)))
         centre = 0.5 * (low + high - gaps * SOURCE_SPACING * scale)
         effect = SourcesEffect(
             cause=self.name, channel=name, centre=centre, scale=scale, apart=SOURCE_SPACING, count=gaps + 1
@@ -141,7 +141,7 @@ class Hysteresis(Cause):
                     self._play(
                         problem, parameter.name, 2.0 * half * width, middle + half * centre, half * scale
                     )
-                    for width, centre, scale in PLAYS
+                    for width, centre, scale in HYSTERESIS_BRANCHES
                 ]
         return made
 

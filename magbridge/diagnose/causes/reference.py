@@ -67,7 +67,7 @@ class MapError(Cause):
         if place is None or np.ptp(place[:, :2], axis=0).max() < 200.0:
             return []
         Z, cell = _cells(place)
-        weights, corners = _between(place, cell)
+        weights, corners = _corner_weights(place, cell)
         seen = diags_array(problem.reference_jacobian) @ weights
         depths, lengths = place[:, 2].max() + cell * SCALES, 2.0 * cell * SCALES
         lacking = _expanded([partial(_lacking, d=d) for d in depths], Z, corners)
@@ -124,7 +124,7 @@ def _each(corners: FloatArray) -> tuple[FloatArray, IndexArray]:
     return np.stack(np.unravel_index(keys, box), axis=1) + low, of
 
 
-def _between(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
+def _corner_weights(place: FloatArray, side: float) -> tuple[csr_array, FloatArray]:
     """(n, c) weights of linear interpolation between the corners (c, d), m, of the visited cells."""
     low = np.floor(place / side)
     high = place / side - low
@@ -139,11 +139,11 @@ def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
     """Return the covariance (n, m), at places (n, 3), (m, 3), of a map's missing field of depth d."""
     r2 = cdist(a[:, :2], b[:, :2], "sqeuclidean")
 
-    def between(above: FloatArray | float, below: FloatArray | float) -> FloatArray:
-        return np.asarray(((above + below) ** 2 + r2) ** -0.5)
+    def reciprocal(upper: FloatArray | float, lower: FloatArray | float) -> FloatArray:
+        return np.asarray(((upper + lower) ** 2 + r2) ** -0.5)
 
     here, there, high = d - a[:, 2:], d - b[:, 2], d + ALTITUDE
-    return between(here, there) - between(here, high) - between(high, there) + between(high, high)
+    return reciprocal(here, there) - reciprocal(here, high) - reciprocal(high, there) + reciprocal(high, high)
 
 
 def _matern(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
@@ -170,8 +170,8 @@ class DiurnalVariation(Cause):
         made = []
         for some in (harmonics[k:] for k in range(len(harmonics))):
 
-            def basis(rows: slice, some: list[int] = some) -> FloatArray:
-                angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(some)
+            def basis(rows: slice, kept: list[int] = some) -> FloatArray:
+                angle = 2.0 * np.pi * t[rows, None] / 86400.0 * np.array(kept)
                 return np.hstack([np.cos(angle), np.sin(angle)])
 
             names = tuple(f"{f} {24 // h} h" for f in ("cos", "sin") for h in some)

@@ -13,7 +13,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
-from magbridge.diagnose.problem import Problem, once
+from magbridge.diagnose.problem import Problem, cached_per_problem
 
 __all__ = ["CurrentField", "PressureOffset", "TemperatureOffset", "TemperatureScale"]
 
@@ -26,7 +26,7 @@ MAX_JOINT_CURRENTS = 12
 """Most currents that are also tried together."""
 
 
-@once
+@cached_per_problem
 def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatArray]]:
     """Return the lagged temperatures, cached: origins and causes share them, each of 5 MB for a month."""
     survey = problem.survey  # a cache that referred to the problem would keep it alive
@@ -145,7 +145,7 @@ class CurrentField(_Proportional):
         if not 2 <= len(alone) <= MAX_JOINT_CURRENTS:
             return alone
         names = tuple(f"{axis} {one.channel}" for one in alone for axis in AXES)
-        every = replace(reduce(Candidate.with_, alone), channel=None, names=names, parts=())
+        every = replace(reduce(Candidate.joined_with, alone), channel=None, names=names, parts=())
         return [*alone, replace(every, spectra=np.ones((1, every.size)))]
 
 

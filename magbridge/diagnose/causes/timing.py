@@ -12,7 +12,7 @@ from magbridge.calibration.effects import ClockEffect
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
-from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, once, rates
+from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, cached_per_problem, rates
 
 __all__ = ["ChannelSkew", "ClockOffset", "EddyCurrent", "FilterLag", "field_rates", "mass_rates"]
 
@@ -24,13 +24,13 @@ CENTRAL_STEP_S = 0.01
 """s by which masses are moved forward and back, for a central difference of the nine coefficients."""
 
 
-@once
+@cached_per_problem
 def field_rates(problem: Problem) -> FloatArray:
     """(3, n) dH_r/dt, nT/s (:func:`~magbridge.diagnose.problem.rates`)."""
     return rates(problem.survey, problem.survey.field.T)
 
 
-@once
+@cached_per_problem
 def mass_rates(problem: Problem) -> FloatArray:
     """(9, n) rates of change, per s, of the nine coefficients while masses move.
 

@@ -170,15 +170,15 @@ def _assessment(found: Assessment) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _notes(some: Sequence[Diagnostic]) -> list[dict[str, Any]]:
-    return [{"code": note.code, "text": note.text, "numbers": note.numbers} for note in some]
+def _notes(notes: Sequence[Diagnostic]) -> list[dict[str, Any]]:
+    return [{"code": note.code, "text": note.text, "numbers": note.numbers} for note in notes]
 
 
-def _follows(what: Seen) -> dict[str, Any]:
+def _follows(seen: Seen) -> dict[str, Any]:
     """Return the observed correlate, without its interpretation."""
     return {
-        "channel": what.channel, "lag_s": what.lag, "axis": what.axis, "amplitude_nT": what.size,
-        "fraction": what.share,
+        "channel": seen.channel, "lag_s": seen.lag, "axis": seen.axis, "amplitude_nT": seen.size,
+        "fraction": seen.share,
     }  # fmt: skip
 
 

@@ -179,8 +179,8 @@ def _visible(result: DiagnosisResult) -> dict[str, Any]:
     report, track = result.diagnosis.isolability, result.assessment.returns
     hidden = [one for one in report.visible if not any(isfinite(size) for size, _ in one.sizes.values())]
 
-    def alike(one: Visible) -> list[tuple[Visible, float]]:
-        return [(b if a is one else a, rho) for a, b, rho in report.pairs if one is a or one is b]
+    def alike(visible: Visible) -> list[tuple[Visible, float]]:
+        return [(b if a is visible else a, rho) for a, b, rho in report.pairs if visible is a or visible is b]
 
     return {
         "hidden": hidden, "shown": [one for one in report.visible if one not in hidden], "alike": alike,
