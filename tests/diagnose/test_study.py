@@ -12,7 +12,7 @@ from scipy.stats import norm
 from study.cases import PARTS, plan
 from study.deployment import CHARTS, LOSSES, MEMORY, charted, drawn, kept_rows, project, whiten
 from study.ideal import SIZES, Draws, Span
-from study.table import lines, needed_size, share
+from study.table import needed_size
 
 from sitl import Twin, load
 from sitl.signals import correlated
@@ -132,13 +132,6 @@ def test_p_values_show_a_detector_that_needs_more_signal() -> None:
     factor, low, high = needed_size(rows) or (0.0, 0.0, 0.0)
     assert factor == pytest.approx(1.1, abs=0.005)
     assert low <= factor <= high < low + 0.02
-
-
-def test_a_share_has_an_interval() -> None:
-    rows = [{"k": k} for k in range(100)]
-    assert share(rows, lambda r: r["k"] < 1) == "1.0 % (0.0-5.4) | 1/100"
-    assert share([], bool) == "not run | 0"
-    assert "not run" in "\n".join(lines([]))
 
 
 def test_a_run_writes_the_table_and_the_plots(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pace import cost
 
 from magbridge.errors import OutOfRange
 from magbridge.field import igrf as module
-from magbridge.field.igrf import coverage, igrf, total_field
+from magbridge.field.igrf import coverage, igrf
 
 
 def at(year: int, month: int, day: int) -> float:
@@ -73,11 +73,6 @@ def test_is_a_potential_field(places: tuple[np.ndarray, ...]) -> None:
     d_east /= 2 * step * per_lat * np.cos(np.radians(lat))
     sphere = -2 * igrf(lon, lat, depth, time)[:, 2] / 6.371e6  # radial divergence of a sphere's coordinates
     assert np.abs(d_north + d_east + d_down + sphere).max() < 3e-4  # nT/m; 60000/6.4e6 x 1/300 of flattening
-
-
-def test_depth_counts() -> None:
-    deep = total_field(-57.9, 49.5, [0.0, 1000.0], at(2013, 12, 5))
-    assert 20 < np.diff(deep)[0] < 30
 
 
 def test_is_finite_and_continuous_at_the_poles() -> None:

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from studies import Column, Row, Study
+import pandas as pd
+from studies import Column, Row, Study, fraction
 
 
 def run(kind: str, seed: int) -> list[Row]:
@@ -32,3 +33,22 @@ def test_rows_are_kept_and_cases_are_not_run_twice(tmp_path: Path) -> None:
         "kind": ["a", "b"], "rows": ["2", "1"], "median": ["11.50", ""], "maximum": ["12.0", ""],
         "failed": ["", "1"],
     }  # fmt: skip
+
+
+def test_rows_have_the_order_of_the_cases(tmp_path: Path) -> None:
+    options = argparse.Namespace(workers=2, out=tmp_path / "rows.parquet")
+    STUDY.rows([("b", 2)], options)
+    rows = STUDY.rows([("c", 5), ("b", 2), ("a", 4)], options)
+    assert list(rows["kind"]) == ["c", "b", "a"]
+
+
+def test_a_column_may_combine_columns_of_the_rows() -> None:
+    rows = pd.DataFrame({"error": [2.0, 9.0, np.nan], "bound": [1.0, 3.0, 1.0]})
+    ratio = Column(("error", "bound"), lambda values: float(np.max(values[:, 0] / values[:, 1])))
+    assert ratio.cell(rows) == "3.00"
+    assert ratio.cell(rows.drop(columns="bound")) == ""
+
+
+def test_a_fraction_has_an_interval() -> None:
+    assert fraction([True, *[False] * 99]) == "1.0 % (0.0-5.4) | 1/100"
+    assert fraction([]) == "not run | 0"
