@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,26 +16,52 @@ from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import load
 
-__all__ = ["START", "small_bridge"]
+__all__ = ["START", "bridge_text", "small_bridge"]
 
 START = 1_780_000_000_000_000
-CONFIG = """
-[sensor]
-driver = "ascii"
-port = "/dev/null"
-options = {columns = ["x", "y", "z", "temperature", "time", "sequence"]}
-[link]
-url = "udpout:127.0.0.1:14550"
-[calibration]
-file = "cal.json"
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {name = "battpos"}
-field = "value"
-[log]
-directory = "logs"
-[publish]
-"""
+ASCII_OPTIONS = 'columns = ["x", "y", "z", "temperature", "time", "sequence"]'
+
+
+def bridge_text(
+    driver: str = "ascii",
+    options: str = ASCII_OPTIONS,
+    *,
+    port: str = "/dev/null",
+    url: str = "udpout:127.0.0.1:14550",
+    masses: Mapping[str, str] = MappingProxyType({"battpos": ""}),
+    calibration: bool = True,
+    log: bool = True,
+    publish: Mapping[str, int] = MappingProxyType({}),
+    more: str = "",
+) -> str:
+    """Return the text of a ``bridge.toml``.
+
+    Parameters
+    ----------
+    driver, options : str
+        Sensor driver, and its options in TOML.
+    port, url : str
+        Port of the sensor and URL of the link.
+    masses : mapping of str to str
+        Telemetry by name, with its unit.
+    calibration : bool
+        Whether the bridge has the calibration ``cal.json``.
+    log : bool
+        Whether it writes a log to the folder ``logs``.
+    publish : mapping of str to int
+        Rates of messages.
+    more : str
+        Further lines; first more keys of ``[publish]``, if any.
+    """
+    lines = ["[sensor]", f'driver = "{driver}"', f'port = "{port}"', f"options = {{{options}}}"]
+    lines += ["[link]", f'url = "{url}"']
+    lines += ["[calibration]", 'file = "cal.json"'] * calibration
+    for name, unit in masses.items():
+        lines += [f"[telemetry.{name}]", 'message = "NAMED_VALUE_FLOAT"', f'match = {{name = "{name}"}}']
+        lines += ['field = "value"', f'unit = "{unit}"']
+    lines += ["[log]", 'directory = "logs"'] * log + ["[publish]"] * bool(publish)
+    lines += [f"{message} = {rate}" for message, rate in publish.items()]
+    return "\n".join([*lines, more])
 
 
 def small_bridge(
@@ -75,6 +102,5 @@ def small_bridge(
     )
     save(cal, folder / "cal.json")
     config = folder / "bridge.toml"
-    published = "".join(f"{message} = 0\n" for message in publish)
-    config.write_text(CONFIG + published + more, encoding="utf-8")
+    config.write_text(bridge_text(publish=dict.fromkeys(publish, 0), more=more), encoding="utf-8")
     return set_up(load(config), start)

@@ -18,6 +18,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from small import bridge_text
 from studies import command_line
 
 from magbridge.bridge import states
@@ -31,20 +32,6 @@ from magbridge.mavlink import Codec, Message
 from magbridge.records import Channel, Quality, Reading
 from sitl.fluxgate import open_encoder
 
-CONFIG = """
-[sensor]
-driver = "digitizer"
-port = "/dev/null"
-options = {sensitivity = 5e-5, reference_voltage = 5.0}
-[link]
-url = "udpout:127.0.0.1:14550"
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {name = "battpos"}
-field = "value"
-[calibration]
-file = "cal.json"
-"""
 BEGIN_US = 1_780_000_000_000_000
 TRUTH = np.array([20_000.0, 1_000.0, 40_000.0])
 """True field in sensor axes, nT."""
@@ -81,7 +68,8 @@ class Soak:
 
     def __init__(self, folder: Path, seed: int) -> None:
         save(calibration(), folder / "cal.json")
-        (folder / "bridge.toml").write_text(CONFIG, encoding="utf-8")
+        text = bridge_text("digitizer", "sensitivity = 5e-5, reference_voltage = 5.0", log=False)
+        (folder / "bridge.toml").write_text(text, encoding="utf-8")
         config = load(folder / "bridge.toml")
         self.pipeline = set_up(config, Start(BEGIN_US))
         self.encoder = open_encoder("digitizer", config.sensor.options)

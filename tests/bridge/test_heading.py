@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small import bridge_text
 
 from magbridge.bridge.check import findings
 from magbridge.bridge.drive import set_up
@@ -35,19 +36,6 @@ PLACE = (49.5, -57.9)
 ROLL, PITCH, YAW = radians(8.0), radians(-20.0), radians(130.0)
 ARDUPILOT, PX4 = 3, 12
 MAIN = igrf(PLACE[1], PLACE[0], 0.0, START * 1e-6)[0]
-CONFIG = """
-[sensor]
-driver = "ascii"
-port = "PORT"
-options = {columns = ["x", "y", "z", "time"]}
-[link]
-url = "LINK"
-[calibration]
-file = "cal.json"
-[publish]
-MAG_FIELD = 0
-ATTITUDE_QUATERNION_COV = 0
-"""
 
 
 def body_field(roll: float = ROLL, pitch: float = PITCH, yaw: float = YAW) -> np.ndarray:
@@ -77,8 +65,11 @@ def write_bridge(
     )
     save(cal, folder / "cal.json")
     path = folder / "bridge.toml"
-    source = CONFIG.replace("PORT", port).replace("LINK", link)
-    path.write_text(f"{source}[heading]\n{heading}\n", encoding="utf-8")
+    text = bridge_text(
+        options='columns = ["x", "y", "z", "time"]', port=port, url=link, masses={}, log=False,
+        publish={"MAG_FIELD": 0, "ATTITUDE_QUATERNION_COV": 0}, more=f"[heading]\n{heading}\n",
+    )  # fmt: skip
+    path.write_text(text, encoding="utf-8")
     return path
 
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from small import bridge_text
 
 from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, Start
@@ -38,20 +39,18 @@ ORIGIN, ORIGIN_ALTITUDE = (49.51, -57.93), 12.0
 QUATERNION = (0.8487626, 0.0993347, -0.1720527, 0.4900333)
 """Of 60 deg of yaw and -0.4 rad of pitch."""
 SENSOR = {"sensitivity": 5e-5, "reference_voltage": 5.0}
-CONFIG = """
-[sensor]
-driver = "digitizer"
-port = "/dev/null"
-options = {sensitivity = 5e-5, reference_voltage = 5.0}
-[link]
-url = "udpout:127.0.0.1:14550"
-[calibration]
-file = "cal.json"
+CONFIG = bridge_text(
+    "digitizer",
+    "sensitivity = 5e-5, reference_voltage = 5.0",
+    masses={},
+    log=False,
+    more="""
 [navigation]
 map = "grid.nc"
 fix = "FIX"
 options = {start_sigma = 200.0, current_sigma = 0.02, bias_sigma = 1.0, interval = 10.0}
-"""
+""",
+)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from small import CONFIG, START
+from small import ASCII_OPTIONS, START, bridge_text
 
 from magbridge.bridge.drive import set_up
 from magbridge.bridge.events import Event, Start
@@ -40,12 +40,9 @@ def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pip
     )
     save(cal, folder / "cal.json")
     config = folder / "bridge.toml"
-    source = CONFIG if known else CONFIG.replace('[calibration]\nfile = "cal.json"\n', "")
-    header, _, _ = source.partition("[telemetry")
-    header = header.replace("options = {", f'options = {{unit = "counts", scale = {COUNT}, ')
-    config.write_text(
-        f'{header}[log]\ndirectory = "logs"\n[publish]\nMAG_FIELD = 0\n{learning}', encoding="utf-8"
-    )
+    options = f'unit = "counts", scale = {COUNT}, {ASCII_OPTIONS}'
+    text = bridge_text(options=options, masses={}, calibration=known, publish={"MAG_FIELD": 0}, more=learning)
+    config.write_text(text, encoding="utf-8")
     return set_up(load_config(config), Start(START))
 
 

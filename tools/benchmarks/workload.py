@@ -13,6 +13,7 @@ from pathlib import Path
 from random import Random
 
 import numpy as np
+from small import bridge_text
 
 from magbridge.bridge.events import Event
 from magbridge.calibration.file import save
@@ -22,7 +23,7 @@ from magbridge.mavlink import Codec
 from magbridge.records import Channel, Reading
 from sitl.fluxgate import Encoder, open_encoder
 
-__all__ = ["BEGIN_US", "CONFIG", "Feed", "calibration", "write_config"]
+__all__ = ["BEGIN_US", "Feed", "calibration", "write_config"]
 
 BEGIN_US = 1_750_000_000_000_000
 TELEMETRY_HZ = 20
@@ -33,35 +34,6 @@ HORIZONTAL, VERTICAL, NOISE = 19_000.0, 48_640.0, 0.5
 DECLINATION = -0.32
 """rad."""
 OPTIONS = {"sensitivity": 5e-5, "reference_voltage": 5.0}
-CONFIG = """
-[sensor]
-driver = "digitizer"
-port = "{port}"
-[sensor.options]
-sensitivity = 5e-5
-reference_voltage = 5.0
-[link]
-url = "{url}"
-[calibration]
-file = "cal.json"
-[telemetry.battpos]
-message = "NAMED_VALUE_FLOAT"
-match = {{name = "battpos"}}
-field = "value"
-unit = "in"
-[telemetry.ballast]
-message = "NAMED_VALUE_FLOAT"
-match = {{name = "ballast"}}
-field = "value"
-unit = "cm3"
-[publish]
-MAG_RAW = 0
-MAG_FIELD = 0
-HIGHRES_IMU = 0
-NAMED_VALUE_FLOAT = 1
-[log]
-directory = "logs"
-"""
 
 
 def calibration() -> Calibration:
@@ -92,7 +64,16 @@ def write_config(
     """Write ``bridge.toml``, with `more` tables, and ``cal.json`` to `folder`; return the first."""
     save(calibration(), folder / "cal.json")
     path = folder / "bridge.toml"
-    path.write_text(CONFIG.format(port=port, url=url) + more, encoding="utf-8")
+    text = bridge_text(
+        "digitizer",
+        ", ".join(f"{name} = {value}" for name, value in OPTIONS.items()),
+        port=port,
+        url=url,
+        masses={"battpos": "in", "ballast": "cm3"},
+        publish={"MAG_RAW": 0, "MAG_FIELD": 0, "HIGHRES_IMU": 0, "NAMED_VALUE_FLOAT": 1},
+        more=more,
+    )
+    path.write_text(text, encoding="utf-8")
     return path
 
 
