@@ -35,12 +35,12 @@ from magbridge.columns import CHANNELS
 from magbridge.config import Align
 from magbridge.correction import Correction
 from magbridge.estimation.residual import rms
+from magbridge.estimation.sequential import ALARM_LOG_RATIO
 from magbridge.field.geodesy import separation
 from magbridge.field.igrf import magnitude
 from magbridge.field.reference import main_field
 from magbridge.learning import Learner
-from magbridge.learning.doubt import LEARNING_ALARM_LOG_RATIO
-from magbridge.learning.nuisance import LENGTH, STATES, Nuisance
+from magbridge.learning.estimator import LENGTH, STATES, Nuisance
 from magbridge.records import Quality, Reading
 from sitl import load, segments, simulate
 from sitl.dataset import channels, side_by_side
@@ -173,7 +173,7 @@ def best_delay(
             v, gain = float(effect[k] - h @ m), P @ h / S
             energy += 0.5 * v * v / S
             m, P, count = m + gain * v, P - np.outer(gain, h @ P), count + (k >= since)
-            if energy > LEARNING_ALARM_LOG_RATIO:
+            if energy > ALARM_LOG_RATIO:
                 break
     return count
 

@@ -11,7 +11,7 @@ from magbridge.calibration.model import Calibration, Parameter
 from magbridge.config import Config
 from magbridge.errors import CalibrationError, ConfigError, WriteError
 from magbridge.learning import Learner
-from magbridge.learning.causes import CAUSE_UNITS
+from magbridge.learning.alarms import CAUSE_UNITS
 from magbridge.learning.start import class_prior
 from magbridge.link.component import Component
 from magbridge.link.output import Rate

@@ -31,7 +31,7 @@ from magbridge.estimation.sequential import RESTART_PERIODS, SequentialTest
 from magbridge.estimation.track_process import TRACK_STATES, TrackProcess
 from magbridge.health.messages import Messages
 
-__all__ = ["MASS_FRACTION", "ConsistencyCheck", "Sample"]
+__all__ = ["MASS_FRACTION", "ConsistencyCheck", "TestedSample"]
 
 MIN_INTERVAL_S: Final = 1.0
 MAX_INTERVAL_S: Final = 4.0
@@ -74,7 +74,7 @@ ERROR_KINDS: Final = ("offset", "offset with temperature", "offset drift", "gain
 DEGENERATE_NT: Final = 1e-6
 
 
-class Sample(NamedTuple):
+class TestedSample(NamedTuple):
     """A sample to test."""
 
     time_us: int
@@ -130,7 +130,7 @@ class ConsistencyCheck:
         self._test.restart()
         self._start = np.zeros(len(self._test.kind))  # regressor of each row at its onset
         self._time_us, self._due_us, self._level = 0, 0, 0.0
-        self._pending: deque[Sample] = deque(maxlen=MAX_PENDING)
+        self._pending: deque[TestedSample] = deque(maxlen=MAX_PENDING)
         self._outliers = 0
         self._last_unit = np.zeros(3)
         self._temperature = 0.0
@@ -144,7 +144,7 @@ class ConsistencyCheck:
             interval = min(max(INTERVAL_M / speed, MIN_INTERVAL_S), MAX_INTERVAL_S)
         return not 0 <= time_us - self._due_us < 0.99e6 * interval
 
-    def add(self, sample: Sample) -> None:
+    def add(self, sample: TestedSample) -> None:
         """Add a sample; it is tested once newer telemetry has come."""
         self._due_us = sample.time_us
         self._pending.append(sample)
@@ -159,7 +159,7 @@ class ConsistencyCheck:
         while self._pending and self._pending[0].time_us <= reported_us:
             self._test_sample(self._pending.popleft())
 
-    def _test_sample(self, sample: Sample) -> None:
+    def _test_sample(self, sample: TestedSample) -> None:
         time_us, unit, total, sigma, temperature, mass_changes, speed = sample
         seconds = 1e-6 * (time_us - self._time_us)
         if not 0.0 < seconds < MAX_GAP_S:

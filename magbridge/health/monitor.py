@@ -8,7 +8,7 @@ from typing import Final
 
 from magbridge.calibration.model import Noise
 from magbridge.health.axes import RepetitionCheck
-from magbridge.health.consistency import ConsistencyCheck, Sample
+from magbridge.health.consistency import ConsistencyCheck, TestedSample
 from magbridge.health.level import LevelCheck
 from magbridge.health.messages import Messages
 from magbridge.health.scatter import Scatter
@@ -111,7 +111,7 @@ class HealthMonitor:
             Age of the oldest telemetry, s.
         mass_changes : callable
             Returns by how much the total field changes where each mass moves, see
-            :class:`.consistency.Sample`.
+            :class:`.consistency.TestedSample`.
         """
         self.flags = 0
         self.is_fault = True
@@ -129,14 +129,14 @@ class HealthMonitor:
         doubtful = stuck or level.is_wrong
         trend.is_outlier = False
         unit = field[0] / total, field[1] / total, field[2] / total
-        apart = sqrt(max(sigma * sigma - self._common, 0.0))
+        own_sigma = sqrt(max(sigma * sigma - self._common, 0.0))
         if not steady:
             trend.has_moved = True
         elif not (self._axes.is_repeating and stuck):
             dx, dy, dz = unit[0] - self._unit[0], unit[1] - self._unit[1], unit[2] - self._unit[2]
             turned = sqrt(dx * dx + dy * dy + dz * dz)
             self._unit = unit
-            variance += trend.check(time_us, total, apart, turned, learn=not doubtful)
+            variance += trend.check(time_us, total, own_sigma, turned, learn=not doubtful)
         self.is_fault = doubtful or trend.is_outlier or time_us < level.until_us
         variance += trend.jump_variance(time_us)
         if self.is_fault or trend.is_away:
@@ -145,7 +145,7 @@ class HealthMonitor:
         speed = trend.crossing_speed
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, speed):
             anomaly = total - reference if reference == reference else total  # noqa: PLR0124 - NaN
-            new = Sample(time_us, unit, anomaly, apart, temperature, tuple(mass_changes()), speed)
+            new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, tuple(mass_changes()), speed)
             consistency.add(new)
         consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))
         return variance + self._scatter.excess() + consistency.variance()

@@ -67,7 +67,7 @@ CHECKPOINT_US: Final = 1_000_000
 CHECKPOINTS: Final = 64
 
 
-class State(NamedTuple):
+class TrendState(NamedTuple):
     """Level (nT), slope (nT/s), their covariance, and the jumps so far, after a sample."""
 
     time_us: int
@@ -106,8 +106,8 @@ class TrendCheck:
     def __init__(self, scatter: Scatter, messages: Messages) -> None:
         self._scatter, self._messages = scatter, messages
         self.is_outlier = self.has_moved = self.is_away = False
-        self._now: State | None = None
-        self._checkpoints: deque[State] = deque(maxlen=CHECKPOINTS)
+        self._now: TrendState | None = None
+        self._checkpoints: deque[TrendState] = deque(maxlen=CHECKPOINTS)
         self._sigma = 0.0
         self._log_q = log(MIN_INTENSITY)
         self._min_log_q = log(MIN_INTENSITY)
@@ -194,7 +194,7 @@ class TrendCheck:
             self._agree(time_us, total, sigma, S, noise)
         return e * e
 
-    def _accept(self, predicted: State, e: float, S: float, sigma: float, noise: float) -> float:
+    def _accept(self, predicted: TrendState, e: float, S: float, sigma: float, noise: float) -> float:
         """Update the filter; return what past outliers add, nT²."""
         self._accepted += 1
         self._agreed = 0
@@ -222,7 +222,7 @@ class TrendCheck:
     def _begin(self, time_us: int, level: float, sigma: float, noise: float) -> None:
         """Begin a trend at a level, nT; the jumps so far and the slope stay."""
         if self._now is None:
-            self._now = State(time_us, level, 0.0, noise, 0.0, self._slope_variance, 0.0, 0.0, 0, 0, 0)
+            self._now = TrendState(time_us, level, 0.0, noise, 0.0, self._slope_variance, 0.0, 0.0, 0, 0, 0)
         p_slope = max(self._now.p_slope, self._slope_variance)
         self._now = self._now._replace(
             time_us=time_us, level=level, p_level=noise, p_cross=0.0, p_slope=p_slope

@@ -1,11 +1,10 @@
 """Learn the calibration's coefficients on board, and detect changes that the model does not explain.
 
 :class:`Learner` receives the samples that the bridge corrects. An :mod:`.estimator` learns the coefficients
-from them, a :mod:`.judge` compares the predictions of the calibrations, and :mod:`.doubt` raises an alarm if
+from them, a :mod:`.judge` compares the predictions of the calibrations, and :mod:`.alarms` raises an alarm if
 no calibration explains the data.
 """
 
-from magbridge.learning.learner import Learner
-from magbridge.learning.report import Notice
+from magbridge.learning.learner import Learner, Notice
 
 __all__ = ["Learner", "Notice"]

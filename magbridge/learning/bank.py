@@ -24,14 +24,13 @@ from math import log
 from typing import Final
 
 from magbridge.arrays import FloatArray
-from magbridge.learning.causes import Alarm
-from magbridge.learning.doubt import LEARNING_ALARM_LOG_RATIO
-from magbridge.learning.estimator import Estimator
+from magbridge.estimation.sequential import ALARM_LOG_RATIO
+from magbridge.learning.alarms import LearningAlarm
+from magbridge.learning.estimator import Estimator, Nuisance
 from magbridge.learning.judge import BEYOND_CHANCE
-from magbridge.learning.model import TEMPERATURE, Model
-from magbridge.learning.nuisance import Nuisance
+from magbridge.learning.model import TEMPERATURE, LearnedTerms
 
-__all__ = ["Bank"]
+__all__ = ["EstimatorBank"]
 
 BANK_MEMORY_SAMPLES: Final = 2000.0
 """Samples over which predictions are weighted (exponential forgetting)."""
@@ -50,12 +49,12 @@ DRIFT_CORRELATION_TIME_S: Final = 2.0 * 3600.0
 """Correlation time of the drift rate, s."""
 
 
-class Bank:
+class EstimatorBank:
     """Estimators of the coefficients, one for each hypothesis.
 
     Parameters
     ----------
-    model : Model
+    model : LearnedTerms
     quiet : Estimator
         Baseline estimator, which assumes no change.
     mapless : Nuisance, optional
@@ -71,7 +70,7 @@ class Bank:
         True if the bank has raised a map alarm and selects `without_map`.
     """
 
-    def __init__(self, model: Model, quiet: Estimator, mapless: Nuisance | None = None) -> None:
+    def __init__(self, model: LearnedTerms, quiet: Estimator, mapless: Nuisance | None = None) -> None:
         self._model, self.all, self._mapless = model, [quiet], mapless
         self._weights, self._best, self._warm = [0.0], 0, 0
         self.without_map: Estimator | None = None
@@ -111,7 +110,7 @@ class Bank:
         for one in self.all:
             one.open(variance)
 
-    def judge(self, time: float) -> Alarm | None:
+    def judge(self, time: float) -> LearningAlarm | None:
         """Score each estimator's prediction at a time (s); return the map alarm, if there is one."""
         for k, one in enumerate(self.all):
             S = one.variance
@@ -123,14 +122,14 @@ class Bank:
             self._best = ahead
         return None if self.without_map is None else self._doubt_map(time, self.without_map, ahead)
 
-    def _doubt_map(self, time: float, without: Estimator, best_with: int) -> Alarm | None:
+    def _doubt_map(self, time: float, without: Estimator, best_with: int) -> LearningAlarm | None:
         lead = self._weights[-1] - self._weights[best_with]
         if lead <= 0.0:
             self.map_doubted, self._since = False, time
-        self.map_doubted = self.map_doubted or lead > LEARNING_ALARM_LOG_RATIO
+        self.map_doubted = self.map_doubted or lead > ALARM_LOG_RATIO
         if not self.map_doubted:
             return None
-        return Alarm(("map_error",), ("",), self._since, abs(without.rock), lead, mapless=True)
+        return LearningAlarm(("map_error",), ("",), self._since, abs(without.crust), lead, mapless=True)
 
     def take_over(self, strength: float) -> bool:
         """Replace the baseline by the estimator that follows the temperature; return True if it is replaced.

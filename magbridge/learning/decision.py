@@ -3,20 +3,153 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final
+
+import msgspec
+import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.file import calibration_id
-from magbridge.calibration.model import Calibration
-from magbridge.learning.causes import NO_COEFFICIENT, Alarm, named
-from magbridge.learning.intake import Sample
-from magbridge.learning.judge import BEYOND_CHANCE, FIRST
+from magbridge.calibration.model import Calibration, Noise
+from magbridge.learning.alarms import NO_COEFFICIENT, AlarmState, LearningAlarm, named
+from magbridge.learning.estimator import Estimator, Nuisance
+from magbridge.learning.judge import BEYOND_CHANCE, CANDIDATE, FIRST, PUBLISHED, Judge
 from magbridge.learning.knowledge import Knowledge
-from magbridge.learning.observation import Observation
-from magbridge.learning.publication import Publication
-from magbridge.learning.standing import Standing
+from magbridge.learning.model import LearnedTerms
+from magbridge.learning.samples import LearningSample, Observation
 
-__all__ = ["Decision"]
+__all__ = ["NO_METHOD", "Decision", "Publication"]
+
+NO_METHOD: Final = "none"
+"""The method of a calibration that is none."""
+MAX_PUBLISHED_DIFFERENCE: Final = 0.3
+"""Difference of learned and published total field that causes an update, as a fraction of the noise."""
+RENEW: Final = 32, 256
+"""Samples after which it may be, and is in any case."""
+
+
+class Publication:
+    """Holds the first calibration and the published one, and judges between them.
+
+    Parameters
+    ----------
+    model : LearnedTerms
+    first : Calibration
+        Initial calibration.
+    nuisance : Nuisance
+
+    Attributes
+    ----------
+    first : Calibration
+        Initial or accepted calibration.
+    calibration : Calibration
+        Published calibration.
+    coefficients : (K,) array
+        Coefficients of the published calibration.
+    judge : Judge
+    renewed : bool
+        True if the last change of the published calibration was a routine update.
+    age : int
+        Samples used since that change.
+    """
+
+    def __init__(self, model: LearnedTerms, first: Calibration, nuisance: Nuisance) -> None:
+        self._model, self.first, self.renewed = model, first, False
+        self.forget(nuisance)
+
+    def forget(self, nuisance: Nuisance) -> None:
+        """Go back to the first, as if nothing had been judged."""
+        self.calibration, self.judge, self.age = self.first, Judge(nuisance), 0
+        self.coefficients = self._model.coefficients(self.first)[0]
+        self._weights = [self._model.weights(self.coefficients)] * 3
+        self._replaced: dict[int, FloatArray] = {}
+
+    @property
+    def learned(self) -> bool:
+        """Return True if the learned calibration is published."""
+        return self.calibration is not self.first
+
+    def nine(self, phi: FloatArray) -> list[FloatArray]:
+        """Return the nine coefficients (9,) at `phi` (m,): first, published one and candidate."""
+        return [phi @ weights for weights in self._weights]
+
+    def replaced(self, phi: FloatArray) -> dict[int, FloatArray]:
+        """Return the nine coefficients (9,), at `phi` (m,), of the calibrations that were replaced."""
+        replaced, self._replaced = self._replaced, {}
+        return {which: phi @ weights for which, weights in replaced.items()}
+
+    def propose(self, coefficients: FloatArray) -> None:
+        """Set the candidate's coefficients (K,)."""
+        self._replace(CANDIDATE, self._model.weights(coefficients))
+
+    def _replace(self, which: int, weights: FloatArray) -> None:
+        self._replaced.setdefault(which, self._weights[which])
+        self._weights[which] = weights
+
+    def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
+        """Return the calibration that an estimator has learned from so many samples, with its origin."""
+        first, coefficients, method = self.first, estimator.coefficients, self.first.method
+        covariance, level = estimator.covariance, first.level
+        reference = first.reference
+        if first.method == NO_METHOD:
+            method = "learned"
+            if self.learned:
+                coefficients = estimator.at_level_of(self.coefficients)
+                by = coefficients - estimator.coefficients
+                covariance = covariance + np.outer(by, by)
+            toward = covariance @ estimator.mean  # how coefficients go with the level, which has this sigma
+            sigma = float(np.sqrt(estimator.mean @ toward))
+            if sigma:  # no sample, no level
+                level = tuple((toward[: first.coefficients.size] / sigma).tolist())
+                reference = msgspec.structs.replace(reference, level_sigma=sigma)
+        elif "learned" not in method:
+            method += ", learned"
+        inputs = first.inputs | {f"calibration {calibration_id(first):08x}": f"{samples} samples later"}
+        made = self._model.calibration(coefficients, covariance)
+        return replace(made, method=method, inputs=inputs, noise=noise, level=level, reference=reference)
+
+    def stale(self, difference: float) -> bool:
+        """Return True if `difference`, learned less published total field (nT), requires an update."""
+        least, most = RENEW
+        far = abs(difference) > MAX_PUBLISHED_DIFFERENCE * self.calibration.noise.sensor
+        return self.learned and ((far and self.age >= least) or self.age >= most)
+
+    def renew(self, calibration: Calibration) -> None:
+        """Update the published calibration with the learned one, without a notification."""
+        self.calibration = calibration
+        self.coefficients = self._model.coefficients(calibration)[0]
+        self._replace(PUBLISHED, self._model.weights(self.coefficients))
+        self.age, self.renewed = 0, True
+
+    def publish(self, calibration: Calibration, how: str) -> str:
+        """Publish it for a reason of its own; return what to say of that."""
+        before = PUBLISHED if self.learned else FIRST
+        self.renew(calibration)
+        return self._change(how, before, CANDIDATE)
+
+    def accept(self) -> None:
+        """Make the published calibration the first one, so that no rollback undoes it."""
+        self.first = self.calibration
+        self._weights[FIRST] = self._weights[PUBLISHED]
+        self.judge.mean_square[FIRST] = self.judge.mean_square[PUBLISHED]
+        self.judge.restart()
+
+    def roll_back(self) -> str:
+        """Publish the first again; return what to say of that."""
+        self.calibration, self.age = self.first, 0
+        self.coefficients = self._model.coefficients(self.first)[0]
+        self._replace(PUBLISHED, self._weights[FIRST])
+        return self._change("rolled back: the first calibration predicts better", PUBLISHED, FIRST)
+
+    def _change(self, how: str, before: int, after: int) -> str:
+        self.renewed = False
+        rms = np.sqrt(self.judge.mean_square)
+        said = f"{how} {calibration_id(self.calibration):08x}"
+        if before == FIRST and self.first.method == NO_METHOD:  # no errors to compare with
+            return f"{said} from nothing"
+        return f"{said}: {rms[before]:.1f} to {rms[after]:.1f} nT"
+
 
 GONE: Final = 9.0
 """Log-likelihood ratio below which an alarm's cause is closed as gone instead of learned."""
@@ -28,7 +161,7 @@ class Decision:
     Parameters
     ----------
     publication : Publication
-    standing : Standing
+    standing : AlarmState
         State of the alarm.
     notify : callable
         Called with the text of a notification, and True if its severity is WARNING.
@@ -40,7 +173,7 @@ class Decision:
     """
 
     def __init__(
-        self, publication: Publication, standing: Standing, notify: Callable[[str, bool], None]
+        self, publication: Publication, standing: AlarmState, notify: Callable[[str, bool], None]
     ) -> None:
         self._publication, self._standing, self._notify = publication, standing, notify
         self.samples = 0
@@ -51,7 +184,7 @@ class Decision:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
         return self._publication.made(knowledge.bank.best, self.samples, knowledge.noise)
 
-    def doubt(self, alarm: Alarm | None) -> None:
+    def raise_alarm(self, alarm: LearningAlarm | None) -> None:
         """Pass an alarm, if there is one, to the alarm's state, and send the notification that results."""
         if alarm is None:
             return
@@ -70,8 +203,8 @@ class Decision:
         if self._standing.alarm is None:
             return
         self._standing.end()
-        knowledge.doubt.restart()
-        knowledge.hindsight.restart()
+        knowledge.detector.restart()
+        knowledge.late_telemetry.restart()
         self._notify(f"explained again: {how}", False)
 
     def gone(self, knowledge: Knowledge) -> None:
@@ -79,7 +212,9 @@ class Decision:
         self._publication.judge.restart()
         self.settle(knowledge, "gone")
 
-    def take(self, knowledge: Knowledge, sample: Sample, way: tuple[float, float], *, frozen: bool) -> bool:
+    def take(
+        self, knowledge: Knowledge, sample: LearningSample, way: tuple[float, float], *, frozen: bool
+    ) -> bool:
         """Predict a sample, compare the calibrations, learn from it, and decide what to publish.
 
         `way` is the distance (m) and time (s) since the previous sample. Return True if learning has to
@@ -91,20 +226,20 @@ class Decision:
             self._standing.count(best.residual, best.variance, telling=False)
             return False
         published = self._judge(knowledge, sample, way)
-        apart = published.e - now.e
+        difference = published.e - now.e
         if knowledge.start is None:
-            self._compare(knowledge, signs.time, apart)
+            self._compare(knowledge, signs.time, difference)
             alarm, learned = knowledge.learn(signs, frozen=frozen)
-            self.doubt(alarm)
+            self.raise_alarm(alarm)
             self._count(learned=learned)
         elif not frozen:
             self._begin(knowledge, sample, way)
         if knowledge.start is not None and not knowledge.start.fitted:
             return False  # neither published nor judged
-        return self._decide(knowledge, apart * now.s, frozen=frozen)
+        return self._decide(knowledge, difference * now.s, frozen=frozen)
 
-    def _judge(self, knowledge: Knowledge, sample: Sample, way: tuple[float, float]) -> Observation:
-        """Let the calibrations predict a sample; return the published one's observation."""
+    def _judge(self, knowledge: Knowledge, sample: LearningSample, way: tuple[float, float]) -> Observation:
+        """Predict a sample by every calibration; return the published one's observation."""
         publication, judge = self._publication, self._publication.judge
 
         def observe(nine: FloatArray) -> Observation:
@@ -121,17 +256,17 @@ class Decision:
         judge.judge(F, (first.e, published.e, candidate.e), first.s)
         return published
 
-    def _compare(self, knowledge: Knowledge, time: float, apart: float) -> None:
-        """Select the best estimator; `apart` (nT) is the published calibration's residual less the best's."""
+    def _compare(self, knowledge: Knowledge, time: float, difference: float) -> None:
+        """Select the best estimator; `difference` (nT): published residual less the best's."""
         bank, publication = knowledge.bank, self._publication
         best, doubted = bank.best, bank.map_doubted
-        seen = (best.residual + apart, best.variance) if publication.learned else publication.judge.last
+        seen = (best.residual + difference, best.variance) if publication.learned else publication.judge.last
         self._standing.count(*seen, telling=bank.quiet.telling)
-        self.doubt(bank.judge(time))
+        self.raise_alarm(bank.judge(time))
         if bank.map_doubted != doubted:
             publication.judge.restart(knowledge.believed)
 
-    def _begin(self, knowledge: Knowledge, sample: Sample, way: tuple[float, float]) -> None:
+    def _begin(self, knowledge: Knowledge, sample: LearningSample, way: tuple[float, float]) -> None:
         """Learn from a sample while the batch fit runs, before a filter can be linearised."""
         if not knowledge.begin(sample, *way):
             self._count(learned=True)
@@ -147,8 +282,8 @@ class Decision:
         self.samples += learned
         self._publication.age += 1
 
-    def _decide(self, knowledge: Knowledge, apart: float, *, frozen: bool) -> bool:
-        """Publish or roll back; `apart` is the difference of learned and published total field, nT."""
+    def _decide(self, knowledge: Knowledge, difference: float, *, frozen: bool) -> bool:
+        """Publish or roll back; `difference` is the difference of learned and published total field, nT."""
         publication = self._publication
         if not frozen and (self._refuted or self._end(knowledge)):
             publication.judge.restart()
@@ -157,7 +292,7 @@ class Decision:
             return True
         worse, relapsed = publication.judge.roll_back, self._standing.relapses > 0
         if worse and not publication.learned and self._standing.alarm is None:
-            publication.judge.discard()  # what is learned may get better yet
+            publication.judge.discard()  # the learned calibration may improve yet
         elif worse or (relapsed and publication.judge.improves < -BEYOND_CHANCE):
             self._standing.mistaken()
             if worse and publication.learned:
@@ -171,12 +306,12 @@ class Decision:
         if pending or not publication.learned:
             if self._holds(knowledge):
                 self._publish_learned(knowledge)
-        elif publication.stale(apart):
+        elif publication.stale(difference):
             publication.renew(self.learned(knowledge))
         return False
 
     def _holds(self, knowledge: Knowledge) -> bool:
-        """Return True if what is learned predicts better, and differs from what is published everywhere."""
+        """Return True if the learned calibration is better, and its change significant everywhere."""
         publication, best = self._publication, knowledge.bank.best
         if knowledge.start is not None and not publication.learned:  # no calibration is published
             return publication.judge.better > BEYOND_CHANCE
@@ -184,7 +319,7 @@ class Decision:
         return publication.judge.adopt and knowledge.coverage.is_significant(change, best.covariance)
 
     def _publish_learned(self, knowledge: Knowledge) -> None:
-        """Publish what is learned; close the alarm that it explains."""
+        """Publish the learned calibration; close the alarm that it explains."""
         if not self._standing.pending:
             for one in knowledge.bank.all:
                 one.keep_level(self._publication.coefficients)
@@ -206,7 +341,7 @@ class Decision:
     def _end(self, knowledge: Knowledge) -> bool:
         """Close an alarm that has been silent for long, or learn the cause of one that is certain enough.
 
-        Return True if learning has to restart, because no later samples confirmed what was learned.
+        Return True if learning has to restart, because no later samples confirmed the learned calibration.
         """
         standing, publication = self._standing, self._publication
         if standing.pending and publication.judge.improves > 0.0:
@@ -235,17 +370,17 @@ class Decision:
     def _take_up(self, knowledge: Knowledge) -> None:
         """Learn the cause of the alarm, if coefficients can represent it, on trial."""
         bank, alarm = knowledge.bank, self._standing.alarm
-        strength = float(knowledge.doubt.statistic.max())
+        strength = float(knowledge.detector.statistic.max())
         if strength < GONE:
             self.gone(knowledge)
             return
         assert alarm is not None
         if "temperature_offset" not in alarm.causes or not bank.take_over(strength):
-            moved = knowledge.doubt.learned()
+            moved = knowledge.detector.learned()
             if moved is None:
                 return
             bank.explained(*moved, strength)
-        knowledge.doubt.restart()
+        knowledge.detector.restart()
         self._publication.judge.discard()
         self._standing.take_up()
         self._unconfirmed = True

@@ -1,33 +1,55 @@
 """A Kalman filter whose state is the calibration's coefficients and the nuisance of the reference field.
 
-The state is the coefficients, the slope of the offset (nT/s, an axis), and the states of :mod:`.nuisance`.
+The state is the coefficients, the slope of the offset (nT/s, an axis), and the states of :class:`Nuisance`.
 
 The filter uses the covariance form. The variance of every prediction, which comparison and alarm need with
 each sample, is then a by-product. A singular prior needs no inverse, for example after a fit that could not
 estimate some combinations. The state is relinearised at each sample.
 
 If the crustal field could explain a sample as well as the coefficients, the filter *considers* the
-coefficients and does not learn them: their gain is zero, and their uncertainty stays in the variance
-(Schmidt 1966; Joseph's form holds for any gain)::
-
-    P <- P - k (h P) - (P h^T) k^T + k S k^T
+coefficients and does not learn them (:mod:`magbridge.estimation.kalman`).
 """
 
 from __future__ import annotations
 
-from math import exp, sqrt
+from math import exp
 from typing import Final
 
 import numpy as np
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.learning.nuisance import STATES, Nuisance
+from magbridge.calibration.model import Noise
+from magbridge.estimation.kalman import KalmanFilter
+from magbridge.estimation.track_process import CORRELATION_LENGTH_M as LENGTH
+from magbridge.estimation.track_process import TRACK_STATES as STATES
+from magbridge.estimation.track_process import TrackProcess
 
-__all__ = ["BESIDE", "SLOPE_STATES", "Estimator"]
+__all__ = ["EXTRA_STATES", "LENGTH", "SLOPE_STATES", "STATES", "Estimator", "Nuisance"]
+
+
+class Nuisance(TrackProcess):
+    """Dynamics of the reference's error for the samples of a calibration.
+
+    Parameters
+    ----------
+    noise : Noise
+        The calibration's noise model.
+    spread, level : float
+        1-sigma of the crustal field and of the reference's constant error, nT.
+    length : float
+        Correlation length of the crustal field, m.
+    """
+
+    def __init__(self, noise: Noise, spread: float, level: float = 0.0, length: float = LENGTH) -> None:
+        super().__init__(
+            noise.sensor, spread, level, length,
+            noise.autocorrelation, noise.interval, noise.white, noise.reference,
+        )  # fmt: skip
+
 
 SLOPE_STATES: Final = 3
 """States of the offset's slope."""
-BESIDE: Final = SLOPE_STATES + STATES
+EXTRA_STATES: Final = SLOPE_STATES + STATES
 """Number of states that are not coefficients."""
 TELLING: Final = 0.01
 """Fraction of a prediction's variance that comes from the coefficients and varies along the track: from here
@@ -63,8 +85,8 @@ class Estimator:
     ----------
     coefficients : (K,) array
         As learned so far.
-    residual, variance : float
-        Innovation (nT) and its variance of the last prediction.
+    filter : KalmanFilter
+        Its state.
     telling : bool
         Whether the last sample says something of the coefficients.
     """
@@ -78,20 +100,18 @@ class Estimator:
         creep: float,
     ) -> None:
         self.size = K = len(coefficients)
-        self.states = K + BESIDE
-        self._x = np.concatenate([coefficients, np.zeros(BESIDE)])
-        self._P = np.zeros((self.states, self.states))
-        self._P[:K, :K] = covariance
-        self._P[-STATES:, -STATES:] = nuisance.initial
+        self.states = K + EXTRA_STATES
+        P = np.zeros((self.states, self.states))
+        P[:K, :K] = covariance
+        P[-STATES:, -STATES:] = nuisance.initial
+        self.filter = KalmanFilter(np.concatenate([coefficients, np.zeros(EXTRA_STATES)]), P)
         self.offsets, self.slope = offsets, np.arange(K, K + SLOPE_STATES)
         self._nuisance, self._creep = nuisance, creep
         self._sloping, self._lasting = False, SLOPE_MEMORY_S
         self._near: FloatArray | None = None
         self._mean, self._share, self._kept = np.zeros(K), 0.0, np.zeros(K)
         self._stay = 1.0
-        self.residual, self.variance, self.telling = 0.0, 1.0, False
-        self._h = np.zeros(self.states)
-        self._Ph = np.zeros(self.states)
+        self.telling = False
 
     def know(
         self, coefficients: FloatArray, nuisances: FloatArray, covariance: FloatArray, nuisance: Nuisance
@@ -99,19 +119,19 @@ class Estimator:
         """Set the state and covariance to a fit's joint result for coefficients (K,) and nuisance (4,)."""
         self._nuisance = nuisance
         both = np.r_[: self.size, self.states - STATES : self.states]
-        self._x[both] = np.concatenate([coefficients, nuisances])
-        self._P[:] = self._kept[:] = 0.0
-        self._P[np.ix_(both, both)] = covariance
+        self.filter.mean[both] = np.concatenate([coefficients, nuisances])
+        self.filter.covariance[:] = self._kept[:] = 0.0
+        self.filter.covariance[np.ix_(both, both)] = covariance
 
     @property
     def coefficients(self) -> FloatArray:
         """The coefficients (K,) as learned so far."""
-        return self._x[: self.size]
+        return self.filter.mean[: self.size]
 
     @property
     def covariance(self) -> FloatArray:
         """Their covariance (K, K), symmetric and positive semidefinite."""
-        P = self._P[: self.size, : self.size]
+        P = self.filter.covariance[: self.size, : self.size]
         kept = self._kept * float(self._mean @ P @ self._mean)  # the part not learned since keep_level
         P = P + np.outer(kept, kept)
         values, vectors = np.linalg.eigh(0.5 * (P + P.T))
@@ -120,7 +140,7 @@ class Estimator:
 
     def follow(self, s: float) -> None:
         """Follow how the total field changes with the coefficients; s is the last residual's scale."""
-        self._mean += (s * self._h[: self.size] - self._mean) / MEAN_SAMPLES
+        self._mean += (s * self.filter.row[: self.size] - self._mean) / MEAN_SAMPLES
         self._share += (1.0 - self._share) / MEAN_SAMPLES
 
     @property
@@ -135,7 +155,7 @@ class Estimator:
         significant, and the published level is kept where the data allow it.
         """
         K = self.size
-        toward = self._P[:K, :K] @ self._mean
+        toward = self.filter.covariance[:K, :K] @ self._mean
         by = float(self._mean @ (published - self.coefficients))
         return np.asarray(self.coefficients + toward * (by / float(self._mean @ toward)))
 
@@ -147,27 +167,27 @@ class Estimator:
         further samples reduce it; the filter's own covariance does not change.
         """
         K = self.size
-        toward = self._P[:, :K] @ self._mean
+        toward = self.filter.covariance[:, :K] @ self._mean
         by, variance = float(self._mean @ (published - self.coefficients)), float(self._mean @ toward[:K])
         if not self._sloping and by * by < CHANGED * CHANGED * variance:
-            self._x += toward * (by / variance)
+            self.filter.mean += toward * (by / variance)
             self._kept = toward[:K] * (by / variance**2)
 
     def open(self, variance: float, which: IndexArray | None = None) -> None:
         """Increase the variance of the coefficients `which` (3,), by default the offsets, by `variance`."""
         which = self.offsets if which is None else which
-        self._P[which, which] += variance
+        self.filter.covariance[which, which] += variance
 
     def drift(self, rate: float, lasting: float) -> None:
         """Add an offset drift of `rate` (nT/s, 1-sigma an axis) with correlation time `lasting` (s)."""
-        self._P[self.slope, self.slope] += rate * rate
+        self.filter.covariance[self.slope, self.slope] += rate * rate
         self._sloping, self._lasting = True, lasting
 
     def shift(self, by: FloatArray, covariance: FloatArray) -> None:
         """Move the state by `by` (n,), which is known to a further `covariance` (n, n)."""
-        self._x += by
-        self._P += covariance
-        self._sloping = bool(self._P[self.slope, self.slope].any())
+        self.filter.mean += by
+        self.filter.covariance += covariance
+        self._sloping = bool(self.filter.covariance[self.slope, self.slope].any())
 
     def advance(self, state: FloatArray, F: FloatArray, seconds: float) -> None:
         """Move `state` (n, ...) on in place, over a time; F (4, 4) is the nuisance's transition."""
@@ -178,9 +198,9 @@ class Estimator:
 
     def propagate(self, metres: float, seconds: float) -> FloatArray:
         """Propagate over a distance (m) and a time (s); return the transition (4, 4) of the nuisance."""
-        P = self._P
+        P = self.filter.covariance
         F, Q = self._nuisance.transition(metres, seconds)
-        self.advance(self._x, F, seconds)
+        self.advance(self.filter.mean, F, seconds)
         self.advance(P, F, seconds)
         self.advance(P.T, F, seconds)
         P[-STATES:, -STATES:] += Q
@@ -195,18 +215,17 @@ class Estimator:
 
     def predict(self, e: float, s: float, by_coefficients: FloatArray) -> None:
         """Compute the innovation from a sample's residual and derivatives (K,) at these coefficients."""
-        K, h = self.size, self._h
-        h[:K] = by_coefficients
-        h[-STATES:] = self._nuisance.row(s)
+        K = self.size
+        h = np.concatenate([by_coefficients, np.zeros(SLOPE_STATES), self._nuisance.row(s)])
         if self._near is None:
             self._near = by_coefficients.copy()
         else:
             self._near += (1.0 - self._stay) * (by_coefficients - self._near)
-        self._Ph = self._P @ h
-        self.variance = float(h @ self._Ph) + self._nuisance.white_variance
-        self.residual = e + float(h[-STATES:] @ self._x[-STATES:])
+        # e is the residual at the present coefficients, so that they have no part in h^T x
+        known = e - float(by_coefficients @ self.coefficients)
+        self.filter.innovate(known, h, self._nuisance.white_variance)
         varying = by_coefficients - self._near
-        self.telling = float(varying @ self._P[:K, :K] @ varying) > TELLING * self.variance
+        self.telling = float(varying @ self.filter.covariance[:K, :K] @ varying) > TELLING * self.variance
 
     def update(self, *, learn: bool) -> FloatArray:
         """Update the state with the predicted sample; return the gain (n,).
@@ -216,40 +235,37 @@ class Estimator:
         learn : bool
             Whether coefficients and slope may learn from it; else they are considered.
         """
-        S, P, Ph = self.variance, self._P, self._Ph
-        gain = Ph / S
-        if not learn:
-            gain[:-STATES] = 0.0
-        self._x -= gain * self.residual
-        cross = np.outer(gain, Ph)
-        P -= cross
-        P -= cross.T
-        P += np.outer(S * gain, gain)
-        return np.asarray(gain)
+        return self.filter.update(None if learn else slice(None, -STATES))
 
     def leave_map(self, nuisance: Nuisance) -> None:
         """Replace the nuisance by `nuisance`, of a reference without a map, in its initial state."""
         self._nuisance = nuisance
-        P, states = self._P, slice(-STATES, None)
-        self._x[states] = 0.0
+        P, states = self.filter.covariance, slice(-STATES, None)
+        self.filter.mean[states] = 0.0
         P[states] = P[:, states] = 0.0
         P[states, states] = nuisance.initial
 
     @property
-    def rock(self) -> float:
+    def crust(self) -> float:
         """Crustal field as estimated, nT."""
-        return float(self._x[-STATES])
+        return float(self.filter.mean[-STATES])
 
     @property
     def expected(self) -> float:
         """Expected residual of the last sample's successor from the nuisance states alone, nT."""
-        return -float(self._h[-STATES:] @ self._x[-STATES:])
+        return -float(self.filter.row[-STATES:] @ self.filter.mean[-STATES:])
 
-    def response(self, signature: FloatArray, state: FloatArray) -> FloatArray:
-        """Return how the innovation (q,) answers signatures (q,) that have moved the state by (n, q)."""
-        return np.asarray(signature + self._h @ state)
+    @property
+    def residual(self) -> float:
+        """Innovation of the last prediction, nT."""
+        return self.filter.innovation
+
+    @property
+    def variance(self) -> float:
+        """Variance of the innovation, nT²."""
+        return self.filter.variance
 
     @property
     def sigma(self) -> float:
         """1-sigma of the innovation, nT."""
-        return sqrt(self.variance)
+        return self.filter.sigma

@@ -1,12 +1,12 @@
-r"""Compare the first calibration with what is learned, by samples that nothing was learned from yet.
+r"""Compare the first calibration with learned coefficients, by samples that came after they were learned.
 
 Time is divided into blocks, each longer than the crustal field is correlated along the track (10 minutes
 suffice), with a turn of the vehicle in it. The coefficients learned before a block are its *candidate*: they
 stay fixed within the block, so that all of its samples test them, most of them at another attitude and
-position. Both calibrations are filtered with the same model of the reference's error (:mod:`.nuisance`), with
-the standard deviation of the crustal field under which the better of them predicts best. With innovations v
-of the first calibration and v + d of the candidate, of variance S, the share of the candidate's change that
-the samples confirm is
+position. Both calibrations are filtered with the same model of the reference's error (:class:`.Nuisance`),
+with the standard deviation of the crustal field under which the better of them predicts best. With
+innovations v of the first calibration and v + d of the candidate, of variance S, the share of the candidate's
+change that the samples confirm is
 
 .. math:: \beta = -\frac{\sum v d / S}{\sum d^2 / S}
 
@@ -29,7 +29,7 @@ from typing import Final
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.learning.nuisance import LENGTH, STATES, Nuisance
+from magbridge.learning.estimator import LENGTH, STATES, Nuisance
 
 __all__ = ["BEYOND_CHANCE", "CANDIDATE", "FIRST", "PUBLISHED", "Coverage", "Judge"]
 
@@ -56,7 +56,8 @@ MAX_BLOCKS: Final = 12
 SIGNIFICANCE_SIGMA: Final = 2.0
 """Normal quantile (2.3 %) at which a share differs from 1/2. Few blocks need more, as Student's t does."""
 MIN_DIRECTIONS: Final = 4
-"""Number of directions of the field, :data:`TURN` apart, from which on a change is known at all attitudes."""
+"""Number of directions of the field, :data:`TURN` from each other, from which on a change is
+known at all attitudes."""
 MIN_CHANGE_RATIO: Final = 3.0
 """Least ratio of a change's mean square to its variance, at all attitudes so far."""
 MAX_ROWS: Final = 64

@@ -10,17 +10,13 @@ import numpy as np
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration
-from magbridge.learning.bank import Bank
-from magbridge.learning.causes import Alarm, Signs
-from magbridge.learning.doubt import Doubt
-from magbridge.learning.estimator import Estimator
-from magbridge.learning.hindsight import Hindsight, Kept
-from magbridge.learning.intake import Sample
+from magbridge.learning.alarms import ChangeDetector, LateTelemetryTest, LearningAlarm, Signs, StoredSample
+from magbridge.learning.bank import EstimatorBank
+from magbridge.learning.estimator import Estimator, Nuisance
 from magbridge.learning.judge import Coverage
-from magbridge.learning.model import Model
-from magbridge.learning.nuisance import Nuisance
-from magbridge.learning.observation import Observation, observe
-from magbridge.learning.start import Start
+from magbridge.learning.model import LearnedTerms
+from magbridge.learning.samples import LearningSample, Observation, observe
+from magbridge.learning.start import BatchFit
 from magbridge.records import Vector
 
 __all__ = ["Knowledge"]
@@ -39,7 +35,7 @@ class Knowledge:
 
     Parameters
     ----------
-    model : Model
+    model : LearnedTerms
     first : Calibration
         Initial calibration; its offsets may have changed at this power-on.
     nuisance : Nuisance
@@ -51,33 +47,38 @@ class Knowledge:
 
     Attributes
     ----------
-    bank : Bank
+    bank : EstimatorBank
         Estimators.
-    doubt : Doubt
+    detector : ChangeDetector
         Change detector of the baseline estimator.
     coverage : Coverage
         Attitudes so far.
-    start : Start or None
+    start : BatchFit or None
         Batch fit, until a filter can continue without it.
     nuisance, noise
         Estimates so far.
     """
 
     def __init__(
-        self, model: Model, first: Calibration, nuisance: Nuisance, mapless: Nuisance | None, turn_on: float
+        self,
+        model: LearnedTerms,
+        first: Calibration,
+        nuisance: Nuisance,
+        mapless: Nuisance | None,
+        turn_on: float,
     ) -> None:
         self._model, self._mapless, self.nuisance, self.noise = model, mapless, nuisance, first.noise
         self._field, offsets = first.reference.field, model.offsets
         coefficients, covariance = model.coefficients(first)
         quiet = Estimator(coefficients, covariance, offsets, nuisance, CREEP)
         quiet.open(turn_on**2)
-        self.bank, self.doubt = Bank(model, quiet, mapless), Doubt(model, quiet)
-        self.hindsight, self._outliers = Hindsight(), 0
+        self.bank, self.detector = EstimatorBank(model, quiet, mapless), ChangeDetector(model, quiet)
+        self.late_telemetry, self._outliers = LateTelemetryTest(), 0
         self.coverage = Coverage(model.size)
         self._before: FloatArray | None = None
-        self.start: Start | None = None
+        self.start: BatchFit | None = None
         if np.trace(covariance[np.ix_(offsets, offsets)]) > 3.0 * LINEAR**2:
-            self.start = Start(model, coefficients, covariance, self._field)
+            self.start = BatchFit(model, coefficients, covariance, self._field)
         else:
             self.bank.suppose()
 
@@ -96,23 +97,23 @@ class Knowledge:
             field, phi @ self._model.weights(one.coefficients), reference
         )
 
-    def look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> Alarm | None:
+    def look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> LearningAlarm | None:
         """Test whether the regressors (m,) reported now fit earlier samples better than those of then."""
         if self.start is not None:
             return None
-        return self.hindsight.test(time_us, phi, positions, self._by(self.bank.quiet))
+        return self.late_telemetry.test(time_us, phi, positions, self._by(self.bank.quiet))
 
-    def keep(self, sample: Sample, innovation: float) -> None:
+    def keep(self, sample: LearningSample, innovation: float) -> None:
         """Keep a sample that is wrong by an innovation (nT), to look back at."""
-        self.hindsight.keep(Kept(*sample[:5], innovation, self.bank.quiet.variance))
+        self.late_telemetry.keep(StoredSample(*sample[:5], innovation, self.bank.quiet.variance))
 
-    def keep_faulty(self, sample: Sample) -> None:
+    def keep_faulty(self, sample: LearningSample) -> None:
         """Keep a sample that is not predicted."""
         quiet = self.bank.quiet
         now = self._by(quiet)(sample.field, sample.phi, sample.reference)
         self.keep(sample, now.e - quiet.expected)
 
-    def predict(self, sample: Sample, metres: float, seconds: float) -> tuple[Observation, Signs]:
+    def predict(self, sample: LearningSample, metres: float, seconds: float) -> tuple[Observation, Signs]:
         """Predict a sample with every estimator, `metres` and `seconds` after the previous one.
 
         Returns
@@ -126,7 +127,7 @@ class Knowledge:
         quiet = self.bank.quiet
         for other in self.bank.all[1:]:
             other.propagate(metres, seconds)
-        self.doubt.propagate(quiet, quiet.propagate(metres, seconds), seconds)
+        self.detector.propagate(quiet, quiet.propagate(metres, seconds), seconds)
         live = {id(one): self._predict(one, sample) for one in self.bank.all}
         best = live[id(self.bank.best)]
         self.coverage.add(best.s * self._model.derivative(sample.phi, best.by_nine), best.direction)
@@ -138,7 +139,7 @@ class Knowledge:
         signs = Signs(sample.time_us * 1e-6, offset, tuple(sample.positions), sample.watched, clock, level)
         return best, signs
 
-    def _predict(self, one: Estimator, sample: Sample) -> Observation:
+    def _predict(self, one: Estimator, sample: LearningSample) -> Observation:
         live = self._by(one)(sample.field, sample.phi, sample.reference)
         one.predict(live.e, live.s, self._model.derivative(sample.phi, live.by_nine))
         one.follow(live.s)
@@ -153,17 +154,17 @@ class Knowledge:
         self._outliers = self._outliers + 1 if far else 0
         return far and self._outliers < AGREE and not learnable
 
-    def learn(self, signs: Signs, *, frozen: bool) -> tuple[Alarm | None, bool]:
+    def learn(self, signs: Signs, *, frozen: bool) -> tuple[LearningAlarm | None, bool]:
         """Test the prediction, then learn from it; return the alarm, and True if the sample was used."""
         quiet = self.bank.quiet
-        alarm = self.doubt.test(quiet, signs)
+        alarm = self.detector.test(quiet, signs)
         for other in self.bank.all[1:]:
             other.update(learn=other.telling and not frozen)
         learn = quiet.telling and not frozen
-        self.doubt.updated(quiet.update(learn=learn))
+        self.detector.updated(quiet.update(learn=learn))
         return alarm, learn
 
-    def begin(self, sample: Sample, metres: float, seconds: float) -> bool:
+    def begin(self, sample: LearningSample, metres: float, seconds: float) -> bool:
         """Add a sample to the batch fit; return True if the fit of all samples was repeated."""
         assert self.start is not None
         quiet = self.bank.quiet

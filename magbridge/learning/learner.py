@@ -4,25 +4,48 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isnan
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from magbridge.calibration.model import Calibration
-from magbridge.learning.decision import Decision
-from magbridge.learning.intake import Intake, Sample
+from magbridge.learning.alarms import AlarmState
+from magbridge.learning.decision import NO_METHOD, Decision, Publication
+from magbridge.learning.estimator import Nuisance
 from magbridge.learning.knowledge import Knowledge
-from magbridge.learning.model import Model
-from magbridge.learning.nuisance import Nuisance
-from magbridge.learning.publication import NO_METHOD, Publication
-from magbridge.learning.report import Notice, State
-from magbridge.learning.standing import Standing
+from magbridge.learning.model import LearnedTerms
+from magbridge.learning.samples import Intake, LearningSample
 from magbridge.records import Quality, Vector
 
 if TYPE_CHECKING:
     from magbridge.field.grid import AnomalyGrid  # it brings scipy
 
-__all__ = ["Learner"]
+__all__ = ["Learner", "LearnerState", "Notice"]
+
+
+class Notice(NamedTuple):
+    """A change to announce, and when (s); `grave` where someone should look."""
+
+    text: str
+    time: float
+    grave: bool = False
+
+    @property
+    def date(self) -> str:
+        """The time, UTC."""
+        return f"{np.datetime64(round(self.time), 's')}Z"
+
+
+class LearnerState(NamedTuple):
+    """What MAG_LEARNING says: see there."""
+
+    learned_samples: int
+    rms: tuple[float, float, float]
+    better: float
+    causes: tuple[str, ...]
+    since_us: int
+    size: float
+
 
 MOVING: Final = int(Quality.MOVING)
 UNFIT: Final = MOVING | int(Quality.STALE_TELEMETRY | Quality.SATURATED | Quality.LATE_JOIN)
@@ -76,7 +99,7 @@ class Learner:
         max_rate: float = 1.0,
         currents: tuple[str, ...] = (),
     ) -> None:
-        self._model = Model(calibration, currents)
+        self._model = LearnedTerms(calibration, currents)
         self.watched = self._model.watched
         self._unfit = UNFIT if calibration.method == NO_METHOD else UNFIT | int(Quality.UNCALIBRATED)
         self._grid, self._max_rate, self._turn_on = grid, max_rate, turn_on
@@ -85,7 +108,7 @@ class Learner:
         self._now_us = 0
         nuisance = Nuisance(calibration.noise, spread, 0.0 if grid is not None else spread)
         self._publication = Publication(self._model, calibration, nuisance)
-        self._standing = Standing(mapped=grid is not None)
+        self._standing = AlarmState(mapped=grid is not None)
         self._begin(nuisance)
 
     @property
@@ -119,13 +142,13 @@ class Learner:
         return self._decision.samples
 
     @property
-    def state(self) -> State:
+    def state(self) -> LearnerState:
         """How learning stands."""
         judge, alarm = self._publication.judge, self._standing.alarm
         first, published, learned = np.sqrt(judge.mean_square).tolist()
         causes = alarm.causes if alarm else ()
         since, size = (round(alarm.since * 1e6), alarm.size) if alarm else (0, 0.0)
-        return State(self.samples, (first, published, learned), judge.better, causes, since, size)
+        return LearnerState(self.samples, (first, published, learned), judge.better, causes, since, size)
 
     def learned(self) -> Calibration:
         """Return the calibration as learned so far, with its covariance and where it comes from."""
@@ -224,7 +247,7 @@ class Learner:
         if isnan(reference) or not np.isfinite(phi).all():
             self._nothing(time_us)
             return
-        self._decision.doubt(self._knowledge.look_back(time_us, phi, positions))
+        self._decision.raise_alarm(self._knowledge.look_back(time_us, phi, positions))
         if unfit:
             self._intake.drop()
         for before in self._intake.confirmed(time_us, age):
@@ -233,7 +256,7 @@ class Learner:
             self._nothing(time_us)
         if unfit:
             return
-        new = Sample(time_us, field, reference, phi, positions, where, tuple(watched), faulty)
+        new = LearningSample(time_us, field, reference, phi, positions, where, tuple(watched), faulty)
         self._intake.wait(new)
 
     def _nothing(self, time_us: int) -> None:
@@ -241,7 +264,7 @@ class Learner:
         if self._intake.short(time_us):
             self._notify("learning: an hour without a sample to learn from", True)
 
-    def _take(self, sample: Sample) -> None:
+    def _take(self, sample: LearningSample) -> None:
         """Learn from a sample, or keep it to look back at."""
         knowledge = self._knowledge
         if sample.faulty:

@@ -18,13 +18,13 @@ from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.model import Calibration, coefficient_tensor
 from magbridge.errors import CalibrationError
 
-__all__ = ["TEMPERATURE", "Model"]
+__all__ = ["TEMPERATURE", "LearnedTerms"]
 
 TEMPERATURE = "sensor_temperature"
 """Name of the only channel that is part of the sensor's reading instead of telemetry."""
 
 
-class Model:
+class LearnedTerms:
     """A calibration's terms, and further ones.
 
     Parameters

@@ -3,7 +3,7 @@ r"""Batch fit of all samples so far, while the calibration is too uncertain for 
 A vehicle's hard iron moves the reading by thousands of nanotesla, over which the field's magnitude is not
 linear: a Kalman filter that was linearised at a wrong guess stays wrong. The samples since the start are
 therefore stored, and refitted by Gauss-Newton when their number has doubled. Residuals and derivatives are
-whitened by the filter of :mod:`.nuisance`; with :math:`c = c_0 + L z, z \sim N(0, I)`, a step solves
+whitened by the filter of :class:`.Nuisance`; with :math:`c = c_0 + L z, z \sim N(0, I)`, a step solves
 
 .. math:: (I + L^T J^T J L)\, z = -L^T J^T (r + J (c_0 - c))
 """
@@ -18,12 +18,12 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.estimation.priors import polynomial_prior
-from magbridge.learning.model import Model
-from magbridge.learning.nuisance import STATES, Nuisance
-from magbridge.learning.observation import Observation, observe
+from magbridge.learning.estimator import STATES, Nuisance
+from magbridge.learning.model import LearnedTerms
+from magbridge.learning.samples import Observation, observe
 from magbridge.records import Vector
 
-__all__ = ["LAST_FIT_SAMPLES", "Fitted", "Start", "class_prior"]
+__all__ = ["LAST_FIT_SAMPLES", "BatchFit", "BatchResult", "class_prior"]
 
 FIRST: Final = 32
 LAST_FIT_SAMPLES: Final = 4096
@@ -70,7 +70,7 @@ def class_prior(parameters: tuple[Parameter, ...], field: float = 50_000.0, orde
     )
 
 
-class Fitted(NamedTuple):
+class BatchResult(NamedTuple):
     """What the samples say."""
 
     coefficients: FloatArray
@@ -83,19 +83,21 @@ class Fitted(NamedTuple):
     """Noise of a channel, nT, 1-sigma."""
 
 
-class Start:
+class BatchFit:
     """Keeps the samples since the start.
 
     Parameters
     ----------
-    model : Model
+    model : LearnedTerms
     coefficients, covariance : (K,), (K, K) arrays
         The prior.
     field : float
         nT, F_0.
     """
 
-    def __init__(self, model: Model, coefficients: FloatArray, covariance: FloatArray, field: float) -> None:
+    def __init__(
+        self, model: LearnedTerms, coefficients: FloatArray, covariance: FloatArray, field: float
+    ) -> None:
         self._model, self._prior, self._field = model, coefficients, field
         values, vectors = np.linalg.eigh(covariance)
         seen = values > values[-1] * 1e-14
@@ -121,7 +123,7 @@ class Start:
         """Whether a filter can go on alone."""
         return len(self._samples) >= LAST_FIT_SAMPLES
 
-    def fit(self, coefficients: FloatArray, nuisance: Nuisance) -> Fitted:
+    def fit(self, coefficients: FloatArray, nuisance: Nuisance) -> BatchResult:
         """Fit all samples, beginning at `coefficients` (K,)."""
         c, z = coefficients, np.full(self._root.shape[1], np.inf)
         for _ in range(MAX_GAUSS_NEWTON_STEPS):
@@ -138,7 +140,7 @@ class Start:
         both = np.vstack([np.eye(len(c)), B])  # coefficients, and the nuisance as it depends on them
         covariance = both @ (self._root @ np.linalg.solve(H, self._root.T)) @ both.T
         covariance[-STATES:, -STATES:] += Pb
-        return Fitted(c, nuisances, covariance, noise)
+        return BatchResult(c, nuisances, covariance, noise)
 
     def _whitened(
         self, c: FloatArray, nuisance: Nuisance

@@ -20,7 +20,7 @@ from magbridge.calibration.file import calibration_id, load
 from magbridge.cli import main
 from magbridge.config import load as load_config
 from magbridge.errors import ConfigError
-from magbridge.learning.causes import CAUSE_UNITS
+from magbridge.learning.alarms import CAUSE_UNITS
 from magbridge.logs.tlog import TlogWriter
 from magbridge.mavlink import Codec, Message
 from magbridge.mavlink.enums import MAG_CAUSE, MAG_LEARNING_STATE, MAV_PARAM_TYPE

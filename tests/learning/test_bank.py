@@ -9,27 +9,26 @@ from worlds import FIELD, World, calibration
 from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.model import Calibration
-from magbridge.learning.bank import Bank
-from magbridge.learning.estimator import MEAN_SAMPLES, Estimator
-from magbridge.learning.model import Model
-from magbridge.learning.nuisance import Nuisance
-from magbridge.learning.observation import observe
+from magbridge.learning.bank import EstimatorBank
+from magbridge.learning.estimator import MEAN_SAMPLES, Estimator, Nuisance
+from magbridge.learning.model import LearnedTerms
+from magbridge.learning.samples import observe
 
 PER_DEGREE = np.array([4.0, -3.0, 5.0])
 
 
-def bank_of(known: Calibration) -> tuple[Bank, Model, Nuisance]:
+def bank_of(known: Calibration) -> tuple[EstimatorBank, LearnedTerms, Nuisance]:
     """Return one that begins with a calibration and the IGRF as reference."""
-    model, nuisance = Model(known, ()), Nuisance(known.noise, 145.0)
+    model, nuisance = LearnedTerms(known, ()), Nuisance(known.noise, 145.0)
     coefficients, covariance = model.coefficients(known)
     quiet = Estimator(coefficients, covariance, model.offsets, nuisance, 0.01)
     quiet.open(20.0**2)
-    bank = Bank(model, quiet)
+    bank = EstimatorBank(model, quiet)
     bank.suppose()
     return bank, model, nuisance
 
 
-def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[Bank, Model]:
+def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[EstimatorBank, LearnedTerms]:
     """Learn from a world whose offset follows the temperature (n,) by so much (3,)."""
     known = calibration()
     bank, model, _ = bank_of(known)
@@ -106,14 +105,14 @@ def test_no_drift_gets_less_certain_than_the_steepest() -> None:
     drifting = bank_of(calibration())[0].all[-1]
     for _ in range(30 * 24):
         drifting.propagate(5000.0, 3600.0)
-    assert 19.0 < np.sqrt(drifting._P[drifting.slope, drifting.slope]).max() * 3600.0 < 30.0
+    assert 19.0 < np.sqrt(drifting.filter.covariance[drifting.slope, drifting.slope]).max() * 3600.0 < 30.0
 
 
 def test_an_unobserved_level_is_kept() -> None:
     """The crustal field absorbs small changes; a significant change of the level is learned."""
     bank, _ = flown(np.full(400, 4.0), PER_DEGREE)
     quiet = bank.quiet
-    learned, rock = quiet.coefficients.copy(), quiet.rock
+    learned, crust = quiet.coefficients.copy(), quiet.crust
 
     def level(coefficients: np.ndarray) -> float:
         return float(quiet._mean @ coefficients)
@@ -126,4 +125,4 @@ def test_an_unobserved_level_is_kept() -> None:
     assert abs(by) > 0.5
     assert level(quiet.coefficients) == pytest.approx(level(published), abs=1e-6)
     share = 1.0 - (1.0 - 1.0 / MEAN_SAMPLES) ** 400  # of the mean derivative that is followed by now
-    assert quiet.rock - rock == pytest.approx(by / share, rel=0.1)
+    assert quiet.crust - crust == pytest.approx(by / share, rel=0.1)

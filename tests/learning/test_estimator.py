@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.calibration.model import Noise
-from magbridge.learning.estimator import Estimator
-from magbridge.learning.nuisance import Nuisance
+from magbridge.learning.estimator import Estimator, Nuisance
 
 
 def estimator(sigma: float) -> Estimator:

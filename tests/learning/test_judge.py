@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from magbridge.calibration.model import Noise
+from magbridge.learning.estimator import Nuisance
 from magbridge.learning.judge import CANDIDATE, FIRST, PUBLISHED, Coverage, Judge
-from magbridge.learning.nuisance import Nuisance
 
 LEG_SAMPLES = 200
 STEP_M, STEP_S = 1.4, 4.0

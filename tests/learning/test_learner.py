@@ -12,8 +12,8 @@ from magbridge.calibration.model import Calibration, Noise
 from magbridge.estimation.noise import whiten
 from magbridge.estimation.residual import Samples, residuals
 from magbridge.learning import Learner
-from magbridge.learning.nuisance import Nuisance
-from magbridge.learning.observation import observe
+from magbridge.learning.estimator import Nuisance
+from magbridge.learning.samples import observe
 from magbridge.records import Quality
 
 

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from magbridge.learning.causes import Alarm
-from magbridge.learning.standing import LOG_RATIO_PER_CAUSE, MAX_WAIT_SAMPLES, QUIET, SURE, Standing
+from magbridge.learning.alarms import (
+    LOG_RATIO_PER_CAUSE,
+    MAX_WAIT_SAMPLES,
+    QUIET,
+    SURE,
+    AlarmState,
+    LearningAlarm,
+)
 from magbridge.records import Quality
 
 
-def alarm(strength: float, *causes: str) -> Alarm:
-    return Alarm(causes, ("",) * len(causes), since=0.0, size=5.0, strength=strength)
+def alarm(strength: float, *causes: str) -> LearningAlarm:
+    return LearningAlarm(causes, ("",) * len(causes), since=0.0, size=5.0, strength=strength)
 
 
-def standing(*alarms: Alarm, telling: int = 0) -> Standing:
+def standing(*alarms: LearningAlarm, telling: int = 0) -> AlarmState:
     """Return how it stands after these, and so many telling samples and as many that are not."""
-    one = Standing()
+    one = AlarmState()
     for each in alarms:
         one.raised(each)
     return counted(one, telling)
 
 
-def counted(one: Standing, telling: int, error: float = 0.0) -> Standing:
+def counted(one: AlarmState, telling: int, error: float = 0.0) -> AlarmState:
     """Return it after so many telling samples, predicted within `error` (nT), and as many that are not."""
     for _ in range(telling):
         one.count(error, 1.0, telling=True)
@@ -49,7 +55,7 @@ def test_patience_is_for_each_cause_and_of_telling_samples() -> None:
 def test_an_alarm_that_is_not_news_for_long_is_gone() -> None:
     """One that grows by less than what makes it news is the same still; flag and sigma stand with it."""
     first = alarm(20.0, "offset_step")
-    assert Standing().raised(first) == "unexplained: 5 nT, offset step"
+    assert AlarmState().raised(first) == "unexplained: 5 nT, offset step"
     assert standing(first).raised(alarm(21.0, "offset_step")) == ""
     assert not standing(first, telling=QUIET).gone
     gone = standing(first, telling=QUIET + 1)
@@ -57,10 +63,10 @@ def test_an_alarm_that_is_not_news_for_long_is_gone() -> None:
     assert (gone.flags, gone.variance) == (int(Quality.UNEXPLAINED), 25.0)
     gone.end()
     assert (gone.alarm, gone.flags, gone.variance) == (None, 0, 0.0)
-    assert not Standing().ripe
+    assert not AlarmState().ripe
 
 
-def relapsed() -> Standing:
+def relapsed() -> AlarmState:
     """Return one whose cause was learned, and mistaken: errors of 30 nT were seen."""
     one = standing(alarm(20.0, "offset_step"))
     one.take_up()

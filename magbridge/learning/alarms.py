@@ -1,0 +1,484 @@
+r"""Alarms: tests whether the model still explains the data, the causes that fit, and the state of an alarm.
+
+:class:`ChangeDetector` tests the innovations of the baseline estimator for each cause, by
+:mod:`magbridge.estimation.sequential`. A cause is learned by passing the result of its test to the estimator:
+the amplitude :math:`\hat a = (I + M)^{-1} y`, of covariance :math:`(I + M)^{-1}`, moves the state by
+:math:`-G \hat a`, where G contains the part that the filter has absorbed, :math:`\Xi`, and the cause's own
+coefficients (Friedland 1969, IEEE Trans. Automatic Control 14:359). If several causes fit, each has a weight
+proportional to :math:`e^L`.
+
+:class:`LateTelemetryTest` tests whether the telemetry of the masses is late, by comparing each sample with
+later reports. Late telemetry shows in the samples before a motion is reported: they fit the positions of a
+later report. A sample of innovation v (variance S) has the innovation v' at the positions that are reported a
+time d later. How late they are is known to a share w only, so the variance of v' is
+:math:`S' = S + w^2 (v' - v)^2`, and the log-likelihood ratio of 'late by about d' over 'in time' is
+
+.. math:: L_d \leftarrow \max\left(0, L_d + \tfrac12 \left(
+          \frac{v^2}{S} - \frac{v'^2}{S'} - \log \frac{S'}{S} \right)\right)
+
+(Page 1954, Biometrika 41:100). With masses at rest v' = v, and the ratio does not change. Late samples look
+like outliers to the other tests, so this test uses them even if the sensor seems to be at fault.
+
+:class:`AlarmState` decides when to announce an alarm, when to learn its cause, and when it is over.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from math import log, sqrt
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from magbridge.arrays import BoolArray, FloatArray, IndexArray
+from magbridge.estimation.sequential import ALARM_LOG_RATIO, RESTART_PERIODS, SequentialTest
+from magbridge.learning.estimator import Estimator
+from magbridge.learning.model import TEMPERATURE, LearnedTerms
+from magbridge.learning.samples import Observation
+from magbridge.records import Quality, Vector
+
+__all__ = [
+    "CAUSE_UNITS",
+    "NO_COEFFICIENT",
+    "AlarmState",
+    "ChangeDetector",
+    "LateTelemetryTest",
+    "LearningAlarm",
+    "Signs",
+    "StoredSample",
+    "named",
+]
+
+CAUSE_UNITS: Final = {
+    "offset_step": 20.0,
+    "offset_drift": 20.0,
+    "temperature_offset": 2.0,
+    "unmodelled_actuator": 20.0,
+    "current_field": 20.0,
+    "clock_offset": 2.0,
+    "map_error": 50.0,
+}
+"""Cause -> the unit of its amplitude: nT, nT/h, nT/degC, nT a half range, nT/A, s, nT. Each cause has a bit
+in MAG_LEARNING."""
+FROM_ZERO: Final = ("offset_step", "current_field", "clock_offset", "map_error")
+"""Causes whose effect is proportional to their regressor, not to its change since the onset."""
+NO_COEFFICIENT: Final = frozenset(("clock_offset", "map_error"))
+"""Causes that no coefficient can represent."""
+
+
+def named(causes: Sequence[str]) -> str:
+    """Return the likeliest two of `causes` in words."""
+    return " or ".join(causes[:2]).replace("_", " ")
+
+
+class Signs(NamedTuple):
+    """What a sample's causes would do to its residual."""
+
+    time: float
+    """Time of the sample, s since 1970 UTC."""
+    offset: FloatArray
+    """(3,): Derivative of the residual by the offset of each axis."""
+    positions: tuple[float, ...]
+    """Parameters, scaled to their range."""
+    watched: tuple[float, ...]
+    """degC and A: temperature and currents; NaN where unknown."""
+    clock: float
+    """nT/s: how the residual changes with the telemetry's time."""
+    level: float
+    """By the reference's level."""
+
+
+class AlarmCause(NamedTuple):
+    """One to test: its name, the telemetry it follows, and the states (3,) that would take it up, if any."""
+
+    name: str
+    channel: str
+    states: IndexArray | None
+
+
+class LearningAlarm(NamedTuple):
+    """The model no longer explains the data."""
+
+    causes: tuple[str, ...]
+    """Which fit, the likeliest first."""
+    channels: tuple[str, ...]
+    """The telemetry that each follows; empty for none."""
+    since: float
+    """Onset of the likeliest cause, s since 1970 UTC."""
+    size: float
+    """Root mean square of the likeliest cause's effect on the total field, nT."""
+    strength: float
+    """Log-likelihood ratio L of the likeliest cause."""
+    mapless: bool = False
+    """True for a map alarm: an unmapped crustal field explains the data. The corrected field is not affected,
+    and the alarm lasts as long as the bank raises it."""
+
+
+MAX_CAUSE_LOG_RATIO: Final = log(20.0)
+"""Largest difference of L from the best cause at which another cause still fits."""
+
+
+class ChangeDetector:
+    """Tests every cause with every sample.
+
+    Parameters
+    ----------
+    model : LearnedTerms
+    estimator : Estimator
+        Estimator whose innovations are tested; another that learns from the same samples may replace it.
+    """
+
+    def __init__(self, model: LearnedTerms, estimator: Estimator) -> None:
+        self._offsets, self._states, self._origin = estimator.offsets, estimator.states, model.origin
+        causes = [
+            AlarmCause("offset_step", "", estimator.offsets),
+            AlarmCause("offset_drift", "", estimator.slope),
+            *(AlarmCause("unmodelled_actuator", name, model.slots(name)) for name in model.parameters),
+            AlarmCause("temperature_offset", TEMPERATURE, model.slots(TEMPERATURE)),
+            *(AlarmCause("current_field", name, model.slots(name)) for name in model.watched[1:]),
+            AlarmCause("clock_offset", "", None),
+            AlarmCause("map_error", "", None),
+        ]
+        self._causes = [cause for cause in causes for _ in RESTART_PERIODS]
+        names = [cause.name for cause in self._causes]
+        self._unit = np.array([CAUSE_UNITS[name] for name in names])
+        self._since_onset = np.array([name not in FROM_ZERO for name in names], float)
+        self._no_vector = np.array([name in NO_COEFFICIENT for name in names])
+        self._test = SequentialTest(len(causes), self._states)
+        self.restart()
+
+    def restart(self) -> None:
+        """Discard all evidence, but keep the estimate of the noise."""
+        self._test.restart()
+        self._start = np.zeros(len(self._causes))  # of each row's regressor
+        self._now = 0.0
+
+    @property
+    def statistic(self) -> FloatArray:
+        """Log-likelihood ratio L of each row (rows,)."""
+        return self._test.statistic
+
+    def propagate(self, estimator: Estimator, F: FloatArray, seconds: float) -> None:
+        """Propagate the absorbed part by `F` (4, 4), the transition of :meth:`.Estimator.propagate`."""
+        estimator.advance(self._test.absorbed, F, seconds)
+
+    def test(self, estimator: Estimator, signs: Signs) -> LearningAlarm | None:
+        """Test the estimator's prediction; return an alarm if a cause exceeds the threshold."""
+        begins = self._test.begin(signs.time, estimator.residual / estimator.sigma)
+        largest = self._test.test(estimator.filter, self._signatures(signs, begins))
+        return self._alarm() if largest > ALARM_LOG_RATIO else None
+
+    def updated(self, gain: FloatArray) -> None:
+        """Subtract the part that the estimator absorbed in its update with `gain` (n,)."""
+        self._test.update(gain)
+
+    def _signatures(self, signs: Signs, begins: BoolArray) -> FloatArray:
+        """Return (rows, 3) residual of one unit of each cause, of which some begin now."""
+        self._now = signs.time
+        now = [1.0, signs.time / 3600.0, *signs.positions, *signs.watched, signs.clock, signs.level]
+        regressor = np.repeat(np.nan_to_num(np.array(now)), len(RESTART_PERIODS))
+        self._start[begins] = regressor[begins]
+        amount = (regressor - self._since_onset * self._start) * self._unit
+        f = amount[:, None] * signs.offset
+        f[self._no_vector] = 0.0
+        f[self._no_vector, 0] = amount[self._no_vector]
+        return np.asarray(f)
+
+    @property
+    def _fitting(self) -> list[int]:
+        """The rows that fit, the likeliest first."""
+        order = np.argsort(-self.statistic, kind="stable").tolist()
+        return [row for row in order if self.statistic[row] > self.statistic[order[0]] - MAX_CAUSE_LOG_RATIO]
+
+    def _alarm(self) -> LearningAlarm:
+        fits = self._fitting
+        best = fits[0]
+        named = list(dict.fromkeys(self._causes[row][:2] for row in fits))
+        return LearningAlarm(
+            causes=tuple(dict.fromkeys(cause for cause, _ in named)),
+            channels=tuple(channel for _, channel in named),
+            since=float(self._test.onset[best]),
+            size=self._test.rms(best),
+            strength=float(self.statistic[best]),
+        )
+
+    def learned(self) -> tuple[FloatArray, FloatArray] | None:
+        """Return the state's shift (n,) by the causes that fit, and its additional covariance (n, n).
+
+        Return None if no coefficient can represent the likeliest cause.
+        """
+        fits = self._fitting
+        if self._causes[fits[0]].states is None:
+            return None
+        share = np.exp(self.statistic[fits] - self.statistic[fits[0]])
+        share /= share.sum()
+        by, covariance = np.zeros(self._states), np.zeros((self._states, self._states))
+        for weight, row in zip(share.tolist(), fits, strict=True):
+            if self._causes[row].states is None:  # it moves no coefficient
+                continue
+            G, a = self._moves(row), self._test.amplitude[row]
+            V = self._test.covariance(row) + np.outer(a, a)
+            covariance += weight * G @ V @ G.T
+            by -= weight * G @ a
+        return by, np.asarray(covariance - np.outer(by, by))
+
+    def _moves(self, row: int) -> FloatArray:
+        """(n, 3) G: by what one unit of a row's cause has moved the filter from the truth."""
+        cause, unit, start = self._causes[row], float(self._unit[row]), float(self._start[row])
+        G = self._test.absorbed[:, row].copy()
+        assert cause.states is not None
+        if cause.name == "offset_drift":
+            G[cause.states, range(3)] += unit / 3600.0
+            G[self._offsets, range(3)] += unit * (self._now / 3600.0 - start)
+            return np.asarray(G)
+        G[cause.states, range(3)] += unit
+        if self._since_onset[row]:
+            G[self._offsets, range(3)] -= unit * (start - self._origin(cause.channel))
+        return np.asarray(G)
+
+
+LATE_US: Final = (8_000_000, 16_000_000, 32_000_000)
+"""µs, d: shorter ones are those of telemetry that comes seldom."""
+MAX_DELAY_ERROR: Final = 0.25
+"""By how much of d a later report may be off."""
+DELAY_UNCERTAINTY: Final = 0.4
+"""w: the next d is the double."""
+MAX_HINDSIGHT_SQUARE: Final = 36.0
+"""v²/S at most: two samples are needed in any case, and the last before a motion is none of them."""
+MAX_STORED_SAMPLES: Final = 41
+"""Samples kept, at most one a second."""
+MOVED: Final = 0.01
+"""Of its scale, by which a parameter has moved."""
+
+
+class StoredSample(NamedTuple):
+    """A sample of masses at rest, with its innovation (nT) and that one's variance (nT²)."""
+
+    time_us: int
+    field: Vector
+    reference: float
+    phi: FloatArray
+    positions: list[float]
+    innovation: float
+    variance: float
+
+
+class LateTelemetryTest:
+    """Keeps the samples of the last half minute."""
+
+    def __init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all evidence."""
+        self._kept: deque[StoredSample] = deque(maxlen=MAX_STORED_SAMPLES)
+        self._ratio = [0.0] * len(LATE_US)
+        self._square = [0.0] * len(LATE_US)
+        self._count = [0] * len(LATE_US)
+        self._since_us = [0] * len(LATE_US)
+        self._tested_us = [0] * len(LATE_US)
+
+    def keep(self, sample: StoredSample) -> None:
+        """Keep a sample."""
+        if not self._kept or sample.time_us - self._kept[-1].time_us >= 1_000_000:
+            self._kept.append(sample)
+            self._count = [count + 1 for count in self._count]
+
+    def test(
+        self,
+        time_us: int,
+        phi: FloatArray,
+        positions: list[float],
+        observe: Callable[[Vector, FloatArray, float], Observation],
+    ) -> LearningAlarm | None:
+        """Test the samples kept by the regressors (m,) and positions reported now.
+
+        `observe` compares a field (nT), measured at some regressors, with a reference (nT).
+        """
+        for k in range(len(LATE_US)):
+            one = self._reported_since(time_us, k)
+            if one is None:
+                continue
+            self._tested_us[k] = one.time_us
+            if np.abs(np.subtract(positions, one.positions)).max(initial=0.0) < MOVED:
+                continue
+            then, now = (observe(one.field, at, one.reference).e for at in (one.phi, phi))
+            S = one.variance
+            more = S + (DELAY_UNCERTAINTY * (now - then)) ** 2
+            v = min(one.innovation**2 / S, MAX_HINDSIGHT_SQUARE)
+            late = (one.innovation + now - then) ** 2 / more + log(more / S)
+            if self._ratio[k] == 0.0:
+                self._square[k], self._count[k], self._since_us[k] = 0.0, 1, one.time_us
+            self._ratio[k] = max(0.0, self._ratio[k] + 0.5 * (v - late))
+            self._square[k] += (now - then) ** 2 * (v > late)
+            if self._ratio[k] > ALARM_LOG_RATIO:
+                size = sqrt(self._square[k] / self._count[k])
+                return LearningAlarm(("clock_offset",), ("",), self._since_us[k] * 1e-6, size, self._ratio[k])
+        return None
+
+    def _reported_since(self, time_us: int, k: int) -> StoredSample | None:
+        """Return the stored sample that the present report would match at the k-th d, or None."""
+        late_us = LATE_US[k]
+        one = min(self._kept, key=lambda one: abs(time_us - one.time_us - late_us), default=None)
+        if one is None or abs(time_us - one.time_us - late_us) > MAX_DELAY_ERROR * late_us:
+            return None
+        return one if one.time_us > self._tested_us[k] else None
+
+
+SURE: Final = 6.0
+"""Least growth of an alarm's log-likelihood ratio before its cause is learned (6 = a factor of 400)."""
+LOG_RATIO_PER_CAUSE: Final = 3.0
+"""Additional growth required for each further cause that fits: more evidence often excludes causes, whereas
+separating them after all were learned takes hours."""
+MAX_WAIT_SAMPLES: Final = 128
+"""Informative samples for each cause that fits, after which the decision is made at the latest."""
+MIN_ALARM_GROWTH: Final = 2.0
+"""Least growth of an alarm's log-likelihood ratio that updates the alarm."""
+QUIET: Final = 300
+"""Informative samples without an alarm after which its cause is cleared."""
+
+
+SLOWER: Final = 4
+"""Factor by which each relapse multiplies the evidence and the samples required."""
+SIGNIFICANT_SQUARE: Final = 16.0
+"""Squared normalised error from which on a prediction error is significant."""
+
+
+class AlarmState:
+    """The current alarm, if any; `mapped` is True if the reference is a map.
+
+    A relapse is an alarm that comes before the last learned cause has explained :data:`QUIET` informative
+    samples. Alarms after a relapse continue the first one: it is announced once, and ends once a learned
+    calibration has explained as many samples.
+
+    Attributes
+    ----------
+    alarm : LearningAlarm or None
+        Alarm at its last update.
+    flags : int
+        ``unexplained`` during an alarm, or 0.
+    variance : float
+        Variance of the unexplained residual, nT².
+    relapses : int
+        Number of relapses.
+    tried : bool
+        True if the cause was learned and no alarm has followed.
+    pending : bool
+        True if, in addition, the learned calibration is not published, as no later samples have confirmed it.
+    """
+
+    def __init__(self, *, mapped: bool = False) -> None:
+        self._mapped = mapped
+        self._peak = self._since = 0.0
+        self.end()
+
+    def end(self) -> None:
+        """Close the alarm."""
+        self.alarm: LearningAlarm | None = None
+        self.flags, self.variance, self.relapses = 0, 0.0, 0
+        self.tried = self.pending = False
+        self._sure = 0.0
+        self._doubted = self._quiet = 0
+        self._explained = QUIET + 1
+
+    @property
+    def _slower(self) -> int:
+        return int(SLOWER**self.relapses)
+
+    def raised(self, alarm: LearningAlarm) -> str:
+        """Update the state with an alarm of the change detector; return the notification, or ""."""
+        before = self.alarm
+        anew = before is None or self.tried
+        if before is not None and (alarm.mapless or before.mapless):
+            if alarm.mapless and before.causes == alarm.causes:
+                self.alarm, self._quiet = alarm, 0
+            return ""  # a map error explains every further alarm
+        if before is not None and not anew and alarm.strength < before.strength + MIN_ALARM_GROWTH:
+            return ""
+        if anew and self._explained <= QUIET:
+            self.relapses += 1
+        self._since = self._since if self.relapses else alarm.since
+        self.alarm, self._quiet = alarm._replace(since=self._since), 0
+        self.tried = self.pending = False
+        self.flags = int(Quality.UNEXPLAINED)
+        self._cover()
+        if anew:
+            self._doubted, self._sure = 0, alarm.strength + self._slower * SURE
+        if before is not None:
+            return ""
+        return f"unexplained{' still' * bool(self.relapses)}: {alarm.size:.0f} nT, {named(alarm.causes)}"
+
+    def take_up(self) -> None:
+        """Record that the alarm's cause was learned, but is not published until it is confirmed."""
+        self.tried = self.pending = True
+        self._quiet = self._explained = 0
+        self._cover()
+
+    def restart(self) -> None:
+        """Require new evidence to learn the alarm's cause, because learning restarts."""
+        if self.alarm is not None:
+            self.alarm = self.alarm._replace(strength=0.0)
+        self._sure, self._doubted = self._slower * SURE, 0
+
+    def confirmed(self) -> bool:
+        """Record that the learned calibration is published; return True if the alarm is closed."""
+        self.pending, self._quiet = False, 0
+        if self.relapses:
+            self._cover()
+            return False
+        self.end()
+        self._explained = 0
+        return True
+
+    def mistaken(self) -> None:
+        """Record that the learned calibration was rolled back."""
+        if self.alarm is not None and not self.mapless:
+            self.relapses, self.tried, self.pending = max(1, self.relapses), True, False
+            self._explained = self._quiet = 0
+
+    def count(self, error: float, variance: float, *, telling: bool) -> None:
+        """Count a sample, with the published calibration's error (nT) and its predicted variance (nT²).
+
+        `telling` is True if the sample is informative about the coefficients.
+        """
+        self._quiet += telling
+        self._doubted += telling
+        self._explained += telling
+        seen = error * error - SIGNIFICANT_SQUARE * variance
+        self._peak = max(self._peak * (1.0 - telling / QUIET), seen)
+        if self.relapses and seen > 0.0:
+            self._quiet = 0
+        self._cover()
+
+    def _cover(self) -> None:
+        """Set the variance to that of the likeliest cause, and of the errors once a cause was learned."""
+        learned = self.tried and not self.pending
+        size = 0.0 if self.alarm is None or learned or self.mapless else self.alarm.size
+        self.variance = max(size * size, self._peak if self.relapses or self.pending else 0.0)
+
+    @property
+    def mapless(self) -> bool:
+        """True during a map alarm: an unmapped crustal field explains the data."""
+        return self.alarm is not None and self.alarm.mapless
+
+    @property
+    def gone(self) -> bool:
+        """True if the alarm has not been raised for :data:`QUIET` informative samples."""
+        return self.alarm is not None and self._quiet > QUIET
+
+    @property
+    def learnable(self) -> bool:
+        """True if there is an alarm whose cause coefficients can represent."""
+        return self.alarm is not None and not NO_COEFFICIENT.issuperset(self.alarm.causes)
+
+    @property
+    def ripe(self) -> bool:
+        """True if the evidence suffices to learn the alarm's cause."""
+        if self.alarm is None or self.tried or not self.learnable:
+            return False
+        fit, slower = len(self.alarm.channels), self._slower
+        sure = self.alarm.strength > self._sure + slower * LOG_RATIO_PER_CAUSE * (fit - 1)
+        if self._mapped and "map_error" in self.alarm.causes:
+            sure = False  # maps have sheets: the attitudes to come tell an offset from another level
+        return sure or self._doubted > slower * MAX_WAIT_SAMPLES * fit
