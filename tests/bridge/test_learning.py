@@ -56,7 +56,7 @@ def test_what_was_learned_is_announced_and_named_in_every_message(
     state = named(messages, "MAG_LEARNING")[-1]
     assert (state["first_calibration_id"], state["calibration_id"]) == (first, last)
     assert state["state"] == MAG_LEARNING_STATE.LEARNED
-    assert state["rms_published"] < 1.5 < state["rms_first"]
+    assert state["rms_learned"] < state["rms_first"]
     assert state["samples"] > 300
     assert any(message["text"].startswith("learned ") for message in named(messages, "STATUSTEXT"))
 
@@ -93,24 +93,25 @@ def test_a_station_forgets_freezes_and_disables(tmp_path: Path) -> None:
     station = Codec(255, 190)
     to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
     feed = events(tmp_path)
-    for event in feed[:800]:
+    now = 1300
+    for event in feed[:now]:
         pipeline.feed(event)
     assert pipeline.learning is not None
     learner = pipeline.learning.learner
     assert learner.calibration is not learner.first
     beat = station.pack("HEARTBEAT", type=6, autopilot=8, mavlink_version=3)
-    pipeline.feed(Event(feed[800].time_us, Channel.LINK, beat))
+    pipeline.feed(Event(feed[now].time_us, Channel.LINK, beat))
 
     def order(name: str, value: float) -> list[Message]:
         frame = station.pack("PARAM_SET", param_id=name, param_value=value, **to)
-        return received(pipeline.feed(Event(feed[800].time_us + 1, Channel.LINK, frame)))
+        return received(pipeline.feed(Event(feed[now].time_us + 1, Channel.LINK, frame)))
 
     answer = named(order("MB_LEARN_CMD", 2.0), "PARAM_VALUE")[-1]
     assert (answer["param_id"], answer["param_value"]) == ("MB_LEARN_CMD", 0.0)
     assert learner.calibration is learner.first
     assert learner.samples == 0
     order("MB_LEARN_FREEZE", 1.0)
-    for event in feed[802:900]:
+    for event in feed[now + 2 :]:
         pipeline.feed(event)
     assert learner.samples == 0
     assert learner.frozen
