@@ -101,7 +101,8 @@ def test_an_alarm_is_shown_accepted_and_forgotten(flying: tuple[Rig, Turning], c
         page.set_default_timeout(PATIENCE)
         page.goto(address)
         panel = page.get_by_role("region", name="Learning in flight")
-        panel.get_by_text("learned", exact=True).wait_for()  # the state
+        panel.get_by_text("learning", exact=True).wait_for()  # the state: nothing is published in a minute
+        page.wait_for_timeout(5000.0)  # samples to learn from
         to = {"target_system": 1, "target_component": 191, "param_type": MAV_PARAM_TYPE.REAL32}
         # learning stops, so that the alarm stays
         rig.autopilot.send_message("PARAM_SET", param_id="MB_LEARN_FREEZE", param_value=1.0, **to)
