@@ -36,25 +36,28 @@ Functions that take a Dataset accept ``time`` in seconds since 1970 UTC or as ``
 imported when it is first used, because the bridge itself needs few of them.
 """
 
+import sys
+from types import ModuleType
+
 TYPE_CHECKING = False  # type checkers take it for true
 if TYPE_CHECKING:
     from magbridge import plot
     from magbridge.api import (
+        correct,
         correct_rows,
         diagnose,
         navigate,
         observations,
+        plan,
         reference_field,
         survey,
         write,
     )
-    from magbridge.calibration.correct import correct
     from magbridge.calibration.corrector import Corrector
     from magbridge.calibration.file import load, save
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.heading import heading
     from magbridge.calibration.model import Calibration
-    from magbridge.calibration.planning.plan import plan
     from magbridge.correction import Correction
     from magbridge.errors import MagbridgeError
     from magbridge.field.read import read_grid
@@ -74,7 +77,7 @@ _HOMES = {
     "Corrector": "calibration.corrector",
     "MagbridgeError": "errors",
     "__version__": "version",
-    "correct": "calibration.correct",
+    "correct": "api",
     "correct_rows": "api",
     "diagnose": "api",
     "fit": "calibration.fitting.fit",
@@ -83,7 +86,7 @@ _HOMES = {
     "load": "calibration.file",
     "navigate": "api",
     "observations": "api",
-    "plan": "calibration.planning.plan",
+    "plan": "api",
     "read": "logs",
     "read_grid": "field.read",
     "reference_field": "api",
@@ -106,3 +109,17 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """Keeps ``survey``, ``navigate`` and ``diagnose`` functions, although packages have the same names.
+
+    The import system binds a package that is imported to its name in the parent.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -6,9 +6,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from magbridge.calibration.correct import CorrectedArrays
+from magbridge.calibration.correct import correct as correct_arrays
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.fitting import observe
+from magbridge.columns import in_seconds
+from magbridge.errors import CalibrationError, WrongUse
 from magbridge.field import reference
+from magbridge.records import Corrected
 from magbridge.rows import correct_rows as correct_rows_in_seconds
 
 if TYPE_CHECKING:
@@ -19,6 +26,7 @@ if TYPE_CHECKING:
     from magbridge.arrays import FloatArray
     from magbridge.calibration.fitting.observations import Observations
     from magbridge.calibration.model import Calibration
+    from magbridge.calibration.planning.plan import Plan
     from magbridge.correction import Correction
     from magbridge.diagnose.assessment import DiagnosisResult
     from magbridge.field.grid import AnomalyGrid
@@ -26,22 +34,9 @@ if TYPE_CHECKING:
     from magbridge.survey.run import Result
 
 __all__ = [
-    "correct_rows", "diagnose", "in_seconds", "navigate", "observations", "reference_field", "survey",
+    "correct", "correct_rows", "diagnose", "navigate", "observations", "plan", "reference_field", "survey",
     "write",
 ]  # fmt: skip
-
-
-def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
-    """Return a Dataset with ``time`` in seconds since 1970-01-01 UTC.
-
-    A Dataset whose times are seconds already is returned unchanged; ``datetime64`` times are taken as UTC.
-    """
-    time = deployment["time"].to_numpy()
-    if time.dtype.kind != "M":
-        return deployment
-    seconds = time.astype("datetime64[ns]").astype(np.int64) * 1e-9
-    seconds[np.isnat(time)] = np.nan
-    return deployment.assign_coords(time=("time", seconds, {"units": "s", "long_name": "time"}))
 
 
 def observations(
@@ -67,6 +62,65 @@ def reference_field(deployment: xr.Dataset, grid: AnomalyGrid | None = None) -> 
     return reference.reference_field(in_seconds(deployment), grid)
 
 
+def correct(
+    calibration: Calibration, field: ArrayLike, channels: ArrayLike = (), time: ArrayLike = 0.0
+) -> Corrected | CorrectedArrays:
+    """Correct one reading, or arrays of readings.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of the sensor that took the samples.
+    field : (3,) or (n, 3) array
+        nT, raw, sensor axes.
+    channels : (k,) or (n, k) array
+        ``calibration.channels``, in that order; NaN where unknown.
+    time : float or (n,) array
+        s since 1970 UTC or ``datetime64``, ascending; only effects with a state use it.
+
+    Returns
+    -------
+    Corrected or CorrectedArrays
+        Of one reading, or of the n.
+
+    Raises
+    ------
+    CalibrationError
+        Another shape, or another number of channels than the calibration's.
+    """
+    readings = np.asarray(field, float)
+    if readings.shape[-1:] != (3,) or readings.ndim > 2:
+        raise CalibrationError(f"field: expected shape (3,) or (n, 3), got {readings.shape}")
+    moments = np.asarray(time)
+    if moments.dtype.kind == "M":
+        moments = (moments - np.datetime64(0, "ns")) / np.timedelta64(1, "s")
+    if readings.ndim == 1:
+        values = np.asarray(channels, float).ravel().tolist()
+        x, y, z = readings.tolist()
+        return Corrector(calibration).step(round(float(moments) * 1e6), (x, y, z), values)
+    moments = np.broadcast_to(moments.astype(float), len(readings))
+    return correct_arrays(calibration, readings, np.asarray(channels, float), moments)
+
+
+def plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10, roll: float = 10.0) -> Plan:
+    """Choose the calibration runs to fly next for a mission like a log.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Calibration so far.
+    mission : Dataset (time)
+        With attitude, position and masses as the mission will have them.
+    runs : int
+        Number of runs.
+    roll : float
+        deg, largest bank either way.
+    """
+    from magbridge.calibration.planning.flight_plan import flight_plan  # noqa: PLC0415 - scipy only where it is used
+
+    return flight_plan(calibration, in_seconds(mission), runs=runs, roll=roll)
+
+
 def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
     """Correct a log as the bridge does; the result has the input's kind of ``time``."""
     corrected = correct_rows_in_seconds(correction, in_seconds(deployment))
@@ -74,18 +128,29 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
 
 
 def diagnose(deployments: Sequence[xr.Dataset], calibration: Calibration, **options: Any) -> DiagnosisResult:
-    """Find what the model gets wrong in these logs; :func:`magbridge.diagnose.run.diagnose`."""
+    """Find what the model gets wrong in these logs; :func:`magbridge.diagnose.run.diagnose`.
+
+    WrongUse: there is no log.
+    """
     from magbridge.diagnose import run  # noqa: PLC0415 - scipy only where it is used
 
+    if not deployments:
+        raise WrongUse("expected at least one deployment")
     return run.diagnose([in_seconds(deployment) for deployment in deployments], calibration, **options)
 
 
 def navigate(
-    deployment: xr.Dataset, grid: AnomalyGrid, options: Options | None = None, **more: Any
+    deployment: xr.Dataset, grid: AnomalyGrid | None = None, options: Options | None = None, **more: Any
 ) -> xr.Dataset:
-    """Return the track that the field and a map give; :func:`magbridge.navigate.batch.navigate`."""
-    from magbridge.navigate import batch  # noqa: PLC0415 - filterpy only where it is used
+    """Return the track that the field and a map give; :func:`magbridge.navigate.batch.navigate`.
 
+    Without a map: where the track crosses itself in the field,
+    :func:`magbridge.navigate.own_survey.localise`.
+    """
+    from magbridge.navigate import Options, batch, own_survey  # noqa: PLC0415 - filterpy only where it is used
+
+    if grid is None:
+        return own_survey.localise(in_seconds(deployment), options or Options())
     return batch.navigate(in_seconds(deployment), grid, options, **more)
 
 
@@ -98,9 +163,16 @@ def survey(deployments: Sequence[xr.Dataset], *calibrations: Calibration) -> Res
         Logs with a vector, which are corrected first, or with ``total_field`` or ``anomaly``.
     *calibrations : Calibration
         One for all logs with a vector, or one for each of them.
+
+    Raises
+    ------
+    WrongUse
+        There is no log.
     """
     from magbridge.survey import run  # noqa: PLC0415 - scipy only where it is used
 
+    if not deployments:
+        raise WrongUse("expected at least one deployment")
     return run.survey(run.samples_of([in_seconds(log) for log in deployments], calibrations))
 
 

@@ -176,6 +176,9 @@ def in_seconds(deployment: xr.Dataset) -> xr.Dataset:
 
     if "time" not in deployment.coords and "time" in deployment:
         deployment = deployment.set_coords("time")
+    if "time" not in deployment.variables:
+        source = deployment.attrs.get("source", "the deployment")
+        raise FormatError(source, absent("time", map(str, deployment.variables)), column="time")
     times = {name: deployment[name] for name in ("time", *CHANNEL_TIMES) if name in deployment.variables}
     for name, time in times.items():
         if time.dtype.kind == "M":

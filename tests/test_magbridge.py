@@ -6,12 +6,19 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from inspect import isfunction
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import magbridge as mb
+from magbridge.calibration.correct import CorrectedArrays
+from magbridge.calibration.model import Noise, identity
+from magbridge.records import Corrected
 from sitl import load, simulate
 
 WORD = re.compile(r"``(\w+)``")
@@ -107,3 +114,67 @@ def test_times_may_be_seconds_or_datetimes(tmp_path: Path) -> None:
 def test_the_heading_of_corrected_vectors() -> None:
     found = mb.heading(np.array([[10_000.0, 0.0, 40_000.0], [0.0, -10_000.0, 40_000.0]]), 0.0, 0.0)
     np.testing.assert_allclose(found.magnetic, [0.0, 90.0])
+
+
+def test_functions_stay_functions_after_packages_of_their_names_are_imported() -> None:
+    for name in ("survey", "navigate", "diagnose"):
+        import_module(f"magbridge.{name}")
+        assert isfunction(getattr(mb, name)), name
+
+
+def test_one_reading_or_arrays_of_them() -> None:
+    calibration = identity()
+    one = mb.correct(calibration, [30.0, 40.0, 0.0])
+    moments = np.array(["2026-01-01"] * 2, "M8[ns]")
+    many = mb.correct(calibration, [[30.0, 40.0, 0.0]] * 2, np.empty((2, 0)), moments)
+    assert isinstance(one, Corrected)
+    assert isinstance(many, CorrectedArrays)
+    assert one.total_field == pytest.approx(50.0)
+    np.testing.assert_allclose(many.total, 50.0)
+    for wrong in ([1.0, 2.0], np.ones((2, 2)), 3.0):
+        with pytest.raises(mb.MagbridgeError, match=r"field: expected shape \(3,\) or \(n, 3\)"):
+            mb.correct(calibration, wrong)
+
+
+def test_datetimes_of_every_channel_are_accepted(tmp_path: Path) -> None:
+    """Axes with times of their own, as our own netCDF holds them and xarray decodes them."""
+    log = simulate(load("demo"), 3).isel(time=slice(0, 600))
+    mb.write(log, tmp_path / "own.nc")
+    back = mb.read(tmp_path / "own.nc", decode_times=True)
+    assert back["mag_time_x"].dtype.kind == back["time"].dtype.kind == "M"
+    assert set(back.data_vars) == set(log.data_vars)
+    expected = mb.observations(log, "battpos")
+    np.testing.assert_allclose(mb.observations(back, "battpos").field, expected.field, atol=1e-3)
+    np.testing.assert_allclose(mb.reference_field(back), mb.reference_field(log))
+    plan = mb.plan(replace(identity(), noise=Noise(1.0)), back, runs=1)
+    assert len(plan.runs) == 1
+
+
+ATTEMPTS: tuple[tuple[Callable[..., object], tuple[object, ...]], ...] = (
+    (mb.survey, ([],)),
+    (mb.diagnose, ([], identity())),
+    (mb.read, ("none.csv",)),
+    (mb.load, ("none.json",)),
+    (mb.read_grid, ("none.nc",)),
+    (mb.save, (identity(), "none/x.json")),
+)
+
+
+@pytest.mark.parametrize(("function", "arguments"), ATTEMPTS)
+def test_every_error_is_a_magbridge_error(
+    function: Callable[..., object], arguments: tuple[object, ...]
+) -> None:
+    with pytest.raises(mb.MagbridgeError):
+        function(*arguments)
+
+
+def test_errors_about_a_dataset_are_magbridge_errors() -> None:
+    log = simulate(load("demo"), 3).isel(time=slice(0, 50))
+    with pytest.raises(mb.MagbridgeError, match="column 'time': expected this column"):
+        mb.correct_rows(mb.Correction(None), log.rename(time="when"))
+    with pytest.raises(mb.MagbridgeError, match="did you mean battpos"):
+        mb.observations(log, "batpos")
+    with pytest.raises(mb.MagbridgeError, match="cannot be written"):
+        mb.write(log, "none/x.nc")
+    with pytest.raises(mb.MagbridgeError, match="did you mean nominal"):
+        mb.fit(mb.observations(log), "nomnal")

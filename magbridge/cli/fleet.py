@@ -220,7 +220,7 @@ def show(
     """
     from magbridge.fleet.catalogue import open_catalogue
     from magbridge.fleet.drift import facts, history
-    from magbridge.fleet.memory import findings, fleets
+    from magbridge.fleet.memory import findings, fleets, last_maps
     from magbridge.fleet.register import vehicles
 
     there = open_catalogue(catalogue)
@@ -237,7 +237,8 @@ def show(
     if html:
         from magbridge.fleet.page import write_page, write_pages
 
-        (write_page if html.suffix == ".html" else write_pages)(found, html, findings(there))
+        write = write_page if html.suffix == ".html" else write_pages
+        write(found, html, findings(there), last_maps(there))
     facts_of = {name: facts(one) for name, one in found.items()}
     print_result({"vehicles": facts_of}, "\n".join(_lines(facts_of)), json)
 

@@ -56,6 +56,10 @@ CATALOGUE_TABLES: dict[str, dict[str, pl.DataType]] = {
         "job": TEXT, "attempt": COUNT, "verdict": TEXT, "cause": TEXT, "channel": TEXT,
         "signal_to_noise": NUMBER,
     },
+    "improvements": {
+        "job": TEXT, "attempt": COUNT, "cause": TEXT, "channel": TEXT, "ratio": NUMBER, "low": NUMBER,
+        "high": NUMBER,
+    },
     "maps": {"job": TEXT, "attempt": COUNT, "path": TEXT, "rms": NUMBER, "sigma": NUMBER},
     "done": {"job": TEXT, "attempt": COUNT, "diagnosed": pl.Boolean(), "mapped": pl.Boolean()},
     "populations": {"of": TEXT, "own": NUMBERS, "shaped": NUMBERS},
@@ -63,7 +67,13 @@ CATALOGUE_TABLES: dict[str, dict[str, pl.DataType]] = {
 }  # fmt: skip
 """Table -> columns and their types, in nT, deg and s since 1970. `calibration` is a whole cal.json,
 `precision` and `vector` what the data alone say of its coefficients (:func:`.packed`); `job` names what a
-result is made of, and its last `attempt` is the one that counts."""
+result is made of, and its last `attempt` is the one that counts. A catalogue may lack a table that is newer
+than it: it is empty."""
+PYTHON_TYPES: dict[pl.DataType, tuple[type, ...]] = {
+    TEXT: (str,), NUMBER: (float, int, type(None)), COUNT: (int,), TEXTS: (list,), NUMBERS: (list,),
+    PACKED: (bytes,), pl.Boolean(): (bool,),
+}  # fmt: skip
+"""Type of a column to those of its values; only numbers may be unknown."""
 
 
 class Catalogue(ABC):
@@ -74,7 +84,6 @@ class Catalogue(ABC):
     results: Path
     """Folder of corrected logs and maps."""
 
-    @abstractmethod
     def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:
         """Return a table's rows, each once, in the order of their keys.
 
@@ -88,10 +97,23 @@ class Catalogue(ABC):
         Raises
         ------
         FormatError
-            A file is damaged.
+            A file is damaged, or a value is not of its column's type.
         PortError
             The server does not answer.
         """
+        wanted = columns or tuple(CATALOGUE_TABLES[table])
+        found = self._rows(table, wanted)
+        for name in wanted:
+            kind = CATALOGUE_TABLES[table][name]
+            for row in found:
+                if not isinstance(row[name], PYTHON_TYPES[kind]):
+                    expected = f"table {table}: expected {kind}, got {row[name]!r}"
+                    raise FormatError(self.name, expected, column=name)
+        return found
+
+    @abstractmethod
+    def _rows(self, table: str, columns: Sequence[str]) -> list[Row]:
+        """Return the columns of a table's rows; errors as of :meth:`rows`."""
 
     def add(self, table: str, rows: Iterable[Row]) -> int:
         """Add rows, unless they are there; return how many were not.

@@ -22,7 +22,7 @@ from scipy.stats import norm
 from magbridge.arrays import FloatArray
 from magbridge.fleet.learn import Fleet, Lesson
 
-__all__ = ["Change", "History", "facts", "history"]
+__all__ = ["ALARM", "Change", "History", "facts", "history"]
 
 FIXED = "hard iron"
 ALARM = 1e-3

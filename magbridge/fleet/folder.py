@@ -52,8 +52,8 @@ class FolderCatalogue(Catalogue):
         except (msgspec.DecodeError, KeyError) as error:
             raise FormatError(mark, f'expected {{"format": {CATALOGUE_FORMAT}}}') from error
 
-    def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:  # noqa: D102  as the catalogue's
-        return self._read(table, columns or tuple(CATALOGUE_TABLES[table])).drop("key").to_dicts()
+    def _rows(self, table: str, columns: Sequence[str]) -> list[Row]:
+        return self._read(table, columns).drop("key").to_dicts()
 
     def compact(self) -> None:
         """Make one file of each table's many small ones.
@@ -96,9 +96,14 @@ class FolderCatalogue(Catalogue):
         parts = [pl.DataFrame(schema=schema)]
         for path in files:
             try:
-                parts.append(pl.read_parquet(path, columns=list(schema)))
+                part = pl.read_parquet(path, columns=list(schema))
             except pl.exceptions.PolarsError as error:
                 raise FormatError(path, f"expected a catalogue's Parquet: {error}") from error
+            for name, kind in schema.items():
+                if part.schema[name] != kind:
+                    expected = f"expected a column of {kind}, got {part.schema[name]}"
+                    raise FormatError(path, expected, column=name)
+            parts.append(part)
         return pl.concat(parts).unique(subset="key").sort("key")
 
     def _files(self, table: str) -> list[Path]:

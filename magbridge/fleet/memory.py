@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from hashlib import sha256
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
@@ -19,7 +20,7 @@ from magbridge.fleet.learn import Fleet, Lesson, learn_fleet, unpacked
 from magbridge.fleet.register import current_files, masses, vehicle_named, vehicles
 from magbridge.fleet.variances import FLEET_LEVELS, Variances
 
-__all__ = ["current", "findings", "fleet_of", "fleets", "lessons", "owner", "remember"]
+__all__ = ["current", "findings", "fleet_of", "fleets", "last_maps", "lessons", "owner", "remember"]
 
 
 class _Taught(NamedTuple):
@@ -120,13 +121,32 @@ def remember(catalogue: Catalogue) -> None:
             catalogue.add("populations", [{"of": of, "own": own, "shaped": shaped}])
 
 
-def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
-    """Return the results of each vehicle's deployments, with their names, in the order of these."""
+def last_maps(catalogue: Catalogue) -> dict[str, tuple[str, Path]]:
+    """Return the deployment and the file of each vehicle's newest anomaly map."""
     of = {job.name: job for job in jobs(catalogue)}
+    start = {row["sha256"]: row["start"] for row in catalogue.rows("logs", ["sha256", "start"])}
+    found: dict[str, tuple[float, str, Path]] = {}
+    for row in current(catalogue, "maps"):
+        job = of[row["job"]]
+        when = max((start.get(log["sha256"]) or 0.0 for log in job.files), default=0.0)
+        name = job.vehicle["vehicle"]
+        if name not in found or when > found[name][0]:
+            found[name] = when, job.deployment, catalogue.results / row["path"]
+    return {name: (deployment, path) for name, (_, deployment, path) in found.items()}
+
+
+def findings(catalogue: Catalogue) -> dict[str, list[Row]]:
+    """Return the results of each vehicle's deployments, with their names, in the order of these.
+
+    A cause has its improvement, ``ratio low high``: the RMS with it over that without, and its interval.
+    """
+    of = {job.name: job for job in jobs(catalogue)}
+    better = {(row["job"], row["cause"], row["channel"]): row for row in current(catalogue, "improvements")}
     found: dict[str, list[Row]] = {}
     for row in current(catalogue, "findings"):
         job = of[row["job"]]
-        found.setdefault(job.vehicle["vehicle"], []).append({"deployment": job.deployment, **row})
+        gain = better.get((row["job"], row["cause"], row["channel"]), {})
+        found.setdefault(job.vehicle["vehicle"], []).append({"deployment": job.deployment, **row, **gain})
     return {name: sorted(rows, key=lambda row: str(row["deployment"])) for name, rows in found.items()}
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from html import escape
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,12 +14,14 @@ from urllib.parse import quote
 import msgspec
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.dates import ConciseDateFormatter
 from matplotlib.figure import Figure
 
-from magbridge.errors import WriteError
+from magbridge.errors import MagbridgeError, WriteError
+from magbridge.field.read import read_grid
 from magbridge.files import atomic_path, new_folder
-from magbridge.fleet.drift import History, facts
+from magbridge.fleet.drift import ALARM, History, facts
 from magbridge.fleet.register import is_file_name
 from magbridge.pictures import literal
 
@@ -49,11 +52,27 @@ th {border-bottom: 1px solid var(--faint)} .changed {color: var(--changed); font
 td.words {white-space: normal; min-width: 14rem}
 .number {text-align: right; font-variant-numeric: tabular-nums}
 """
+EXPLANATION = (
+    "<p>A vehicle's magnetism is compared with the prediction from earlier deployments and its fleet. "
+    "The broad band is that prediction (2 sigma); for a first deployment, the fleet's. The dot is the "
+    "estimate with the deployment's own runs, its bar 2 sigma. A dotted line is a refit. "
+    f"<span class=changed>Red</span>: the runs moved the coefficient farther than chance does once in "
+    f"{1.0 / ALARM:,.0f} deployments. Of many coefficients, some lie outside their bands by chance.</p>"
+)
+"""The sentences above the charts."""
+MAX_BAND_RATIO = 6.0
+"""Largest width of a band over the range of the estimates at which the whole band is drawn."""
+UNCHANGED = "No coefficient moved farther than by chance."
+FIRST_ONLY = "One deployment: nothing to compare with."
+Maps = Mapping[str, tuple[str, Path]]
+"""Vehicle -> deployment and file of its last anomaly map."""
 Findings = Mapping[str, Sequence[Mapping[str, Any]]]
 """Vehicle -> rows of the findings in its deployments."""
 
 
-def write_pages(histories: Mapping[str, History], folder: Path, findings: Findings) -> None:
+def write_pages(
+    histories: Mapping[str, History], folder: Path, findings: Findings, maps: Maps | None = None
+) -> None:
     """Write index.html of a fleet, VEHICLE.html of each, and all numbers as fleet.json.
 
     Parameters
@@ -63,7 +82,9 @@ def write_pages(histories: Mapping[str, History], folder: Path, findings: Findin
     folder : path
         Where to; made where it is not there.
     findings : mapping
-        Of the vehicles whose deployments were diagnosed: deployment, verdict, cause, channel.
+        Of the vehicles whose deployments were diagnosed: deployment, verdict, cause, channel, improvement.
+    maps : mapping, optional
+        Deployment and file of each vehicle's last anomaly map.
 
     Raises
     ------
@@ -81,16 +102,20 @@ def write_pages(histories: Mapping[str, History], folder: Path, findings: Findin
             temporary.write_bytes(msgspec.json.encode(numbers))
         for name, one in histories.items():
             back = '<p><a href="index.html">Fleet</a></p>'
-            _write(folder / f"{name}.html", name, [back, *_vehicle(name, one, findings.get(name, ()), "h1")])
+            last = (maps or {}).get(name)
+            body = [back, *_vehicle(name, one, findings.get(name, ()), "h1"), *_survey(last)]
+            _write(folder / f"{name}.html", name, body)
         links = {name: quote(f"{name}.html") for name in histories}
         _write(folder / "index.html", "Fleet", ["<h1>Fleet</h1>", *_overview(histories, links)])
 
 
-def write_page(histories: Mapping[str, History], path: Path, findings: Findings) -> None:
+def write_page(
+    histories: Mapping[str, History], path: Path, findings: Findings, maps: Maps | None = None
+) -> None:
     """Write the same as one page; parameters and errors as of :func:`write_pages`."""
     body = ["<h1>Fleet</h1>", *_overview(histories, {name: f"#{quote(name)}" for name in histories})]
     for name, one in histories.items():
-        body += _vehicle(name, one, findings.get(name, ()), "h2")
+        body += [*_vehicle(name, one, findings.get(name, ()), "h2"), *_survey((maps or {}).get(name))]
     _write(path, "Fleet", body)
 
 
@@ -110,11 +135,7 @@ def _table(headings: str, rows: Sequence[str]) -> str:
 
 
 def _overview(histories: Mapping[str, History], links: Mapping[str, str]) -> Iterator[str]:
-    yield (
-        "<p>A vehicle's magnetism is compared with the prediction from earlier deployments and its fleet. "
-        "The broad band is that expectation (2 sigma), the dot what the deployment's own runs made of it, a "
-        "dotted line a refit; <span class=changed>red</span> left its band.</p>"
-    )
+    yield EXPLANATION
     rows = []
     for name, one in histories.items():
         evidence = "; ".join(f"{_day(when)} {escape(', '.join(what))}" for when, what in _changed(one)[-2:])
@@ -141,6 +162,8 @@ def _vehicle(name: str, one: History, found: Sequence[Mapping[str, Any]], headin
     if not one.lessons:
         yield "<p>No deployment has been calibrated.</p>"
         return
+    if heading == "h1":
+        yield EXPLANATION
     rows = [
         f"<tr><td>{_day(lesson.time)}</td><td>{escape(lesson.deployment)}</td><td>{escape(lesson.refit)}</td>"
         f"<td class=changed>{escape(change.what)}</td><td class=number>{change.by:+.0f} nT</td>"
@@ -151,16 +174,51 @@ def _vehicle(name: str, one: History, found: Sequence[Mapping[str, Any]], headin
     yield (
         _table("date, deployment, refit, what moved, by, sigmas, as if by", rows)
         if rows
-        else "<p>Nothing left its band.</p>"
+        else f"<p>{UNCHANGED if len(one.lessons) > 1 else FIRST_ONLY}</p>"
     )
     yield f"<div class=panels>{''.join(_panel(one, k) for k in range(len(one.names)))}</div>"
     if found:
-        yield _table("deployment, verdict, cause, follows", [_found(row) for row in found])
+        rows = [_found(row) for row in found]
+        yield _table("deployment, verdict, cause, RMS with its correction, follows", rows)
 
 
 def _found(row: Mapping[str, Any]) -> str:
-    words = (str(row[key] or "").replace("_", " ") for key in ("deployment", "verdict", "cause", "channel"))
-    return f"<tr>{''.join(f'<td>{escape(word)}</td>' for word in words)}</tr>"
+    words = {
+        key: str(row[key] or "").replace("_", " ") for key in ("deployment", "verdict", "cause", "channel")
+    }
+    gain = ""
+    if row.get("ratio") is not None:
+        gain = f"{row['ratio']:.2f} times ({row['low']:.2f} to {row['high']:.2f})"
+        gain += ", no improvement is shown" * (row["high"] >= 1.0)
+    cells = words["deployment"], words["verdict"], words["cause"], gain, words["channel"]
+    return f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in cells)}</tr>"
+
+
+def _survey(last: tuple[str, Path] | None) -> Iterator[str]:
+    """Yield the picture of a vehicle's last anomaly map; nothing where its file cannot be read."""
+    if last is None:
+        return
+    deployment, path = last
+    try:
+        grid = read_grid(path)
+    except MagbridgeError:
+        return
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    ax = figure.subplots()
+    limit = float(np.nanquantile(np.abs(grid.anomaly), 0.98)) or 1.0
+    drawn = ax.pcolormesh(
+        grid.longitude, grid.latitude, grid.anomaly, cmap="RdBu_r", vmin=-limit, vmax=limit, rasterized=True
+    )
+    figure.colorbar(drawn, label="anomaly, nT")
+    ax.set_aspect(1.0 / np.cos(np.radians(float(np.mean(grid.latitude)))))
+    ax.set_xlabel("longitude, deg")
+    ax.set_ylabel("latitude, deg")
+    ax.ticklabel_format(useOffset=False)
+    picture = BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    source = f"data:image/png;base64,{b64encode(picture.getvalue()).decode()}"
+    label = escape(f"Anomaly map of deployment {deployment}")
+    yield f'<h3>{label}</h3><img alt="{label}" src="{source}" style="max-width:100%">'
 
 
 def _panel(one: History, k: int) -> str:
@@ -181,6 +239,7 @@ def _panel(one: History, k: int) -> str:
             if before.refit != after.refit:
                 middle = datetime.fromtimestamp((before.time + after.time) / 2.0, UTC)
                 ax.axvline(middle, color=REFIT, lw=0.8, ls=":")  # type: ignore[arg-type]
+        _limit(ax, one, k, later)
         ax.set_title(f"{one.names[k]}, nT", fontsize=9, loc="left")
         aside = max(0.08 * (when[-1] - when[0]), timedelta(days=10))  # one deployment alone has no span
         ax.set_xlim(when[0] - aside, when[-1] + aside)
@@ -193,6 +252,18 @@ def _panel(one: History, k: int) -> str:
     for stand_in, colour in PAGE_COLOURS.items():
         text = text.replace(stand_in, colour)
     return text[text.index("<svg") :]
+
+
+def _limit(ax: Axes, one: History, k: int, later: slice) -> None:
+    """Set the vertical axis by the estimates where a band is far wider, and state that band."""
+    low = float((one.found[:, k] - 2.0 * one.found_sigma[:, k]).min())
+    high = float((one.found[:, k] + 2.0 * one.found_sigma[:, k]).max())
+    half = float(2.0 * one.expected_sigma[later, k].max())
+    if 2.0 * half <= MAX_BAND_RATIO * (high - low):
+        return
+    ax.set_ylim(low - (high - low), high + (high - low))
+    note = f"expected {one.expected[later, k][-1]:,.0f} ± {half:,.0f}"
+    ax.text(0.98, 0.04, note, transform=ax.transAxes, ha="right", fontsize=7, color=INK)
 
 
 def _day(time: float) -> str:

@@ -54,16 +54,28 @@ class PostgresCatalogue(Catalogue):
             found = connection.execute("select max(format) from magbridge_fleet.catalogue").fetchone()
         self._check_format(found[0] if found else 0)
 
-    def rows(self, table: str, columns: Sequence[str] = ()) -> list[Row]:  # noqa: D102  as the catalogue's
+    def _rows(self, table: str, columns: Sequence[str]) -> list[Row]:
         query = sql.SQL('select {} from {}.{} order by key collate "C"').format(
-            sql.SQL(", ").join(map(sql.Identifier, columns or CATALOGUE_TABLES[table])),
+            sql.SQL(", ").join(map(sql.Identifier, columns)),
             SCHEMA,
             sql.Identifier(table),
         )
-        with self._connected() as connection, connection.cursor(row_factory=dict_row, binary=True) as cursor:
-            return cursor.execute(query).fetchall()
+        try:
+            with (
+                self._connected() as connection,
+                connection.cursor(row_factory=dict_row, binary=True) as cursor,
+            ):
+                return cursor.execute(query).fetchall()
+        except PortError as error:
+            if isinstance(error.__cause__, psycopg.errors.UndefinedTable):  # it is newer than the catalogue
+                return []
+            raise
 
     def _insert(self, table: str, keyed: Mapping[str, Row]) -> int:
+        with self._connected() as connection:
+            known = connection.execute("select to_regclass(%s)", (f"magbridge_fleet.{table}",)).fetchone()
+            if known is None or known[0] is None:
+                self._make(connection)
         names = ("key", *CATALOGUE_TABLES[table])
         query = sql.SQL("insert into {}.{} ({}) values ({}) on conflict (key) do nothing").format(
             SCHEMA,

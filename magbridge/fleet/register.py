@@ -94,8 +94,14 @@ def vehicles(catalogue: Catalogue) -> dict[str, Row]:
 
 
 def masses(row: Row) -> dict[str, Mounting]:
-    """Return where a vehicle's masses sit, by the columns that move them."""
-    return msgspec.json.decode(row["mass"], type=dict[str, Mounting])
+    """Return where a vehicle's masses sit, by the columns that move them.
+
+    FormatError: the catalogue's text does not say so.
+    """
+    try:
+        return msgspec.json.decode(row["mass"], type=dict[str, Mounting])
+    except msgspec.DecodeError as error:
+        raise FormatError(f"vehicle {row['vehicle']}", f"mass: expected places of masses: {error}") from error
 
 
 def vehicle_named(catalogue: Catalogue, name: str) -> Row:

@@ -7,7 +7,6 @@ file that is gone or has changed, a full disk) is reported, not recorded, and th
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -106,7 +105,7 @@ def _deployment(job: Job, results: Path, tables: dict[str, list[Row]]) -> None:
             {**row, "sha256": sha, "path": path.relative_to(results).as_posix()}
         )
     if job.diagnose:
-        tables["findings"] = list(_findings(job, together, found.calibration))
+        tables["findings"], tables["improvements"] = _findings(job, together, found.calibration)
     if job.map:
         path = folder / f"map-{job.name[:8]}.nc"
         row = _map(job, list(logs.values()), found.calibration, path)
@@ -173,17 +172,19 @@ def _correct(job: Job, calibration: Calibration, log: xr.Dataset, path: Path) ->
     }  # fmt: skip
 
 
-def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> Iterator[Row]:
-    """Yield a row for each cause found, or one that says that there is none."""
+def _findings(job: Job, log: xr.Dataset, calibration: Calibration) -> tuple[list[Row], list[Row]]:
+    """Return a row for each cause found, or one that says that there is none; and their improvements."""
     found = diagnose([log], calibration, training_logs=[log]).diagnosis
     nothing: Row = {**job.mark, "verdict": found.verdict}
     if not found.findings:
-        yield {**nothing, "cause": "", "channel": "", "signal_to_noise": None}
+        return [{**nothing, "cause": "", "channel": "", "signal_to_noise": None}], []
+    rows, improvements = [], []
     for one in found.findings:
-        yield {
-            **nothing, "cause": one.candidate.cause, "channel": one.candidate.channel or "",
-            "signal_to_noise": one.signal_to_noise,
-        }  # fmt: skip
+        name = {"cause": one.candidate.cause, "channel": one.candidate.channel or ""}
+        rows.append({**nothing, **name, "signal_to_noise": one.signal_to_noise})
+        low, high = one.improvement.interval
+        improvements.append({**job.mark, **name, "ratio": one.improvement.ratio, "low": low, "high": high})
+    return rows, improvements
 
 
 def _map(job: Job, logs: list[xr.Dataset], calibration: Calibration, path: Path) -> Row:

@@ -31,7 +31,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.learning.estimator import LENGTH, STATES, Nuisance
 
-__all__ = ["BEYOND_CHANCE", "CANDIDATE", "FIRST", "PUBLISHED", "Coverage", "Judge"]
+__all__ = ["BEYOND_CHANCE", "CANDIDATE", "FIRST", "JUDGE_MEMORY_SAMPLES", "PUBLISHED", "Coverage", "Judge"]
 
 FIRST, PUBLISHED, CANDIDATE = range(3)
 BEYOND_CHANCE: Final = 13.5

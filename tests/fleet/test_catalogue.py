@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import polars as pl
 import pytest
 from fleets import fly
 
 from magbridge.calibration.fitting.mounted_masses import Mounting
+from magbridge.cli import main
 from magbridge.errors import ConfigError, FormatError, WriteError, WrongUse
 from magbridge.fleet import folder as room
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
@@ -157,3 +159,34 @@ def test_a_fleet_toml_names_what_is_wrong(tmp_path: Path) -> None:
     path.write_text("[vehicle.comet.mass.battpos]\nat = [-0.5, 0.0]\ntravel = [0.0254, 0.0, 0.0]\n")
     with pytest.raises(ConfigError, match=r"vehicle\.comet\.mass.*\.at: expected `array` of length 3"):
         read_fleet(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "words"),
+    [
+        ("version", "first", pl.String, "column 'version': expected a column of Int64, got String"),
+        ("version", None, pl.Int64, "column 'version': table vehicles: expected Int64, got None"),
+        ("mass", "nonsense", pl.String, "vehicle comet: mass: expected places of masses"),
+    ],
+)
+def test_a_damaged_or_foreign_catalogue_is_one_line(
+    name: str,
+    value: object,
+    kind: type[pl.DataType],
+    words: str,
+    empty: Catalogue,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    add_vehicle(empty, "comet", Vehicle(parameters=("battpos",)))
+    (path,) = (tmp_path / "fleet" / "vehicles").glob("*.parquet")
+    table = pl.read_parquet(path)
+    table.with_columns(pl.lit(value, dtype=kind()).alias(name)).write_parquet(path)
+    for command in ("status", "show", "process"):
+        code = main(["fleet", command, "--catalogue", str(tmp_path / "fleet")])
+        err = capsys.readouterr().err
+        assert "Traceback" not in err
+        assert code in {0, 1}
+        assert all(text.startswith("magbridge: ") for text in err.splitlines())
+    with pytest.raises(FormatError, match=words):
+        list(map(masses, vehicles(empty).values()))

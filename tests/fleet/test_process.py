@@ -13,6 +13,7 @@ from fleets import catalogue_of, content, fly
 from magbridge.calibration.file import decode_calibration, load
 from magbridge.cli import main
 from magbridge.errors import WriteError
+from magbridge.field.grid import AnomalyGrid
 from magbridge.fleet.folder import FolderCatalogue as Catalogue
 from magbridge.fleet.job import jobs, new_jobs
 from magbridge.fleet.memory import current, lessons
@@ -184,6 +185,19 @@ def test_a_change_is_dated_and_reported(
         "changes"
     ]
     assert change["what"] == "hard iron, y"
+    # a finding with its improvement, and the last map
+    job, grid = jobs(catalogue)[-1], tmp_path / "results" / "map.nc"
+    axes = np.linspace(10.0, 10.01, 8), np.linspace(48.0, 48.01, 9)
+    AnomalyGrid(*axes, np.add.outer(np.arange(9.0), np.arange(8.0)), 5.0, 0.0).save(grid)
+    cause = {**job.mark, "cause": "temperature_offset", "channel": "sensor_temperature"}
+    catalogue.add("findings", [{**cause, "verdict": "explained", "signal_to_noise": 9.0}])
+    catalogue.add("improvements", [{**cause, "ratio": 0.42, "low": 0.37, "high": 0.49}])
+    catalogue.add("maps", [{**job.mark, "path": str(grid), "rms": 1.0, "sigma": 2.0}])
+    assert main(["fleet", "show", "--catalogue", place, "--html", str(page)]) == 0
+    text = page.read_text()
+    assert "<td>temperature offset</td><td>0.42 times (0.37 to 0.49)</td>" in text
+    assert 'alt="Anomaly map of deployment d4" src="data:image/png;base64,' in text
+    assert "Of many coefficients, some lie outside their bands by chance." in text
 
 
 def test_a_calibration_starts_from_its_fleet(
