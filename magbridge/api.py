@@ -130,7 +130,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
 def diagnose(deployments: Sequence[xr.Dataset], calibration: Calibration, **options: Any) -> DiagnosisResult:
     """Find what the model gets wrong in these logs; :func:`magbridge.diagnose.run.diagnose`.
 
-    WrongUse: there is no log.
+    WrongUse: the sequence is empty.
     """
     from magbridge.diagnose import run  # noqa: PLC0415 - scipy only where it is used
 
@@ -167,7 +167,7 @@ def survey(deployments: Sequence[xr.Dataset], *calibrations: Calibration) -> Res
     Raises
     ------
     WrongUse
-        There is no log.
+        The sequence is empty.
     """
     from magbridge.survey import run  # noqa: PLC0415 - scipy only where it is used
 

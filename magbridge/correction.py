@@ -13,7 +13,7 @@ from typing import Any
 
 from magbridge.align import Aligner, Sample
 from magbridge.calibration.corrector import Corrector
-from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Condition, identity
+from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
 from magbridge.filter_lag import FilterLag
@@ -316,7 +316,7 @@ class Correction:
         return more
 
 
-def _unmodelled_conditions(calibration: Calibration) -> dict[str, tuple[Condition, float]]:
+def _unmodelled_conditions(calibration: Calibration) -> dict[str, tuple[CalibratedRange, float]]:
     """Return the conditions that no parameter and no effect follows, each with its value: not known yet."""
     modelled = calibration.channels
     return {one.name: (one, nan) for one in calibration.conditions if one.name not in modelled}

@@ -19,7 +19,7 @@ BAR_INTERVAL_S = 0.1
 
 
 LINE_INTERVAL_S = 10.0
-"""s between two lines where there is no terminal."""
+"""s between two lines if stderr is not a terminal."""
 
 
 def track(items: Iterable[T], what: str, total: int | None = None, *, in_lines: bool = False) -> Iterator[T]:

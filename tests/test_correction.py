@@ -12,7 +12,7 @@ import xarray as xr
 from magbridge.calibration.file import decode_calibration, encode_calibration
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration, Condition, Noise, Parameter, Reference
+from magbridge.calibration.model import CalibratedRange, Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.config import Align
 from magbridge.correction import Correction
@@ -106,7 +106,7 @@ def test_the_temperature_may_be_in_rows_of_another_log() -> None:
 def test_sigma_grows_with_the_depth_beyond_the_calibrated_range(
     calibration: Calibration, depth: float, factor: float
 ) -> None:
-    seen = replace(calibration, conditions=(Condition("depth", 0.0, 181.0),))
+    seen = replace(calibration, conditions=(CalibratedRange("depth", 0.0, 181.0),))
     correction = Correction(decode_calibration(encode_calibration(seen)))
     correction.telemetry("battpos", 0.2, START)
     _, corrected = correction.reading(Reading(FIELD), START, depth=depth)
@@ -119,7 +119,7 @@ def test_sigma_grows_with_the_temperature_outside_the_calibrated_range(
     calibration: Calibration, temperature: float
 ) -> None:
     """One temperature of calibration holds for 2 degC either way, and an effect takes the range's place."""
-    seen = replace(calibration, conditions=(Condition("sensor_temperature", 15.0, 15.0),))
+    seen = replace(calibration, conditions=(CalibratedRange("sensor_temperature", 15.0, 15.0),))
     followed = replace(follows("sensor_temperature", "degC"), conditions=seen.conditions)
     sigma = []
     for one in (seen, followed):

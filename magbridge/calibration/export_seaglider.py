@@ -97,14 +97,14 @@ def heading_cost(calibration: Calibration, dip_deg: float) -> list[HeadingCost]:
     R = rotation(calibration)
     costs = []
     for k in range(-1, len(ends) if len(ends) > 1 else 0):
-        moved = list(product(*ends)) if k < 0 else [_with(centre, k, end) for end in ends[k]]
+        moved = list(product(*ends)) if k < 0 else [_moved_mass(centre, k, end) for end in ends[k]]
         errors = np.concatenate([_errors(calibration, R, np.array(one), dip_deg) for one in moved])
         name = calibration.parameters[k].name if k >= 0 else ""
         costs.append(HeadingCost(name, float(np.sqrt(np.mean(errors**2))), float(np.abs(errors).max())))
     return costs if ends else []
 
 
-def _with(centre: FloatArray, k: int, value: float) -> FloatArray:
+def _moved_mass(centre: FloatArray, k: int, value: float) -> FloatArray:
     positions = centre.copy()
     positions[k] = value
     return positions
@@ -154,6 +154,6 @@ def position_table(calibration: Calibration, parameter: str) -> str:
     header += [f"matrix_{row}{column}" for row in axes for column in axes]
     lines = [",".join(header)]
     for position in np.linspace(one.low, one.high, TABLE_POSITIONS):
-        A, T = matrix_and_offset(calibration, _with(middle(calibration), k, position))
+        A, T = matrix_and_offset(calibration, _moved_mass(middle(calibration), k, position))
         lines.append(",".join(f"{value:.9g}" for value in (position, *T, *(R @ A).ravel())))
     return "\n".join(lines) + "\n"

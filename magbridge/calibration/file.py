@@ -17,8 +17,8 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.model import (
     MIN_HALF_RANGE,
     Boresight,
+    CalibratedRange,
     Calibration,
-    Condition,
     Noise,
     Parameter,
     Reference,
@@ -71,7 +71,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     doubts: tuple[str, ...] = ()
     level: tuple[float, ...] = ()
     sensors: tuple[ScalarSensor, ...] = ()
-    conditions: tuple[Condition, ...] = ()
+    conditions: tuple[CalibratedRange, ...] = ()
 
 
 class _Version(msgspec.Struct):

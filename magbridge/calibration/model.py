@@ -37,8 +37,18 @@ from magbridge.estimation.residual import PAIRS, symmetric
 from magbridge.wording import counted
 
 __all__ = [
-    "LEVEL_STEP_SIGMA", "MIN_HALF_RANGE", "Boresight", "Calibration", "Condition", "Noise", "Parameter",
-    "Reference", "Run", "Sensor", "coefficient_tensor", "identity",
+    "LEVEL_STEP_SIGMA",
+    "MIN_HALF_RANGE",
+    "Boresight",
+    "CalibratedRange",
+    "Calibration",
+    "Noise",
+    "Parameter",
+    "Reference",
+    "Run",
+    "Sensor",
+    "coefficient_tensor",
+    "identity",
 ]  # fmt: skip
 
 SLOT = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
@@ -235,7 +245,7 @@ MIN_HALF_RANGE = {"depth": 10.0, "sensor_temperature": 2.0}
 at one temperature, holds for this much more."""
 
 
-class Condition(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class CalibratedRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The range of a condition in the data of a fit that does not model its effect: depth, temperature."""
 
     name: str
@@ -289,7 +299,7 @@ class Calibration:
     where that was known."""
     sensors: tuple[ScalarSensor, ...] = ()
     """Scalar magnetometers beside the vector sensor."""
-    conditions: tuple[Condition, ...] = ()
+    conditions: tuple[CalibratedRange, ...] = ()
     """Ranges of depth and temperature in the data that it was fitted to."""
 
     def __post_init__(self) -> None:

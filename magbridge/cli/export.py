@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 
-NT_PER_COUNT = 100.0
+SEAGLIDER_COUNT_NT = 100.0
 """nT in a count of most of a Seaglider's compasses."""
 
 
@@ -29,7 +29,9 @@ def export(
     px4: Annotated[Path | None, Parameter(validator=file_to_write(".params"))] = None,
     number: Annotated[Whole, Parameter(validator=validators.Number(gte=0, lte=3))] = 0,
     seaglider: Annotated[Path | None, Parameter(validator=file_to_write(".cal"))] = None,
-    nt_per_count: Annotated[float, Parameter(validator=validators.Number(gt=0, lte=1e5))] = NT_PER_COUNT,
+    nt_per_count: Annotated[
+        float, Parameter(validator=validators.Number(gt=0, lte=1e5))
+    ] = SEAGLIDER_COUNT_NT,
     table: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
     parameter: str = "",
     dip: Annotated[float, Parameter(validator=validators.Number(gt=-90, lt=90))] = 60.0,

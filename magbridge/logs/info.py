@@ -44,11 +44,11 @@ INFO_GAP_INTERVALS = 2.5
 """A pause longer than this many sampling intervals is a gap."""
 ABOVE = 2.0
 """m above the surface, from which on a vehicle that has a depth at all is hardly there."""
-FOLLOWED = "sensor_temperature", "depth"
+CONDITION_COLUMNS = "sensor_temperature", "depth"
 """Columns with a meaning of their own that a fit may follow."""
-CONDITIONS = {"degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar"}
+CONDITION_UNITS = {"degC", "K", "Pa", "hPa", "kPa", "mbar", "bar", "dbar"}
 """Units of temperatures and pressures."""
-STATES = {*(*CONDITIONS, "inHg", "V", "s", "m", "m/s", "nT", "arcmin")}
+STATES = {*(*CONDITION_UNITS, "inHg", "V", "s", "m", "m/s", "nT", "arcmin")}
 """Units of what a vehicle is in, or drifts by: temperatures, pressures, voltages, speeds."""
 
 
@@ -132,8 +132,10 @@ def movers(log: xr.Dataset) -> list[str]:
 
 def conditions(log: xr.Dataset) -> list[str]:
     """Return the columns of temperatures and pressures, which may move the field: those that vary."""
-    reckoned = [name for name in FOLLOWED if name in log and float(np.ptp(_known(log, name))) > 0.0]
-    return reckoned + [name for name in telemetry(log) if log[name].attrs.get("units", "1") in CONDITIONS]
+    reckoned = [name for name in CONDITION_COLUMNS if name in log and float(np.ptp(_known(log, name))) > 0.0]
+    return reckoned + [
+        name for name in telemetry(log) if log[name].attrs.get("units", "1") in CONDITION_UNITS
+    ]
 
 
 def _known(log: xr.Dataset, name: str) -> FloatArray:

@@ -9,7 +9,7 @@ __all__ = ["MAX_ALARMS", "Alarm", "AlarmGroup", "Alarms", "cause_of"]
 
 MAX_ALARMS = 100
 """Alarms that are kept at most; the oldest go first."""
-CAUSES = {
+ALARM_CAUSES = {
     "sensor": ("Sensor", "gap", "saturated", "offset_suspect", "lost:", "sensor"),
     "autopilot": ("Autopilot", "stale_telemetry", "link", "autopilot"),
     "log": ("Log", "log"),
@@ -22,10 +22,10 @@ CAUSES = {
 
 
 def cause_of(key: str) -> str:
-    """Return the cause of an alarm: a key of :data:`CAUSES`, or a text's words before the colon."""
+    """Return the cause of an alarm: a key of :data:`ALARM_CAUSES`, or a text's words before the colon."""
     kind, colon, text = key.partition(": ")
     words = text.split() if colon and kind == "text" else [key]
-    for cause, names in CAUSES.items():
+    for cause, names in ALARM_CAUSES.items():
         if any(word in names or word.rstrip(":") in names for word in words):
             return cause
     return text.partition(":")[0] if colon else key

@@ -191,7 +191,7 @@ def learned_worth(learning: dict[str, Any]) -> tuple[str, bool]:
         f"one: {ratio:.2f} times (95 %: {low:.2f} to {high:.2f}, over {count} samples)."
     )
     if learning.get("better", 0.0) < 0.0:
-        return f"{text} The last samples speak for the first calibration.", False
+        return f"{text} The last samples favour the first calibration.", False
     if high >= 1.0:
         return f"{text} It is not shown to be better.", False
     return text, True

@@ -80,7 +80,7 @@ def test_alarms_of_one_cause_are_one_group() -> None:
     [
         (12.0, 3.0, 2000, 20.0, "12.00 nT ...: 0.25 times (95 %: 0.23 to 0.27, over 500", True),
         (10.0, 9.8, 100, 1.0, "0.98 times (95 %: 0.81 to 1.19, over 100 samples). It is not shown", False),
-        (10.0, 5.0, 2000, -3.0, "speak for the first calibration", False),
+        (10.0, 5.0, 2000, -3.0, "favour the first calibration", False),
         (0.0, 0.0, 0, 0.0, "not known yet", False),
     ],
 )

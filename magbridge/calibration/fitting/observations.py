@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import BoolArray, FloatArray
-from magbridge.calibration.model import Calibration, Condition, Parameter
+from magbridge.calibration.model import CalibratedRange, Calibration, Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import Samples
@@ -161,7 +161,7 @@ class Observations:
             steps[1:][near] = np.maximum(np.rint(apart[near] / np.median(apart)), 1.0)
         return steps
 
-    def conditions(self) -> tuple[Condition, ...]:
+    def conditions(self) -> tuple[CalibratedRange, ...]:
         """Return the ranges of depth and temperature, as far as they are known."""
         found = []
         for name, values in (("depth", self.depth), (TEMPERATURE, self.temperature)):
@@ -170,7 +170,7 @@ class Observations:
                 known = np.maximum(known, 0.0)  # above the surface the pressure does not change enough
             if known.size:
                 low, high = np.quantile(known, [RARE, 1.0 - RARE]).tolist()
-                found.append(Condition(name, low, high))
+                found.append(CalibratedRange(name, low, high))
         return tuple(found)
 
     def ranges(self) -> tuple[Parameter, ...]:
