@@ -31,7 +31,7 @@ Baudrate = Annotated[int, Meta(gt=0, le=20_000_000)]
 """Bounded: what does not fit 32 bits is refused only when the port is opened."""
 
 
-MAX_SENSORS = 4
+MAX_BRIDGE_SENSORS = 4
 """Sensors of a bridge at most: the log numbers their ports."""
 
 
@@ -53,7 +53,7 @@ class Sensor(Table, frozen=True):
     """The driver's own settings."""
     name: Annotated[str, Meta(max_length=16, pattern=r"^\w*$")] = ""
     """NAME of ``[sensor.NAME]``: what messages and the log call the sensor; not a key of the file."""
-    id: Annotated[int, Meta(ge=0, lt=MAX_SENSORS)] | None = None
+    id: Annotated[int, Meta(ge=0, lt=MAX_BRIDGE_SENSORS)] | None = None
     """``sensor_id`` in all messages; by default the sensors are numbered from 0 in the order of the file.
     Sensor 0 is the main sensor: heading, learning and navigation use it."""
     calibration: Name | None = None
@@ -357,8 +357,10 @@ def _named_sensors(sensor: Any) -> dict[str, Any]:
 
 def _numbered(sensors: list[Sensor], path: Path) -> list[Sensor]:
     """Return the sensors by id, each with its own; ConfigError: too many, or ids or names that clash."""
-    if len(sensors) > MAX_SENSORS:
-        raise ConfigError(path, "sensor", f"expected at most {MAX_SENSORS} sensors, got {len(sensors)}")
+    if len(sensors) > MAX_BRIDGE_SENSORS:
+        raise ConfigError(
+            path, "sensor", f"expected at most {MAX_BRIDGE_SENSORS} sensors, got {len(sensors)}"
+        )
     names = [one.name for one in sensors]
     if len(set(names)) < len(names):
         raise ConfigError(
@@ -367,7 +369,7 @@ def _numbered(sensors: list[Sensor], path: Path) -> list[Sensor]:
     ids = [one.id for one in sensors if one.id is not None]
     if len(set(ids)) < len(ids):
         raise ConfigError(path, "sensor", f"expected a different id for each sensor, got {ids}")
-    free = iter(sorted(set(range(MAX_SENSORS)) - set(ids)))
+    free = iter(sorted(set(range(MAX_BRIDGE_SENSORS)) - set(ids)))
     numbered = [msgspec.structs.replace(one, id=next(free) if one.id is None else one.id) for one in sensors]
     numbered.sort(key=lambda one: one.id or 0)
     if numbered[0].id != 0:

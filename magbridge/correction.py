@@ -16,7 +16,7 @@ from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, CalibratedRange, Calibration, identity
 from magbridge.config import Align
 from magbridge.field.nearby import HeldField
-from magbridge.filter_lag import FilterLag
+from magbridge.filter_lag import LagCorrection
 from magbridge.health import DirectionCheck, HealthMonitor, Messages
 from magbridge.health.consistency import MASS_FRACTION
 from magbridge.learning import Learner
@@ -88,7 +88,7 @@ class Correction:
         self._conditions = _unmodelled_conditions(calibration)
         self.stated_sigma = nan
         cutoff_hz = calibration.sensor.filter_cutoff
-        self._filter_lag = FilterLag(cutoff_hz) if cutoff_hz else None
+        self._filter_lag = LagCorrection(cutoff_hz) if cutoff_hz else None
 
     @property
     def calibration(self) -> Calibration:

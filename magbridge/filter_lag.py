@@ -24,19 +24,19 @@ from typing import Final
 
 from magbridge.records import Vector
 
-__all__ = ["FilterLag"]
+__all__ = ["LagCorrection"]
 
 SPAN_TIME_CONSTANTS: Final = 4.0
 """Time constants that the parabola spans: over shorter spans the derivative would be noise."""
 BLOCKS: Final = 12
 """Blocks of samples in that span."""
-MIN_BLOCKS: Final = 3
+MIN_PARABOLA_BLOCKS: Final = 3
 """Blocks of a parabola, also where one sample lasts longer than a block."""
 MAX_INTERVAL_RATIO: Final = 10.0
 """Interval over the one before it, beyond which it is a gap: no derivative is taken across it."""
 
 
-class FilterLag:
+class LagCorrection:
     """Undo the lag of a first-order filter.
 
     Parameters
@@ -114,7 +114,7 @@ class FilterLag:
         else:
             blocks.append([1.0, time_s, *field, time_s])
         span_s = SPAN_TIME_CONSTANTS * self.time_constant
-        while len(blocks) > MIN_BLOCKS and time_s - blocks[0][5] > span_s:
+        while len(blocks) > MIN_PARABOLA_BLOCKS and time_s - blocks[0][5] > span_s:
             blocks.popleft()
 
     def _derivative(self) -> Vector:

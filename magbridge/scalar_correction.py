@@ -32,7 +32,7 @@ from magbridge.track import Input
 
 __all__ = ["CorrectedReading", "ScalarCorrection"]
 
-MAX_AGE_S = 30.0
+MAX_TELEMETRY_AGE_S = 30.0
 """s after which telemetry is stale, unless the configuration sets another age."""
 MAX_WAIT_US = 3_000_000
 """µs that a reading waits for the next one and for the vector; then it is published without a field."""
@@ -86,7 +86,9 @@ class ScalarCorrection:
     def __init__(self, sensor: ScalarSensor | None, settings: Align, sigma: float | None = None) -> None:
         self._sensor = sensor
         channels = sensor.channels if sensor is not None else ()
-        inputs = tuple(Input(one.name, one.low, one.high, MAX_AGE_S, is_mass=False) for one in channels)
+        inputs = tuple(
+            Input(one.name, one.low, one.high, MAX_TELEMETRY_AGE_S, is_mass=False) for one in channels
+        )
         self.aligner = Aligner(inputs, settings)
         self._messages = Messages()
         self.notices = self._messages.lines

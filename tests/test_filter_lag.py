@@ -13,7 +13,7 @@ from magbridge.calibration.model import Noise, Sensor, identity
 from magbridge.config import Align
 from magbridge.correction import Correction
 from magbridge.errors import CalibrationError
-from magbridge.filter_lag import FilterLag
+from magbridge.filter_lag import LagCorrection
 from magbridge.records import Reading
 
 CUTOFF_HZ, HORIZONTAL_NT = 0.33, 18_000.0
@@ -45,7 +45,7 @@ def heading_error(field: np.ndarray, true: np.ndarray) -> float:
 @pytest.mark.parametrize("step_s", [4.0, 1.0, 0.1, 0.02])
 def test_the_lag_of_a_turn_is_undone_and_the_length_stays(step_s: float) -> None:
     time, true, measured = turning(step_s, 1.0)
-    lag = FilterLag(CUTOFF_HZ)
+    lag = LagCorrection(CUTOFF_HZ)
     found, variance = [], []
     for seconds, field in zip(time.tolist(), measured.tolist(), strict=True):
         found.append(lag.undo(round(seconds * 1e6), tuple(field)))
@@ -58,7 +58,7 @@ def test_the_lag_of_a_turn_is_undone_and_the_length_stays(step_s: float) -> None
 
 def test_an_abrupt_change_is_no_turn_but_makes_the_vector_uncertain() -> None:
     """Eight time constants after a step nothing of it is left in the filter; the slope says otherwise."""
-    lag = FilterLag(CUTOFF_HZ)
+    lag = LagCorrection(CUTOFF_HZ)
     before, after = (20_000.0, 0.0, 40_000.0), (0.0, 20_000.0, 40_000.0)
     for k, field in enumerate([before] * 5 + [after] * 5):
         assert lag.undo(4_000_000 * k, field) == pytest.approx(field, abs=1.0)
@@ -66,7 +66,7 @@ def test_an_abrupt_change_is_no_turn_but_makes_the_vector_uncertain() -> None:
 
 
 def test_a_gap_and_a_missing_number_are_no_slope() -> None:
-    lag = FilterLag(CUTOFF_HZ)
+    lag = LagCorrection(CUTOFF_HZ)
     assert lag.undo(0, (1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
     assert np.isnan(lag.undo(1_000_000, (np.nan, 2.0, 3.0))[0])
     lag.undo(1_000_000, (2.0, 2.0, 3.0))

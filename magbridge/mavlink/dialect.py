@@ -1046,8 +1046,7 @@ setattr(MAVLink_mag_column_message, "name", mavlink_msg_deprecated_name_property
 
 class MAVLink_mag_host_stall_message(MAVLink_message):
     """
-    In logs only: the bridge stood still, and what came meanwhile
-    waited.
+    In logs only: the bridge stood still; inputs of that time waited.
     """
 
     id = MAVLINK_MSG_ID_MAG_HOST_STALL
@@ -1086,8 +1085,8 @@ setattr(MAVLink_mag_host_stall_message, "name", mavlink_msg_deprecated_name_prop
 
 class MAVLink_mag_learning_message(MAVLink_message):
     """
-    What was learned of the calibration in flight, and whether it
-    still explains the data.
+    State of the in-flight calibration, and whether it explains the
+    data.
     """
 
     id = MAVLINK_MSG_ID_MAG_LEARNING
@@ -2202,7 +2201,7 @@ class MAVLink(object):
 
     def mag_host_stall_encode(self, time_usec: int, duration: int) -> MAVLink_mag_host_stall_message:
         """
-        In logs only: the bridge stood still, and what came meanwhile waited.
+        In logs only: the bridge stood still; inputs of that time waited.
 
         time_usec                 : UNIX time of its end. [us] (type:uint64_t)
         duration                  : For how long. [us] (type:uint32_t)
@@ -2212,7 +2211,7 @@ class MAVLink(object):
 
     def mag_host_stall_send(self, time_usec: int, duration: int, force_mavlink1: bool = False) -> None:
         """
-        In logs only: the bridge stood still, and what came meanwhile waited.
+        In logs only: the bridge stood still; inputs of that time waited.
 
         time_usec                 : UNIX time of its end. [us] (type:uint64_t)
         duration                  : For how long. [us] (type:uint32_t)
@@ -2222,8 +2221,7 @@ class MAVLink(object):
 
     def mag_learning_encode(self, time_usec: int, alarm_since: int, calibration_id: int, first_calibration_id: int, samples: int, rms_first: float, rms_published: float, rms_learned: float, better: float, alarm_amplitude: float, causes: int, state: int, sensor_id: int) -> MAVLink_mag_learning_message:
         """
-        What was learned of the calibration in flight, and whether it still
-        explains the data.
+        State of the in-flight calibration, and whether it explains the data.
 
         time_usec                 : UNIX time of the sample. [us] (type:uint64_t)
         alarm_since               : UNIX time since when the data are not explained; 0: they are. [us] (type:uint64_t)
@@ -2231,10 +2229,10 @@ class MAVLink(object):
         first_calibration_id        : The calibration that it began with, or that was accepted. (type:uint32_t)
         samples                   : Samples that the coefficients were learned from. (type:uint32_t)
         rms_first                 : Error of prediction, lately, of the first calibration. [nT] (type:float)
-        rms_published             : Of the published one. [nT] (type:float)
-        rms_learned               : Of what is learned, published or not. [nT] (type:float)
-        better                    : Log-likelihood ratio of what is learned over the first calibration, lately; below 0 it speaks against what is published of it. (type:float)
-        alarm_amplitude           : Root mean square of what is not explained. [nT] (type:float)
+        rms_published             : Error of prediction, lately, of the published calibration. [nT] (type:float)
+        rms_learned               : Error of prediction, lately, of the learned calibration, published or not. [nT] (type:float)
+        better                    : Log-likelihood ratio of the learned over the first calibration, lately; below 0 the first one predicts better. (type:float)
+        alarm_amplitude           : Root mean square of the unexplained part. [nT] (type:float)
         causes                    : Which causes fit. (type:uint16_t, values:MAG_CAUSE)
         state                     : What it does. (type:uint8_t, values:MAG_LEARNING_STATE)
         sensor_id                 : Which sensor. (type:uint8_t)
@@ -2244,8 +2242,7 @@ class MAVLink(object):
 
     def mag_learning_send(self, time_usec: int, alarm_since: int, calibration_id: int, first_calibration_id: int, samples: int, rms_first: float, rms_published: float, rms_learned: float, better: float, alarm_amplitude: float, causes: int, state: int, sensor_id: int, force_mavlink1: bool = False) -> None:
         """
-        What was learned of the calibration in flight, and whether it still
-        explains the data.
+        State of the in-flight calibration, and whether it explains the data.
 
         time_usec                 : UNIX time of the sample. [us] (type:uint64_t)
         alarm_since               : UNIX time since when the data are not explained; 0: they are. [us] (type:uint64_t)
@@ -2253,10 +2250,10 @@ class MAVLink(object):
         first_calibration_id        : The calibration that it began with, or that was accepted. (type:uint32_t)
         samples                   : Samples that the coefficients were learned from. (type:uint32_t)
         rms_first                 : Error of prediction, lately, of the first calibration. [nT] (type:float)
-        rms_published             : Of the published one. [nT] (type:float)
-        rms_learned               : Of what is learned, published or not. [nT] (type:float)
-        better                    : Log-likelihood ratio of what is learned over the first calibration, lately; below 0 it speaks against what is published of it. (type:float)
-        alarm_amplitude           : Root mean square of what is not explained. [nT] (type:float)
+        rms_published             : Error of prediction, lately, of the published calibration. [nT] (type:float)
+        rms_learned               : Error of prediction, lately, of the learned calibration, published or not. [nT] (type:float)
+        better                    : Log-likelihood ratio of the learned over the first calibration, lately; below 0 the first one predicts better. (type:float)
+        alarm_amplitude           : Root mean square of the unexplained part. [nT] (type:float)
         causes                    : Which causes fit. (type:uint16_t, values:MAG_CAUSE)
         state                     : What it does. (type:uint8_t, values:MAG_LEARNING_STATE)
         sensor_id                 : Which sensor. (type:uint8_t)

@@ -101,9 +101,15 @@ def test_a_block_of_toml_is_read_by_what_reads_such_a_file(block: Block, here: P
         points = [tomllib.loads(one.read_text("utf-8"))["project"]["entry-points"] for one in templates]
         assert tomllib.loads(block.text)["project"]["entry-points"] in points  # which are installed and used
     else:
-        missing = [text for table, text in LEAST.items() if f"[{table}]" not in block.text]
+        missing = [
+            text
+            for table, text in LEAST.items()
+            if not re.search(rf"^\[{table}[.\]]", block.text, re.MULTILINE)
+        ]
         file.write_text("".join(missing) + block.text, encoding="utf-8")
-        for name in re.findall(r'^(?:file|map|signing_key) = "([^"]+)"', block.text, re.MULTILINE):
+        for name in re.findall(
+            r'^(?:file|map|signing_key|calibration) = "([^"]+)"', block.text, re.MULTILINE
+        ):
             (here / name).touch()
         config = load(file)
         if config.navigation:
