@@ -31,14 +31,14 @@ WEIGHT_ITERATIONS = 5
 """Fits, each with the noise and the number of independent samples that the last one left."""
 SAME_WEIGHT = 0.02
 """Relative change of the weights below which they have converged."""
-CHOOSING_SAMPLES, MAX_FIT_SAMPLES = 3_000, 50_000
+CHOOSING_SAMPLES, MAX_ELLIPSOID_SAMPLES = 3_000, 50_000
 """Samples at most that choose the prior and the start, and that are fitted in the end."""
 WIDTH_FACTORS = (1.0, 2.0, 4.0, 8.0)
 """Factors of the prior widths of gain and soft iron. Fluxgates have scales within a few per cent of 1, some
 compasses of 0.8 to 1.5; parts left out, later ones predicted from earlier ones among them, choose one."""
-WORTHWHILE = 0.7
+WORTHWHILE_ERROR_RATIO = 0.7
 """Share of the error on parts left out, below which a wider prior is taken."""
-MIN_LOG_LIKELIHOOD_GAIN = 0.02
+CONVERGED_LOG_LIKELIHOOD_GAIN = 0.02
 """Gain in log likelihood of one more step, below which a fit has converged."""
 ALL_AROUND = 0.05
 """Least variance of the field along any axis, over its square: 1/3 where all attitudes are seen, and 1 % on a
@@ -134,14 +134,16 @@ def _chosen(
             failure = failure or error
             continue
         left = leave_out(few, prior, one.z, one.noise, data.runs[::step], weighted=one.weighted)
-        if best is None or left.carried < WORTHWHILE * best[1].carried:
+        if best is None or left.carried < WORTHWHILE_ERROR_RATIO * best[1].carried:
             best = one, left
     if best is None:
         assert failure is not None
         raise failure
     if step == 1:
         return best
-    return _fitted(_every(samples, max(len(data) // MAX_FIT_SAMPLES, 1)), best[0].prior, best[0].z), best[1]
+    return _fitted(
+        _every(samples, max(len(data) // MAX_ELLIPSOID_SAMPLES, 1)), best[0].prior, best[0].z
+    ), best[1]
 
 
 def _every(samples: Samples, step: int) -> Samples:
@@ -168,7 +170,7 @@ def _fitted(samples: Samples, prior: Prior, near: FloatArray | None = None) -> E
         z = first
         noise = weighted = NoiseModel(1e-3 * samples.F_0)  # wide at first: residuals are not noise yet
         for _ in range(WEIGHT_ITERATIONS):
-            found = gauss_newton(samples, prior, weighted, z, tolerance=MIN_LOG_LIKELIHOOD_GAIN)
+            found = gauss_newton(samples, prior, weighted, z, tolerance=CONVERGED_LOG_LIKELIHOOD_GAIN)
             z = found.z
             last, (noise, weighted) = weighted, _weighted(samples, prior, found, weighted)
             if abs(weighted.sigma - last.sigma) < SAME_WEIGHT * last.sigma:
