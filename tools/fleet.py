@@ -154,7 +154,7 @@ def main() -> None:
     parser = study_options(__doc__)
     parser.add_argument("--vehicles", type=int, default=12)
     parser.add_argument("--deployments", type=int, default=8, help="of each vehicle; the last is scored")
-    parser.add_argument("--sample-interval", type=int, default=2, help="deployments of each refit")
+    parser.add_argument("--refit-interval", type=int, default=2, help="deployments of each refit")
     parser.add_argument("--refit", choices=["usual", "battery"], default="usual")
     parser.add_argument("--runs", type=int, nargs="+", default=[0, 2, 10])
     parser.add_argument(
@@ -163,7 +163,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     flights = [
-        Flight(vehicle, number, options.refit, options.every, options.seed)
+        Flight(vehicle, number, options.refit, options.refit_interval, options.seed)
         for vehicle in range(options.vehicles)
         for number in range(options.deployments)
     ]
@@ -172,7 +172,7 @@ def main() -> None:
     where = {name: Mounting(MOUNTINGS[name].at, MOUNTINGS[name].travel) for name in MASSES}
     mounted = {f"vehicle {k}": where for k in range(options.vehicles)} if options.mounted else {}
     fleet = learn_fleet([one for one in reported if isinstance(one, Lesson)], mounted)
-    refit = f"refit {last // options.every}"
+    refit = f"refit {last // options.refit_interval}"
     cases = [
         (one, tuple(options.runs), fleet.known(f"vehicle {one.vehicle}", refit))
         for one in flights
