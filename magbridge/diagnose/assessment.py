@@ -29,7 +29,7 @@ from magbridge.diagnose.problem import (
     samples_of,
 )
 from magbridge.diagnose.texts import (
-    CONDITIONS,
+    CONDITION_CODES,
     Diagnostic,
     label,
     measured,
@@ -366,15 +366,15 @@ def _fitness(diagnosis: Diagnosis, use: bool, against: Sequence[Diagnostic]) -> 
     if reason is not None:
         return "no", reason
     other_day = diagnosis.other_day is not None and diagnosis.other_day.shown
-    if other_day and not any(note.code in CONDITIONS for note in against):
+    if other_day and not any(note.code in CONDITION_CODES for note in against):
         return "yes", "held_out_and_other_day"
     return "conditional", "one_condition"
 
 
 def _condition(diagnosis: Diagnosis, against: Sequence[Diagnostic], manoeuvres: Sequence[str]) -> str:
     """Return the condition that removes the weightiest objection, else that of a log of another day."""
-    codes = [note.code for note in against if note.code in CONDITIONS]
-    code = min(codes, key=CONDITIONS.index, default="same_log")
+    codes = [note.code for note in against if note.code in CONDITION_CODES]
+    code = min(codes, key=CONDITION_CODES.index, default="same_log")
     warnings = "; ".join(diagnosis.problem.calibration.warnings)
     return write_text(f"condition.{code}", warnings=warnings, manoeuvres="; ".join(manoeuvres))
 

@@ -15,7 +15,7 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.problem import Problem
 
 __all__ = [
-    "AXES", "Candidate", "Columns", "GridPoint", "Group", "Interpolated", "Mixture", "absent_before",
+    "AXIS_NAMES", "Candidate", "Columns", "GridPoint", "Group", "Interpolated", "Mixture", "absent_before",
     "effect_columns", "join_columns", "of_effect", "of_reference", "parts", "per", "places", "size_of",
     "slices", "times",
 ]  # fmt: skip
@@ -23,7 +23,7 @@ __all__ = [
 Columns = Callable[[slice], FloatArray]
 """A function from a slice of m rows to (m, k): what one unit of each of k coefficients, if the calibration
 lacks it, adds to the residual. Best stored column by column."""
-AXES = ("x", "y", "z")
+AXIS_NAMES = ("x", "y", "z")
 About = Literal["vehicle", "constant", "place", "time"]
 Group = tuple[str, str | None]
 """A cause and its channel: candidates that share both are one grid."""
@@ -315,7 +315,7 @@ def of_effect(
     if not names:
         powers = effect.size // 3
         names = tuple(
-            axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXES
+            axis + (str(power + 1) if powers > 1 else "") for power in range(powers) for axis in AXIS_NAMES
         )
     parts = (unit,) if isinstance(unit, str) else unit
     units = tuple(part for part in parts for _ in range(effect.size // len(parts)))

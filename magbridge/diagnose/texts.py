@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 from magbridge.diagnose.columns import Candidate
 
 __all__ = [
-    "CONDITIONS", "MAX_UNFOLDED_NUMBERS", "Diagnostic", "chance", "label", "measured", "names_of", "number",
-    "series_of", "sizes", "write_text",
+    "CONDITION_CODES", "MAX_UNFOLDED_NUMBERS", "Diagnostic", "chance", "label", "measured", "names_of",
+    "number", "series_of", "sizes", "write_text",
 ]  # fmt: skip
 
 SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -124,7 +124,7 @@ TEXTS = {
     "own.",
     "condition.same_log": "the improvement must show in a log of another day as well.",
 }
-CONDITIONS = tuple(code.removeprefix("condition.") for code in TEXTS if code.startswith("condition."))
+CONDITION_CODES = tuple(code.removeprefix("condition.") for code in TEXTS if code.startswith("condition."))
 """Codes of objections that a condition removes, the weightiest first."""
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.instrument_effects import ResponseEffect, TimeEffect
 from magbridge.diagnose.causes.base import Cause
-from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect, per
+from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.problem import Problem
 
 __all__ = ["MAX_BEND_NT", "InterferenceTone", "Nonlinearity", "OffsetDrift", "OffsetStep", "Saturation"]
@@ -101,7 +101,7 @@ class InterferenceTone(Cause):
 
         def rebuild(period: float) -> Candidate:
             effect = TimeEffect(cause=self.name, shape="tone", start=float(t[0]), period=period)
-            names = tuple(f"{f} {axis}" for f in ("cos", "sin") for axis in AXES)
+            names = tuple(f"{f} {axis}" for f in ("cos", "sin") for axis in AXIS_NAMES)
             return of_effect(
                 problem, effect, 10.0, "nT", names=names, look_elsewhere=0.5 * len(t),
                 point=GridPoint({"period": (period, "s")}, rebuild),
@@ -173,7 +173,7 @@ class Nonlinearity(Cause):
     def _power(self, problem: Problem, power: int, width: float) -> Candidate:
         unit = problem.calibration.reference.field
         effect = ResponseEffect(cause=self.name, unit=unit, power=power)
-        names = tuple(f"{axis}{power}" for axis in AXES)
+        names = tuple(f"{axis}{power}" for axis in AXIS_NAMES)
         return of_effect(problem, effect, width, per(f"{unit:.0f} nT", power), names=names)
 
 
@@ -202,5 +202,5 @@ class Saturation(Cause):
         point = GridPoint({"knee": (knee, "nT")}, lambda other: self._clipped(problem, axis, other))
         return of_effect(
             problem, effect, np.array([100.0, 0.1 * unit]), ("nT", per(f"{unit:.0f} nT")),
-            names=(f"{AXES[axis]} jump", f"{AXES[axis]} slope"), point=point,
+            names=(f"{AXIS_NAMES[axis]} jump", f"{AXIS_NAMES[axis]} slope"), point=point,
         )  # fmt: skip

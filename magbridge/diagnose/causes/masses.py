@@ -9,7 +9,7 @@ import numpy as np
 from magbridge.calibration.effects import LegendreEffect, PlayEffect, PowersEffect, SourcesEffect
 from magbridge.calibration.terms import Exponents, Polynomial, full_order
 from magbridge.diagnose.causes.base import Cause
-from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect, per
+from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.problem import FALL, Problem
 
 __all__ = ["ActuatorOrder", "Hysteresis", "UnmodelledActuator"]
@@ -96,7 +96,7 @@ class ActuatorOrder(Cause):
         own = [(p, e) for p, e in zip(problem.calibration.parameters, exponents, strict=True) if e]
         label = " ".join(f"P{e}({p.name})" for p, e in own)
         effect = LegendreEffect(cause=self.name, exponents=exponents)
-        return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXES))
+        return of_effect(problem, effect, 50.0, "nT", names=tuple(f"{axis} {label}" for axis in AXIS_NAMES))
 
     def _sources(self, problem: Problem, name: str, distance: float) -> Candidate:
         """Return sources all along one mass' path, and a little beyond its ends, of one common size."""
@@ -108,7 +108,7 @@ class ActuatorOrder(Cause):
             cause=self.name, channel=name, centre=centre, scale=scale, apart=SOURCE_SPACING, count=gaps + 1
         )
         places = centre + SOURCE_SPACING * scale * np.arange(gaps + 1)
-        names = tuple(f"{axis} {name} {x:.3g}" for x in places for axis in AXES)
+        names = tuple(f"{axis} {name} {x:.3g}" for x in places for axis in AXIS_NAMES)
         return of_effect(problem, effect, 50.0, "nT", names=names, spectra=np.ones((1, effect.size)))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ChannelEffect, lagged
 from magbridge.diagnose.causes.base import Cause
-from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
+from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.problem import Problem, cached_per_problem
 
 __all__ = ["CurrentField", "PressureOffset", "TemperatureOffset", "TemperatureScale"]
@@ -144,7 +144,7 @@ class CurrentField(_Proportional):
         alone = super().candidates(problem)
         if not 2 <= len(alone) <= MAX_JOINT_CURRENTS:
             return alone
-        names = tuple(f"{axis} {one.channel}" for one in alone for axis in AXES)
+        names = tuple(f"{axis} {one.channel}" for one in alone for axis in AXIS_NAMES)
         every = replace(reduce(Candidate.joined_with, alone), channel=None, names=names, parts=())
         return [*alone, replace(every, spectra=np.ones((1, every.size)))]
 

@@ -11,7 +11,7 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import ClockEffect
 from magbridge.calibration.instrument_effects import RateEffect
 from magbridge.diagnose.causes.base import Cause
-from magbridge.diagnose.columns import AXES, Candidate, GridPoint, of_effect
+from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, cached_per_problem, rates
 
 __all__ = ["ChannelSkew", "ClockOffset", "EddyCurrent", "FilterLag", "field_rates", "mass_rates"]
@@ -58,7 +58,7 @@ class _Rate(Cause):
     on: ClassVar[Literal["skew", "eddy"]]
     width_s: ClassVar[float]
     """Plausible coefficient, s."""
-    axes: ClassVar[tuple[str, ...]] = AXES
+    axes: ClassVar[tuple[str, ...]] = AXIS_NAMES
     """Names of the coefficients."""
 
     def candidates(self, problem: Problem) -> list[Candidate]:
@@ -79,7 +79,7 @@ class EddyCurrent(_Rate):
     meaning = "currents that are induced while the vehicle turns make a field"
     disambiguation = "reverse the turn"
     on, width_s = "eddy", 0.3
-    axes = tuple(i + j for i in AXES for j in AXES if i != j)
+    axes = tuple(i + j for i in AXIS_NAMES for j in AXIS_NAMES if i != j)
 
 
 class ChannelSkew(_Rate):
