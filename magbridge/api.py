@@ -154,7 +154,9 @@ def navigate(
     return batch.navigate(in_seconds(deployment), grid, options, **more)
 
 
-def survey(deployments: Sequence[xr.Dataset], *calibrations: Calibration) -> Result:
+def survey(
+    deployments: Sequence[xr.Dataset], *calibrations: Calibration, scalar: str = "", **options: Any
+) -> Result:
     """Level and grid the corrected samples of several logs; :func:`magbridge.survey.run.survey`.
 
     Parameters
@@ -163,6 +165,10 @@ def survey(deployments: Sequence[xr.Dataset], *calibrations: Calibration) -> Res
         Logs with a vector, which are corrected first, or with ``total_field`` or ``anomaly``.
     *calibrations : Calibration
         One for all logs with a vector, or one for each of them.
+    scalar : str
+        Column of a scalar magnetometer to survey with instead.
+    **options
+        Of a scalar's survey: ``names``, ``lag``, ``lever``; :func:`magbridge.survey.run.scalar_survey`.
 
     Raises
     ------
@@ -173,7 +179,10 @@ def survey(deployments: Sequence[xr.Dataset], *calibrations: Calibration) -> Res
 
     if not deployments:
         raise WrongUse("expected at least one deployment")
-    return run.survey(run.samples_of([in_seconds(log) for log in deployments], calibrations))
+    logs = [in_seconds(log) for log in deployments]
+    if scalar:
+        return run.scalar_survey(logs, scalar, calibrations=calibrations, **options)
+    return run.survey(run.samples_of(logs, calibrations))
 
 
 def write(deployment: xr.Dataset, path: str | Path) -> None:

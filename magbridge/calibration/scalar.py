@@ -30,11 +30,14 @@ from magbridge.errors import CalibrationError
 __all__ = [
     "CYCLE_LEVEL_SIGMA_NT", "DISAGREEMENT_SIGMA", "PLATFORM_TERMS", "CorrectedScalar", "ScalarChannel",
     "ScalarNoise", "ScalarQuality", "ScalarSensor", "ScalarSeries", "Witness", "compare_sensors",
-    "correct_scalar", "scalar_design",
+    "correct_scalar", "scalar_design", "term_columns",
 ]  # fmt: skip
 
 PLATFORM_TERMS = 19
 """Permanent (3), induced (6), eddy (9) and lag (1) columns, before the channels' three each."""
+PLATFORM_COLUMNS = {
+    "permanent": slice(0, 3), "induced": slice(3, 9), "eddy": slice(9, 18), "lag": slice(18, 19)
+}  # fmt: skip
 CYCLE_LEVEL_SIGMA_NT = 30.0
 """nT, 1-sigma of the level of a power cycle."""
 SAME_POWER_CYCLE_S = 12 * 3600.0
@@ -182,6 +185,14 @@ def scalar_design(
         z = (values - channel.centre) / channel.scale
         columns += [z * u[:, i] for i in range(3)]
     return np.stack(columns, axis=1)
+
+
+def term_columns(channels: tuple[ScalarChannel, ...]) -> dict[str, slice]:
+    """Return the columns of :func:`scalar_design` that each term has: the platform's, then the channels'."""
+    columns = dict(PLATFORM_COLUMNS)
+    for index, channel in enumerate(channels):
+        columns[channel.name] = slice(PLATFORM_TERMS + 3 * index, PLATFORM_TERMS + 3 * index + 3)
+    return columns
 
 
 def correct_scalar(sensor: ScalarSensor, series: ScalarSeries) -> CorrectedScalar:

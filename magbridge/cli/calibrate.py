@@ -159,7 +159,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 
-    beside = _scalar_options(scalar, reference, lag, lever)
+    beside = scalar_options(scalar, reference, lag, lever)
     named_channels = tuple(name for name in parameter if name != AUTO)
     start = fleet_start(fleet, vehicle, refit, files) if fleet else None
     parameter = parameter or (start.names if start else ())
@@ -217,7 +217,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     )
 
 
-def _scalar_options(scalar: str, reference: str | None, lag: str, lever: str) -> dict[str, Any]:
+def scalar_options(scalar: str, reference: str | None, lag: str, lever: str) -> dict[str, Any]:
     """Return lag and lever arm as numbers; WrongUse: not numbers, or options without --scalar."""
     if not scalar:
         if reference == "scalar" or lag != "auto" or lever:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
+from magbridge.cli.calibrate import scalar_options
 from magbridge.cli.common import (
     AS_THEY_SAY,
     Base,
@@ -48,6 +49,9 @@ def survey(
     save: Written = None,
     position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
     base: Base = None,
+    scalar: str = "",
+    lag: str = "auto",
+    lever: str = "",
     spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
     altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
     predict: Path | None = None,
@@ -86,6 +90,16 @@ def survey(
     base
         A base station's log (total_field, or a vector): its variation is subtracted. A log of an
         observatory (IAGA-2002) among the logs is used in the same way.
+    scalar
+        The column of a scalar magnetometer, nT, to make the map of. Lag, lever arm and heading error are
+        fitted together with the crustal field and the lines' levels. A calibration that has this sensor
+        compensates it first; without one --parameter names the channels that disturb it (auto: all
+        telemetry).
+    lag
+        Time in s by which the scalar is behind the positions; auto estimates it.
+    lever
+        Position of the scalar sensor: m forward, starboard and down of the log's positions, as 1.5,0,-0.3; if
+        not given, forward and starboard are estimated.
     spacing
         m between nodes of the map; by default an eighth of the crustal field's length.
     altitude
@@ -109,12 +123,16 @@ def survey(
     logs_to_read(logs, output, base, predict, *calibration)
     if predict is None and output.suffix.lower() != ".nc":
         raise WrongUse(f"{output}: a map's name must end in .nc")
-    if calibration and save:
-        raise WrongUse("--save: with --calibration none is found")
+    if (calibration or scalar) and save:
+        raise WrongUse("--save: with --calibration or --scalar none is found")
+    beside = scalar_options(scalar, None, lag, lever)
     with waiting("surveying"):
         options: dict[str, Any] = {"position_sigma": position_sigma} if position_sigma else {}
-        samples = _samples(logs, parameter, order, calibration, save, base, options, reading)
-        done = make(samples)
+        if scalar:
+            given = {"lag": beside["lag"], "lever": beside["lever"] if lever else None}
+            done = _scalar_survey(logs, scalar, parameter, calibration, base, reading, given)
+        else:
+            done = make(_samples(logs, parameter, order, calibration, save, base, options, reading))
     for warning in done.warnings:
         complain(warning)
     if predict:
@@ -126,6 +144,35 @@ def survey(
     if crossovers:
         write_crossovers(done.found, done.samples, done.before, done.after, crossovers)
     print_result(facts(done, output), f"{output}: {summary(done)}", json)
+
+
+def _scalar_survey(
+    files: tuple[Path, ...],
+    scalar: str,
+    parameters: tuple[str, ...],
+    calibration: tuple[Path, ...],
+    base: Path | None,
+    reading: Reading,
+    given: dict[str, Any],
+) -> Result:
+    """Return the survey of a scalar magnetometer."""
+    from magbridge.calibration.file import load
+    from magbridge.calibration.fitting.scalar_log import telemetry_columns
+    from magbridge.field.reference import with_true_heading
+    from magbridge.logs import read_each
+    from magbridge.survey.run import scalar_survey
+
+    logs = by_base_station(read_each(list(files), options=reading.options), base)
+    logs = [with_true_heading(log) for log in logs]
+    note_losses(*(log.attrs for log in logs))
+    known = [load(path) for path in calibration]
+    for path, found in zip(calibration, known, strict=True):
+        if all(sensor.column != scalar for sensor in found.sensors):
+            complain(f"{path}: has no scalar sensor {scalar!r}: it is not compensated")
+    names = [name for name in parameters if name != "auto"]
+    if "auto" in parameters:
+        names = sorted({name for log in logs for name in telemetry_columns(log, scalar)})
+    return scalar_survey(logs, scalar, names, known, **given)
 
 
 def _samples(

@@ -39,7 +39,7 @@ from magbridge.survey.roughness import Roughness
 from magbridge.survey.rows import Rows
 from magbridge.survey.samples import Samples
 
-__all__ = ["gridded"]
+__all__ = ["FINER_NODES", "FINE_NOISE_NT", "gridded", "level_blocks"]
 
 LEVEL, LEVEL_SPREAD = 5.0, np.log(5.0)
 """nT by which lines are off each other's level, and the 1-sigma of its logarithm."""
@@ -54,13 +54,17 @@ VARIATION_BOX_M = 5_000.0
 """m, north and east of it: where there are more samples within, every second or tenth of these."""
 GRID_OUTLIER_SIGMA = 6.0
 """Sigmas beyond which a sample is left out."""
+FINER_NODES = 2.5
+"""Factor of the nodes per length where a joint fit has found the field, for noise of a thousandth of it."""
+FINE_NOISE_NT = 0.05
+"""Noise from which the likeliest one of a scalar's survey is sought; its search is fast upwards only."""
 LARGE, LIKELIER = 100.0, 5.0
 """Areas of a length's square, and log-likelihood gain, from which on the field's size may vary with place."""
 MAX_GRID_NODES = 40_000
 """Nodes at most; their variances take 0.5 GB."""
 
 
-def gridded(samples: Samples, *, local: bool = True) -> Gridded:
+def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None) -> Gridded:
     """Grid a survey.
 
     Parameters
@@ -69,13 +73,16 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         Corrected.
     local : bool
         Whether the field's size may vary from place to place.
+    start : Choice, optional
+        Field and noise, where a joint fit has found them; searched if not given.
     """
-    sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1)
-    choice, roughness = _searched(samples, sigma, local=local)
-    nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MAX_GRID_NODES)
+    sigma = max(robust_scale(np.diff(samples.value)) / 2.0**0.5, 0.1) if start is None else FINE_NOISE_NT
+    choice, roughness = _searched(samples, sigma, local=local, start=start)
+    finer = 1.0 if start is None else FINER_NODES
+    nodes = nodes_for(samples.place, choice.field.length, choice.field.alpha, MAX_GRID_NODES, finer)
     choice = replace(choice, field=replace(choice.field, nodes=nodes))
     every = np.arange(len(samples.value))
-    problem = Rows(samples, _groups(samples), roughness)
+    problem = Rows(samples, level_blocks(samples), roughness)
     sums = problem.sums(choice.field, every)
     groups = _needed(problem.groups, sums, choice, sigma)
     family = with_blocks(NO_COEFFICIENTS, groups)
@@ -104,7 +111,7 @@ def gridded(samples: Samples, *, local: bool = True) -> Gridded:
         tuple(posteriors), roughness, choice.rho, problem.middle,
         float(samples.value[problem.kept].mean()), problem.kept, widths,
     )  # fmt: skip
-    if fine_enough(nodes, choice.field.length, choice.field.alpha):
+    if fine_enough(nodes, choice.field.length, choice.field.alpha, finer):
         return found
     levelled, kept = samples.value - found.levels, problem.kept
     return replace(found, kriged=kriged(samples.part(kept), levelled[kept], choice.field.length))
@@ -142,7 +149,7 @@ def _posterior(
     )  # fmt: skip
 
 
-def _groups(samples: Samples) -> tuple[ParameterBlock, ...]:
+def level_blocks(samples: Samples) -> tuple[ParameterBlock, ...]:
     """Return the levels, one a line (or log), and what changes slowly within a log."""
     of = np.unique(samples.line, return_inverse=True)[1].ravel()
     levels = np.zeros((len(of), int(of.max()) + 1))
@@ -174,31 +181,46 @@ def _needed(
     )
 
 
-def _searched(samples: Samples, sigma: float, *, local: bool) -> tuple[Choice, Roughness]:
+def _searched(
+    samples: Samples, sigma: float, *, local: bool, start: Choice | None = None
+) -> tuple[Choice, Roughness]:
     """Return the field that a part of the samples, with noise of about `sigma` nT, is select_blocks with."""
     part = np.flatnonzero(about_the_middle(samples.place, SEARCHED, VARIATION_BOX_M))
     step = max(len(part) // SEARCHED, 1)
     few = samples.part(part[::step])
-    groups, rows = _groups(few), np.arange(len(few.value))
+    groups, rows = level_blocks(few), np.arange(len(few.value))
     family = with_blocks(NO_COEFFICIENTS, groups)
     weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))
     even = Roughness.even()
     problem = Rows(few, groups, even)
     size = max(robust_scale(few.value - problem.mean), 5.0)
-    best = choose(
-        lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
-        harmonic=bool(np.ptp(problem.deeper) > 5.0), effort=0.5, most=SEARCHED_NODES,
-        rho=None if samples.rho is None else samples.rho**step,
-    )  # fmt: skip
-    rho = best.rho ** (1.0 / step) if samples.rho is None else samples.rho
-    area = float(np.prod(np.ptp(samples.place, axis=0)))
-    if not local or area < LARGE * best.field.length**2:
+    uniform = not local or _few_lengths(samples, start)
+    if start is not None and uniform:
+        return start, even
+    if start is not None:
+        begin = replace(start, rho=start.rho**step)
+        best = climb(problem.sums(start.field, rows), begin, weighed, move_rho=False, steps=16)
+        rho = start.rho
+    else:
+        best = choose(
+            lambda field: problem.sums(field, rows), few.place, weighed, size / sigma,
+            harmonic=bool(np.ptp(problem.deeper) > 5.0), effort=0.5, most=SEARCHED_NODES,
+            rho=None if samples.rho is None else samples.rho**step,
+        )  # fmt: skip
+        rho = best.rho ** (1.0 / step) if samples.rho is None else samples.rho
+    if uniform or _few_lengths(samples, best):
         return replace(best, rho=rho), even
     uneven = Roughness.of(samples, best.field.length)
     problem = Rows(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
     best, chosen = (other, uneven) if other.score > best.score + LIKELIER else (best, even)
     return replace(best, rho=rho), chosen
+
+
+def _few_lengths(samples: Samples, choice: Choice | None) -> bool:
+    """Return whether a survey is too small for a field whose size varies; False without a field."""
+    area = float(np.prod(np.ptp(samples.place, axis=0)))
+    return choice is not None and area < LARGE * choice.field.length**2
 
 
 def _solved(

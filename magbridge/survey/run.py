@@ -19,20 +19,23 @@ from magbridge.calibration.fitting.crossings import (
     jumps,
     too_rough,
 )
+from magbridge.calibration.fitting.field_search import Choice
 from magbridge.calibration.model import Calibration
 from magbridge.columns import CHANNELS
 from magbridge.errors import CalibrationError, DataError, FormatError
+from magbridge.survey.alignment import ScalarTerms, align
 from magbridge.survey.crossovers import Crossovers, crossovers
 from magbridge.survey.gridded import Gridded
 from magbridge.survey.gridding import gridded
 from magbridge.survey.read import corrected_by_others, from_vector, joined
 from magbridge.survey.samples import Samples
+from magbridge.survey.scalar import scalar_rows
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Result", "facts", "samples_of", "summary", "survey"]
+__all__ = ["Result", "facts", "samples_of", "scalar_survey", "summary", "survey"]
 
 DRAWN_TRACKS = 16
 """Fields and places that are drawn where a track jumps."""
@@ -52,6 +55,8 @@ class Result:
     residual: FloatArray
     """(n,), nT, of every sample."""
     warnings: tuple[str, ...]
+    scalar: ScalarTerms | None = None
+    """Lag, lever arm and heading error of a scalar magnetometer, where the survey is its."""
 
 
 def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) -> Samples:
@@ -91,8 +96,21 @@ def samples_of(logs: Sequence[xr.Dataset], calibrations: Sequence[Calibration]) 
     return joined(parts)
 
 
-def survey(samples: Samples) -> Result:
-    """Level and grid corrected samples; CalibrationError: they cannot be gridded."""
+def survey(samples: Samples, start: Choice | None = None) -> Result:
+    """Level and grid corrected samples.
+
+    Parameters
+    ----------
+    samples : Samples
+        Corrected.
+    start : Choice, optional
+        Field and noise, where a joint fit has found them.
+
+    Raises
+    ------
+    CalibrationError
+        The samples cannot be gridded.
+    """
     warnings: list[str] = []
     far = far_off(samples.place)
     if count := int(far.sum()):
@@ -100,7 +118,7 @@ def survey(samples: Samples) -> Result:
     samples = samples.part(~far)
     with threadpool_limits(1, "blas"):
         try:
-            found = _gridded(samples)
+            found = _gridded(samples, start)
         except np.linalg.LinAlgError as problem:
             raise CalibrationError(f"the survey cannot be gridded: {problem}") from problem
     ties = crossovers(samples.place, samples.line)
@@ -126,7 +144,48 @@ def survey(samples: Samples) -> Result:
     return Result(samples, found, ties, before, after, residual, tuple(warnings))
 
 
-def _gridded(samples: Samples) -> Gridded:
+def scalar_survey(
+    logs: Sequence[xr.Dataset],
+    column: str,
+    names: Sequence[str] = (),
+    calibrations: Sequence[Calibration] = (),
+    *,
+    lag: float | None = None,
+    lever: tuple[float, float, float] | None = None,
+) -> Result:
+    """Align, level and grid the samples of a scalar magnetometer.
+
+    Parameters
+    ----------
+    logs : sequence of Dataset
+        Each with `column`, nT, and positions.
+    column : str
+        The scalar's reading.
+    names : sequence of str
+        Telemetry channels whose effect is fitted, where no calibration has the sensor.
+    calibrations : sequence of Calibration
+        None, one for all logs, or one for each. One whose ``sensors`` hold `column` compensates it.
+    lag : float, optional
+        Time of the reading after the position, s; estimated if not given.
+    lever : tuple of 3 float, optional
+        Position of the sensor relative to the logged positions, m forward, starboard and down; its
+        horizontal part is estimated if not given.
+
+    Raises
+    ------
+    FormatError
+        A column is missing.
+    DataError
+        The reading is not nT, or the number of calibrations does not fit.
+    CalibrationError
+        The samples cannot be aligned or gridded.
+    """
+    rows = scalar_rows(logs, column, names, calibrations, lever)
+    samples, terms = align(rows, lag=lag, lever_known=lever is not None)
+    return replace(survey(samples, terms.field), scalar=terms)
+
+
+def _gridded(samples: Samples, start: Choice | None) -> Gridded:
     """Grid samples; where the track jumps, they are as uncertain as their places.
 
     Where stretches that are out of place cross, they contradict each other: each has a level of its own, and
@@ -135,7 +194,7 @@ def _gridded(samples: Samples) -> Gridded:
     at = jumps(samples.place, samples.time)
     at = at[samples.line[at] == samples.line[at + 1]]
     if not len(at):
-        return gridded(samples)
+        return gridded(samples, start=start)
     first = np.diff(samples.line, prepend=samples.line[0]) != 0
     first[at + 1] = True
     apart = replace(samples, time=np.full(len(samples.time), np.nan), line=np.cumsum(first))
@@ -181,6 +240,7 @@ def facts(result: Result, path: Path) -> dict[str, Any]:
         "depth_m": found.middle,
         "level_sigma_nT": result.samples.level_sigma,
         "warnings": result.warnings,
+        **({"scalar": result.scalar.facts()} if result.scalar else {}),
     }
 
 
@@ -197,6 +257,7 @@ def summary(result: Result) -> str:
     return (
         f"{known['samples']} samples on {counted(known['lines'], 'line')}, {ties}; crustal field of "
         f"{rock['size_nT']:.0f} nT over {rock['length_m']:.0f} m, noise {known['noise_nT']:.2f} nT"
+        + (f"; {result.scalar.summary()}" if result.scalar else "")
     )
 
 

@@ -22,15 +22,21 @@ MAX_FIELD_NODES = 4_000
 SIDE = 1_500
 """Nodes along a side of the area's box at most, where it is a square."""
 MIN_LENGTH_M = 60.0
-"""Shortest correlation length, m."""
+"""Shortest correlation length, m; a twentieth of an area smaller than that."""
 
 
-def fine_enough(nodes: Nodes, length: float, alpha: int) -> bool:
+def fine_enough(nodes: Nodes, length: float, alpha: int, finer: float = 1.0) -> bool:
     """Return True if nodes are fine enough for a field of a `length`, m, and power alpha."""
-    return 0.7 <= length / nodes.spacing / NODES_PER_LENGTH.get(alpha, ENOUGH) <= 1.5
+    return 0.7 <= length / nodes.spacing / _nodes_per_length(alpha, finer) <= 1.5
 
 
-def nodes_for(place: FloatArray, length: float, alpha: int, most: int = MAX_FIELD_NODES) -> Nodes:
+def _nodes_per_length(alpha: int, finer: float) -> float:
+    return max(NODES_PER_LENGTH.get(alpha, ENOUGH), finer * ENOUGH)
+
+
+def nodes_for(
+    place: FloatArray, length: float, alpha: int, most: int = MAX_FIELD_NODES, finer: float = 1.0
+) -> Nodes:
     """Return the nodes of a field around places (n, 2), m; coarser if they are too many.
 
     Parameters
@@ -43,9 +49,11 @@ def nodes_for(place: FloatArray, length: float, alpha: int, most: int = MAX_FIEL
         Its smoothness: a rough one takes finer nodes.
     most : int
         Nodes at most, about.
+    finer : float
+        Factor of the nodes per length of a smooth field; the error of its splines falls as the fourth power.
     """
     box = np.ptp(place, axis=0) + 4.0 * PAD_LENGTHS * length
-    spacing = max(length / NODES_PER_LENGTH.get(alpha, ENOUGH), float(np.sqrt(box.prod())) / SIDE)
+    spacing = max(length / _nodes_per_length(alpha, finer), float(np.sqrt(box.prod())) / SIDE)
     while (nodes := nodes_near(place, spacing, PAD_LENGTHS * length)).size > 1.05 * most:
         spacing *= (nodes.size / most) ** 0.5
     return nodes
@@ -67,5 +75,5 @@ def ladder(place: FloatArray) -> FloatArray:
     known = place[np.isfinite(place).all(axis=1)]
     extent = float(np.hypot(*np.ptp(known, axis=0)))
     step = np.linalg.norm(np.diff(known, axis=0), axis=1)
-    shortest = max(4.0 * float(np.median(step)), extent / 60.0, MIN_LENGTH_M)
+    shortest = max(4.0 * float(np.median(step)), extent / 60.0, min(MIN_LENGTH_M, extent / 20.0))
     return np.asarray(np.geomspace(shortest, max(extent / 2.5, 1.5 * shortest), RUNGS))

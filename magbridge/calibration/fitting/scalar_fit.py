@@ -40,6 +40,7 @@ from magbridge.calibration.scalar import (
     ScalarSensor,
     ScalarSeries,
     scalar_design,
+    term_columns,
 )
 from magbridge.errors import CalibrationError
 
@@ -453,17 +454,16 @@ def _power_cycles(
 
 
 def _blocks(channels: tuple[ScalarChannel, ...], levels: int, *, fixed_lag: bool) -> tuple[_Block, ...]:
-    sizes = (("permanent", 0, 3), ("induced", 3, 9), ("eddy", 9, 18))
+    columns = term_columns(channels)
     blocks = [
-        _Block(name, slice(begin, end), WIDTH_CENTRES_NT[name], LOG_WIDTH_SIGMA) for name, begin, end in sizes
+        _Block(name, columns[name], centre, LOG_WIDTH_SIGMA) for name, centre in WIDTH_CENTRES_NT.items()
     ]
-    blocks.append(_Block("lag", slice(18, 19), 1e-9 if fixed_lag else LAG_SIGMA_S, 0.0))
-    column = PLATFORM_TERMS
-    for channel in channels:
-        blocks.append(
-            _Block(channel.name, slice(column, column + 3), CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA)
-        )
-        column += 3
+    blocks.append(_Block("lag", columns["lag"], 1e-9 if fixed_lag else LAG_SIGMA_S, 0.0))
+    blocks += [
+        _Block(channel.name, columns[channel.name], CHANNEL_WIDTH_NT, LOG_CHANNEL_WIDTH_SIGMA)
+        for channel in channels
+    ]
+    column = PLATFORM_TERMS + 3 * len(channels)
     blocks.append(_Block("level", slice(column, column + levels), CYCLE_LEVEL_SIGMA_NT, 0.0))
     return tuple(blocks)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,6 +21,8 @@ from magbridge.calibration.scalar import (
     ScalarSeries,
     compare_sensors,
     correct_scalar,
+    scalar_design,
+    term_columns,
 )
 from magbridge.columns import CHANNELS, COLUMNS, require
 from magbridge.errors import DataError, FormatError
@@ -31,12 +33,17 @@ if TYPE_CHECKING:
 
     from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["SCALAR_COLUMNS", "calibrate_scalar", "merit_of", "telemetry_columns", "with_scalar"]
+__all__ = [
+    "SCALAR_COLUMNS", "Compensation", "calibrate_scalar", "compensate", "merit_of", "moved_to_sensor",
+    "scalar_reading", "telemetry_columns", "with_scalar",
+]  # fmt: skip
 
 SCALAR_COLUMNS = "scalar_field", "scalar_field_sigma", "scalar_level_sigma", "scalar_quality"
 """Columns that compensation adds."""
 MAX_CHANNEL_GAP_S = 30.0
 """s between two values of a channel, across which it is not interpolated."""
+MAX_MODES, MIN_MODE_NT = 24, 0.02
+"""Uncertain combinations of a compensation at most, and the RMS effect, nT, below which one is left out."""
 EARTH_RADIUS_M = 6371008.8
 TELEMETRY_OF_SENSOR = ("sensor_temperature", "depth")
 """Columns with a meaning of their own that may also be telemetry channels."""
@@ -111,14 +118,8 @@ def calibrate_scalar(
         Too few samples.
     """
     require(ds, (*CHANNELS, column, *names))
-    reading = ds[column].to_numpy().astype(float)
-    usual = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
-    if not 1e4 < usual < 1e5:
-        source = ds.attrs.get("source", "the log")
-        raise DataError(
-            f"{source}: column {column!r}: expected the total field in nT, got a median of {usual:g}"
-        )
-    reference = reference_field(_moved(ds, lever), grid)
+    reading = scalar_reading(ds, column)
+    reference = reference_field(moved_to_sensor(ds, lever), grid)
     if "daily_variation" in ds:
         reference = reference + ds["daily_variation"].to_numpy()
     rows = at_one_time(ds)
@@ -133,6 +134,18 @@ def calibrate_scalar(
     )
     after = correct_scalar(fit.sensor, series).field - reference
     return replace(fit, merit=merit_of(ds, reading - reference, after))
+
+
+def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
+    """Return a scalar magnetometer's reading (n,), nT; DataError: the column is no total field in nT."""
+    reading = ds[column].to_numpy().astype(float)
+    usual = float(np.nanmedian(reading)) if np.isfinite(reading).any() else np.nan
+    if not 1e4 < usual < 1e5:
+        source = ds.attrs.get("source", "the log")
+        raise DataError(
+            f"{source}: column {column!r}: expected the total field in nT, got a median of {usual:g}"
+        )
+    return reading
 
 
 def merit_of(ds: xr.Dataset, before: FloatArray, after: FloatArray) -> dict[str, Any] | None:
@@ -179,16 +192,10 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
     sensor = next((one for one in sensors if one.column in log), None)
     if sensor is None:
         return corrected
-    if missing := [channel.name for channel in sensor.channels if channel.name not in log]:
-        source = log.attrs.get("source", "the log")
-        raise FormatError(source, f"column {missing[0]!r} is missing: the scalar's compensation needs it")
-    log = log.sel(time=corrected["time"]) if log.sizes["time"] != corrected.sizes["time"] else log
-    vector = np.stack([corrected[f"field_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+    series = _series_of_sensor(corrected, log, sensor)
     total, sigma = (corrected[name].to_numpy() for name in ("total_field", "total_field_sigma"))
-    reference = total - corrected["anomaly"].to_numpy()
-    series = _series(log, sensor.column, [channel.name for channel in sensor.channels], vector, reference)
     found = correct_scalar(adapt_to_log(sensor, series.channels), series)
-    seen = compare_sensors(found.field, found.sigma, total, sigma, reference)
+    seen = compare_sensors(found.field, found.sigma, total, sigma, series.reference)
     quality = np.zeros(len(total), int)
     for flag, rows in (
         (ScalarQuality.EXTRAPOLATED, found.extrapolated),
@@ -210,6 +217,66 @@ def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[Scalar
     wider = np.sqrt(sigma**2 + seen.vector_variance)
     own = {"total_field_sigma": ("time", wider, corrected["total_field_sigma"].attrs)}
     return corrected.assign(own | added)
+
+
+class Compensation(NamedTuple):
+    """A compensated scalar of a survey, n samples."""
+
+    field: FloatArray
+    """Compensated total field, nT, (n,); NaN where an input is missing or the vector disagrees."""
+    modes: FloatArray
+    """Effect of each uncertain combination of coefficients, 1-sigma, nT, (n, r)."""
+    contribution: dict[str, float]
+    """Standard deviation of the effect of each block of coefficients, nT."""
+
+
+def compensate(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> Compensation:
+    """Compensate a log's scalar and return the parts of it, for a joint fit with a survey's terms.
+
+    Parameters
+    ----------
+    corrected : Dataset (time)
+        What the correction of the vector sensor made of `log`.
+    log : Dataset
+        With the scalar's column and its channels.
+    sensor : ScalarSensor
+        The calibrated scalar.
+
+    Raises
+    ------
+    FormatError
+        A telemetry channel of the compensation is not in the log.
+    """
+    series = _series_of_sensor(corrected, log, sensor)
+    adapted = adapt_to_log(sensor, series.channels)
+    found = correct_scalar(adapted, series)
+    total, sigma = (corrected[name].to_numpy() for name in ("total_field", "total_field_sigma"))
+    seen = compare_sensors(found.field, found.sigma, total, sigma, series.reference)
+    design = scalar_design(series, adapted.channels, adapted.reference_field)
+    mean, size = np.array(adapted.coefficients), design.shape[1]
+    contribution = {
+        name: float(np.nanstd(design[:, columns] @ mean[columns]))
+        for name, columns in term_columns(adapted.channels).items()
+    }
+    values, vectors = np.linalg.eigh(np.array(adapted.covariance)[:size, :size])
+    effects = design @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    known = np.isfinite(effects).all(axis=1)
+    centred = effects - effects[known].mean(axis=0)  # the level is the survey's own
+    _, sizes, turned = np.linalg.svd(centred[known], full_matrices=False)
+    large = sizes[:MAX_MODES] / np.sqrt(max(known.sum(), 1)) > MIN_MODE_NT
+    modes = centred @ turned[:MAX_MODES][large].T
+    return Compensation(np.where(seen.disagrees, np.nan, found.field), modes, contribution)
+
+
+def _series_of_sensor(corrected: xr.Dataset, log: xr.Dataset, sensor: ScalarSensor) -> ScalarSeries:
+    """Return the samples at the rows of a corrected log; FormatError: a channel is missing."""
+    if missing := [channel.name for channel in sensor.channels if channel.name not in log]:
+        source = log.attrs.get("source", "the log")
+        raise FormatError(source, f"column {missing[0]!r} is missing: the scalar's compensation needs it")
+    log = log.sel(time=corrected["time"]) if log.sizes["time"] != corrected.sizes["time"] else log
+    vector = np.stack([corrected[f"field_{axis}"].to_numpy() for axis in "xyz"], axis=1)
+    reference = corrected["total_field"].to_numpy() - corrected["anomaly"].to_numpy()
+    return _series(log, sensor.column, [channel.name for channel in sensor.channels], vector, reference)
 
 
 def _series(
@@ -241,15 +308,18 @@ def _at_rows(time: FloatArray, ds: xr.Dataset, name: str) -> FloatArray:
     return np.where(known, values, np.where(far, np.nan, filled))
 
 
-def _moved(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dataset:
+def moved_to_sensor(ds: xr.Dataset, lever: tuple[float, float, float]) -> xr.Dataset:
     """Return a log with the positions of the scalar sensor instead of its own.
 
-    FormatError: there is a lever, and the log has positions but no attitude.
+    A log without roll or pitch is taken to be level. FormatError: it has positions but no heading.
     """
     if not any(lever) or not {"latitude", "longitude"} <= set(ds.variables):
         return ds
-    require(ds, ("roll", "pitch", "heading"))
-    angles = [ds[name].to_numpy().astype(float) for name in ("heading", "pitch", "roll")]
+    require(ds, ("heading",))
+    level = np.zeros(ds.sizes["time"])
+    angles = [
+        ds[name].to_numpy().astype(float) if name in ds else level for name in ("heading", "pitch", "roll")
+    ]
     known: BoolArray = np.isfinite(np.stack(angles)).all(axis=0)
     turned = np.zeros((len(known), 3))
     turned[known] = Rotation.from_euler("ZYX", np.stack(angles, axis=1)[known], degrees=True).apply(lever)

@@ -1,0 +1,406 @@
+r"""Lag, lever arm and heading error of a survey's scalar magnetometer, from the survey itself.
+
+.. math:: s_i = f(x_i - \tau v_i + R(\psi_i) a) + h(\psi_i) + \sum_k c_k \cdot z_k + l_{line} + e_i
+
+f is the crustal field in place, :math:`\tau` the lag of the reading after the position, v the velocity, a the
+lever arm (forward, starboard) from the positions to the sensor, h the heading error with two harmonics, z_k
+the telemetry channels or the uncertain combinations of a compensation, and l the level of the line.
+
+Lag and forward lever arm move the samples along the track. The likelihood of that shift has several maxima:
+the shift is scanned on a grid first. Then Gauss-Newton steps refine all terms, with the field's gradient as
+the derivative by the shift. At one speed only ``lever - v * lag`` is determined.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from magbridge.arrays import FloatArray, IndexArray
+from magbridge.calibration.figure_of_merit import figure_of_merit, merit_text
+from magbridge.calibration.fitting.field_nodes import SMOOTH, about_the_middle, ladder, nodes_for
+from magbridge.calibration.fitting.field_search import BENDS, Choice, Weighed, choose, climb
+from magbridge.errors import CalibrationError
+from magbridge.estimation.blocks import NO_COEFFICIENTS, ParameterBlock, with_blocks
+from magbridge.estimation.elimination import eliminate_field
+from magbridge.estimation.hyperparameters import maximise_evidence
+from magbridge.estimation.information import covariance_of
+from magbridge.estimation.residual import rms, robust_scale
+from magbridge.survey.crossovers import crossovers
+from magbridge.survey.gridding import FINE_NOISE_NT, FINER_NODES, level_blocks
+from magbridge.survey.roughness import Roughness
+from magbridge.survey.rows import Rows
+from magbridge.survey.samples import Samples
+from magbridge.survey.scalar import COMPENSATION, ScalarRows
+
+__all__ = ["ScalarTerms", "align"]
+
+LAG_SIGMA_S, LEVER_SIGMA_M = 0.5, 2.0
+"""Prior 1-sigma of the lag, s, and of each component of the lever arm, m."""
+SCANNED_LAG_S, SCANNED_LEVER_M = 1.0, 5.0
+"""Largest lag, s, and forward lever arm, m, of the scan."""
+SCAN_STEP_LENGTHS, MIN_SCAN_STEPS, MAX_SCAN_STEPS = 1.0 / 8.0, 9, 41
+"""Step of the scan in lengths of the field, and fewest and most steps."""
+HEADING_WIDTH_NT, LOG_HEADING_SPREAD = 2.0, float(np.log(5.0))
+"""Width of a harmonic of the heading error, nT, and the 1-sigma of its logarithm."""
+CHANNEL_WIDTH_NT, LOG_CHANNEL_SPREAD = 10.0, 1.5
+"""Width of a channel's effect for one swing, nT, and the 1-sigma of its logarithm."""
+FITTED_SAMPLES, FITTED_NODES = 8_000, 8_000
+"""Samples and nodes of the joint fit, at most."""
+SCANNED_SAMPLES, SCANNED_NODES = 4_000, 3_000
+"""Samples and nodes of the scan, at most."""
+MAX_SPACING_FRACTION = 1.0 / 240.0
+"""Largest distance of fitted samples, as a fraction of the survey's extent."""
+GAUSS_NEWTON_STEPS, SEARCH_EFFORT, CLIMB_STEPS = 4, 0.3, 14
+SEPARABLE_FRACTION = 0.5
+"""Posterior over prior 1-sigma of lag or lever arm, above which the two are not separable."""
+SHIFT_NAMES = ("lag", "forward", "starboard")
+HARMONICS = ("cos", "sin", "cos2", "sin2")
+"""Functions of the heading in the heading error."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScalarTerms:
+    """What the joint fit found about a scalar magnetometer."""
+
+    column: str
+    shift: FloatArray
+    """(3,), lag (s), forward and starboard lever arm (m)."""
+    shift_sigma: FloatArray
+    """(3,), 1-sigma of each."""
+    along_m: float
+    along_sigma_m: float
+    """`along_m`, `along_sigma_m`: m, forward lever arm minus speed times lag, and its 1-sigma."""
+    speed: float
+    """Median speed, m/s."""
+    separable: bool
+    """True if lag and forward lever arm are known each by itself."""
+    heading_error: FloatArray
+    """(4,), nT, of cos, sin of the heading and cos, sin of twice the heading."""
+    contribution: dict[str, float]
+    """Standard deviation, nT, of each term over the survey."""
+    misties_raw: float
+    """RMS, nT, of the crossings as read."""
+    field: Choice
+    """Crustal field and noise of the joint fit, for the map."""
+    merit: dict[str, Any] | None
+    """Figure of merit of a box that was not fitted; None without one."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return the numbers to print as JSON."""
+        named = zip(SHIFT_NAMES, self.shift.tolist(), self.shift_sigma.tolist(), strict=True)
+        shift = {
+            f"{name}_{'s' if name == 'lag' else 'm'}": {"value": value, "sigma": sigma}
+            for name, value, sigma in named
+        }
+        return {
+            "column": self.column,
+            **shift,
+            "along_track_m": {"value": self.along_m, "sigma": self.along_sigma_m},
+            "speed_m_s": self.speed,
+            "lag_and_lever_separable": self.separable,
+            "heading_error_nT": dict(zip(HARMONICS, self.heading_error.tolist(), strict=True)),
+            "contribution_nT": self.contribution,
+            "misties_as_read_nT": self.misties_raw,
+            "figure_of_merit": self.merit and {**self.merit, "fitted": False},
+        }
+
+    def summary(self) -> str:
+        """Return the numbers as text."""
+        lag, forward, starboard = self.shift
+        sigma = self.shift_sigma
+        if self.separable:
+            parts = [f"lag {lag:.3f} ± {sigma[0]:.3f} s, forward lever arm {forward:.2f} ± {sigma[1]:.2f} m"]
+        else:
+            known = f"lever - v * lag = {self.along_m:.2f} ± {self.along_sigma_m:.2f} m forward"
+            parts = [f"{known} (lag and lever arm cannot be separated at one speed, {self.speed:.1f} m/s)"]
+        parts.append(f"starboard {starboard:.2f} ± {sigma[2]:.2f} m")
+        turn = np.radians(np.arange(0.0, 360.0, 5.0))
+        parts.append(f"heading error {np.ptp(_harmonics(turn) @ self.heading_error):.2f} nT peak to peak")
+        parts.append(f"crossings {self.misties_raw:.2f} nT RMS as read")
+        if self.merit:
+            parts.append(merit_text(self.merit))
+        return f"scalar {self.column}: " + ", ".join(parts)
+
+
+def align(
+    rows: ScalarRows, *, lag: float | None = None, lever_known: bool = False
+) -> tuple[Samples, ScalarTerms]:
+    """Fit lag, lever arm, heading error and channels together with the crustal field and the lines' levels.
+
+    Parameters
+    ----------
+    rows : ScalarRows
+        The survey.
+    lag : float, optional
+        Time of the reading after the position, s; estimated if not given.
+    lever_known : bool
+        The positions are those of the sensor already.
+
+    Returns
+    -------
+    samples : Samples
+        At the sensor's places, without heading error and channels; their uncertainty is in `modes`.
+    terms : ScalarTerms
+        The result of the fit.
+
+    Raises
+    ------
+    CalibrationError
+        The samples do not determine a field.
+    """
+    free = np.array([lag is None, not lever_known, not lever_known])
+    try:
+        with threadpool_limits(1, "blas"):
+            fit = _JointFit(rows, np.array([lag or 0.0, 0.0, 0.0]), free)
+            return fit.result()
+    except np.linalg.LinAlgError as problem:
+        raise CalibrationError(
+            f"{rows.column}: lag and heading error cannot be fitted to this survey: {problem}"
+        ) from problem
+
+
+class _Solution(NamedTuple):
+    """Unknowns of the joint fit."""
+
+    effects: FloatArray
+    """Heading error, then each term's unknowns, then the free components of the shift's last step."""
+    covariance: FloatArray
+    """Covariance of `effects`."""
+    slopes: FloatArray
+    """Change of each fitted sample with each free component of the shift, nT/s and nT/m, (n, k)."""
+    field: FloatArray
+    """Coefficients of the crustal field."""
+
+
+class _JointFit:
+    """Scan, then Gauss-Newton, on some of the samples."""
+
+    def __init__(self, rows: ScalarRows, shift: FloatArray, free: FloatArray) -> None:
+        self.rows, self.shift, self.free = rows, shift, np.flatnonzero(free)
+        self.prior_sigma = np.array([LAG_SIGMA_S, LEVER_SIGMA_M, LEVER_SIGMA_M])[self.free]
+        self.speed = float(np.median(np.linalg.norm(rows.velocity, axis=1)))
+        forward = np.stack([np.cos(rows.heading), np.sin(rows.heading)], axis=1)
+        starboard = np.stack([-np.sin(rows.heading), np.cos(rows.heading)], axis=1)
+        # Derivatives of the place by lag, forward and starboard lever arm.
+        self.directions = np.stack([-rows.velocity, forward, starboard])
+        self.chosen = _fitted_rows(rows.samples, FITTED_SAMPLES)
+        few = _fitted_rows(rows.samples, SCANNED_SAMPLES)
+        choice = self._search(few)
+        choice = self._scan(few, choice)
+        nodes = nodes_for(
+            rows.samples.place[self.chosen], choice.field.length, choice.field.alpha, FITTED_NODES
+        )
+        self.choice = replace(choice, field=replace(choice.field, nodes=nodes))
+        self._gauss_newton()
+        # The noise is smaller at the right shift: choose field and noise again, on finer nodes.
+        self.choice = self._refine_field(self.choice)
+        self.solution = self._gauss_newton()
+
+    def place(self, shift: FloatArray) -> FloatArray:
+        """Return the sensor's place (n, 2), m, with a lag (s), forward and starboard lever arm (m)."""
+        return np.asarray(self.rows.samples.place + np.tensordot(shift, self.directions, 1))
+
+    def _blocks(self, chosen: IndexArray) -> tuple[ParameterBlock, ...]:
+        """Return levels, slow changes, heading error and terms of some samples."""
+        blocks = list(level_blocks(self.rows.samples.part(chosen)))
+        harmonics = _harmonics(self.rows.heading[chosen])
+        blocks.append(
+            ParameterBlock("heading error", harmonics, np.ones(4), HEADING_WIDTH_NT, LOG_HEADING_SPREAD)
+        )
+        for name, columns in self.rows.terms:
+            width, spread = (1.0, 0.0) if name == COMPENSATION else (CHANNEL_WIDTH_NT, LOG_CHANNEL_SPREAD)
+            shape = np.ones(columns.shape[1])
+            blocks.append(ParameterBlock(f"effect of {name}", columns[chosen], shape, width, spread))
+        return tuple(replace(block, offered=False) for block in blocks)
+
+    def _problem(self, chosen: IndexArray, shift: FloatArray, blocks: tuple[ParameterBlock, ...]) -> Rows:
+        samples = replace(self.rows.samples, place=self.place(shift)).part(chosen)
+        return Rows(samples, blocks, Roughness.even())
+
+    def _weighed(self, blocks: tuple[ParameterBlock, ...], length: float) -> Weighed:
+        family = with_blocks(NO_COEFFICIENTS, blocks)
+        return Weighed(family, family.centre, FINE_NOISE_NT, length)
+
+    def _search(self, chosen: IndexArray) -> Choice:
+        """Return a field for the samples as they are, on coarse nodes."""
+        blocks, every = self._blocks(chosen), np.arange(len(chosen))
+        problem = self._problem(chosen, self.shift, blocks)
+        place = problem.samples.place
+        weighed = self._weighed(blocks, float(np.median(ladder(place))))
+        size = max(robust_scale(problem.samples.value - problem.mean), 5.0)
+        change = max(robust_scale(np.diff(problem.samples.value)) / 2.0**0.5, FINE_NOISE_NT)
+        return choose(
+            lambda field: problem.sums(field, every), place, weighed, size / change,
+            harmonic=bool(np.ptp(problem.deeper) > 5.0), effort=SEARCH_EFFORT, most=SCANNED_NODES,
+        )  # fmt: skip
+
+    def _scan(self, chosen: IndexArray, choice: Choice) -> Choice:
+        """Set the shift along the track to the likeliest one of a grid; return the field of that shift."""
+        if not len(self.free):
+            return choice
+        component = int(self.free[0])  # lag, else forward lever arm
+        reach = SCANNED_LAG_S if component == 0 else SCANNED_LEVER_M
+        metres = reach * (self.speed if component == 0 else 1.0)
+        steps = int(
+            np.clip(2.0 * metres / (SCAN_STEP_LENGTHS * choice.field.length), MIN_SCAN_STEPS, MAX_SCAN_STEPS)
+        )
+        blocks, every = self._blocks(chosen), np.arange(len(chosen))
+        weighed = self._weighed(blocks, choice.field.length)
+
+        def score(value: float) -> float:
+            shift = self.shift.copy()
+            shift[component] = value
+            sums = self._problem(chosen, shift, blocks).sums(choice.field, every)
+            reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
+            return weighed.score(reduced, choice.field, choice.ratio)
+
+        grid = np.linspace(-reach, reach, steps | 1)
+        self.shift[component] = grid[int(np.argmax([score(value) for value in grid]))]
+        sums = self._problem(chosen, self.shift, blocks).sums(choice.field, every)
+        return climb(sums, choice, weighed, steps=CLIMB_STEPS)
+
+    def _refine_field(self, choice: Choice) -> Choice:
+        """Return the likelier one of a field with white noise and one whose noise is correlated in time."""
+        blocks, every = self._blocks(self.chosen), np.arange(len(self.chosen))
+        problem = self._problem(self.chosen, self.shift, blocks)
+        field = choice.field
+        if field.alpha > SMOOTH and not field.buried:  # finer nodes would be too many for its condition
+            length = field.length * ((field.alpha - 1) / (SMOOTH - 1)) ** BENDS
+            field = replace(field, alpha=SMOOTH, length=length)
+        nodes = nodes_for(problem.samples.place, field.length, field.alpha, FITTED_NODES, FINER_NODES)
+        field = replace(field, nodes=nodes)
+        weighed, sums = self._weighed(blocks, field.length), problem.sums(field, every)
+        start = replace(choice, field=field)
+        # White noise of the innovations' size; the size of the correlated noise is larger.
+        ratio = choice.ratio / np.sqrt(1.0 - choice.rho**2)
+        white = climb(sums, replace(start, rho=0.0, ratio=ratio), weighed, move_rho=False, steps=CLIMB_STEPS)
+        if choice.rho == 0.0:
+            return white
+        return max(white, climb(sums, start, weighed, steps=CLIMB_STEPS), key=lambda found: found.score)
+
+    def _gauss_newton(self) -> _Solution:
+        """Refine the shift together with all other terms."""
+        blocks, every = self._blocks(self.chosen), np.arange(len(self.chosen))
+        effects = sum(len(block.shape) for block in blocks if _is_effect(block))
+        slopes: FloatArray | None = None
+        for _ in range(GAUSS_NEWTON_STEPS + 1):
+            joint = blocks
+            if slopes is not None and len(self.free):
+                joint = (*blocks, ParameterBlock("shift", slopes, self.prior_sigma, 1.0))
+            problem = self._problem(self.chosen, self.shift, joint)
+            family = with_blocks(NO_COEFFICIENTS, joint)
+            sums = problem.sums(self.choice.field, every)
+            reduced = eliminate_field(sums, self.choice.field, self.choice.ratio, self.choice.rho)
+            sigma = self._weighed(joint, self.choice.field.length).sigma
+            widths = maximise_evidence(reduced.quadratic, family, family.centre, sigma)
+            prior = family.at(widths.eta).precision
+            # The prior of the shift is about zero, and the step's about minus the shift so far.
+            mean = np.zeros(len(prior))
+            moved = len(self.free) if slopes is not None else 0
+            if moved:
+                mean[-moved:] = -self.shift[self.free]
+            precision = reduced.quadratic.precision / widths.sigma**2 + prior
+            z = np.asarray(
+                np.linalg.solve(precision, reduced.quadratic.vector / widths.sigma**2 + prior @ mean), float
+            )
+            w = reduced.field(z)
+            if moved:
+                self.shift[self.free] += z[-moved:]
+            used = slice(len(z) - effects - moved, None)
+            solution = _Solution(
+                z[used], covariance_of(precision)[used, used], self._slopes(self.chosen, w), w
+            )
+            slopes = solution.slopes
+        return solution
+
+    def _slopes(self, chosen: IndexArray, w: FloatArray) -> FloatArray:
+        """Return the change of samples with the free components of the shift, (n, k), nT/s and nT/m."""
+        place, field = self.place(self.shift)[chosen], self.choice.field
+        inside = field.nodes.inside(place)
+        gradient = np.zeros((len(place), 2))
+        gradient[inside] = np.stack([part @ w for part in field.slopes(place[inside])], axis=1)
+        return np.asarray(np.einsum("knj,nj->nk", self.directions[self.free][:, chosen], gradient))
+
+    def result(self) -> tuple[Samples, ScalarTerms]:
+        """Return the aligned samples and the report."""
+        rows, found = self.rows, self.solution
+        every = np.arange(len(rows.raw))
+        slopes = self._slopes(every, found.field)
+        columns = [_harmonics(rows.heading), *(term.columns for term in rows.terms)]
+        edges = np.cumsum([0, *(part.shape[1] for part in columns)])
+        parts = [found.effects[a:b] for a, b in pairwise(edges)]
+        effects = [part @ values for part, values in zip(columns, parts, strict=True)]
+        modes = np.hstack([*columns, slopes]) @ _root(found.covariance)
+        samples = replace(
+            rows.samples,
+            place=self.place(self.shift),
+            value=rows.samples.value - np.sum(effects, axis=0),
+            modes=modes,
+        )
+        names = ["heading error", *(term.name for term in rows.terms)]
+        contribution = dict(rows.compensated)
+        for name, effect in zip(names, effects, strict=True):
+            contribution["correction of the compensation" if name == COMPENSATION else name] = float(
+                np.std(effect)
+            )
+        contribution["lag and lever arm"] = float(np.std(slopes @ self.shift[self.free]))
+        raw = crossovers(rows.samples.place, rows.samples.line).misties(rows.raw)
+        return samples, self._terms(parts, contribution, rms(raw) if len(raw) else 0.0)
+
+    def _every_sample(self) -> Choice:
+        """Return the field with the noise's autocorrelation between all samples, not only the fitted ones."""
+        step = int(np.median(np.diff(self.chosen)))
+        return replace(self.choice, rho=self.choice.rho ** (1.0 / step))
+
+    def _terms(self, parts: list[FloatArray], contribution: dict[str, float], misties: float) -> ScalarTerms:
+        """Return the report."""
+        many = len(self.free)
+        covariance = np.zeros((3, 3))
+        if many:
+            covariance[np.ix_(self.free, self.free)] = self.solution.covariance[-many:, -many:]
+        sigma = np.sqrt(np.diag(covariance))
+        along = np.array([-self.speed, 1.0, 0.0])
+        both = {0, 1} <= set(self.free.tolist())
+        known = sigma[:2] < SEPARABLE_FRACTION * np.array([LAG_SIGMA_S, LEVER_SIGMA_M])
+        merit = None
+        if self.rows.boxes:
+            box, heading, raw, value, terms = self.rows.boxes[0]
+            columns = [_harmonics(heading), *(term.columns for term in terms)]
+            after = value - sum(part @ values for part, values in zip(columns, parts, strict=True))
+            merit = figure_of_merit(box, raw, after)
+        return ScalarTerms(
+            self.rows.column, self.shift, sigma, float(along @ self.shift),
+            float(np.sqrt(along @ covariance @ along)), self.speed, not both or bool(known.all()), parts[0],
+            contribution, misties, self._every_sample(), merit,
+        )  # fmt: skip
+
+
+def _is_effect(block: ParameterBlock) -> bool:
+    """Return whether a block is a heading error or a term, not a level of a line or a slow change."""
+    return block.name == "heading error" or block.name.startswith("effect of ")
+
+
+def _harmonics(heading: FloatArray) -> FloatArray:
+    """Return cosine and sine of headings (n,), rad, and of twice them, (n, 4)."""
+    return np.stack([np.cos(heading), np.sin(heading), np.cos(2 * heading), np.sin(2 * heading)], axis=1)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Return a root R (r, r) of a covariance, ``R R^T``."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _fitted_rows(samples: Samples, most: int) -> IndexArray:
+    """Return at most so many samples: evenly thinned where they are dense, then about the middle."""
+    place = samples.place
+    spacing = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
+    extent = float(np.hypot(*np.ptp(place, axis=0)))
+    longest = max(1, int(MAX_SPACING_FRACTION * extent / max(spacing, 1e-6)))
+    rows = np.arange(0, len(place), int(np.clip(len(place) // most, 1, longest)))
+    return rows[about_the_middle(place[rows], most)]
