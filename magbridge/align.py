@@ -219,7 +219,7 @@ class Aligner:
                 quality |= STALE_FLAG
                 oldest = inf
                 continue
-            value, age, low, high = track.at(sample_us)
+            value, age, low, high = track.value_at(sample_us)
             values.append(value)
             oldest = max(oldest, age)
             if track.lacking or age > track.max_age:
@@ -233,7 +233,7 @@ class Aligner:
             if sample_us < track.first_us or (late_us and (undated or sample_us > track.last_us)):
                 quality |= LATE_JOIN
             if undated:
-                spans.append((index, *track.between(late_us)))
+                spans.append((index, *track.extremes_since(late_us)))
             elif track.guess_us[0] <= sample_us <= track.guess_us[1]:
                 quality |= LATE_JOIN
                 spans.append((index, *track.guess))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from magbridge.correction import Correction
     from magbridge.diagnose.assessment import DiagnosisResult
     from magbridge.field.grid import AnomalyGrid
-    from magbridge.navigate.options import Options
+    from magbridge.navigate.options import NavigationOptions
     from magbridge.survey.run import Result
 
 __all__ = [
@@ -140,17 +140,20 @@ def diagnose(deployments: Sequence[xr.Dataset], calibration: Calibration, **opti
 
 
 def navigate(
-    deployment: xr.Dataset, grid: AnomalyGrid | None = None, options: Options | None = None, **more: Any
+    deployment: xr.Dataset,
+    grid: AnomalyGrid | None = None,
+    options: NavigationOptions | None = None,
+    **more: Any,
 ) -> xr.Dataset:
     """Return the track that the field and a map give; :func:`magbridge.navigate.batch.navigate`.
 
     Without a map: where the track crosses itself in the field,
     :func:`magbridge.navigate.own_survey.localise`.
     """
-    from magbridge.navigate import Options, batch, own_survey  # noqa: PLC0415 - filterpy only where it is used
+    from magbridge.navigate import NavigationOptions, batch, own_survey  # noqa: PLC0415 - filterpy only where it is used
 
     if grid is None:
-        return own_survey.localise(in_seconds(deployment), options or Options())
+        return own_survey.localise(in_seconds(deployment), options or NavigationOptions())
     return batch.navigate(in_seconds(deployment), grid, options, **more)
 
 

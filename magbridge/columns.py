@@ -243,14 +243,14 @@ def usual(unit: str) -> str:
     return _SAME.get(unit) or (_SAME.get(written_out, unit) if len(written_out) > 4 else unit)
 
 
-def may_be(unit: str, other: str) -> bool:
+def may_be(unit: str, other_unit: str) -> bool:
     """Return True if two units can be equal; either may be undeclared (empty, or then written as 1)."""
-    return {unit, other} & {"", "1"} != set() or usual(unit) == usual(other)
+    return {unit, other_unit} & {"", "1"} != set() or usual(unit) == usual(other_unit)
 
 
-def absent(name: str, there: Iterable[str]) -> str:
+def absent(name: str, present: Iterable[str]) -> str:
     """Return the message that a column is missing, which there are, and how to declare it."""
-    names = [repr(one) if " " in one else one for one in there]
+    names = [repr(one) if " " in one else one for one in present]
     headings = " ".join(names[:MAX_NAMES]) + f" and {len(names) - MAX_NAMES} more" * (len(names) > MAX_NAMES)
     near = suggestion(name, names)
     return f'expected this column{near}; there are: {headings}; if one is it: --column {name}="THEIRS [unit]"'

@@ -122,7 +122,7 @@ class Correction:
         restarted: bool = False,
         missing: int = 0,
         main_field: float = nan,
-        where: tuple[float, float] | None = None,
+        position: tuple[float, float] | None = None,
         depth: float = nan,
     ) -> tuple[Sample, Corrected]:
         """Align and correct one reading, and check the result.
@@ -133,7 +133,7 @@ class Correction:
             As for :meth:`magbridge.align.Aligner.reading`.
         main_field : float
             nT, the main field's total where the sample was taken; NaN where that is not known.
-        where : tuple of 2 float or None
+        position : tuple of 2 float or None
             deg, latitude and longitude; None where not known.
         depth : float
             m; NaN where not known.
@@ -154,7 +154,7 @@ class Correction:
             turned = self._filter_lag.variance
         judged = 0.0
         if self.health is not None:
-            arguments = (self.health, sample, reading, (F, sigma), vector, quality, main_field, where)
+            arguments = (self.health, sample, reading, (F, sigma), vector, quality, main_field, position)
             judged, flags = parts.call("plausibility check", (0.0, 0), self._check_field, *arguments)
             quality |= flags
         if self.direction is not None:
@@ -163,7 +163,7 @@ class Correction:
             turned += more
         if self.learner is not None:
             flags, variance = parts.call(
-                "learning", (0, 0.0), self._learn, sample, quality, main_field, where, restarted
+                "learning", (0, 0.0), self._learn, sample, quality, main_field, position, restarted
             )
             quality |= flags
             judged += variance
@@ -192,11 +192,11 @@ class Correction:
         vector: Vector,
         quality: int,
         main_field: float,
-        where: tuple[float, float] | None,
+        position: tuple[float, float] | None,
     ) -> tuple[float, int]:
         """Return the variance (nT^2) and the flags that the checks of the corrected field add."""
-        if where is not None:
-            health.set_position(sample.time_us, *where)
+        if position is not None:
+            health.set_position(sample.time_us, *position)
         is_moving = bool(sample.quality & MOVING)
         if is_moving and not self._was_moving:
             health.begin_motion(self.aligner.motion_since_us)
@@ -254,7 +254,7 @@ class Correction:
         sample: Sample,
         quality: int,
         main_field: float,
-        where: tuple[float, float] | None,
+        position: tuple[float, float] | None,
         restarted: bool,
     ) -> tuple[int, float]:
         """Update the learner with the sample; return its flags and its variance, nT^2."""
@@ -269,10 +269,10 @@ class Correction:
             quality,
             faulty=self.health is not None and self.health.is_fault,
             reference=main_field,
-            where=where,
+            position=position,
             age=sample.age,
             settled=self.aligner.channels.settled,
-            watched=[self.aligner.by_name[name].at(sample.time_us)[0] for name in self.learner.watched],
+            watched=[self.aligner.by_name[name].value_at(sample.time_us)[0] for name in self.learner.watched],
         )
         return self.learner.flags, self.learner.variance
 

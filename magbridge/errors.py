@@ -90,9 +90,9 @@ class NoSolutionError(CalibrationError):
 class OutOfRange(DataError, ValueError):
     """A date, position or grid cell outside the data: ``quantity = value: expected range``."""
 
-    def __init__(self, what: str, value: object, covered: str) -> None:
-        self.what, self.value, self.covered = what, value, covered
-        super().__init__(f"{what} = {value}: {covered}")
+    def __init__(self, quantity: str, value: object, covered: str) -> None:
+        self.what, self.value, self.covered = quantity, value, covered
+        super().__init__(f"{quantity} = {value}: {covered}")
 
 
 class PortError(MagbridgeError, OSError):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 if sys.platform != "win32":
     import resource
 
-__all__ = ["Guarded", "Job", "guarded"]
+__all__ = ["Guarded", "GuardedJob", "guarded"]
 
 T = TypeVar("T")
 
@@ -52,14 +52,14 @@ class Raised(NamedTuple):
     arguments: tuple[Any, ...]
 
     @classmethod
-    def by(cls, error: BaseException) -> Raised:
+    def from_exception(cls, error: BaseException) -> Raised:
         """Return an error without its causes, which other packages would pickle with it."""
         how = error.__reduce__()
         assert isinstance(how, tuple)
         return cls(*how[:2])
 
 
-class Job(NamedTuple):
+class GuardedJob(NamedTuple):
     """A file, and what returns an iterable of objects read from it, which can be pickled."""
 
     path: Path
@@ -96,7 +96,7 @@ def guarded(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
     Without fork (Windows), or where a process may not have children (a worker of a pool), this process reads
     the file: then a crash ends the process, and nothing limits the time.
     """
-    one = Guarded([Job(path, read)])
+    one = Guarded([GuardedJob(path, read)])
     try:
         yield from one.pieces(0)
     finally:
@@ -109,7 +109,7 @@ class Guarded:
     The child of a file that ends it is followed by another, for the files after that.
     """
 
-    def __init__(self, jobs: Sequence[Job]) -> None:
+    def __init__(self, jobs: Sequence[GuardedJob]) -> None:
         self._jobs = jobs
         self._received: list[deque[tuple[bool, Any]]] = [deque() for _ in jobs]
         self._at = 0
@@ -147,7 +147,7 @@ class Guarded:
             done, piece = self._child.receive(job)
         except FormatError as error:
             self.close()
-            done, piece = True, Raised.by(error)
+            done, piece = True, Raised.from_exception(error)
         self._received[self._at].append((done, piece))
         self._at += done
         if self._at == len(self._jobs):
@@ -157,7 +157,7 @@ class Guarded:
 class _Child:
     """A process that reads files, and the pipe through which the pieces come."""
 
-    def __init__(self, jobs: Sequence[Job]) -> None:
+    def __init__(self, jobs: Sequence[GuardedJob]) -> None:
         import multiprocessing  # noqa: PLC0415 - every command imports this module, few need a child
 
         context = multiprocessing.get_context("fork")
@@ -172,7 +172,7 @@ class _Child:
         end.close()
         self.end = weakref.finalize(self, _end, self._process, self._pieces)
 
-    def receive(self, job: Job) -> tuple[bool, Any]:
+    def receive(self, job: GuardedJob) -> tuple[bool, Any]:
         """Return whether `job` is done, and its piece; FormatError: it takes too much, or ends the child."""
         (seconds, memory), waited = job.limits, 0.0
         while not self._pieces.poll(POLL):
@@ -215,7 +215,7 @@ def _foreseen(path: Path, read: Callable[[], Iterable[T]]) -> Iterator[T]:
         raise damaged from error
 
 
-def _send(end: Connection, jobs: Sequence[Job]) -> None:
+def _send(end: Connection, jobs: Sequence[GuardedJob]) -> None:
     """Read in the child, and send (False, piece) for each of a file, then (True, None) or (True, Raised)."""
     faulthandler.disable()
     silent = os.open(os.devnull, os.O_WRONLY)
@@ -234,7 +234,7 @@ def _send(end: Connection, jobs: Sequence[Job]) -> None:
             except BrokenPipeError:
                 raise
             except (MagbridgeError, OSError) as error:
-                end.send((True, Raised.by(error)))
+                end.send((True, Raised.from_exception(error)))
     except BrokenPipeError:  # the parent wants no more
         pass
 

@@ -168,8 +168,8 @@ class OneTime:
             self.settled = x - x_was * dx, y - y_was * dy, z - z_was * dz
 
 
-def _slope(change: float, step: float, before: float) -> float:
-    """Return a slope, nT/s: for a channel that was not read again that of `before`, or 0 if it had none."""
+def _slope(change: float, step: float, previous: float) -> float:
+    """Return a slope, nT/s: for a channel that was not read again that of `previous`, or 0 if it had none."""
     if step > 0.0:
         return change / step
-    return 0.0 if isnan(before) else before
+    return 0.0 if isnan(previous) else previous

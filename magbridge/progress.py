@@ -22,15 +22,15 @@ LINE_INTERVAL_S = 10.0
 """s between two lines if stderr is not a terminal."""
 
 
-def track(items: Iterable[T], what: str, total: int | None = None, *, in_lines: bool = False) -> Iterator[T]:
+def track(items: Iterable[T], task: str, total: int | None = None, *, in_lines: bool = False) -> Iterator[T]:
     """Yield `items`; once that has taken two seconds, show on a terminal how far it is.
 
     Without a terminal nothing is shown, or with `in_lines` a line on stderr every :data:`LINE_INTERVAL_S`.
     """
     if in_lines and not sys.stderr.isatty():
-        yield from _lines(items, what, total)
+        yield from _lines(items, task, total)
         return
-    with _bar(what, total) as update:
+    with _bar(task, total) as update:
         updated = time.monotonic()
         for done, item in enumerate(items, 1):
             yield item
@@ -40,7 +40,7 @@ def track(items: Iterable[T], what: str, total: int | None = None, *, in_lines: 
                 updated = now
 
 
-def _lines(items: Iterable[T], what: str, total: int | None) -> Iterator[T]:
+def _lines(items: Iterable[T], task: str, total: int | None) -> Iterator[T]:
     """Yield `items`, and print how many are done: at intervals, and after the last where it took as long."""
     begin = printed = time.monotonic()
     of = "" if total is None else f" of {total}"
@@ -49,22 +49,22 @@ def _lines(items: Iterable[T], what: str, total: int | None) -> Iterator[T]:
         now = time.monotonic()
         is_last = done == total and now - begin >= LINE_INTERVAL_S
         if now - printed >= LINE_INTERVAL_S or is_last:
-            print(f"magbridge: {what}: {done}{of}, {now - begin:.0f} s", file=sys.stderr, flush=True)
+            print(f"magbridge: {task}: {done}{of}, {now - begin:.0f} s", file=sys.stderr, flush=True)
             printed = now
 
 
 @contextmanager
-def waiting(what: str) -> Iterator[Callable[[str], object]]:
+def waiting(task: str) -> Iterator[Callable[[str], object]]:
     """Once the block has taken two seconds, show on a terminal that it is at work, and for how long.
 
     Yields a function that shows the name of the next step.
     """
-    with _bar(what) as update:
+    with _bar(task) as update:
         yield lambda step: update(description=step)
 
 
 @contextmanager
-def _bar(what: str, total: float | None = None) -> Iterator[Callable[..., object]]:
+def _bar(title: str, total: float | None = None) -> Iterator[Callable[..., object]]:
     """Show a bar from two seconds on, and the time it has taken; yield a function that updates it."""
     if not sys.stderr.isatty():
         yield lambda **_: None
@@ -74,7 +74,7 @@ def _bar(what: str, total: float | None = None) -> Iterator[Callable[..., object
 
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(what, total=total, visible=False)
+        task = progress.add_task(title, total=total, visible=False)
         appear = Timer(BAR_DELAY_S, progress.update, (task,), {"visible": True})
         appear.daemon = True
         appear.start()

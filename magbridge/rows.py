@@ -83,7 +83,7 @@ def correct_rows(correction: Correction, deployment: xr.Dataset) -> xr.Dataset:
             correction.direction.expect(*vectors[row].tolist())
             correction.direction.attitude(stamp, *attitudes[row])
         sample, one = correction.reading(
-            reading, stamp, main_field=known[row], where=places[row], depth=float(depth[row])
+            reading, stamp, main_field=known[row], position=places[row], depth=float(depth[row])
         )
         level[row], age[row] = correction.level(sample, one), sample.age
         fields[row], values[row] = sample.field, sample.values[: values.shape[1]]
@@ -184,7 +184,7 @@ def _as_live(held: HeldField, deployment: xr.Dataset) -> FloatArray:
     found = np.full(n, nan)
     for row, (place, down) in enumerate(zip(_places(deployment), np.nan_to_num(depth).tolist(), strict=True)):
         if place is not None:
-            found[row] = held.at((*place, down), utc_us[row])
+            found[row] = held.field_at((*place, down), utc_us[row])
     return found
 
 

@@ -124,11 +124,11 @@ class ScalarCorrection:
         restarted: bool = False,
         missing: int = 0,
         main_field: float = nan,
-        where: tuple[float, float] | None = None,
+        position: tuple[float, float] | None = None,
     ) -> None:
         """Record one reading; parameters as for :meth:`magbridge.correction.Correction.reading`."""
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
-        self._pending.append(PendingReading(sample, main_field, where))
+        self._pending.append(PendingReading(sample, main_field, position))
 
     def samples(self, now_us: int) -> list[CorrectedReading]:
         """Return the samples that are complete at `now_us` (µs)."""
@@ -199,28 +199,28 @@ class ScalarCorrection:
         far = np.abs(times[np.clip(np.searchsorted(times, wanted), 0, len(times) - 1)] - wanted) > MAX_WAIT_US
         return np.where(far[:, None], nan, np.stack(columns, axis=1))
 
-    def _checked(self, one: PendingReading, total: float, sigma: float, flags: int) -> CorrectedReading:
+    def _checked(self, pending: PendingReading, total: float, sigma: float, flags: int) -> CorrectedReading:
         """Return a sample with the flags and the variance that alignment and plausibility checks add."""
-        sample = one.sample
+        sample = pending.sample
         quality = sample.quality | flags | self._flags
         variance = sigma * sigma + sample.sigma * sample.sigma
         stated_sigma = sqrt(variance)
         if self._health is not None and isfinite(total):
-            arguments = (self._health, one, (total, sigma), quality)
+            arguments = (self._health, pending, (total, sigma), quality)
             added, more = self.parts.call("plausibility check", (0.0, 0), self._check, *arguments)
             variance, quality = variance + added, quality | more
         corrected = Corrected(total, sqrt(variance), NO_VECTOR, NO_VECTOR, quality)
-        return CorrectedReading(sample, corrected, one.main_field, stated_sigma)
+        return CorrectedReading(sample, corrected, pending.main_field, stated_sigma)
 
     def _check(
-        self, health: HealthMonitor, one: PendingReading, total: tuple[float, float], quality: int
+        self, health: HealthMonitor, pending: PendingReading, total: tuple[float, float], quality: int
     ) -> tuple[float, int]:
         """Return the variance (nT²) and the flags of the plausibility checks."""
-        sample, F = one.sample, one.sample.field[0]
-        if one.where is not None:
-            health.set_position(sample.time_us, *one.where)
+        sample, F = pending.sample, pending.sample.field[0]
+        if pending.where is not None:
+            health.set_position(sample.time_us, *pending.where)
         no_masses: Callable[[], tuple[float, ...]] = tuple
-        reference = one.main_field, self.aligner.settings.reference_sigma
+        reference = pending.main_field, self.aligner.settings.reference_sigma
         # one channel in place of three: its direction never changes, and it repeats only as a whole
         variance = health.check(
             sample.time_us, (F, F, F), (total[0], 0.0, 0.0), total, quality, reference,

@@ -40,8 +40,8 @@ class Track:
         "max_age", "moved_us",
     )  # fmt: skip
 
-    def __init__(self, what: Input) -> None:
-        self.input, self.max_age = what, what.max_age
+    def __init__(self, quantity: Input) -> None:
+        self.input, self.max_age = quantity, quantity.max_age
         self.history: deque[tuple[int, float]] = deque(maxlen=TRACK_LENGTH)
         self.last_us, self.last, self.before = NEVER, nan, nan  # the newest, and the value before it
         self.first_us = NEVER
@@ -90,7 +90,7 @@ class Track:
         """Time of the report before the last one, µs."""
         return self.history[-2][0] if len(self.history) > 1 else self.last_us
 
-    def between(self, begin_us: int) -> tuple[float, float]:
+    def extremes_since(self, begin_us: int) -> tuple[float, float]:
         """Return the least and the greatest value since `begin_us`, including the value held then."""
         low = high = self.last
         for then_us, value in reversed(self.history):
@@ -99,7 +99,7 @@ class Track:
                 break
         return low, high
 
-    def at(self, time_us: int) -> tuple[float, float, float, float]:
+    def value_at(self, time_us: int) -> tuple[float, float, float, float]:
         """Return the value at `time_us`, its age in s, and two values between which a moving mass is.
 
         Between two values it is interpolated (age 0); after the last it is held; before the first, the first

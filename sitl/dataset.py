@@ -30,8 +30,8 @@ OWN = {
 """Columns that a simulation adds to those of any deployment."""
 
 
-def dataset(track: Track, when: FloatArray, columns: Mapping[str, FloatArray], source: str) -> xr.Dataset:
-    """Return `columns`, sampled at `when` (n,), s after the track's start, as a deployment."""
+def dataset(track: Track, time: FloatArray, columns: Mapping[str, FloatArray], source: str) -> xr.Dataset:
+    """Return `columns`, sampled at `time` (n,), s after the track's start, as a deployment."""
     known = dict(COLUMNS | OWN)
     for name in track.parameters:
         unit = MOUNTINGS[name].unit if name in MOUNTINGS else "1"
@@ -39,7 +39,7 @@ def dataset(track: Track, when: FloatArray, columns: Mapping[str, FloatArray], s
     parts = [(part, track.start + first, track.start + last) for part, first, last in track.segments]
     return xr.Dataset(
         {name: ("time", columns[name], known[name]._asdict()) for name in known if name in columns},
-        coords={"time": ("time", track.start + when, COLUMNS["time"]._asdict())},
+        coords={"time": ("time", track.start + time, COLUMNS["time"]._asdict())},
         attrs={"source": f"simulated: {source}", "segments": json.dumps(parts)},
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray
-from magbridge.bridge.events import Start
+from magbridge.bridge.events import StartEvent
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import Fit, fit
 from magbridge.calibration.fitting.lowpass import unfiltered
@@ -66,7 +66,7 @@ def demo(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -> 
     step("replaying the survey: the fluxgate through a pty, the autopilot through a socket, into the bridge")
     listener = Listener()
     stage = Stage(config, listener.receive, folder / "logs")
-    stage.play(Start(start_us(survey)), emulate(survey, load_config(config)), inf)
+    stage.play(StartEvent(start_us(survey)), emulate(survey, load_config(config)), inf)
     step(f"heard {sum(listener.counts.values())} messages as a ground station would")
 
     received = _align(listener.field(), survey)

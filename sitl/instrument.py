@@ -73,7 +73,7 @@ class Instrument(Table, frozen=True):
         return np.asarray(np.diag(self.scale) @ axes @ rotation(*self.mounting).as_matrix().T)
 
     def measure(
-        self, field: FloatArray, water: FloatArray, step: float, when: FloatArray, rng: np.random.Generator
+        self, field: FloatArray, water: FloatArray, step: float, time: FloatArray, rng: np.random.Generator
     ) -> Samples:
         """Measure a field given on a uniform grid.
 
@@ -85,7 +85,7 @@ class Instrument(Table, frozen=True):
             degC around the instrument.
         step : float
             s between the grid's points.
-        when : array (m,)
+        time : array (m,)
             s after the first point at which triples are taken; inside the grid, channel delays included.
         rng : Generator
             Of the offsets at power-on and of the noise.
@@ -100,17 +100,17 @@ class Instrument(Table, frozen=True):
 
         time_constant = 1 / (2 * np.pi * self.corner) if self.corner else 0.0
         filtered = first_order(analogue, step, time_constant)
-        channels = autoregressive(rng, (len(when), 3), self.noise_sigma, self.noise_memory)
+        channels = autoregressive(rng, (len(time), 3), self.noise_sigma, self.noise_memory)
         for axis, delay in enumerate(self.channel_delay):
             channels[:, axis] += first_order_at(
-                analogue[:, axis], filtered[:, axis], step, time_constant, when + delay
+                analogue[:, axis], filtered[:, axis], step, time_constant, time + delay
             )
         grid = step * np.arange(len(field))
         return Samples(
             channels=self.digitise(channels),
-            times=when[:, None] + np.asarray(self.channel_delay),
-            temperature=np.interp(when, grid, temperature),
-            power_cycle=np.searchsorted(np.asarray(self.power_on), when, side="right").astype(np.float64),
+            times=time[:, None] + np.asarray(self.channel_delay),
+            temperature=np.interp(time, grid, temperature),
+            power_cycle=np.searchsorted(np.asarray(self.power_on), time, side="right").astype(np.float64),
         )
 
     def temperature(self, water: FloatArray, step: float) -> FloatArray:

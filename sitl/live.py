@@ -86,7 +86,7 @@ def flying(folder: Path, seed: int = 1, notify: Callable[[str], None] = print) -
             command, stderr=subprocess.DEVNULL, start_new_session=True
         )
         opened.callback(_end, bridge)
-        survey = _at(survey, time.time() + LEAD)
+        survey = _state_at(survey, time.time() + LEAD)
         for thread in (
             Thread(target=router.run, args=(stop,), daemon=True),
             Thread(target=_play, args=(survey, config, master, router, stop), daemon=True),
@@ -111,7 +111,7 @@ def _prepare(folder: Path, seed: int) -> xr.Dataset:
     return parts["survey"]
 
 
-def _at(survey: xr.Dataset, begin: float) -> xr.Dataset:
+def _state_at(survey: xr.Dataset, begin: float) -> xr.Dataset:
     """Return the survey with its times moved to `begin`, s since 1970."""
     shift = begin - float(survey["time"][0])
     moved = {

@@ -99,7 +99,7 @@ class Spirals(Table, frozen=True, tag_field="kind", tag="spirals"):
                 pitch=run.pitch,
                 roll=bank if run.roll is None else run.roll,
                 turn=360 * self.turns / self.duration,
-                parameters=others(rng, limits) | run.parameters,
+                parameters=other_channels(rng, limits) | run.parameters,
                 segment=self.segment,
             )
             legs.append(leg)
@@ -143,7 +143,7 @@ class CrissCross(Table, frozen=True, tag_field="kind", tag="criss_cross"):
                     pitch=pitch,
                     roll=float(rng.normal(*self.roll)),
                     heading=(self.axis + back + side * self.zigzag) % 360,
-                    parameters=others(rng, limits)
+                    parameters=other_channels(rng, limits)
                     | {
                         "battpos": float(np.clip(battery, low, high)),
                         "ballast": float(np.copysign(200, pitch)),
@@ -176,7 +176,7 @@ def _table_1(trial: int) -> tuple[Run, ...]:
     )
 
 
-def others(rng: np.random.Generator, limits: Mapping[str, Limit]) -> dict[str, float]:
+def other_channels(rng: np.random.Generator, limits: Mapping[str, Limit]) -> dict[str, float]:
     """Draw a position for every mass that is not in Table 1, within the inner nine tenths of its travel."""
     return {
         name: float(rng.uniform(0.95 * limit.low + 0.05 * limit.high, 0.05 * limit.low + 0.95 * limit.high))

@@ -49,7 +49,7 @@ def first_order(
 
 
 def first_order_at(
-    u: FloatArray, y: FloatArray, step: float, time_constant: float, when: FloatArray
+    u: FloatArray, y: FloatArray, step: float, time_constant: float, time: FloatArray
 ) -> FloatArray:
     r"""Return a first-order lag's output between the points of its grid.
 
@@ -59,7 +59,7 @@ def first_order_at(
         Input, and output of :func:`first_order`, on the grid.
     step, time_constant : float
         s.
-    when : array (m,)
+    time : array (m,)
         s after the first point; inside the grid.
 
     Returns
@@ -71,8 +71,8 @@ def first_order_at(
     Within a step, :math:`y(s) = a y_k + (1 - a)(u_k - c \tau) + c s` with :math:`a = e^{-s/\tau}` and c the
     slope of u.
     """
-    k = np.clip(np.floor(when / step).astype(np.intp), 0, len(u) - 2)
-    s = when - k * step
+    k = np.clip(np.floor(time / step).astype(np.intp), 0, len(u) - 2)
+    s = time - k * step
     slope = (u[k + 1] - u[k]) / step
     if time_constant == 0:
         return np.asarray(u[k] + slope * s)

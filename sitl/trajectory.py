@@ -73,12 +73,12 @@ class Track:
         """Time since the start, s, (n,)."""
         return np.asarray(self.step * np.arange(len(self.depth)))
 
-    def at(self, when: FloatArray) -> dict[str, FloatArray]:
-        """Return every quantity by name at `when` (m,), s after the start, linear between the points."""
+    def pose_at(self, time: FloatArray) -> dict[str, FloatArray]:
+        """Return every quantity by name at `time` (m,), s after the start, linear between the points."""
         names = ("latitude", "longitude", "depth", "roll", "pitch", "heading")
         columns = {name: getattr(self, name) for name in names} | self.parameters
         elapsed = self.elapsed
-        return {name: np.interp(when, elapsed, column) for name, column in columns.items()}
+        return {name: np.interp(time, elapsed, column) for name, column in columns.items()}
 
     def local(self, latitude: FloatArray, longitude: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return places (m,), deg, as metres north and east of where the track begins."""

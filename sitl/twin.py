@@ -99,14 +99,14 @@ class Twin:
         step = min(FINE_STEP, 1 / self.scenario.instrument.rate)
         return fly(legs, start, step, rng, self.scenario.motion, limits)
 
-    def measure(self, track: Track, when: FloatArray) -> xr.Dataset:
+    def measure(self, track: Track, time: FloatArray) -> xr.Dataset:
         """Measure along a track.
 
         Parameters
         ----------
         track : Track
             As :meth:`fly` returns it.
-        when : array (n,)
+        time : array (n,)
             s after the track's start of each triple; channel delays must end inside the track.
 
         Returns
@@ -116,9 +116,9 @@ class Twin:
         """
         ambient = self.ambient(track)
         samples = self.scenario.instrument.measure(
-            ambient.field, ambient.water, track.step, when, self.instrument_rng()
+            ambient.field, ambient.water, track.step, time, self.instrument_rng()
         )
-        return self.log(track, when, ambient.earth, samples)
+        return self.log(track, time, ambient.earth, samples)
 
     def ambient(self, track: Track) -> Ambient:
         """Return what the instrument is exposed to along a track."""
@@ -134,22 +134,22 @@ class Twin:
         """Return the generator of the instrument's offsets at power-on and of its noise."""
         return _stream(self.seed, 3)
 
-    def log(self, track: Track, when: FloatArray, earth: FloatArray, samples: Samples) -> xr.Dataset:
+    def log(self, track: Track, time: FloatArray, earth: FloatArray, samples: Samples) -> xr.Dataset:
         """Return the deployment of an instrument's samples, as :meth:`measure` does.
 
         Parameters
         ----------
-        track, when
+        track, time
             As for :meth:`measure`.
         earth : array (n, 3)
             As :attr:`Ambient.earth`.
         samples : Samples
-            What the instrument gave for `when`.
+            What the instrument gave for `time`.
         """
-        true = track.at(when)
-        field_ned = np.column_stack([np.interp(when, track.elapsed, b) for b in earth.T])
+        true = track.pose_at(time)
+        field_ned = np.column_stack([np.interp(time, track.elapsed, b) for b in earth.T])
         field_body = rotation(true["roll"], true["pitch"], true["heading"]).apply(field_ned, inverse=True)
-        columns = self._telemetry(true, when) | {
+        columns = self._telemetry(true, time) | {
             TEMPERATURE: samples.temperature,
             "power_cycle": samples.power_cycle,
             "truth_total_field": np.linalg.norm(field_ned, axis=1),
@@ -162,13 +162,13 @@ class Twin:
             if any(self.scenario.instrument.channel_delay):
                 columns[f"mag_time_{axis}"] = track.start + samples.times[:, k]
         if track.run is not None:
-            columns["run"] = track.run[np.rint(when / track.step).astype(np.intp)]
+            columns["run"] = track.run[np.rint(time / track.step).astype(np.intp)]
         reference = self.scenario.telemetry.reference
         if reference == "true":
             columns["reference_field"] = columns["truth_total_field"]
         elif reference == "map":
-            columns["reference_field"] = self._map_reference(columns, track.start + when)
-        return dataset(track, when, columns, self.scenario.name)
+            columns["reference_field"] = self._map_reference(columns, track.start + time)
+        return dataset(track, time, columns, self.scenario.name)
 
     def anomaly_map(self) -> AnomalyGrid:
         """Return the aeromagnetic map of the scenario's world: see :meth:`World.anomaly_map`."""
@@ -191,7 +191,7 @@ class Twin:
 
     def _channels(self, track: Track, water: FloatArray) -> dict[str, FloatArray]:
         """Return the channels on which the vehicle depends, the fluxgate's temperature among them."""
-        known = track.at(track.elapsed)
+        known = track.pose_at(track.elapsed)
         known[TEMPERATURE] = self.scenario.instrument.temperature(water, track.step)
         for name in self.vehicle.channels:
             if name not in known:
@@ -200,17 +200,17 @@ class Twin:
                 )
         return {name: known[name] for name in self.vehicle.channels}
 
-    def _telemetry(self, true: dict[str, FloatArray], when: FloatArray) -> dict[str, FloatArray]:
+    def _telemetry(self, true: dict[str, FloatArray], time: FloatArray) -> dict[str, FloatArray]:
         """Return the telemetry: attitude and position with their errors, all else as it is."""
         settings, rng = self.scenario.telemetry, _stream(self.seed, 4)
         seen = dict(true)
         for name in ("roll", "pitch"):
-            seen[name] = true[name] + rng.normal(0, settings.roll_pitch_sigma, len(when))
-        seen["heading"] = (true["heading"] + rng.normal(0, settings.heading_sigma, len(when))) % 360
+            seen[name] = true[name] + rng.normal(0, settings.roll_pitch_sigma, len(time))
+        seen["heading"] = (true["heading"] + rng.normal(0, settings.heading_sigma, len(time))) % 360
         north, east = separation(*self.world.origin, true["latitude"], true["longitude"])
         current = rng.normal(0, settings.drift, 2)
         seen["latitude"], seen["longitude"] = offset(
-            *self.world.origin, north - current[0] * when, east - current[1] * when
+            *self.world.origin, north - current[0] * time, east - current[1] * time
         )
         return seen
 
@@ -239,18 +239,18 @@ def simulate(scenario: Scenario, seed: int = 0) -> xr.Dataset:
     return twin.measure(track, when)
 
 
-def _with_hidden(twin: Twin, track: Track, when: FloatArray) -> xr.Dataset:
+def _with_hidden(twin: Twin, track: Track, moment: FloatArray) -> xr.Dataset:
     """Measure twice, and take each effect's segment from where it is: the noise is the same in both."""
-    from sitl.inject import Hidden, disturb  # noqa: PLC0415 - the effects simulate with twins
+    from sitl.inject import HiddenEffect, disturb  # noqa: PLC0415 - the effects simulate with twins
 
-    out = disturb(twin, (), track, when, twin.seed)
+    out = disturb(twin, (), track, moment, twin.seed)
     spans = {name: (begin, end) for name, begin, end in json.loads(out.attrs["segments"])}
     time = out["time"].to_numpy()
     for number, one in enumerate(twin.scenario.hidden):
         if one.segment not in spans:
             raise WrongUse(f"scenario {twin.scenario.name!r}: no segment {one.segment!r}")
-        effect = Hidden(one.effect, one.size, twin.seed + number)
-        other = disturb(twin, (effect,), track, when, twin.seed)
+        effect = HiddenEffect(one.effect, one.size, twin.seed + number)
+        other = disturb(twin, (effect,), track, moment, twin.seed)
         begin, end = spans[one.segment]
         there = (time >= begin) & (time <= end)
         for name in other.data_vars:
@@ -258,5 +258,5 @@ def _with_hidden(twin: Twin, track: Track, when: FloatArray) -> xr.Dataset:
     return out
 
 
-def _stream(seed: int, which: int) -> np.random.Generator:
-    return np.random.default_rng([seed, which])
+def _stream(seed: int, hidden: int) -> np.random.Generator:
+    return np.random.default_rng([seed, hidden])

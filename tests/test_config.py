@@ -21,7 +21,7 @@ from magbridge.config import (
     load,
 )
 from magbridge.errors import ConfigError
-from magbridge.navigate import Options
+from magbridge.navigate import NavigationOptions
 from magbridge.sensors.options import attributes_of
 
 GOOD = """
@@ -137,7 +137,7 @@ def test_telemetry_in_another_unit_than_the_calibration_s(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "table", [Sensor, Link, Telemetry, CalibrationFile, Align, Navigation, Learning, Log, Options]
+    "table", [Sensor, Link, Telemetry, CalibrationFile, Align, Navigation, Learning, Log, NavigationOptions]
 )
 def test_every_key_says_what_it_means(table: type[msgspec.Struct]) -> None:
     """Also where several share a string: the documentation's tables are made of these."""

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.model import Noise, Sensor, identity
+from magbridge.calibration.model import CalibratedSensor, Noise, identity
 from magbridge.config import Align
 from magbridge.correction import Correction
 from magbridge.errors import CalibrationError
@@ -76,7 +76,7 @@ def test_a_gap_and_a_missing_number_are_no_slope() -> None:
 @pytest.mark.parametrize("delay_s", [0.0, 0.3])
 def test_a_calibration_that_names_the_filter_corrects_without_lag(delay_s: float) -> None:
     """What ``align.filter_delay`` corrects in the time of a sample is not undone once more."""
-    sensor = Sensor("ascii", filter_cutoff=CUTOFF_HZ)
+    sensor = CalibratedSensor("ascii", filter_cutoff=CUTOFF_HZ)
     calibration = replace(identity(), sensor=sensor, method="made for a test", noise=Noise(1.0))
     kept = decode_calibration(encode_calibration(calibration))
     assert kept.sensor == calibration.sensor
@@ -92,6 +92,6 @@ def test_a_calibration_that_names_the_filter_corrects_without_lag(delay_s: float
 
 @pytest.mark.parametrize("cutoff", [-1.0, 1e9])
 def test_an_impossible_cutoff_is_refused(cutoff: float) -> None:
-    calibration = replace(identity(), sensor=Sensor("ascii", filter_cutoff=cutoff))
+    calibration = replace(identity(), sensor=CalibratedSensor("ascii", filter_cutoff=cutoff))
     with pytest.raises(CalibrationError, match="filter_cutoff"):
         decode_calibration(encode_calibration(calibration))

@@ -13,7 +13,7 @@ import pytest
 
 from magbridge import guard
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.guard import Guarded, Job, guarded
+from magbridge.guard import Guarded, GuardedJob, guarded
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def where() -> Iterator[int]:
 def test_one_child_reads_several_files_and_another_what_follows_a_crash(
     file: Path, order: tuple[int, ...]
 ) -> None:
-    child = Guarded([Job(file, read) for read in (where, where, crashes, where, stumbles)])
+    child = Guarded([GuardedJob(file, read) for read in (where, where, crashes, where, stumbles)])
     found: dict[int, list[int]] = {}
     failed: dict[int, str] = {}
     for k in order:
@@ -160,5 +160,5 @@ def test_each_of_several_files_has_its_own_time(file: Path, monkeypatch: pytest.
             pass
         yield 1
 
-    child = Guarded([Job(file, busy)] * 4)
+    child = Guarded([GuardedJob(file, busy)] * 4)
     assert [list(child.pieces(k)) for k in range(4)] == [[1]] * 4

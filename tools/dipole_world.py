@@ -238,7 +238,7 @@ def correct_live(
             for name, column in values.items():
                 correction.telemetry(name, column[k], stamps[k])
         reading = Reading(tuple(fields[k]), temperature=warmth[k])
-        _, one = correction.reading(reading, stamps[k], main_field=main[k], where=where[k])
+        _, one = correction.reading(reading, stamps[k], main_field=main[k], position=where[k])
         total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
         notices += [(k, text) for text in correction.notices]
         correction.notices.clear()

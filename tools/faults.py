@@ -23,7 +23,7 @@ from studies import Column, Row, Study, study_options
 from magbridge.arrays import FloatArray
 from magbridge.bridge import states
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.lowpass import unfiltered
@@ -100,7 +100,7 @@ def prepare(folder: Path, seed: int, hours: float, *, calibrated_by: int | None 
 def score(flight: Flight, rows: xr.Dataset, change: Callable[[Events], Events] = iter) -> Score:
     """Feed the bridge with `rows` of a flight, their events changed by `change`; compare with the truth."""
     config = load_config(flight.folder / "bridge.toml")
-    pipeline = set_up(config, Start(start_us(rows)))
+    pipeline = set_up(config, StartEvent(start_us(rows)))
     listener = Listener()
     for event in change(emulate(rows, config)):
         sent = pipeline.feed(event)

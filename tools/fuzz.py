@@ -35,7 +35,7 @@ from ulogs import ulog_of
 
 from magbridge import config, logs
 from magbridge.calibration.file import decode_calibration, encode_calibration
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference, Run
 from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import MagbridgeError
 from magbridge.field import read
@@ -144,7 +144,7 @@ def _calibration(_: Path) -> list[bytes]:
         covariance=root @ root.T,
         noise=Noise(1.0, 0.0, 0.3, 4.0),
         reference=Reference(51_000.0, "IGRF"),
-        sensor=Sensor("digitizer", 3),
+        sensor=CalibratedSensor("digitizer", 3),
         boresight=None,
         runs=(Run("1", 225, 1.1, (0.3,)),),
         method="auto",

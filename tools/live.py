@@ -252,7 +252,7 @@ def learn(learner: Learner, calibration: Calibration, log: xr.Dataset) -> Publis
         for key, values in telemetry.items():
             correction.telemetry(key, values[k], stamps[k] - round(AGE_S * 1e6))
         reading = Reading(tuple(fields[k]), temperature=warmth[k])
-        _, one = correction.reading(reading, stamps[k], main_field=reference[k], where=where[k])
+        _, one = correction.reading(reading, stamps[k], main_field=reference[k], position=where[k])
         total[k], sigma[k], quality[k] = one.total_field, one.total_field_sigma, one.quality
         if any(notice.text.startswith("unexplained") for notice in learner.notices):
             alarms.append((k, learner.state.causes))

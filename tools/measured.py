@@ -338,7 +338,7 @@ def show_survey(data: Path, console: Console) -> None:
     samples = read_table(data / "rio_magnetic" / "rio-magnetic.csv.xz")
     done = survey(samples.part(~samples.tie))
     ties = samples.part(samples.tie)
-    anomaly, sigma = done.gridded.at(ties.place, ties.depth)
+    anomaly, sigma = done.gridded.evaluate(ties.place, ties.depth)
     error = anomaly - ties.value
     kriged = done.gridded.kriged
     z = error / np.hypot(sigma, done.gridded.sigma if kriged is None else kriged.of_a_line(ties.place))

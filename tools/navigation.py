@@ -65,7 +65,7 @@ from magbridge.navigate.bank import Tracker
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.bound import position_bound
 from magbridge.navigate.model import Block, prior, transition
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 MAPS = (Map(60, 2000), Map(60, 800), Map(20, 1000), Map(20, 1000, rough=True), Map(5, 1000), Map(1, 2000))
 STARTS = {"narrow": 0.2, "wide": 1.0}
@@ -340,8 +340,8 @@ def show_magnav(folder: Path, console: Console) -> None:
     title = f"MagNav.jl's flight, {metres / 1e3:.0f} km; inertial track: {inertial:.1f} m"
     shown = table(title, "start, m", "interval, s", "error, m", "smoothed", "bound")
     motions = ((3.0, 0.01, 0.01), (100.0, 0.5, 0.1))
-    for (start, current, drift), interval in product(motions, (Options().interval, 0.0)):
-        options = Options(
+    for (start, current, drift), interval in product(motions, (NavigationOptions().interval, 0.0)):
+        options = NavigationOptions(
             bias_sigma=3.0, bias_time=600.0, map_sigma=3.0, interval=interval,
             start_sigma=start, current_sigma=current, drift=drift,
         )  # fmt: skip

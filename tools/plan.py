@@ -45,7 +45,7 @@ def plans(scenario: Scenario, noise: float) -> dict[str, tuple[list[PlannedRun],
     parts = segments(simulate(scenario, 0))
     runs, survey = (observed(parts[name]) for name in ("calibration", "survey"))
     before = expected_calibration(runs.ranges(), float(runs.reference.mean()), noise=noise)
-    mission, ned = Mission.of(survey), main_field(parts["calibration"])[0]
+    mission, ned = Mission.from_observations(survey), main_field(parts["calibration"])[0]
     paper = [
         PlannedRun(pitch, BANK_DEG, (battery, float(np.copysign(200.0, pitch))))
         for _, pitch, battery, _ in TABLE_1

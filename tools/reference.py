@@ -61,7 +61,7 @@ def commands() -> str:
 def configuration() -> Iterator[str]:
     """Yield the page of ``bridge.toml``: its tables as they are defined, and the options of every driver."""
     from magbridge.config import Config  # noqa: PLC0415 - imports the program only where pages are made
-    from magbridge.navigate import Options  # noqa: PLC0415
+    from magbridge.navigate import NavigationOptions  # noqa: PLC0415
     from magbridge.sensors import DRIVERS  # noqa: PLC0415
     from magbridge.sensors.options import attributes_of, options_of  # noqa: PLC0415
 
@@ -83,7 +83,7 @@ def configuration() -> Iterator[str]:
         yield f"### {driver}\n"
         yield from _keys(options_of(driver))
     yield "## navigation.options\n"
-    yield from _keys(attributes_of(Options))
+    yield from _keys(attributes_of(NavigationOptions))
 
 
 def _keys(options: Iterable[Option]) -> Iterator[str]:

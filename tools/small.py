@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Start
+from magbridge.bridge.events import StartEvent
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference
@@ -66,7 +66,7 @@ def bridge_text(
 
 def small_bridge(
     folder: Path,
-    start: Start,
+    start: StartEvent,
     battery: Parameter,
     publish: Sequence[str],
     more: str = "",

@@ -23,9 +23,9 @@ from studies import command_line
 
 from magbridge.bridge import states
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Sensor
+from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.config import load
 from magbridge.mavlink import Codec, Message
@@ -58,7 +58,7 @@ def calibration() -> Calibration:
         covariance=np.eye(18),
         noise=Noise(1.0),
         reference=Reference(float(np.linalg.norm(TRUTH))),
-        sensor=Sensor("digitizer"),
+        sensor=CalibratedSensor("digitizer"),
         method="made for a soak",
     )
 
@@ -71,7 +71,7 @@ class Soak:
         text = bridge_text("digitizer", "sensitivity = 5e-5, reference_voltage = 5.0", log=False)
         (folder / "bridge.toml").write_text(text, encoding="utf-8")
         config = load(folder / "bridge.toml")
-        self.pipeline = set_up(config, Start(BEGIN_US))
+        self.pipeline = set_up(config, StartEvent(BEGIN_US))
         self.encoder = open_encoder("digitizer", config.sensor.options)
         self.rng = np.random.default_rng(seed)
         self.made = self.published = self.wrong = self.flagged = 0

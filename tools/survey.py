@@ -107,7 +107,7 @@ def score_map(twin: Twin, done: Result, size: float, length: float, best: Survey
     along = place[rng.integers(len(place), size=PLACES)]
     places = np.concatenate([along, along + rng.normal(0, TRACK_DISTANCE_LENGTHS * length, along.shape)])
     true = crust.anomaly(places + shift)
-    anomaly, sigma = done.gridded.at(places)
+    anomaly, sigma = done.gridded.evaluate(places)
     known = _oracle_map(twin, done, places, size, length, crust.anomaly(place + shift))
     ours, ideal, peer = (
         _about_track_mean(one - true) for one in (anomaly, known, _equivalent_sources(done, places, length))

@@ -35,9 +35,9 @@ from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.depth import at_depth
 from magbridge.navigate.model import Block, Collector, block_length
 from magbridge.navigate.navigator import Navigator
-from magbridge.navigate.options import Options, informed
+from magbridge.navigate.options import NavigationOptions, informed
 from magbridge.navigate.own_survey import localise
-from magbridge.navigate.record import State
+from magbridge.navigate.record import NavigationState
 from magbridge.navigate.reference_track import errors as track_errors
 from magbridge.rows import correct_rows
 from sitl import Twin, load, segments, simulate
@@ -53,7 +53,9 @@ SPEEDS = (0.35, 0.25, 0.5)
 """m/s, from run to run."""
 LEFT = {"auto": 0.5, "nominal": 125.0}
 """Slow error that a calibration leaves in addition to 1 nT of white noise, nT (tools/accuracy.py)."""
-GLIDER = Options(current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0)
+GLIDER = NavigationOptions(
+    current_sigma=0.05, bias_sigma=LEFT["auto"], bias_time=1800.0, map_sigma=1.0, interval=40.0
+)
 """A glider moves 14 m in 40 s: less than 2 % of any correlation length here."""
 OUTSIDE = float(chi2.ppf(0.9999, 2))
 """Squared distance beyond which the filter is wrong."""
@@ -91,7 +93,7 @@ def synthetic(kind: Map, seed: int, extent: float = 16_000.0) -> AnomalyGrid:
 
 def track_over(
     grid: AnomalyGrid,
-    options: Options,
+    options: NavigationOptions,
     seed: int,
     *,
     hours: float = 6.0,
@@ -132,7 +134,7 @@ def track_over(
 
 def adrift(
     grid: AnomalyGrid,
-    options: Options,
+    options: NavigationOptions,
     rng: np.random.Generator,
     velocity: FloatArray,
     errors: FloatArray,
@@ -213,7 +215,7 @@ class Run:
             unaided=self.unaided,
             lost=longest(self.nees[half] > OUTSIDE, self.hours[half]) > 0.5,
             nees=float(np.mean(self.nees[half])) / 2,
-            false_alarm=bool((self.state == State.LOST).any()) and away <= 0.1,
+            false_alarm=bool((self.state == NavigationState.LOST).any()) and away <= 0.1,
             valid=float(np.mean(self.valid)),
             waited=float(self.hours[self.valid][0]) if self.valid.any() else inf,
             seconds=self.seconds,
@@ -241,7 +243,7 @@ def longest(flags: BoolArray, hours: FloatArray) -> float:
     return float(max(spans, default=0.0))
 
 
-def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
+def sail(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Run:
     """Run the navigator over a track."""
     navigator = Navigator(grid, options)
     every = float(ds["time"][1] - ds["time"][0])
@@ -286,7 +288,7 @@ def sail(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Run:
     )
 
 
-def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> Iterator[tuple[Block, float]]:
+def blocks(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> Iterator[tuple[Block, float]]:
     """Yield the measurements that the navigator makes of a track, and the metres travelled until each."""
     where = DeadReckoning()
     where.place(*PLACE)
@@ -382,7 +384,8 @@ def dived(seed: int) -> tuple[Dived, Dived]:
     grid, log = Twin.draw(scenario, seed).anomaly_map(), simulate(scenario, seed)
     log = log.assign(total_field=log["truth_total_field"])
     found = [
-        navigate(log, *how) for how in ((grid, Options()), at_depth(grid, Options(), log["depth"].to_numpy()))
+        navigate(log, *how)
+        for how in ((grid, NavigationOptions()), at_depth(grid, NavigationOptions(), log["depth"].to_numpy()))
     ]
     return _score(found[0]), _score(found[1])
 
@@ -464,7 +467,7 @@ class Vehicle:
         Half the side of the map, m.
     """
 
-    options: Options
+    options: NavigationOptions
     hours: float
     speed: float
     every: float
@@ -474,7 +477,9 @@ class Vehicle:
 
 
 SURVEYOR = Vehicle(
-    Options(start_sigma=20.0, current_sigma=0.02, drift=0.2, bias_sigma=0.5, bias_time=1800.0, map_sigma=0.0),
+    NavigationOptions(
+        start_sigma=20.0, current_sigma=0.02, drift=0.2, bias_sigma=0.5, bias_time=1800.0, map_sigma=0.0
+    ),
     hours=6.0,
     speed=0.35,
     every=4.0,
@@ -484,7 +489,7 @@ SURVEYOR = Vehicle(
 )
 """A current of 2 cm/s remains when its mean is known from the last surfacings."""
 AIRCRAFT = Vehicle(
-    Options(
+    NavigationOptions(
         start_sigma=10.0, current_sigma=0.5, current_time=3600.0, drift=0.1,
         bias_sigma=0.5, bias_time=1800.0, map_sigma=0.0,
     ),

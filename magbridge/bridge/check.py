@@ -77,16 +77,16 @@ def _errors(table: dict[str, Any], attempt: Callable[[], object]) -> Iterator[Co
             attempt()
         except ConfigError as error:
             yield error
-            if _without(table, error.key):
+            if _remove_key(table, error.key):
                 continue
         return
 
 
-def _without(table: dict[str, Any], key: str) -> bool:
+def _remove_key(table: dict[str, Any], key: str) -> bool:
     """Remove a dotted key from nested tables; return False if it does not exist."""
     first, _, rest = key.replace("[...]", "").partition(".")
     if rest and isinstance(table.get(first), dict):
-        return _without(table[first], rest)
+        return _remove_key(table[first], rest)
     return table.pop(first, None) is not None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
-from magbridge.bridge.events import Event, Start, port_number
+from magbridge.bridge.events import Event, StartEvent, port_number
 from magbridge.bridge.learning import first_calibration
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.sensor_stream import other_calibrations
@@ -33,7 +33,7 @@ class Edge(Protocol):
         ...
 
 
-def set_up(config: Config, start: Start) -> Pipeline:
+def set_up(config: Config, start: StartEvent) -> Pipeline:
     """Return the pipeline that a configuration describes.
 
     ConfigError, FormatError, CalibrationError: the content of the configuration, or of a file that it names,
@@ -49,8 +49,8 @@ def set_up(config: Config, start: Start) -> Pipeline:
     return Pipeline(config, calibration, start, key, navigate, other_calibrations(config))
 
 
-def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callable[[int], None]) -> None:
-    """Feed the pipeline until the edge ends; call ``after(time_us)`` after each event."""
+def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after_event: Callable[[int], None]) -> None:
+    """Feed the pipeline until the edge ends; call ``after_event(time_us)`` after each event."""
     for event in edge.events(lambda: pipeline.deadline):
         sent = pipeline.feed(event)
         if pipeline.component.genuine:
@@ -64,4 +64,4 @@ def drive(pipeline: Pipeline, edge: Edge, log: TlogWriter | None, after: Callabl
         records = pipeline.recorder.drain()
         if log is not None and records:
             log.extend(records)
-        after(event.time_us)
+        after_event(event.time_us)

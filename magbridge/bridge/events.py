@@ -10,10 +10,10 @@ from magbridge.mavlink import Stream
 from magbridge.mavlink.enums import MAG_PORT_NAME
 from magbridge.records import Channel
 
-__all__ = ["Event", "HostClock", "Start", "port_number", "source_of"]
+__all__ = ["Event", "HostClock", "StartEvent", "port_number", "source_of"]
 
 
-class Start(msgspec.Struct, frozen=True):
+class StartEvent(msgspec.Struct, frozen=True):
     """State of a run in addition to its configuration, its calibration and its events."""
 
     time_us: int

@@ -141,10 +141,10 @@ class Fixing:
         if handler := self._handlers.get(message.id):
             handler(message, time_us)
 
-    def send(self, at: Reckoned | None, resets: int) -> bool:
+    def send(self, reckoned: Reckoned | None, resets: int) -> bool:
         """Send the present position as a fix if the autopilot needs it; return True if it was sent."""
         now_us = self._component.codec.now_us
-        fix = self._fix(at, resets, now_us)
+        fix = self._fix(reckoned, resets, now_us)
         if isinstance(fix, str):
             self._before_us = self._last = None
             self._report_none(fix)
@@ -164,21 +164,21 @@ class Fixing:
             self._await_answer()
         return True
 
-    def _fix(self, at: Reckoned | None, resets: int, now_us: int) -> Fix | str:
+    def _fix(self, reckoned: Reckoned | None, resets: int, now_us: int) -> Fix | str:
         """Return the fix, or the reason why there is none."""
         unwanted = self._unwanted(now_us)
-        if unwanted or at is None:
+        if unwanted or reckoned is None:
             return unwanted or "no valid position"
-        pose = self._frame.pose(now_us, at.latitude, at.longitude) if self._kind.local else None
+        pose = self._frame.pose(now_us, reckoned.latitude, reckoned.longitude) if self._kind.local else None
         if isinstance(pose, str):
             return pose
         fix = Fix(
             time_us=now_us + self._component.codec.utc_offset_us,
-            latitude=at.latitude,
-            longitude=at.longitude,
-            covariance_nn=at.covariance_nn,
-            covariance_ne=at.covariance_ne,
-            covariance_ee=at.covariance_ee,
+            latitude=reckoned.latitude,
+            longitude=reckoned.longitude,
+            covariance_nn=reckoned.covariance_nn,
+            covariance_ne=reckoned.covariance_ne,
+            covariance_ee=reckoned.covariance_ee,
             altitude=self._frame.altitude(now_us),
             pose=pose,
             resets=resets,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from magbridge.bridge import states
-from magbridge.bridge.events import Start
+from magbridge.bridge.events import StartEvent
 from magbridge.bridge.learning import keep, kept_path
 from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
@@ -55,10 +55,10 @@ class Keeper:
         if self._key is not None and readable_by_all(self._key):
             self._notify(states.notice(f"{self._key.name[-20:]}: every user can read this key"))
 
-    def start(self, time_us: int) -> Start:
+    def start(self, time_us: int) -> StartEvent:
         """Return the start of a run at `time_us`."""
         kept = self._kept
-        return Start(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
+        return StartEvent(time_us, kept.parameters, kept.signing_timestamp, kept.signing_streams)
 
     def look(self, pipeline: Pipeline, time_us: int) -> None:
         """Save the learned calibration, changed parameters within `SAVE_US`, time stamps every `KEEP_US`."""

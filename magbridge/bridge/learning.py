@@ -17,7 +17,7 @@ from magbridge.link.component import Component
 from magbridge.link.output import Rate
 from magbridge.mavlink.enums import MAG_LEARNING_STATE, MAV_SEVERITY
 
-__all__ = ["Learning", "first_calibration", "keep", "kept_path", "open_learner"]
+__all__ = ["LearningService", "first_calibration", "keep", "kept_path", "open_learner"]
 
 ACCEPT, FORGET = 1.0, 2.0
 FILE_INTERVAL_US = 600_000_000
@@ -99,7 +99,7 @@ def kept_path(config: Config) -> Path | None:
     return folder / f"{first.stem}-learned.json"
 
 
-class Learning:
+class LearningService:
     """Connect a learner to the link.
 
     Attributes
@@ -170,7 +170,7 @@ class Learning:
         )
 
 
-def keep(learning: Learning, path: Path) -> str:
+def keep(learning: LearningService, path: Path) -> str:
     """Write the last published calibration if it is new; return the reason of a failure, or nothing.
 
     The first calibration, gone back to, is written as well: the file is what the bridge corrects with.

@@ -132,7 +132,7 @@ class LiveCheck:
     def _receive(self, event: Event) -> None:
         """Count the messages and the values of telemetry in an event of the link."""
         late = event.time_us - self._begin_us >= self._duration_us * (RATE_INTERVALS - 1) // RATE_INTERVALS
-        for message in self._ear.parse(event.data, whole=self._link.shared):
+        for message in self._ear.parse(event.data, final=self._link.shared):
             if not message.known:
                 continue
             key = message.system, message.component, message.id

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from magbridge.bridge.events import Start
+from magbridge.bridge.events import StartEvent
 from magbridge.config import Config, Sensor, Telemetry
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAV_PARAM_TYPE
@@ -16,7 +16,7 @@ __all__ = ["beginning", "declarations"]
 
 
 def beginning(
-    config: Config, start: Start, calibration_id: int, parameters: Mapping[str, float]
+    config: Config, start: StartEvent, calibration_id: int, parameters: Mapping[str, float]
 ) -> list[bytes]:
     """Return the frames that record how a run started, with these values of the parameters by name."""
     codec = Codec(config.link.system, config.link.component)

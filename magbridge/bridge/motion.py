@@ -20,7 +20,7 @@ from magbridge.mavlink.enums import MAV_FRAME, MAV_SEVERITY
 from magbridge.navigate import Navigator
 from magbridge.navigate.deadreckoning import GLIDE
 
-__all__ = ["Motion", "Source"]
+__all__ = ["Motion", "MotionSource"]
 
 MAX_SOURCE_AGE_US = 30_000_000
 """µs without it, after which the next best source is used."""
@@ -39,7 +39,7 @@ JUMP = 10.0
 """m: a step in a position that its own velocity does not explain by more than that is a reset."""
 
 
-class Source(IntEnum):
+class MotionSource(IntEnum):
     """Source of dead reckoning; earlier ones are preferred."""
 
     OTHER = 0
@@ -79,7 +79,7 @@ class Motion:
     def __init__(
         self, navigator: Navigator, component: Component, frame: Frame, velocity_stays: Callable[[], bool]
     ) -> None:
-        self.source, self.fed_back, self.gps_trusted = Source.NONE, False, True
+        self.source, self.fed_back, self.gps_trusted = MotionSource.NONE, False, True
         self._navigator, self._component, self._frame = navigator, component, frame
         self._velocity_stays = velocity_stays
         self._received_us = 0
@@ -106,8 +106,8 @@ class Motion:
 
     def fixes_sent(self) -> None:
         """Record that the autopilot's position contains the bridge's fixes from now on."""
-        if not self.fed_back and self.source is Source.TRACK and not self._velocity_stays():
-            self.source = Source.NONE  # the next best is used at once
+        if not self.fed_back and self.source is MotionSource.TRACK and not self._velocity_stays():
+            self.source = MotionSource.NONE  # the next best is used at once
         self.fed_back = True
 
     def gps_held(self) -> None:
@@ -118,13 +118,13 @@ class Motion:
         self._heading, self._pitch = degrees(message["yaw"]) % 360.0, degrees(message["pitch"])
         if abs(self._pitch) >= GLIDE:
             self._steep_us = time_us
-        if self.source is Source.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
+        if self.source is MotionSource.SPEED and time_us - self._received_us < MAX_SOURCE_AGE_US:
             self._pass(time_us, heading=self._heading, pitch=self._pitch)
         elif time_us - self._steep_us < GLIDING_US and isfinite(self._frame.depth(time_us)):
-            if self._use(Source.GLIDE, time_us, "heading, pitch and depth"):
+            if self._use(MotionSource.GLIDE, time_us, "heading, pitch and depth"):
                 self._pass(time_us, heading=self._heading, pitch=self._pitch)
         elif isfinite(self._last) and self._use(
-            Source.LAST, time_us, "heading and the last known speed: no other is sent"
+            MotionSource.LAST, time_us, "heading and the last known speed: no other is sent"
         ):
             self._pass(time_us, heading=self._heading, speed=self._last)
 
@@ -140,8 +140,8 @@ class Motion:
             self._equal = 0
             self._last = speed
             # a source that is followed already has the heading, from the time of its report
-            heading = nan if self.source is Source.SPEED else self._heading
-            if self._use(Source.SPEED, time_us, "heading and speed through the water or air"):
+            heading = nan if self.source is MotionSource.SPEED else self._heading
+            if self._use(MotionSource.SPEED, time_us, "heading and speed through the water or air"):
                 self._pass(time_us, heading=heading, pitch=self._pitch, speed=speed)
 
     def _gps(self, message: Message, time_us: int) -> None:  # noqa: ARG002 - as the other handlers
@@ -187,7 +187,7 @@ class Motion:
                 last, speed = self._last, hypot(*velocity)
                 self._last = last + SPEED_WEIGHT * (speed - last) if isfinite(last) else speed
         measured = stream in self._measured
-        source = Source.TRACK if own else Source.OTHER
+        source = MotionSource.TRACK if own else MotionSource.OTHER
         clean = not (own and self.fed_back)
         if own and measured and (self._velocity_stays() or (clean and place is None)):
             if self._use(source, time_us, "the autopilot's velocity", stream):
@@ -213,7 +213,9 @@ class Motion:
         self._step = time_us, *place, resets
         self._pass(time_us, north=place[0] - self._jumps[0], east=place[1] - self._jumps[1])
 
-    def _use(self, source: Source, time_us: int, words: str, stream: tuple[int, int] | None = None) -> bool:
+    def _use(
+        self, source: MotionSource, time_us: int, words: str, stream: tuple[int, int] | None = None
+    ) -> bool:
         """Return True if dead reckoning uses a source, because no better one is recent."""
         same = (source, stream) == (self.source, self._stream)
         if not same and source >= self.source and time_us - self._received_us < MAX_SOURCE_AGE_US:
@@ -222,7 +224,7 @@ class Motion:
             self._navigator.new_motion(time_us)
             self.source, self._stream, self._step = source, stream, None
         self._received_us = time_us
-        severity = MAV_SEVERITY.WARNING if source is Source.LAST else MAV_SEVERITY.INFO
+        severity = MAV_SEVERITY.WARNING if source is MotionSource.LAST else MAV_SEVERITY.INFO
         self._component.announcer.state("motion", f"dead reckoning by {words}", severity)
         return True
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from magbridge.bridge.fixing import FIX_3D, Fixing
 from magbridge.bridge.frame import Frame
-from magbridge.bridge.motion import Motion, Source
+from magbridge.bridge.motion import Motion, MotionSource
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config
 from magbridge.config import Navigation as Wanted
@@ -21,7 +21,7 @@ from magbridge.link.fixes import FIX_MESSAGES, Kind
 from magbridge.link.output import Rate
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_SEVERITY
-from magbridge.navigate import Navigator, Options, Record, State
+from magbridge.navigate import NavigationOptions, NavigationState, Navigator, Record
 from magbridge.navigate.depth import at_depth
 from magbridge.navigate.gnss import GnssReason, GnssState
 from magbridge.navigate.options import informed
@@ -29,15 +29,15 @@ from magbridge.records import Corrected
 from magbridge.toml import convert
 from magbridge.wording import one_of
 
-__all__ = ["Navigation", "open_navigation"]
+__all__ = ["NavigationService", "open_navigation"]
 
 GPS, INTEGRITY = spec("GPS_RAW_INT").id, spec("GNSS_INTEGRITY").id
 STATE_TEXTS = {
-    State.OFF: "waiting for a first position",
-    State.SEARCHING: "searching",
-    State.TRACKING: "tracking",
-    State.DEAD_RECKONING: "dead reckoning: no information in the field here",
-    State.LOST: "lost: the field and the map disagree",
+    NavigationState.OFF: "waiting for a first position",
+    NavigationState.SEARCHING: "searching",
+    NavigationState.TRACKING: "tracking",
+    NavigationState.DEAD_RECKONING: "dead reckoning: no information in the field here",
+    NavigationState.LOST: "lost: the field and the map disagree",
 }
 
 GPS_REASONS = {
@@ -57,7 +57,7 @@ COPIED_FIELDS = (
 """Fields of MAG_NAVIGATION that a record has under the same name."""
 
 
-class Navigation:
+class NavigationService:
     """Feed the navigator, and send its updates and fixes.
 
     Parameters
@@ -69,7 +69,9 @@ class Navigation:
     component : Component
     """
 
-    def __init__(self, grid: AnomalyGrid, options: Options, fix: Kind, component: Component) -> None:
+    def __init__(
+        self, grid: AnomalyGrid, options: NavigationOptions, fix: Kind, component: Component
+    ) -> None:
         self.navigator = Navigator(grid, options)
         self._component = component
         self._frame = Frame()
@@ -81,7 +83,7 @@ class Navigation:
             now_us = component.codec.now_us
             component.timers.every("fix", round(1e6 / fix.rate), lambda _: self._send(), now_us)
         self._rate: Rate = component.rates["MAG_NAVIGATION"]
-        self._state = State.OFF
+        self._state = NavigationState.OFF
 
     def receive(self, message: Message, time_us: int) -> None:
         """Pass the vehicle's motion or surface position in a message to the navigator."""
@@ -128,7 +130,7 @@ class Navigation:
         component = self._component
         if record.state is not self._state:
             self._state = record.state
-            severity = MAV_SEVERITY.WARNING if record.state is State.LOST else MAV_SEVERITY.INFO
+            severity = MAV_SEVERITY.WARNING if record.state is NavigationState.LOST else MAV_SEVERITY.INFO
             component.announcer.state("navigation", f"navigation: {STATE_TEXTS[record.state]}", severity)
         offset_us = component.codec.utc_offset_us
         if self._rate.due(record.time_us):
@@ -148,9 +150,9 @@ class Navigation:
 
     def _send(self) -> None:
         """Send the position, dead-reckoned until now, as a fix."""
-        if self._state is State.OFF:
+        if self._state is NavigationState.OFF:
             return
-        moving = self.motion.source is not Source.NONE
+        moving = self.motion.source is not MotionSource.NONE
         now = self.navigator.reckon(self._component.codec.now_us) if moving else None
         if self.fixing.send(now, len(self.navigator.estimate.jumps)):
             self.motion.fixes_sent()
@@ -158,7 +160,7 @@ class Navigation:
 
 def open_navigation(
     config: Config, wanted: Wanted, calibration: Calibration | None
-) -> Callable[[Component], Navigation]:
+) -> Callable[[Component], NavigationService]:
     """Return a function that makes the navigation of a configuration for a component.
 
     Where the configuration sets neither ``noise`` nor ``bias_sigma``, both are taken from the calibration.
@@ -168,7 +170,7 @@ def open_navigation(
     """
     if wanted.fix not in FIX_MESSAGES:
         raise ConfigError(config.path, "navigation.fix", one_of(wanted.fix, FIX_MESSAGES))
-    options = convert(wanted.options, Options, config.path, "navigation.options.")
+    options = convert(wanted.options, NavigationOptions, config.path, "navigation.options.")
     if calibration is not None and not wanted.options.keys() & {"noise", "bias_sigma"}:
         options = informed(options, calibration, calibration.noise.sensor)
     kind = FIX_MESSAGES[wanted.fix]
@@ -180,4 +182,4 @@ def open_navigation(
             raise ConfigError(config.path, "navigation.rate", f"{expected}, not {wanted.rate:g}")
         kind = kind._replace(rate=wanted.rate)
     dives = np.linspace(0.0, wanted.depth)
-    return partial(Navigation, *at_depth(read_grid(config.resolve(wanted.map)), options, dives), kind)
+    return partial(NavigationService, *at_depth(read_grid(config.resolve(wanted.map)), options, dives), kind)

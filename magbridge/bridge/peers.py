@@ -179,16 +179,16 @@ class Peers:
         peer = self._peers[address] = Peer(address)
         return peer
 
-    def _prove(self, peer: Peer, frame: bytes, now: float) -> None:
-        if now - peer.genuine > TIMEOUT:
-            peer.since, self._look = now, 0.0
-        peer.genuine = now
+    def _prove(self, peer: Peer, frame: bytes, now_s: float) -> None:
+        if now_s - peer.genuine > TIMEOUT:
+            peer.since, self._look = now_s, 0.0
+        peer.genuine = now_s
         who = (frame[5], frame[6]) if frame[0] == V2 else (frame[3], frame[4])
         self._routes[who] = peer
         if who == self._autopilot:
-            if now - peer.pilot > TIMEOUT:
+            if now_s - peer.pilot > TIMEOUT:
                 self._look = 0.0
-            peer.pilot = now
+            peer.pilot = now_s
 
     def _notify(self, text: str, holds: bool) -> None:
         """Note a text once, when it begins to hold."""

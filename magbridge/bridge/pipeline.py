@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final
 from magbridge.align import Sample
 from magbridge.bridge import states
 from magbridge.bridge.changes import StateChanges
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.heading import LiveHeading
-from magbridge.bridge.learning import Learning, open_learner
+from magbridge.bridge.learning import LearningService, open_learner
 from magbridge.bridge.log_header import beginning, declarations
 from magbridge.bridge.position import Position
 from magbridge.bridge.recorder import Recorder
@@ -39,7 +39,7 @@ from magbridge.sensors.clock import Stamp
 from magbridge.version import __version__
 
 if TYPE_CHECKING:
-    from magbridge.bridge.navigation import Navigation  # imports filterpy, which few vehicles have
+    from magbridge.bridge.navigation import NavigationService  # imports filterpy, which few vehicles have
 
 __all__ = ["Pipeline"]
 
@@ -97,9 +97,9 @@ class Pipeline:
         self,
         config: Config,
         calibration: Calibration | None,
-        start: Start,
+        start: StartEvent,
         key: bytes | None = None,
-        navigate: Callable[[Component], Navigation] | None = None,
+        navigate: Callable[[Component], NavigationService] | None = None,
         more: Mapping[int, Calibration] | None = None,
     ) -> None:
         self._config, self._start = config, start
@@ -149,7 +149,7 @@ class Pipeline:
         ]
         self.recorder = Recorder(config.link.system, config.link.component, active=config.log is not None)
         self.navigation = navigate(self.component) if navigate else None
-        self.learning = Learning(learner, self.component) if learner is not None else None
+        self.learning = LearningService(learner, self.component) if learner is not None else None
         self._raw_rate = self.component.rates["MAG_RAW"]
         self._parts, self._ignored_positions = main.parts, set[int]()
         self._position = Position(self._report_no_anomaly)
@@ -188,7 +188,7 @@ class Pipeline:
         """The frames that every file of the log begins with."""
         own, parameters = self._config.link, self.component.parameters
         keys = [row.key for row in parameters.table.values()]
-        settings = {key: parameters.of(key) for key in keys if key.startswith(("align.", "telemetry."))}
+        settings = {key: parameters.value_of(key) for key in keys if key.startswith(("align.", "telemetry."))}
         telemetry, nt_per_count = self._config.telemetry, self.streams[0].driver.nt_per_count
         others = [(one.sensor, one.driver) for one in self.streams[1:]]
         return declarations(own.system, own.component, telemetry, nt_per_count, settings, others)
@@ -243,7 +243,7 @@ class Pipeline:
         position, main = self._position, self.streams[0]
         utc_us = stamp.time_us + self.component.codec.utc_offset_us
         main_field = self._parts.call("position", nan, position.main_field, stamp.time_us, utc_us)
-        for result in stream.correct(reading, stamp, main_field, position.where, position.depth):
+        for result in stream.correct(reading, stamp, main_field, position.last_position, position.depth):
             self._process(stream, result)
         if stream is main:
             for other in self.streams[1:]:
@@ -363,8 +363,8 @@ class Pipeline:
     def _tune(self, _: str = "") -> None:
         """Apply the present values of the parameters to the alignment."""
         parameters = self.component.parameters
-        settings = {name: parameters.of(f"align.{name}") for name in Align.__struct_fields__}
-        ages = {name: parameters.of(f"telemetry.{name}.max_age") for name in self._config.telemetry}
+        settings = {name: parameters.value_of(f"align.{name}") for name in Align.__struct_fields__}
+        ages = {name: parameters.value_of(f"telemetry.{name}.max_age") for name in self._config.telemetry}
         for stream in self.streams:
             stream.tune(Align(**settings), ages)
 
@@ -388,7 +388,7 @@ class Pipeline:
     def _report_no_anomaly(self, reason: str) -> None:
         self.component.announcer.state("anomaly", f"no anomaly: {reason}", MAV_SEVERITY.WARNING)
 
-    def _begin(self, start: Start, calibration: Calibration | None, *, foreign: bool) -> None:
+    def _begin(self, start: StartEvent, calibration: Calibration | None, *, foreign: bool) -> None:
         """Record what a replay needs, and announce the calibration in use."""
         for frame in self.beginning(start.parameters):
             self.recorder.state(start.time_us, frame)

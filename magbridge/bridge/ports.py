@@ -56,9 +56,11 @@ def ports() -> list[SerialDevice]:
     return [SerialDevice(one.device, _described(one)) for one in sorted(found)]
 
 
-def _described(one: Any) -> str:
-    number = f"serial number {one.serial_number}" if one.serial_number else ""
-    return ", ".join(text for text in (one.manufacturer, one.product or one.description, number) if text)
+def _described(device: Any) -> str:
+    number = f"serial number {device.serial_number}" if device.serial_number else ""
+    return ", ".join(
+        text for text in (device.manufacturer, device.product or device.description, number) if text
+    )
 
 
 def listen(

@@ -60,14 +60,14 @@ class Position:
         self._trusted_us = self._jumped_us = 0
 
     @property
-    def where(self) -> tuple[float, float] | None:
+    def last_position(self) -> tuple[float, float] | None:
         """Latitude and longitude of the last position, deg; None before the first and after a jump."""
         return None if self._jumped_us else self._where
 
     @property
     def depth(self) -> float:
         """Depth of the last position, m; NaN where :attr:`where` is None."""
-        return nan if self.where is None else self._depth
+        return nan if self.last_position is None else self._depth
 
     def update(self, message: Message, time_us: int) -> None:
         """Use a GLOBAL_POSITION_INT; ignore one that states an unknown or impossible position.
@@ -114,7 +114,11 @@ class Position:
         time_us, utc_us : int
             µs of event time, and of UNIX time by the host's clock as it is set now.
         """
-        if self.where is None or utc_us < CLOCK_SET_US or abs(time_us - self._when_us) > MAX_POSITION_AGE_US:
+        if (
+            self.last_position is None
+            or utc_us < CLOCK_SET_US
+            or abs(time_us - self._when_us) > MAX_POSITION_AGE_US
+        ):
             return nan
         if abs(utc_us - self._evaluated_us) > FIELD_INTERVAL_US:
             self._evaluated_us = utc_us
@@ -141,7 +145,7 @@ class Position:
                 from magbridge.field.nearby import NearbyField  # noqa: PLC0415 - the field model is optional live
 
                 self._model = NearbyField()
-            return self._model.at(*self._where, self._depth, utc_us * 1e-6)[0]
+            return self._model.field_and_slopes(*self._where, self._depth, utc_us * 1e-6)[0]
         except (ImportError, OSError, MagbridgeError) as error:  # OSError: no file handle is left
             self._notify(str(error))
             return nan

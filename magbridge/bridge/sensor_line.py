@@ -156,7 +156,7 @@ class SensorLine:
     def _wake(self, time_us: int, listen_us: int = 0) -> None:
         self.state, self._received_us = MAG_PORT_STATE.SILENT, time_us
         if listen_us:
-            self._timers.once(
+            self._timers.run_once(
                 self._command_timer, time_us + listen_us, lambda t: self._command(t, self._commands)
             )
         else:
@@ -165,6 +165,6 @@ class SensorLine:
     def _command(self, time_us: int, commands: tuple[bytes, ...]) -> None:
         if commands:
             self.to_send.append(commands[0])
-            self._timers.once(
+            self._timers.run_once(
                 self._command_timer, time_us + COMMAND_GAP_US, lambda t: self._command(t, commands[1:])
             )

@@ -65,7 +65,7 @@ def other_calibrations(config: Config) -> dict[int, Calibration]:
 
 
 def scalar_entry(
-    sensor: Sensor, config: Config, own: Calibration | None, main: Calibration | None
+    sensor: Sensor, config: Config, own_calibration: Calibration | None, main: Calibration | None
 ) -> ScalarSensor | None:
     """Return the compensation of a scalar sensor; None if no calibration has one.
 
@@ -75,17 +75,17 @@ def scalar_entry(
         Its name is the column of the compensation.
     config : Config
         For its path and its telemetry.
-    own, main : Calibration or None
+    own_calibration, main : Calibration or None
         That of the sensor itself, and that of sensor 0.
 
     Raises
     ------
     ConfigError
-        `own` has no entry for the sensor, or a channel is not in ``[telemetry]``.
+        `own_calibration` has no entry for the sensor, or a channel is not in ``[telemetry]``.
     """
-    entries = (own or main).sensors if own is not None or main is not None else ()  # type: ignore[union-attr]
+    entries = (own_calibration or main).sensors if own_calibration is not None or main is not None else ()  # type: ignore[union-attr]
     entry = next((one for one in entries if one.column == sensor.name), None)
-    if entry is None and own is not None:
+    if entry is None and own_calibration is not None:
         if len(entries) != 1:
             columns = ", ".join(one.column for one in entries) or "none"
             text = f"expected a scalar sensor called {sensor.name!r}, got {columns}"
@@ -133,7 +133,7 @@ class SensorStream:
     ) -> None:
         self.sensor, self.driver, self.correction, self.publisher = sensor, driver, correction, publisher
         self.sensor_id = sensor.id or 0
-        self.clock = DeviceClock.of(driver)
+        self.clock = DeviceClock.for_driver(driver)
         self.line = SensorLine(
             sensor.label, driver.start, round(sensor.timeout * 1e6), component.announcer, component.timers,
             start_us, searching=has_magic(sensor.port), sensor_id=self.sensor_id,
@@ -156,7 +156,7 @@ class SensorStream:
         reading: Reading,
         stamp: Stamp,
         main_field: float,
-        where: tuple[float, float] | None,
+        position: tuple[float, float] | None,
         depth: float,
     ) -> list[CorrectedReading]:
         """Correct a reading; return the samples that are complete now.
@@ -167,7 +167,7 @@ class SensorStream:
             As :meth:`receive` returns them.
         main_field : float
             nT, the main field's total; NaN where unknown.
-        where : tuple of 2 float or None
+        position : tuple of 2 float or None
             deg, latitude and longitude; None where not known.
         depth : float
             m; NaN where not known.
@@ -180,12 +180,12 @@ class SensorStream:
         restarted, missing = stamp.restarted, stamp.missing
         if isinstance(correction, Correction):
             sample, corrected = correction.reading(
-                reading, time_us, restarted=restarted, missing=missing, main_field=main_field, where=where,
-                depth=depth,
+                reading, time_us, restarted=restarted, missing=missing, main_field=main_field,
+                position=position, depth=depth,
             )  # fmt: skip
             return [CorrectedReading(sample, corrected, main_field, correction.stated_sigma)]
         correction.reading(
-            reading, time_us, restarted=restarted, missing=missing, main_field=main_field, where=where
+            reading, time_us, restarted=restarted, missing=missing, main_field=main_field, position=position
         )
         return self.complete()
 
@@ -241,7 +241,7 @@ def open_correction(
     sensor: Sensor,
     driver: Driver,
     config: Config,
-    own: Calibration | None,
+    own_calibration: Calibration | None,
     main: Calibration | None,
     learner: Learner | None = None,
 ) -> tuple[Correction | ScalarCorrection, Calibration | None]:
@@ -251,7 +251,7 @@ def open_correction(
     ----------
     sensor, driver, config
         The sensor, its driver, and the configuration.
-    own, main : Calibration or None
+    own_calibration, main : Calibration or None
         That of the sensor itself, and that of sensor 0.
     learner : Learner, optional
         Of sensor 0.
@@ -263,11 +263,11 @@ def open_correction(
     """
     settings = own_settings(sensor, driver, config.align)
     if is_scalar(driver):
-        entry = scalar_entry(sensor, config, own, main) if config.sensor != sensor else None
-        used = None if entry is None else own or main
+        entry = scalar_entry(sensor, config, own_calibration, main) if config.sensor != sensor else None
+        used = None if entry is None else own_calibration or main
         return ScalarCorrection(entry, settings, sensor.sigma), used
-    if own is not None:
-        check(own, config)
-        if not own.sensor.may_be(sensor.driver):
+    if own_calibration is not None:
+        check(own_calibration, config)
+        if not own_calibration.sensor.may_be(sensor.driver):
             return Correction(None, settings, learner), None
-    return Correction(own, settings, learner), own
+    return Correction(own_calibration, settings, learner), own_calibration

@@ -33,19 +33,19 @@ def notice(text: str, severity: MAV_SEVERITY = MAV_SEVERITY.WARNING) -> bytes:
     return _frame("STATUSTEXT", severity=int(severity), text=text)
 
 
-def port(number: int, what: Port, reason: str) -> bytes:
+def port(number: int, link: Port, reason: str) -> bytes:
     """Return the frame for a port that opened (no `reason`) or that is not open, with the reason."""
     state = MAG_PORT_STATE.LOST if reason else MAG_PORT_STATE.OK
     # the name last, because the end of a long text is cut off
-    why = f"{reason}: {what.name}" if reason else ""
-    return _frame("MAG_PORT", port=number, state=int(state), dropped=what.dropped, reason=why)
+    why = f"{reason}: {link.name}" if reason else ""
+    return _frame("MAG_PORT", port=number, state=int(state), dropped=link.dropped, reason=why)
 
 
-def too_slow(number: int, what: Port) -> bytes:
+def too_slow(number: int, link: Port) -> bytes:
     """Return the frame for an open port that is too slow for the sent data."""
-    why = f"too slow, {what.overrun} bytes not sent so far"
+    why = f"too slow, {link.overrun} bytes not sent so far"
     state = int(MAG_PORT_STATE.OK)
-    return _frame("MAG_PORT", port=number, state=state, dropped=what.dropped, reason=why)
+    return _frame("MAG_PORT", port=number, state=state, dropped=link.dropped, reason=why)
 
 
 def opened(name: int) -> bytes:

@@ -19,7 +19,7 @@ from magbridge.calibration.corrector import (
 )
 from magbridge.calibration.kernel import Kernel, apply, prepare
 from magbridge.calibration.model import Calibration
-from magbridge.calibration.terms import Series, Step
+from magbridge.calibration.terms import LogSeries, Step
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import PAIRS
 from magbridge.records import MAX_MEASURED_NT
@@ -145,7 +145,7 @@ def regressors(
     Arguments as for :func:`correct`, which steps through the effects as the bridge does.
     """
     kernel, channels = calibration.kernel, channels.reshape(len(field), -1)
-    series = Series(time, field, dict(zip(calibration.channels, channels.T, strict=True)), kernel)
+    series = LogSeries(time, field, dict(zip(calibration.channels, channels.T, strict=True)), kernel)
     positions = list(channels.T)[: len(kernel.centre)]
     phi = [*kernel.monomials(positions, np.ones(len(field)))]
     for effect in calibration.effects:

@@ -191,9 +191,9 @@ class Corrector:
         return linear(self._kernel.monomials(positions, 1.0), self._weights)
 
 
-def _total(field: tuple[float, float, float], there: Linear) -> float:
+def _total(field: tuple[float, float, float], linear: Linear) -> float:
     """Return ``|A (H_r - T)|``."""
-    xx, yy, zz, xy, xz, yz, tx, ty, tz = there
+    xx, yy, zz, xy, xz, yz, tx, ty, tz = linear
     hx, hy, hz = field
     dx, dy, dz = hx - tx, hy - ty, hz - tz
     bx = xx * dx + xy * dy + xz * dz

@@ -23,7 +23,7 @@ from numpy.polynomial.legendre import leg2poly
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import MAX_ORDER, Effect, Exponents, Power, Series, Step, Width
+from magbridge.calibration.terms import MAX_ORDER, Effect, Exponents, LogSeries, Power, Step, Width
 from magbridge.errors import CalibrationError
 
 __all__ = [
@@ -50,13 +50,13 @@ def powers(x: Any, order: int) -> tuple[Any, ...]:
     return tuple(accumulate(repeat(x, order), mul))
 
 
-def held(values: FloatArray, before: float) -> FloatArray:
-    """Return values (n,) with each NaN replaced by the last known value, or by `before`."""
+def held(values: FloatArray, first: float) -> FloatArray:
+    """Return values (n,) with each NaN replaced by the last known value, or by `first`."""
     known = ~np.isnan(values)
     if known.all():
         return values
     last = np.maximum.accumulate(np.where(known, np.arange(1, len(values) + 1), 0))
-    return np.append(before, values)[last]
+    return np.append(first, values)[last]
 
 
 def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) -> FloatArray:
@@ -158,7 +158,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(1, n) regressors; 0 before the first value."""
         values = series.values[self.channel]
         known = np.flatnonzero(~np.isnan(values))
@@ -200,7 +200,7 @@ class PathEffect(MassEffect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(r, n) regressors."""
         return np.stack(self.regressors(held((series.values[self.channel] - self.centre) / self.scale, 0.0)))
 
@@ -294,7 +294,7 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(1, n) regressors."""
         values = list(series.values.values())
         return np.reshape(_product(self._factors(series.kernel), values), (1, -1))
@@ -370,7 +370,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(r, n) regressors; 0 before the first value."""
         values = series.values[self.channel]
         known = ~np.isnan(values)
@@ -437,7 +437,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(9, n) regressors."""
         monomials = np.stack(series.kernel.monomials([*series.values.values()], np.ones(len(series.time))))
         apart = 1e-6 * np.diff(series.time_us)

@@ -122,14 +122,14 @@ def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
     return tuple(longest[key] for key in sorted(longest, key=lambda key: (key[0], AXES.index(key[1]))))
 
 
-def figure_of_merit(box: BoxFlight, before: FloatArray, after: FloatArray) -> dict[str, Any]:
+def figure_of_merit(box: BoxFlight, measured: FloatArray, compensated: FloatArray) -> dict[str, Any]:
     """Return figure of merit and improvement ratio.
 
     Parameters
     ----------
     box : BoxFlight
         The manoeuvres.
-    before, after : (n,) array
+    measured, compensated : (n,) array
         nT, field before and after compensation; NaN where unknown.
 
     Returns
@@ -138,7 +138,7 @@ def figure_of_merit(box: BoxFlight, before: FloatArray, after: FloatArray) -> di
         ``before_nT`` and ``after_nT`` (sums), ``improvement_ratio``, ``manoeuvres`` (number), and
         ``peak_to_peak``: a list with axis, heading (deg), before and after (nT) of each.
     """
-    seen = [_band(_filled(values), box.interval) for values in (before, after)]
+    seen = [_band(_filled(values), box.interval) for values in (measured, compensated)]
     table: list[dict[str, Any]] = [
         {
             "axis": one.axis,
@@ -148,7 +148,7 @@ def figure_of_merit(box: BoxFlight, before: FloatArray, after: FloatArray) -> di
         }
         for one in box.manoeuvres
     ]
-    inside = box.rows(len(before))
+    inside = box.rows(len(measured))
     spread = [float(np.std(values[inside])) for values in seen]
     return {
         "before_nT": float(sum(row["before_nT"] for row in table)),
@@ -167,8 +167,8 @@ def merit_text(merit: dict[str, Any]) -> str:
     )
 
 
-def _length(one: Manoeuvre) -> int:
-    return int(one.rows.stop - one.rows.start)
+def _length(manoeuvre: Manoeuvre) -> int:
+    return int(manoeuvre.rows.stop - manoeuvre.rows.start)
 
 
 def _filled(values: FloatArray) -> FloatArray:

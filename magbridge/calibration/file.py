@@ -18,12 +18,12 @@ from magbridge.calibration.model import (
     MIN_HALF_RANGE,
     Boresight,
     CalibratedRange,
+    CalibratedSensor,
     Calibration,
     Noise,
     Parameter,
     Reference,
     Run,
-    Sensor,
 )
 from magbridge.calibration.scalar import PLATFORM_TERMS, ScalarSensor
 from magbridge.calibration.terms import Effect, PositionTerm, Term, term_class
@@ -57,7 +57,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     format: int
     software: str
     method: str
-    sensor: Sensor
+    sensor: CalibratedSensor
     parameters: tuple[Parameter, ...]
     terms: list[dict[str, Any]]
     effects: list[dict[str, Any]]
@@ -254,19 +254,19 @@ def _check_scalar(sensor: ScalarSensor) -> None:
     _check_covariance(np.array(sensor.covariance), where)
 
 
-def _check_covariance(covariance: FloatArray, whose: str = "") -> None:
+def _check_covariance(covariance: FloatArray, prefix: str = "") -> None:
     """Symmetric and positive semidefinite, up to rounding."""
     if np.abs(covariance).max(initial=0.0) > MAX_STATED_SIGMA**2:
-        raise CalibrationError(f"{whose}covariance: expected standard deviations up to {MAX_STATED_SIGMA:g}")
+        raise CalibrationError(f"{prefix}covariance: expected standard deviations up to {MAX_STATED_SIGMA:g}")
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     with np.errstate(over="ignore"):  # a covariance with a variance of zero: rejected below
         correlation = covariance / scale / scale[:, None]
     if (np.diag(covariance) < 0.0).any() or np.abs(correlation).max(initial=0.0) > 1.0 + 1e-6:
-        raise CalibrationError(f"{whose}covariance: a variance is negative or a correlation above 1")
+        raise CalibrationError(f"{prefix}covariance: a variance is negative or a correlation above 1")
     if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
-        raise CalibrationError(f"{whose}covariance: expected a symmetric matrix")
+        raise CalibrationError(f"{prefix}covariance: expected a symmetric matrix")
     if np.linalg.eigvalsh(correlation)[0] < -1e-6 * len(correlation):
-        raise CalibrationError(f"{whose}covariance: expected a positive semidefinite matrix")
+        raise CalibrationError(f"{prefix}covariance: expected a positive semidefinite matrix")
 
 
 def _plain(problem: Exception) -> str:

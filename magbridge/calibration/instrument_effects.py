@@ -12,7 +12,7 @@ from msgspec import Meta
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import MAX_INTERVAL, offsets, powers
 from magbridge.calibration.kernel import Kernel
-from magbridge.calibration.terms import MAX_ORDER, Effect, Power, Series, Step, Width
+from magbridge.calibration.terms import MAX_ORDER, Effect, LogSeries, Power, Step, Width
 
 __all__ = ["RateEffect", "ResponseEffect", "TimeEffect"]
 
@@ -61,7 +61,7 @@ class TimeEffect(Effect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(r, n) regressors."""
         after = series.time_us - round(self.start * 1e6)
         if self.shape == "step":
@@ -125,7 +125,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(3, n) the same backward difference: a centred one correlates less with its own sample's noise."""
         known = np.flatnonzero(np.isfinite(series.reading).all(axis=1))
         apart = 1e-6 * np.diff(series.time_us[known])
@@ -179,7 +179,7 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
 
         return step
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(r, n) regressors."""
         if self.power:
             return np.asarray(powers(series.reading.T / self.unit, self.power)[-1])

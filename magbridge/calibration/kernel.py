@@ -106,18 +106,18 @@ class Kernel:
         """(m, 9) those rows in nT at F_0: times the monomials' rates, they give the nine coefficients'."""
         return np.asarray(self.position_weights * np.array([self.field] * 6 + [1.0] * 3))
 
-    def monomials(self, values: Sequence[Any], one: Any) -> list[Any]:
+    def monomials(self, values: Sequence[Any], unit: Any) -> list[Any]:
         """Return the monomials of positions (floats or arrays), each as its parent times one position.
 
         `values` may hold more channels than there are positions: those of effects, which follow, are ignored.
-        `one` is the constant monomial: 1.0 or an array of ones.
+        `unit` is the constant monomial: 1.0 or an array of ones.
         """
         # strict=False: the channels of effects are left aside
         x = [
             (value - centre) / scale
             for value, centre, scale in zip(values, self.centre, self.scale, strict=False)
         ]
-        phi = [one]
+        phi = [unit]
         for parent, k in self.parents:
             phi.append(phi[parent] * x[k])
         return phi

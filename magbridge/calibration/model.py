@@ -41,12 +41,12 @@ __all__ = [
     "MIN_HALF_RANGE",
     "Boresight",
     "CalibratedRange",
+    "CalibratedSensor",
     "Calibration",
     "Noise",
     "Parameter",
     "Reference",
     "Run",
-    "Sensor",
     "coefficient_tensor",
     "identity",
 ]  # fmt: skip
@@ -175,7 +175,7 @@ def _combinations(S: FloatArray) -> FloatArray:
     return np.array([*Q, *S[:9, 9:].ravel(), *(S[9 + i, 9 + j] for i, j in PAIRS)])
 
 
-class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class CalibratedSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which instrument was calibrated, and in which of its power cycles (None: unknown)."""
 
     name: str = ""
@@ -188,7 +188,7 @@ class Sensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return "" in (self.name, name) or self.name == name
 
 
-UNKNOWN = Sensor()
+UNKNOWN = CalibratedSensor()
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -283,7 +283,7 @@ class Calibration:
     noise: Noise
     reference: Reference
     effects: tuple[Effect, ...] = ()
-    sensor: Sensor = UNKNOWN
+    sensor: CalibratedSensor = UNKNOWN
     boresight: Boresight | None = None
     runs: tuple[Run, ...] = ()
     method: str = ""

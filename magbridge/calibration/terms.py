@@ -25,8 +25,22 @@ from magbridge.plugins import load, plugins
 from magbridge.wording import one_of
 
 __all__ = [
-    "MAX_ORDER", "SLOTS", "TERMS", "Effect", "Expansion", "Exponents", "Parameter", "Polynomial",
-    "PositionTerm", "Power", "Series", "Step", "Term", "Width", "full_order", "term_class",
+    "MAX_ORDER",
+    "SLOTS",
+    "TERMS",
+    "Effect",
+    "Expansion",
+    "Exponents",
+    "LogSeries",
+    "Parameter",
+    "Polynomial",
+    "PositionTerm",
+    "Power",
+    "Step",
+    "Term",
+    "Width",
+    "full_order",
+    "term_class",
 ]  # fmt: skip
 
 Exponents = tuple[int, ...]
@@ -139,7 +153,7 @@ class Polynomial(PositionTerm, frozen=True, kw_only=True):
         return Expansion(self.exponents, np.eye(9 * m).reshape(9 * m, m, 9))
 
 
-class Series(NamedTuple):
+class LogSeries(NamedTuple):
     """A log of n samples, as the array form of an effect takes it."""
 
     time: FloatArray
@@ -156,10 +170,10 @@ class Series(NamedTuple):
         """(n,) µs, rounded as those of single samples are."""
         return np.rint(self.time * 1e6)
 
-    def part(self, rows: slice, names: Sequence[str]) -> Series:
+    def part(self, rows: slice, names: Sequence[str]) -> LogSeries:
         """Return these rows, with the telemetry of these names."""
         values = {name: self.values[name][rows] for name in names}
-        return Series(self.time[rows], self.reading[rows], values, self.kernel)
+        return LogSeries(self.time[rows], self.reading[rows], values, self.kernel)
 
 
 class Effect(Term, frozen=True, kw_only=True):
@@ -201,7 +215,7 @@ class Effect(Term, frozen=True, kw_only=True):
             That of the calibration.
         """
 
-    def batch(self, series: Series) -> FloatArray:
+    def batch(self, series: LogSeries) -> FloatArray:
         """(r, n) regressors of a whole log, from a fresh state: by default those of :meth:`begin`."""
         step = self.begin(tuple(series.values), series.kernel)
         values = np.reshape([*series.values.values()], (-1, len(series.time))).T.tolist()

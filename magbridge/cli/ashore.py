@@ -18,7 +18,7 @@ from magbridge.cli.common import (
     Json,
     Log,
     Plot,
-    Reading,
+    ReadingOptions,
     Whole,
     check_inputs,
     command,
@@ -38,7 +38,7 @@ def convert(
     output: Log,
     heading_reference: Heading = None,
     metadata: Path | None = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Convert logs from any readable format to any writable one; several logs are merged in time order.
@@ -90,7 +90,7 @@ def simulate(
     seed: Annotated[Whole, Parameter(validator=validators.Number(gte=0))] = 0,
     trajectory_from: tuple[Path, ...] = (),
     reference: Literal["none", "true", "map"] | None = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     map_output: Annotated[Path | None, Parameter(name="--map", validator=file_to_write(".nc"))] = None,
     json: Json = False,
 ) -> None:

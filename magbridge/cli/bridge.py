@@ -14,7 +14,7 @@ from magbridge.cli.common import (
     AS_THEY_SAY,
     Folder,
     Json,
-    Reading,
+    ReadingOptions,
     Whole,
     command,
     complain,
@@ -158,7 +158,7 @@ def replay(
     config: Path | None = None,
     speed: str = "max",
     log: Annotated[Path | None, Parameter(validator=folder_to_write)] = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Replay logs through the unmodified bridge: real bytes through a pty, real MAVLink through a socket.

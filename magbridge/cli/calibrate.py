@@ -15,7 +15,7 @@ from magbridge.cli.common import (
     Heading,
     Output,
     Plot,
-    Reading,
+    ReadingOptions,
     Whole,
     check_inputs,
     command,
@@ -65,7 +65,7 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
     lever: str = "",
     plot: Plot = None,
     force: bool = False,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: bool = False,
 ) -> None:
     """Fit a calibration to logs of calibration runs.
@@ -302,13 +302,13 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
     return deployment, GAIN_SIGMA * mean if site_bias is None else site_bias
 
 
-def _of(path: Path, compass: int) -> Path:
+def _compass_path(path: Path, compass: int) -> Path:
     """Return the name of a file for one of several compasses."""
     return path.with_name(f"{path.stem}_{compass}{path.suffix}")
 
 
 def _each_compass(
-    files: tuple[Path, ...], output: Path, plot: Path | None, reading: Reading, **options: Any
+    files: tuple[Path, ...], output: Path, plot: Path | None, reading: ReadingOptions, **options: Any
 ) -> None:
     """Calibrate every compass of the logs; DataError: not one could be."""
     from magbridge.logs import read_each
@@ -319,7 +319,10 @@ def _each_compass(
         found = {one.number for log in read_each(files, options=first.options) for one in compasses_in(log)}
     failed = 0
     for number in sorted(found) or [0]:
-        own: dict[str, Any] = {"output": _of(output, number), "plot": plot and _of(plot, number)}
+        own: dict[str, Any] = {
+            "output": _compass_path(output, number),
+            "plot": plot and _compass_path(plot, number),
+        }
         try:
             calibrate(*files, reading=replace(reading, compass=str(number)), **own, **options)
         except DataError as error:

@@ -21,9 +21,9 @@ from magbridge.logs import Options, suffixes
 from magbridge.logs.registry import is_bag
 
 __all__ = [
-    "AS_THEY_SAY", "Base", "Day", "Folder", "Grid", "Heading", "Json", "Log", "Output", "Plot", "Reading",
-    "Whole", "app", "check_inputs", "command", "complain", "file_to_write", "folder_to_write", "logs_to_read",
-    "print_result",
+    "AS_THEY_SAY", "Base", "Day", "Folder", "Grid", "Heading", "Json", "Log", "Output", "Plot",
+    "ReadingOptions", "Whole", "app", "check_inputs", "command", "complain", "file_to_write",
+    "folder_to_write", "logs_to_read", "print_result",
 ]  # fmt: skip
 
 
@@ -86,7 +86,7 @@ def folder_to_write(_: Any, path: Any) -> None:
         raise ValueError(f"The folder {there} cannot be written to.")
 
 
-def _whole(_: Any, tokens: Sequence[Token]) -> int:
+def _whole_number(_: Any, tokens: Sequence[Token]) -> int:
     """Read a whole number; cyclopts would round 1.5 to 2."""
     try:
         return int(tokens[0].value)
@@ -107,7 +107,7 @@ Day = Annotated[dt.date | None, Parameter(converter=_day)]
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class Reading:
+class ReadingOptions:
     """How to read logs.
 
     Parameters
@@ -148,12 +148,12 @@ class Reading:
         )
 
     @property
-    def alone(self) -> Options:
+    def without_sensor_logs(self) -> Options:
         """Options for a log that is read without the sensor's own logs."""
         return replace(self.options, sensor_log=(), clock_offset_s=0.0)
 
 
-AS_THEY_SAY = Reading()
+AS_THEY_SAY = ReadingOptions()
 """Logs are read as they say themselves."""
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
@@ -165,7 +165,7 @@ Heading = Annotated[
     Parameter(help="What headings refer to. If not given: what the log says, else true north."),
 ]
 Plot = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
-Whole = Annotated[int, Parameter(converter=_whole)]
+Whole = Annotated[int, Parameter(converter=_whole_number)]
 Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
 
 

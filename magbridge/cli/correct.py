@@ -13,7 +13,7 @@ from magbridge.cli.common import (
     Json,
     Log,
     Plot,
-    Reading,
+    ReadingOptions,
     check_inputs,
     command,
     complain,
@@ -60,7 +60,7 @@ def correct(
     config: Path | None = None,
     save: Annotated[Path | None, Parameter(validator=file_to_write())] = None,
     plot: Plot = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Correct a log with a calibration, as the bridge would have done live.
@@ -203,7 +203,7 @@ def _corrected(
         if not whole:
             refuse_unsuited(known, part)
         sampled = part[list(CHANNELS)].to_array().notnull()
-        corrected = _beside(part, correct_rows(correction, part), known, file)
+        corrected = _with_log_columns(part, correct_rows(correction, part), known, file)
         yield part, corrected.isel(time=sampled.any("variable").to_numpy()), correction
         whole = whole or bool(sampled.all("variable").any())
     if not whole:
@@ -247,7 +247,7 @@ def _keep_learned(learner: Learner, known: Calibration, facts: dict[str, Any], f
     return f"; {state.learned_samples} learned from, calibration {name} at last"
 
 
-def _beside(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Path) -> xr.Dataset:
+def _with_log_columns(log: xr.Dataset, corrected: xr.Dataset, known: Calibration, file: Path) -> xr.Dataset:
     """Return the corrected columns with those of the log that say where and in what state they were taken."""
     from magbridge.calibration.file import calibration_id
     from magbridge.logs.deployment import HISTORY_ATTRIBUTE, MEANING, lasting

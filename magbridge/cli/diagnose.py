@@ -12,7 +12,7 @@ from magbridge.cli.common import (
     AS_THEY_SAY,
     Folder,
     Json,
-    Reading,
+    ReadingOptions,
     command,
     complain,
     logs_to_read,
@@ -41,7 +41,7 @@ def diagnose(
     output: Annotated[Folder, Parameter(name=["--output", "-o"])],
     training_logs: tuple[Path, ...] = (),
     grid: Path | None = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Find the errors of the calibration model and their causes, and measure how much an extension gains.
@@ -75,8 +75,8 @@ def diagnose(
 
     known = load(calibration)
     with waiting("reading") as step:
-        logs = [read(path, options=reading.alone) for path in files]
-        logs += [read(path, options=reading.alone) for path in reading.sensor_log]
+        logs = [read(path, options=reading.without_sensor_logs) for path in files]
+        logs += [read(path, options=reading.without_sensor_logs) for path in reading.sensor_log]
         named = [False] * len(files) + [True] * len(reading.sensor_log)
         combined = combine(logs, named, reading.clock_offset)
         own = [path for path in files if digest(path) in known.inputs.values()]
@@ -95,7 +95,7 @@ def diagnose(
             logs,
             known,
             output,
-            training_logs=[*own_logs, *(read(path, options=reading.alone) for path in others)],
+            training_logs=[*own_logs, *(read(path, options=reading.without_sensor_logs) for path in others)],
             grid=read_grid(grid) if grid else None,
             progress=step,
             remarks=remarks,
@@ -157,17 +157,17 @@ def causes_of(facts: dict[str, Any]) -> list[str]:
     return causes or ["no cause"]
 
 
-def _followed(what: dict[str, Any] | None) -> str:
+def _followed(series: dict[str, Any] | None) -> str:
     """Return the series that an effect follows, with lag and axis, without its interpretation."""
-    if not what:
+    if not series:
         return ""
-    late = f" {what['lag_s']:g} s late" * bool(what["lag_s"])
-    along = f" along {what['axis']}" * bool(what["axis"])
-    return f", follows {what['channel']}{late}{along}" if what["channel"] else f",{along}" * bool(along)
+    late = f" {series['lag_s']:g} s late" * bool(series["lag_s"])
+    along = f" along {series['axis']}" * bool(series["axis"])
+    return f", follows {series['channel']}{late}{along}" if series["channel"] else f",{along}" * bool(along)
 
 
-def _plain(one: dict[str, Any]) -> str:
-    return f"{one['cause']} ({one['channel']})" if one["channel"] else str(one["cause"])
+def _plain(cause: dict[str, Any]) -> str:
+    return f"{cause['cause']} ({cause['channel']})" if cause["channel"] else str(cause["cause"])
 
 
 def _suspect(log: xr.Dataset) -> Iterator[str]:

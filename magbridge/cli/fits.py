@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.calibration.fitting.observations import Observations
-    from magbridge.fleet.start import Start
+    from magbridge.fleet.start import FleetPrediction
 
 __all__ = ["drifting", "fitted", "fleet_start", "from_fleet", "naming", "undeclared_columns"]
 
@@ -51,7 +51,7 @@ def fitted(
 
 
 def from_fleet(
-    start: Start, data: Observations, order: int, **options: Any
+    start: FleetPrediction, data: Observations, order: int, **options: Any
 ) -> tuple[Fit, list[str], dict[str, Any]]:
     """Return the fit that starts there, and what that is worth against one that does not: lines, facts."""
     from magbridge.calibration.fitting.fit import fit
@@ -66,7 +66,7 @@ def from_fleet(
     return found, lines, {"fleet": facts}
 
 
-def fleet_start(fleet: str, member: str, refit: str, files: tuple[Path, ...]) -> Start:
+def fleet_start(fleet: str, member: str, refit: str, files: tuple[Path, ...]) -> FleetPrediction:
     """Return a fleet's prior for these logs."""
     from magbridge.fleet.start import start
 

@@ -6,7 +6,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magbridge.cli.common import AS_THEY_SAY, Json, Reading, command, complain, logs_to_read, print_result
+from magbridge.cli.common import (
+    AS_THEY_SAY,
+    Json,
+    ReadingOptions,
+    command,
+    complain,
+    logs_to_read,
+    print_result,
+)
 from magbridge.cli.remarks import note_losses
 from magbridge.progress import waiting
 from magbridge.wording import counted
@@ -19,7 +27,7 @@ WIDE_TERMINAL = 110
 
 
 @command("info FILE... [OPTIONS]")
-def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> None:
+def info(*files: Path, reading: ReadingOptions = AS_THEY_SAY, json: Json = False) -> None:
     """Describe logs: columns, units, rates, gaps, ranges, and the commands that could use them.
 
     Several logs are described one after the other; a sensor's own log and a vehicle's logs also together.
@@ -39,7 +47,7 @@ def info(*files: Path, reading: Reading = AS_THEY_SAY, json: Json = False) -> No
     logs = {}
     with waiting("reading"):
         for file in dict.fromkeys((*files, *reading.sensor_log)):
-            logs[str(file)] = read(file, options=reading.alone)
+            logs[str(file)] = read(file, options=reading.without_sensor_logs)
         named = [Path(name) in reading.sensor_log for name in logs]
         combined = combine(list(logs.values()), named, reading.clock_offset)
         if len(combined) < len(logs):

@@ -14,7 +14,7 @@ from magbridge.cli.common import (
     Json,
     Log,
     Plot,
-    Reading,
+    ReadingOptions,
     command,
     complain,
     logs_to_read,
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from magbridge.calibration.model import Calibration
     from magbridge.field.grid import AnomalyGrid
-    from magbridge.navigate import Options
+    from magbridge.navigate import NavigationOptions
 
 __all__ = ["navigate"]
 
@@ -45,7 +45,7 @@ def navigate(
     sample_interval: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lte=1e6))] = None,
     plot: Plot = None,
     heading_reference: Heading = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Find the track by matching the corrected field to an anomaly map.
@@ -94,17 +94,19 @@ def navigate(
 
     from magbridge.field.read import read_grid
     from magbridge.logs import write
-    from magbridge.navigate import Options
+    from magbridge.navigate import NavigationOptions
     from magbridge.navigate.batch import navigate as find_way
     from magbridge.navigate.options import informed, with_level
 
     if known is None or calibration is None:
         deployment = _scalar(files, heading_reference, reading)
         level = float(deployment["level_sigma"].median()) if "level_sigma" in deployment else 0.0
-        options = options or with_level(Options(), level)
+        options = options or with_level(NavigationOptions(), level)
     else:
         deployment = _corrected(files, known, calibration, heading_reference, reading)
-        options = options or informed(Options(), known, float(deployment["total_field_sigma"].median()))
+        options = options or informed(
+            NavigationOptions(), known, float(deployment["total_field_sigma"].median())
+        )
     if map is None:
         from magbridge.navigate.own_survey import localise
 
@@ -123,7 +125,7 @@ def navigate(
     print_result({"file": str(output), **facts}, f"{output}: {summary}", json)
 
 
-def _scalar(files: tuple[Path, ...], heading_reference: Heading, reading: Reading) -> xr.Dataset:
+def _scalar(files: tuple[Path, ...], heading_reference: Heading, reading: ReadingOptions) -> xr.Dataset:
     """Return logs that hold the total field; WrongUse: they hold what must be corrected first."""
     from magbridge.errors import WrongUse
     from magbridge.field.reference import with_true_heading
@@ -142,7 +144,7 @@ def _corrected(
     known: Calibration,
     calibration: Path,
     heading_reference: Heading,
-    reading: Reading,
+    reading: ReadingOptions,
 ) -> xr.Dataset:
     """Return the logs with their field corrected by the calibration `known`, which the file holds."""
     from magbridge.columns import CHANNELS
@@ -187,22 +189,22 @@ def _bound(
     files: tuple[Path, ...],
     map: Path,  # noqa: A002
     output: Path,
-    options: Options | None,
+    options: NavigationOptions | None,
     calibration: Calibration | None,
     sample_interval: float | None,
     plot: Path | None,
-    reading: Reading,
+    reading: ReadingOptions,
     json: bool,
 ) -> None:
     from magbridge.field.read import read_grid
     from magbridge.logs import read, write
-    from magbridge.navigate import Options
+    from magbridge.navigate import NavigationOptions
     from magbridge.navigate.bound import as_dataset, position_bound
 
     place = ["latitude", "longitude"]
     with waiting("reading"):
         plan = read(files, required=place, options=reading.options).dropna("time", subset=place)
-    grid, options = _continued(read_grid(map), options or Options(), plan)
+    grid, options = _continued(read_grid(map), options or NavigationOptions(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0
     sample_interval = sample_interval or _sample_interval(plan, calibration)
@@ -227,7 +229,9 @@ def _sample_interval(plan: xr.Dataset, calibration: Calibration | None) -> float
     return 4.0
 
 
-def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> tuple[AnomalyGrid, Options]:
+def _continued(
+    grid: AnomalyGrid, options: NavigationOptions, deployment: xr.Dataset
+) -> tuple[AnomalyGrid, NavigationOptions]:
     """Return the map continued to the deployment's depth, and options with the error of that; report it."""
     from magbridge.navigate.depth import at_depth
 
@@ -242,10 +246,10 @@ def _continued(grid: AnomalyGrid, options: Options, deployment: xr.Dataset) -> t
     return there, known
 
 
-def _options(config: Path | None) -> Options | None:
+def _options(config: Path | None) -> NavigationOptions | None:
     """Return the options of a bridge's configuration; None where it has none."""
     from magbridge.errors import ConfigError
-    from magbridge.navigate import Options
+    from magbridge.navigate import NavigationOptions
     from magbridge.toml import convert, load_toml
 
     if config is None:
@@ -254,4 +258,4 @@ def _options(config: Path | None) -> Options | None:
     given = section.get("options") if isinstance(section, dict) else None
     if given is None:
         raise ConfigError(config, "navigation.options", "missing key")
-    return convert(given, Options, config, "navigation.options.")
+    return convert(given, NavigationOptions, config, "navigation.options.")

@@ -11,7 +11,7 @@ from magbridge.cli.common import (
     AS_THEY_SAY,
     Heading,
     Json,
-    Reading,
+    ReadingOptions,
     Whole,
     command,
     complain,
@@ -33,7 +33,7 @@ def plan(
     parameter: tuple[str, ...] = (),
     roll: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=90))] = 10.0,
     heading_reference: Heading = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Choose the calibration runs to fly next: those that make the mission's worst error smallest.

@@ -56,11 +56,11 @@ def by_base_station(logs: Sequence[xr.Dataset], base: Path | None) -> list[xr.Da
 
     FormatError, DataError: the base station's log has no field, or not for the logs' time.
     """
-    from magbridge.field.base_station import apart, with_daily_variation
+    from magbridge.field.base_station import separate_observatories, with_daily_variation
     from magbridge.logs import read
     from magbridge.logs.deployment import join
 
-    own, stations = apart(logs)
+    own, stations = separate_observatories(logs)
     if base is not None:
         stations = [read(base)]
     if not own or not stations:

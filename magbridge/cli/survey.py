@@ -16,7 +16,7 @@ from magbridge.cli.common import (
     Json,
     Output,
     Plot,
-    Reading,
+    ReadingOptions,
     Whole,
     command,
     complain,
@@ -59,7 +59,7 @@ def survey(
     tracks: Annotated[Path | None, Parameter(validator=file_to_write(".geojson", ".json", ".kml"))] = None,
     crossovers: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
     plot: Plot = None,
-    reading: Reading = AS_THEY_SAY,
+    reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
     """Make an anomaly map, with its sigma, from a survey's own logs: no calibration runs, no map.
@@ -152,7 +152,7 @@ def _scalar_survey(
     parameters: tuple[str, ...],
     calibration: tuple[Path, ...],
     base: Path | None,
-    reading: Reading,
+    reading: ReadingOptions,
     given: dict[str, Any],
 ) -> Result:
     """Return the survey of a scalar magnetometer."""
@@ -183,7 +183,7 @@ def _samples(
     save: Path | None,
     base: Path | None,
     options: dict[str, Any],
-    reading: Reading,
+    reading: ReadingOptions,
 ) -> Samples:
     """Return the corrected samples of all files."""
     from magbridge.calibration.file import load
@@ -257,7 +257,7 @@ def _predict(done: Result, points: Path, output: Path) -> None:
     from magbridge.survey.write import write_points
 
     longitude, latitude, depth, place = read_points(points, done.samples.origin)
-    anomaly, sigma = done.gridded.at(place, depth)
+    anomaly, sigma = done.gridded.evaluate(place, depth)
     write_points(longitude, latitude, anomaly, sigma, output)
 
 

@@ -54,7 +54,7 @@ from magbridge.diagnose.columns import (
     slices,
 )
 from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statistic, normal, volume_of
-from magbridge.diagnose.noise import Noise
+from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import DERIVATIVE_ROWS, Problem, side_by_side
 
 __all__ = [
@@ -144,7 +144,7 @@ class Information:
 
 def information(
     problem: Problem,
-    noise: Noise,
+    noise: ResidualNoise,
     base: Joint,
     columns: Sequence[Columns],
     unshared: int = 0,
@@ -297,7 +297,7 @@ def log_odds(
     return 0.5 * (ratio - shaped) + worth + known - further - prices
 
 
-def certainty(residual: FloatArray, noise: Noise, columns: Sequence[Columns]) -> list[float]:
+def certainty(residual: FloatArray, noise: ResidualNoise, columns: Sequence[Columns]) -> list[float]:
     r"""Degrees of freedom of the noise's level at the frequencies where each of `columns` has its power.
 
     `residual` (n,) is what the noise was fitted to, nT.

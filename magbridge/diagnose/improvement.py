@@ -40,7 +40,7 @@ from magbridge.diagnose.extend import (
 from magbridge.diagnose.joint import HeldOut, Joint, fit_joint, held_out, paired
 from magbridge.diagnose.problem import DELAYS, Problem, derivatives, floor, isotropic, samples_of
 from magbridge.diagnose.survey import Survey, days_of
-from magbridge.estimation.residual import Samples, residuals, rms
+from magbridge.estimation.residual import ResidualSamples, residuals, rms
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
 from magbridge.rows import correct_rows
@@ -255,7 +255,7 @@ def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
     return float(limit[worst]), float(excess[worst] * limit[worst])
 
 
-def _turned(samples: Samples) -> Samples:
+def _turned(samples: ResidualSamples) -> ResidualSamples:
     """Return samples with their readings, and these turned both ways about each axis of the sensor."""
     angle, readings = np.radians(DOMAIN_TURN_DEG), [samples.field]
     for axis in range(3):

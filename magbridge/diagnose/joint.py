@@ -46,7 +46,7 @@ import numpy as np
 
 from magbridge.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from magbridge.diagnose.columns import Columns, places, size_of, times
-from magbridge.diagnose.noise import Noise, fit_noise
+from magbridge.diagnose.noise import ResidualNoise, fit_noise
 from magbridge.diagnose.problem import DELAYS, Problem, pieces, side_by_side
 from magbridge.estimation.residual import robust_scale
 
@@ -131,7 +131,7 @@ class JointDesign:
 def normal(
     X: Columns,
     y: FloatArray,
-    noise: Noise | None = None,
+    noise: ResidualNoise | None = None,
     asked: Sequence[tuple[slice, slice]] = ALL_PRODUCTS,
     stride: int = 1,
 ) -> tuple[FloatArray, FloatArray]:
@@ -258,7 +258,7 @@ class Joint:
     """(k,) of the effects, in units of their prior width."""
     covariance: FloatArray
     """(q + k, q + k)."""
-    noise: Noise
+    noise: ResidualNoise
     residual: FloatArray
     """(n,) nT, residual of the fit."""
     prior: FloatArray
@@ -327,12 +327,12 @@ def fit_joint(
     centre = np.append(problem.centre, np.zeros(k))
     past = problem.survey.history(order)
 
-    def evaluated(c: FloatArray) -> tuple[FloatArray, Noise]:
+    def evaluated(c: FloatArray) -> tuple[FloatArray, ResidualNoise]:
         residual = problem.residual - X.times(c)
         known = None if like is None else like.noise
         return residual, fit_noise(residual, past, blocks=blocks, like=known, brief=brief)
 
-    def value(c: FloatArray, noise: Noise) -> float:
+    def value(c: FloatArray, noise: ResidualNoise) -> float:
         return noise.log_likelihood - 0.5 * float(prior @ (c - centre) ** 2)
 
     # noise of a long correlation absorbs a slow effect, and no later step finds it again: so one start is

@@ -23,7 +23,7 @@ from magbridge.diagnose.columns import Candidate, Columns, places, times
 from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, information
 from magbridge.diagnose.joint import Joint, JointDesign, Ridge, Statistic, in_threads, precomputed
-from magbridge.diagnose.noise import Noise, fit_noise
+from magbridge.diagnose.noise import ResidualNoise, fit_noise
 from magbridge.diagnose.observed import Memory, memory
 from magbridge.diagnose.problem import Problem, pieces
 from magbridge.diagnose.search import Outliers
@@ -224,7 +224,11 @@ def leftover(
 
 
 def _scored(
-    problem: Problem, noise: Noise, fit: Joint, model: Sequence[Columns], listed: Sequence[Description]
+    problem: Problem,
+    noise: ResidualNoise,
+    fit: Joint,
+    model: Sequence[Columns],
+    listed: Sequence[Description],
 ) -> Iterator[Scored]:
     """Score each description with each of its widths under `noise`."""
     columns = [*(one.columns for one in listed), *model]
@@ -240,7 +244,9 @@ def _scored(
             )
 
 
-def _calm(problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence[Description]) -> Noise:
+def _calm(
+    problem: Problem, model: Sequence[Columns], fit: Joint, slow: Sequence[Description]
+) -> ResidualNoise:
     """Return the noise that is left when slow curves are fitted, beginning with white noise."""
     level = np.full(len(problem), robust_scale(np.diff(fit.residual)) / np.sqrt(2.0) + 1e-12)
     ar, innovations = np.zeros_like(fit.noise.ar), fit.residual / level

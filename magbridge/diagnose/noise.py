@@ -37,7 +37,7 @@ from magbridge.diagnose.problem import DERIVATIVE_ROWS
 from magbridge.diagnose.survey import MAX_LAG, Past
 from magbridge.estimation.residual import robust_scale
 
-__all__ = ["BRIEFEST", "MAX_NOISE_ORDER", "TAILS", "Noise", "autoregressive_order", "fit_noise"]
+__all__ = ["BRIEFEST", "MAX_NOISE_ORDER", "TAILS", "ResidualNoise", "autoregressive_order", "fit_noise"]
 
 BAND = 32
 """Rows that are filtered by one product of matrices."""
@@ -69,7 +69,7 @@ BRIEFEST, SLOWEST = 20.0, 2000.0
 
 
 @dataclass(frozen=True, eq=False)
-class Noise:
+class ResidualNoise:
     """Noise as fitted."""
 
     ar: FloatArray
@@ -291,9 +291,9 @@ def fit_noise(
     history: Past,
     *,
     blocks: bool | None = None,
-    like: Noise | None = None,
+    like: ResidualNoise | None = None,
     brief: bool = False,
-) -> Noise:
+) -> ResidualNoise:
     """Fit the noise model.
 
     Parameters
@@ -333,7 +333,7 @@ def fit_noise(
         weight = (nu + 1.0) / (nu + (v / scale) ** 2)
         if abs(log_likelihood - before) < MIN_GAIN:
             break
-    return Noise(ar, scale, nu, history, log_likelihood, v / scale)
+    return ResidualNoise(ar, scale, nu, history, log_likelihood, v / scale)
 
 
 def _regressed(lags: FloatArray, r: FloatArray, weight: FloatArray) -> FloatArray:

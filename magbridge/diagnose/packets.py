@@ -33,7 +33,7 @@ from magbridge.arrays import FloatArray
 from magbridge.diagnose.columns import Columns
 from magbridge.diagnose.evidence import log_bayes
 from magbridge.diagnose.joint import Joint, in_threads
-from magbridge.diagnose.noise import Noise
+from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import Problem
 
 __all__ = ["Packets", "packets", "passage"]
@@ -142,7 +142,7 @@ def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
     return np.stack([length * one, f[asked][line], every * at, ratio[at, line], -np.log(ratio.size) * one])
 
 
-def _passed(noise: Noise, frequency: FloatArray) -> FloatArray:
+def _passed(noise: ResidualNoise, frequency: FloatArray) -> FloatArray:
     """(2, k) power gain of whitening at frequencies (k,), per sample: away from gaps, and after them."""
     past, gaps = noise.past, noise.near_gaps
     lags = np.arange(1, past.order + 1)

@@ -54,11 +54,11 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import regressors
 from magbridge.calibration.effects import powers
 from magbridge.calibration.model import Calibration, coefficient_tensor
-from magbridge.calibration.terms import Effect, Polynomial, Series
+from magbridge.calibration.terms import Effect, LogSeries, Polynomial
 from magbridge.diagnose.survey import Survey
 from magbridge.estimation.noise import whiten
 from magbridge.estimation.priors import HARD_IRON_SIGMA_NT, SOFT_IRON_SIGMA
-from magbridge.estimation.residual import Samples, jacobian, residuals, robust_scale
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, robust_scale
 
 __all__ = [
     "AXIS_DELAY_SIGMA_S", "DELAYS", "DERIVATIVE_ROWS", "FALL", "MAX_MISSING_SAMPLES", "Problem",
@@ -163,7 +163,9 @@ def side_by_side(blocks: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate([block.T for block in blocks], out=out).T
 
 
-def derivatives(calibration: Calibration, samples: Samples, g: FloatArray, L: FloatArray) -> FloatArray:
+def derivatives(
+    calibration: Calibration, samples: ResidualSamples, g: FloatArray, L: FloatArray
+) -> FloatArray:
     """(n, q): derivatives of the residual by all coefficients, times L (K, q), in bounded memory."""
     tensor, _ = coefficient_tensor(calibration)  # C_krs of :mod:`.problem`
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], tensor[0].size).T
@@ -219,7 +221,7 @@ def _factor(covariance: FloatArray) -> FloatArray:
 
 
 def prior(
-    survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
+    survey: Survey, calibration: Calibration, samples: ResidualSamples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return L (K, q) and m (q,) of the prior ``c = c_0 + L z``, ``z ~ N(m, 1)``, :func:`floor` included."""
     L, centre = _without_repeats(survey, calibration, samples, e, g)
@@ -228,7 +230,7 @@ def prior(
 
 
 def _without_repeats(
-    survey: Survey, calibration: Calibration, samples: Samples, e: FloatArray, g: FloatArray
+    survey: Survey, calibration: Calibration, samples: ResidualSamples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return L and m of the posterior without the information of samples that are compared here again.
 
@@ -330,11 +332,11 @@ class Problem:
         slopes = self.jacobian[:, 6:]
         return np.concatenate([slow_columns(slopes, rows) @ z[self.slow] for rows in pieces(len(self))])
 
-    def series(self, effect: Effect, rows: slice = slice(None)) -> Series:
+    def series(self, effect: Effect, rows: slice = slice(None)) -> LogSeries:
         """Return rows of the log as the array form of an effect takes them."""
         names = dict.fromkeys([*(p.name for p in self.calibration.parameters), *effect.channels()])
         values = {name: self.survey.channels[name].values[rows] for name in names}
-        return Series(self.survey.time[rows], self.reading[rows], values, self.calibration.kernel)
+        return LogSeries(self.survey.time[rows], self.reading[rows], values, self.calibration.kernel)
 
     @cached_property
     def coefficient_jacobian(self) -> FloatArray:
@@ -380,7 +382,7 @@ def cached_per_problem(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
     return cached
 
 
-def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, FloatArray]:
+def samples_of(survey: Survey, calibration: Calibration) -> tuple[ResidualSamples, FloatArray]:
     """Return the residual's samples, with effects among the regressors, and its coefficients (9 m,)."""
     phi = regressors(calibration, survey.field, survey.values(calibration.channels), survey.time)
     unit = calibration.reference.field
@@ -389,11 +391,13 @@ def samples_of(survey: Survey, calibration: Calibration) -> tuple[Samples, Float
     W[:, :6] *= unit
     noise = calibration.noise
     kappa = noise.reference / noise.sensor if noise.sensor > 0.0 else 0.0
-    return Samples(survey.field, survey.reference, phi.T, survey.steps.astype(float), unit, kappa), W.ravel()
+    return ResidualSamples(
+        survey.field, survey.reference, phi.T, survey.steps.astype(float), unit, kappa
+    ), W.ravel()
 
 
 def linearised(
-    samples: Samples, coefficients: FloatArray
+    samples: ResidualSamples, coefficients: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Compute the residual and its derivatives at readings that are moved until the residual vanishes.
 

@@ -34,7 +34,7 @@ from magbridge.diagnose.evidence import (
     wald_ratio,
 )
 from magbridge.diagnose.joint import RIDGE, Joint, fit_joint, in_threads, precomputed
-from magbridge.diagnose.noise import Noise
+from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import Problem
 
 __all__ = ["SearchState", "refined", "sharpen"]
@@ -186,7 +186,7 @@ class SearchState:
         return self._information_under(everything.noise, model, base, stride).fitted(base)
 
     def _information_under(
-        self, noise: Noise, model: Sequence[Candidate], base: Joint, stride: int = 1
+        self, noise: ResidualNoise, model: Sequence[Candidate], base: Joint, stride: int = 1
     ) -> Information:
         """Information of all candidates and of `model` under a noise, in every `stride`-th piece."""
         columns = [*self.columns, *(candidate.columns for candidate in model)]

@@ -52,10 +52,12 @@ class ColumnProducts:
     VB: FloatArray
     BB: csr_array
 
-    def plus(self, other: ColumnProducts, factor: float = 1.0) -> ColumnProducts:
+    def plus(self, products: ColumnProducts, factor: float = 1.0) -> ColumnProducts:
         """Return the sum with `factor` times another."""
         return ColumnProducts(
-            self.VV + factor * other.VV, self.VB + factor * other.VB, csr_array(self.BB + factor * other.BB)
+            self.VV + factor * products.VV,
+            self.VB + factor * products.VB,
+            csr_array(self.BB + factor * products.BB),
         )
 
     def times(self, factor: float) -> ColumnProducts:
@@ -63,7 +65,7 @@ class ColumnProducts:
         return ColumnProducts(factor * self.VV, factor * self.VB, csr_array(factor * self.BB))
 
     @classmethod
-    def of(cls, V: FloatArray, B: csr_array, weight: FloatArray | None = None) -> ColumnProducts:
+    def from_rows(cls, V: FloatArray, B: csr_array, weight: FloatArray | None = None) -> ColumnProducts:
         """Return those of rows V (n, 1 + q) and B (n, nodes), each counted `weight` (n,) times."""
         if weight is None:
             return cls(V.T @ V, np.asarray((B.T @ V).T), csr_array(B.T @ B))
@@ -116,9 +118,9 @@ def sum_rows(pieces: Iterable[LinearisedRows]) -> SampleSums:
             ends[0] = -float(ahead[0])
         some, pair = np.flatnonzero(ends), np.flatnonzero(follows)
         found = [
-            ColumnProducts.of(V[new], B[new]),
-            ColumnProducts.of(V[some], B[some], ends[some]),
-            ColumnProducts.of(V[pair] - V[pair - 1], csr_array(B[pair] - B[pair - 1])),
+            ColumnProducts.from_rows(V[new], B[new]),
+            ColumnProducts.from_rows(V[some], B[some], ends[some]),
+            ColumnProducts.from_rows(V[pair] - V[pair - 1], csr_array(B[pair] - B[pair - 1])),
         ]
         total = found if total is None else [a.plus(b) for a, b in zip(total, found, strict=True)]
         samples, pairs = samples + len(V) - int(overlap), pairs + len(pair)

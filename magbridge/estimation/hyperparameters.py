@@ -105,8 +105,8 @@ def is_maximum(information: GaussianInformation, family: PriorFamily, widths: Hy
     x = np.append(widths.eta, np.log(widths.sigma))
     scale = np.append(family.spread, LOG_SIGMA_SCALE)
 
-    def slope(at: FloatArray) -> FloatArray:
-        return np.asarray(log_evidence(information, family, at[:-1], at[-1])[1] * scale)
+    def slope(point: FloatArray) -> FloatArray:
+        return np.asarray(log_evidence(information, family, point[:-1], point[-1])[1] * scale)
 
     bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
     values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))

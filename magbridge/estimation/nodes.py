@@ -61,7 +61,7 @@ class Nodes:
             edges = [*edges[:-1], self.size] if len(edges) > 1 else [0, self.size]
         return np.array(edges)
 
-    def inside(self, place: FloatArray) -> BoolArray:
+    def covers(self, place: FloatArray) -> BoolArray:
         """Return which places (n, 2), m, have all the nodes that a spline there needs: (n,)."""
         return np.asarray((self._around(place)[0] >= 0).all(axis=(1, 2)))
 

@@ -22,7 +22,7 @@ from scipy.linalg.lapack import dpotrf
 from magbridge.arrays import FloatArray
 from magbridge.estimation.noise import NoiseModel, Whitening
 from magbridge.estimation.priors import Prior
-from magbridge.estimation.residual import CHUNK_ROWS, Samples, jacobian, residuals
+from magbridge.estimation.residual import CHUNK_ROWS, ResidualSamples, jacobian, residuals
 
 __all__ = ["NormalEquations", "Solution", "gauss_newton", "normal_equations"]
 
@@ -57,7 +57,7 @@ class Solution:
 
 
 def normal_equations(
-    samples: Samples,
+    samples: ResidualSamples,
     coefficients: FloatArray,
     weight: FloatArray | None = None,
     rho: float = 0.0,
@@ -96,7 +96,7 @@ def normal_equations(
 
 
 def gauss_newton(
-    samples: Samples,
+    samples: ResidualSamples,
     prior: Prior,
     noise: NoiseModel,
     start: FloatArray,

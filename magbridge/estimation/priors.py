@@ -83,11 +83,11 @@ class PriorFamily:
         """(q,) prior 1-sigma of z at `eta` (h,)."""
         return np.asarray(np.exp(self.constant + self.design @ eta))
 
-    def near(self, start: FloatArray) -> FloatArray:
+    def nearest_latent(self, start: FloatArray) -> FloatArray:
         """Return the smallest z (q,) whose constant terms are `start` (9,), nT."""
         return np.asarray(np.linalg.lstsq(self.E[:9], start - self.offset[:9], rcond=None)[0])
 
-    def at(self, eta: FloatArray) -> Prior:
+    def prior(self, eta: FloatArray) -> Prior:
         """Return the family's prior at `eta` (h,)."""
         return Prior(np.diag(self.widths(eta) ** -2.0), self.E, self.offset)
 
@@ -107,7 +107,7 @@ def polynomial_prior(exponents: tuple[Exponents, ...], names: tuple[str, ...], F
     names : tuple of str
         Of the parameters.
     F_0 : float
-        nT, as in :class:`~magbridge.estimation.residual.Samples`.
+        nT, as in :class:`~magbridge.estimation.residual.ResidualSamples`.
     """
     labels = ["gain", "soft iron", "hard iron"]
     widths = (np.sqrt(3.0) * GAIN_SIGMA * F_0, SOFT_IRON_SIGMA * F_0, HARD_IRON_SIGMA_NT)

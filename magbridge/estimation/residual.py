@@ -26,7 +26,7 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray, IndexArray
 
 __all__ = [
-    "CHUNK_ROWS", "PAIRS", "Samples", "jacobian", "residuals", "residuals_of", "rms", "robust_scale",
+    "CHUNK_ROWS", "PAIRS", "ResidualSamples", "jacobian", "residuals", "residuals_of", "rms", "robust_scale",
     "scales_and_offsets", "symmetric",
 ]  # fmt: skip
 
@@ -37,7 +37,7 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class ResidualSamples:
     """The samples that a fit compares with their reference."""
 
     field: FloatArray
@@ -53,14 +53,14 @@ class Samples:
     kappa: float = 0.0
     """Noise of the reference divided by the sensor's."""
 
-    def part(self, rows: slice | BoolArray | IndexArray) -> Samples:
+    def part(self, rows: slice | BoolArray | IndexArray) -> ResidualSamples:
         """Pick samples: an (n,) mask, places or a slice."""
-        return Samples(
+        return ResidualSamples(
             self.field[rows], self.reference[rows], self.phi[rows], self.steps[rows], self.F_0, self.kappa
         )
 
 
-def residuals(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+def residuals(samples: ResidualSamples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the residual e (n,) in sensor nT, and its derivative by the nine coefficients (n, 9).
 
     Parameters
@@ -102,7 +102,7 @@ def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:
     return np.asarray(phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
 
 
-def residuals_of(samples: Samples, coefficients: FloatArray) -> FloatArray:
+def residuals_of(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
     """Residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
     pieces = [
         residuals(samples.part(slice(start, start + CHUNK_ROWS)), coefficients)[0]
@@ -121,7 +121,7 @@ def robust_scale(values: FloatArray) -> float:
     return 1.4826 * float(np.median(np.abs(values)))
 
 
-def scales_and_offsets(samples: Samples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
+def scales_and_offsets(samples: ResidualSamples, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues of A (n, 3) and size of T (n,), nT, at every sample."""
     theta = samples.phi @ coefficients.reshape(-1, 9)
     A = np.eye(3) + symmetric(theta) / samples.F_0

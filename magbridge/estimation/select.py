@@ -26,7 +26,7 @@ BLOCK_LOG_EVIDENCE_PRICE = 6.0
 
 def select_blocks(
     quadratic: GaussianInformation,
-    own: PriorFamily,
+    family: PriorFamily,
     groups: tuple[ParameterBlock, ...],
     eta: FloatArray,
     sigma: float,
@@ -37,8 +37,8 @@ def select_blocks(
     Parameters
     ----------
     quadratic : GaussianInformation
-        In the unknowns of all groups, behind those of `own`.
-    own : PriorFamily
+        In the unknowns of all groups, behind those of `family`.
+    family : PriorFamily
         Of the coefficients.
     groups : tuple of ParameterBlock
         All that are in the fit.
@@ -47,17 +47,18 @@ def select_blocks(
     price : float
         Nats that each must gain.
     """
-    first, free = _starts(own, groups)
+    first, free = _starts(family, groups)
 
     def score(kept: tuple[ParameterBlock, ...]) -> float:
-        rows = [np.arange(own.E.shape[1])]
+        rows = [np.arange(family.E.shape[1])]
         rows += [first[one.name] + np.arange(len(one.shape)) for one in kept]
         i = np.concatenate(rows)
         part = quadratic.part(i)
-        widths = [*range(len(own.centre)), *(free[one.name] for one in kept if one.spread)]
+        widths = [*range(len(family.centre)), *(free[one.name] for one in kept if one.spread)]
         terms = sum(one.offered for one in kept)
         return (
-            maximise_evidence(part, with_blocks(own, kept), eta[widths], sigma).log_evidence - price * terms
+            maximise_evidence(part, with_blocks(family, kept), eta[widths], sigma).log_evidence
+            - price * terms
         )
 
     return max(_choices(groups), key=score)
@@ -71,9 +72,9 @@ def _choices(groups: tuple[ParameterBlock, ...]) -> Iterator[tuple[ParameterBloc
         yield tuple(one for one in groups if not one.offered or one in chosen)
 
 
-def _starts(own: PriorFamily, groups: tuple[ParameterBlock, ...]) -> tuple[dict[str, int], dict[str, int]]:
+def _starts(family: PriorFamily, groups: tuple[ParameterBlock, ...]) -> tuple[dict[str, int], dict[str, int]]:
     """Return where the unknowns of each group begin, and where its width stands."""
-    first, free, row, column = {}, {}, own.E.shape[1], len(own.centre)
+    first, free, row, column = {}, {}, family.E.shape[1], len(family.centre)
     for one in groups:
         first[one.name], free[one.name] = row, column
         row, column = row + len(one.shape), column + bool(one.spread)

@@ -19,13 +19,13 @@ from magbridge.errors import DataError, FormatError
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["apart", "with_daily_variation"]
+__all__ = ["separate_observatories", "with_daily_variation"]
 
 MAX_EXTRAPOLATION_S = 600.0
 """s beyond the station's log, for which its last value is held."""
 
 
-def apart(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
+def separate_observatories(logs: Sequence[xr.Dataset]) -> tuple[list[xr.Dataset], list[xr.Dataset]]:
     """Separate the vehicle's logs from those of an observatory."""
     own = [log for log in logs if "observatory" not in log.attrs]
     return own, [log for log in logs if "observatory" in log.attrs]

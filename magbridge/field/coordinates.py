@@ -156,11 +156,11 @@ def _reprojected(
     return longitude, latitude, {name: _sampled(values, at) for name, values in fields.items()}
 
 
-def _sampled(values: RealArray, at: RealArray) -> RealArray:
+def _sampled(values: RealArray, indices: RealArray) -> RealArray:
     """Return values (ny, nx) at fractional rows and columns (2, m, n): NaN outside and next to a hole."""
     from scipy.ndimage import map_coordinates  # noqa: PLC0415  the live path runs without scipy
 
-    hole = map_coordinates(np.isnan(values).astype(float), at, order=1, mode="constant", cval=1.0)
+    hole = map_coordinates(np.isnan(values).astype(float), indices, order=1, mode="constant", cval=1.0)
     spline = coefficients(filled(np.asarray(values, np.float64)))  # a node more on each side
-    found = map_coordinates(spline, at + 1.0, order=3, mode="nearest", prefilter=False)
+    found = map_coordinates(spline, indices + 1.0, order=3, mode="nearest", prefilter=False)
     return np.asarray(np.where(hole > 1e-9, np.nan, found))

@@ -226,7 +226,7 @@ class AnomalyGrid:
             parts[:, ~inside] = variance[~inside] = nan
         return Local._make([*parts, variance])
 
-    def at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> FloatArray:
+    def anomaly_at(self, longitude: ArrayLike, latitude: ArrayLike, depth: ArrayLike = nan) -> FloatArray:
         """Return the anomaly at n places, nT, (n,): see :meth:`evaluate`.
 
         OutOfRange: a place that the map does not cover.
@@ -319,27 +319,27 @@ def _left_out(values: FloatArray, known: NDArray[np.bool_], step: int) -> float:
     return float(np.sqrt(np.mean(error**2))) if error.size else 0.0
 
 
-def _axis(values: ArrayLike, name: str, what: str) -> tuple[FloatArray, bool]:
+def _axis(values: ArrayLike, name: str, axis_name: str) -> tuple[FloatArray, bool]:
     """Return the axis ascending and exactly even, and whether it was descending."""
     axis = np.array(values, float).ravel()
     if axis.size < 4 or not np.isfinite(axis).all():
-        raise FormatError(name, "expected at least 4 finite coordinates", column=what)
-    limit = 90.0 if what == "latitude" else 540.0  # 359 360 361 is how some write Greenwich
+        raise FormatError(name, "expected at least 4 finite coordinates", column=axis_name)
+    limit = 90.0 if axis_name == "latitude" else 540.0  # 359 360 361 is how some write Greenwich
     if np.abs(axis).max() > limit * (1 + 1e-9):
         raise FormatError(
             name,
             f"expected degrees, found {axis[np.abs(axis).argmax()]:.6g}: projected coordinates;"
             " reproject the grid to longitude and latitude",
-            column=what,
+            column=axis_name,
         )
     flip = bool(np.median(np.diff(axis)) < 0.0)
     axis = axis[::-1] if flip else axis
-    if what == "longitude":  # 178 179 180 -179: the same meridians, unwound
+    if axis_name == "longitude":  # 178 179 180 -179: the same meridians, unwound
         axis = np.degrees(np.unwrap(np.radians(axis)))
     even = np.linspace(axis[0], axis[-1], axis.size)
     step = (axis[-1] - axis[0]) / (axis.size - 1)
     if step <= 0.0 or np.abs(axis - even).max() > EVEN * step:
-        raise FormatError(name, "expected evenly spaced coordinates in order", column=what)
+        raise FormatError(name, "expected evenly spaced coordinates in order", column=axis_name)
     return even, flip
 
 

@@ -42,7 +42,7 @@ OTHERS = (
 HEADER_HINT = "name the columns in the first row: longitude,latitude,anomaly"
 
 
-class Column(NamedTuple):
+class GridColumn(NamedTuple):
     """A column's place, its name in small letters without unit, and the unit."""
 
     place: int
@@ -106,7 +106,7 @@ def _is_remark(line: str, remarks: list[str]) -> bool:
     return found
 
 
-def _named(path: Path, words: list[str]) -> tuple[Column, Column, Column]:
+def _named(path: Path, words: list[str]) -> tuple[GridColumn, GridColumn, GridColumn]:
     """Return the columns of x, y and anomaly by their names."""
     columns = [_column(place, word) for place, word in enumerate(words)]
     x, y, z = (
@@ -125,7 +125,7 @@ def _named(path: Path, words: list[str]) -> tuple[Column, Column, Column]:
     return x, y, z
 
 
-def _column(place: int, word: str) -> Column:
+def _column(place: int, word: str) -> GridColumn:
     """Return the column of a word in the header: ``mag``, ``mag [uT]``, ``mag (uT)`` or ``mag_uT``."""
     name, *inside = re.split(r"\s*[\[(]\s*", word.strip("\"' "), maxsplit=1)
     name = re.sub(r"_(dd|wgs84|decimal_degrees)$", "", name.strip().replace(" ", "_"))
@@ -133,7 +133,7 @@ def _column(place: int, word: str) -> Column:
     stem, _, ending = name.rpartition("_")
     if not unit and stem and ending in UNIT_SUFFIXES:
         name, unit = stem, ending
-    return Column(place, name, unit)
+    return GridColumn(place, name, unit)
 
 
 def _order(path: Path, rows: RealArray) -> list[int]:

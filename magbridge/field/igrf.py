@@ -202,9 +202,9 @@ def _outside(values: FloatArray, low: float, high: float) -> list[float]:
     return [float(value) for value in values[(values < low) | (values > high)][:1]]
 
 
-def _refuse(what: str, values: FloatArray, low: float, high: float, covered: str) -> None:
+def _refuse(quantity: str, values: FloatArray, low: float, high: float, covered: str) -> None:
     if bad := _outside(values, low, high):
-        raise OutOfRange(what, bad[0], covered)
+        raise OutOfRange(quantity, bad[0], covered)
 
 
 def _date(time: float) -> str:

@@ -36,12 +36,12 @@ class HeldField:
         self._where = (np.nan, np.nan, np.nan)
         self._when_us, self._field = 0, np.nan
 
-    def at(self, where: tuple[float, float, float], utc_us: int) -> float:
+    def field_at(self, position: tuple[float, float, float], utc_us: int) -> float:
         """Return the total field in nT; a value computed for this place less than a second ago is reused.
 
         Parameters
         ----------
-        where : tuple of 3 float
+        position : tuple of 3 float
             deg, deg, m: latitude, longitude, depth.
         utc_us : int
             µs since 1970 UTC.
@@ -51,9 +51,9 @@ class HeldField:
         OutOfRange
             As :func:`~magbridge.field.igrf.total_field`.
         """
-        if where != self._where or abs(utc_us - self._when_us) > CACHE_TIME_US:
-            self._field = self._model.at(*where, utc_us * 1e-6)[0]
-            self._where, self._when_us = where, utc_us
+        if position != self._where or abs(utc_us - self._when_us) > CACHE_TIME_US:
+            self._field = self._model.field_and_slopes(*position, utc_us * 1e-6)[0]
+            self._where, self._when_us = position, utc_us
         return self._field
 
 
@@ -64,7 +64,9 @@ class NearbyField:
         self._middle = (np.nan, np.nan, np.nan)  # latitude, longitude, time
         self._c = [0.0] * 11
 
-    def at(self, latitude: float, longitude: float, depth: float, time: float) -> tuple[float, float, float]:
+    def field_and_slopes(
+        self, latitude: float, longitude: float, depth: float, time: float
+    ) -> tuple[float, float, float]:
         """Return the total field (nT) and its slopes north and east (nT/m).
 
         Parameters

@@ -20,13 +20,13 @@ from magbridge.field.geodesy import signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.files import atomic_path
 
-__all__ = ["Step", "continue_upward", "draw_steps", "merge", "prepare", "surveyed_at"]
+__all__ = ["PreparationStep", "continue_upward", "draw_steps", "merge", "prepare", "surveyed_at"]
 
 MAX_MERGED_NODES = 10_000_000
 """Nodes of a merged map. As many, from two surveys that overlap, take 2 GB."""
 
 
-class Step(NamedTuple):
+class PreparationStep(NamedTuple):
     """A stage of the preparation and the grid that it left."""
 
     title: str
@@ -39,7 +39,7 @@ def prepare(
     smooth: float = 0.0,
     mask: ArrayLike | None = None,
     spacing: float | None = None,
-) -> tuple[AnomalyGrid, list[Step]]:
+) -> tuple[AnomalyGrid, list[PreparationStep]]:
     """Return one map from several surveys, and each intermediate step.
 
     Parameters
@@ -62,7 +62,7 @@ def prepare(
         unknown altitude that is to be continued, or merged with one of known altitude. More than
         :data:`MAX_MERGED_NODES` nodes.
     """
-    steps = [Step(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
+    steps = [PreparationStep(f"as surveyed: {Path(grid.name).name}", grid) for grid in grids]
     known = [grid.altitude for grid in grids if isfinite(grid.altitude)]
     level = altitude if altitude is not None else max(known, default=nan)
     if isfinite(level) and len(known) < len(grids):
@@ -77,21 +77,23 @@ def prepare(
         up = level - grid.altitude
         if isfinite(up) and up != 0.0:
             lifted.append(continue_upward(grid, up))
-            steps.append(Step(f"continued {up:+.0f} m: {Path(grid.name).name}", lifted[-1]))
+            steps.append(PreparationStep(f"continued {up:+.0f} m: {Path(grid.name).name}", lifted[-1]))
         else:
             lifted.append(grid)
     result, apart = merge(lifted, spacing)
     if len(grids) > 1:
         nowhere = "no two of them overlap"
         differ = f"{apart:.1f} nT RMS difference in their overlap" if isfinite(apart) else nowhere
-        steps.append(Step(f"merged, {differ}", result))
+        steps.append(PreparationStep(f"merged, {differ}", result))
     if mask is not None:
         result = _masked(result, np.asarray(mask, float))
-        steps.append(Step("masked", result))
+        steps.append(PreparationStep("masked", result))
     if smooth:
         before, result = result, smoothed(result, 1000.0 * smooth)
         lost = float(np.sqrt(np.nanmean((before.anomaly - result.anomaly) ** 2)))
-        steps.append(Step(f"smoothed over {smooth:g} km: {lost:.1f} nT RMS removed, now its sigma", result))
+        steps.append(
+            PreparationStep(f"smoothed over {smooth:g} km: {lost:.1f} nT RMS removed, now its sigma", result)
+        )
     return result, steps
 
 
@@ -170,7 +172,7 @@ def merge(grids: Sequence[AnomalyGrid], spacing: float | None = None) -> tuple[A
     return merged, apart
 
 
-def draw_steps(steps: Sequence[Step], path: str | Path) -> None:
+def draw_steps(steps: Sequence[PreparationStep], path: str | Path) -> None:
     """Draw every step on one page, one colour scale, to `path` (PNG, PDF, SVG)."""
     from matplotlib.figure import Figure  # noqa: PLC0415  only drawing needs it
 
@@ -221,7 +223,7 @@ def _cover(axes: Sequence[FloatArray], step: float) -> FloatArray:
     return axis
 
 
-def _reach(axis: FloatArray, own: FloatArray) -> slice:
-    """Return where on an axis a grid with its `own` axis has values, and a node more on either side."""
-    first, last = np.searchsorted(axis, own[[0, -1]])
+def _reach(axis: FloatArray, grid_axis: FloatArray) -> slice:
+    """Return where on an axis a grid with its `grid_axis` axis has values, and a node more on either side."""
+    first, last = np.searchsorted(axis, grid_axis[[0, -1]])
     return slice(max(int(first) - 1, 0), int(last) + 1)

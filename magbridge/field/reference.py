@@ -90,7 +90,7 @@ def reference_field(
     reference[unknown] = site_bias + magnitude((main_field(deployment) if main is None else main)[unknown])
     if grid is not None:
         there = continued(grid, depth[unknown]).grid
-        reference[unknown] += there.at(longitude[unknown], latitude[unknown], depth[unknown])
+        reference[unknown] += there.anomaly_at(longitude[unknown], latitude[unknown], depth[unknown])
     return reference
 
 
@@ -194,9 +194,9 @@ def positions(deployment: xr.Dataset) -> tuple[FloatArray, FloatArray, FloatArra
     and after the last one that is known, the vehicle is taken to have stood still.
     """
     time = deployment["time"].to_numpy()
-    longitude = _between(time, deployment, "longitude", turn=360.0)
-    depth = _between(time, deployment, "depth") if "depth" in deployment else np.zeros(time.size)
-    return wrap(longitude), _between(time, deployment, "latitude"), np.nan_to_num(depth)
+    longitude = _interpolated(time, deployment, "longitude", turn=360.0)
+    depth = _interpolated(time, deployment, "depth") if "depth" in deployment else np.zeros(time.size)
+    return wrap(longitude), _interpolated(time, deployment, "latitude"), np.nan_to_num(depth)
 
 
 def placed(deployment: xr.Dataset) -> BoolArray:
@@ -219,7 +219,9 @@ def placed(deployment: xr.Dataset) -> BoolArray:
     return np.asarray(near if near.mean() > 0.5 else np.ones(len(time), bool))
 
 
-def _between(time: FloatArray, deployment: xr.Dataset, column: str, turn: float | None = None) -> FloatArray:
+def _interpolated(
+    time: FloatArray, deployment: xr.Dataset, column: str, turn: float | None = None
+) -> FloatArray:
     values = deployment[column].to_numpy().astype(float)
     known = np.isfinite(values)
     if not known.any():

@@ -139,12 +139,12 @@ class Catalogue(ABC):
             )
 
 
-def open_catalogue(where: str | Path, results: Path | None = None, *, create: bool = False) -> Catalogue:
+def open_catalogue(location: str | Path, results: Path | None = None, *, create: bool = False) -> Catalogue:
     """Open a catalogue.
 
     Parameters
     ----------
-    where : str or Path
+    location : str or Path
         A folder, or the URL of a PostgreSQL database: ``postgresql://USER@HOST/DATABASE``.
     results : Path, optional
         Folder of corrected logs and maps; by default `results` in the catalogue's folder, and
@@ -161,15 +161,15 @@ def open_catalogue(where: str | Path, results: Path | None = None, *, create: bo
     MissingExtra
         A server was named, and its client is not installed.
     """
-    if str(where).startswith(SERVERS):
+    if str(location).startswith(SERVERS):
         try:
             from magbridge.fleet.postgres import PostgresCatalogue  # noqa: PLC0415  an extra of its own
         except ImportError:
             raise MissingExtra("psycopg", "postgres") from None
-        return PostgresCatalogue(str(where), results or Path("fleet-results"), create=create)
+        return PostgresCatalogue(str(location), results or Path("fleet-results"), create=create)
     from magbridge.fleet.folder import FolderCatalogue  # noqa: PLC0415  it builds on this module
 
-    return FolderCatalogue(Path(where), results, create=create)
+    return FolderCatalogue(Path(location), results, create=create)
 
 
 def _key(row: Row) -> str:

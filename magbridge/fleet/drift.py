@@ -84,7 +84,9 @@ def history(fleet: Fleet, vehicle: str) -> History:
             changes.append(())
             continue
         refitted = lesson.refit not in {one.refit for one in mine[: len(rows) - 1]}
-        changes.append(tuple(_beyond(names, (after - before.mean)[places], np.sqrt(moved), refitted)))
+        changes.append(
+            tuple(_significant_changes(names, (after - before.mean)[places], np.sqrt(moved), refitted))
+        )
     expected, sigma, found, left = np.array(rows).reshape(len(mine), 4, len(places)).swapaxes(0, 1)
     return History(names, mine, expected, sigma, found, left, tuple(changes))
 
@@ -113,7 +115,9 @@ def facts(history: History) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _beyond(names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool) -> list[Change]:
+def _significant_changes(
+    names: tuple[str, ...], moves: FloatArray, sigmas: FloatArray, refitted: bool
+) -> list[Change]:
     """Return the moves (k,) beyond their sigmas (k,), the farthest first."""
     found = []
     for name, move, sigma in zip(names, moves, sigmas, strict=True):

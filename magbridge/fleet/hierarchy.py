@@ -86,14 +86,16 @@ class Population:
     rounds: int = 0
     """Of expectation-maximisation."""
 
-    def expected(self, vehicle: str, past: Iterable[Observed], refit: str) -> tuple[FloatArray, FloatArray]:
+    def expected(
+        self, vehicle: str, observed: Iterable[Observed], refit: str
+    ) -> tuple[FloatArray, FloatArray]:
         """Return mean (K,) and covariance (K, K) of the next deployment's z.
 
         Parameters
         ----------
         vehicle : str
             May be none of the fleet's.
-        past : iterable of Observed
+        observed : iterable of Observed
             The same vehicle's deployments before.
         refit : str
             Its refit: one of the past, or another.
@@ -104,10 +106,10 @@ class Population:
         mean, P = _moments(others)
         P = P + by_vehicle.S
         branches: dict[str, list[GaussianInformation]] = defaultdict(list)
-        for one in past:
-            branches[one.refit].append(_up(one.information, by_power_up).evidence)
+        for one in observed:
+            branches[one.refit].append(_to_parent(one.information, by_power_up).evidence)
         own = branches.pop(refit, [])
-        elsewhere = [_up(_summed(leaves), by_refit).evidence for leaves in branches.values()]
+        elsewhere = [_to_parent(_summed(leaves), by_refit).evidence for leaves in branches.values()]
         mean, P = _updated(mean, P, elsewhere)
         mean, P = _updated(mean, P + by_refit.S, own)
         return mean, P + by_power_up.S
@@ -164,16 +166,16 @@ def _round(
     spreads = {one.vehicle: spreads_of(variances, shapes, one.vehicle) for one in observed}
     tree: dict[str, dict[str, list[_Passed]]] = defaultdict(lambda: defaultdict(list))
     for one in observed:
-        tree[one.vehicle][one.refit].append(_up(one.information, spreads[one.vehicle][2]))
+        tree[one.vehicle][one.refit].append(_to_parent(one.information, spreads[one.vehicle][2]))
     middle = {
         vehicle: {
-            refit: _up(_summed([leaf.evidence for leaf in leaves]), spreads[vehicle][1])
+            refit: _to_parent(_summed([leaf.evidence for leaf in leaves]), spreads[vehicle][1])
             for refit, leaves in refits.items()
         }
         for vehicle, refits in tree.items()
     }
     top = {
-        vehicle: _up(_summed([one.evidence for one in refits.values()]), spreads[vehicle][0])
+        vehicle: _to_parent(_summed([one.evidence for one in refits.values()]), spreads[vehicle][0])
         for vehicle, refits in middle.items()
     }
     total = _summed([GaussianInformation(np.eye(K), np.zeros(K)), *(one.evidence for one in top.values())])
@@ -183,31 +185,31 @@ def _round(
     for vehicle, at in top.items():
         by = spreads[vehicle]
         score += at.score
-        there = _down(at, mean, P, sums, 0, by[0])
+        there = _to_child(at, mean, P, sums, 0, by[0])
         for refit, inner in middle[vehicle].items():
             score += inner.score
-            here = _down(inner, *there, sums, 1, by[1])
+            here = _to_child(inner, *there, sums, 1, by[1])
             for leaf in tree[vehicle][refit]:
                 score += leaf.score
-                _down(leaf, *here, sums, 2, by[2])
+                _to_child(leaf, *here, sums, 2, by[2])
     score += log_prior(variances, groups, shapes)
     each = {name: one.evidence for name, one in top.items()}
     return Population(variances, shapes, total, each, float(score)), sums
 
 
-def _up(own: GaussianInformation, spread: Spread) -> _Passed:
+def _to_parent(information: GaussianInformation, spread: Spread) -> _Passed:
     """Integrate a node out whose difference from its parent has that covariance."""
-    L = own.precision + spread.W
+    L = information.precision + spread.W
     factor = cho_factor(L)
     R = np.asarray(cho_solve(factor, np.eye(len(L))))
-    G, g = R @ spread.W, R @ own.vector
-    J = own.precision @ G
+    G, g = R @ spread.W, R @ information.vector
+    J = information.precision @ G
     log_L = 2.0 * np.log(np.diag(factor[0])).sum()
-    score = 0.5 * (own.vector @ g - log_L - spread.log_det)
+    score = 0.5 * (information.vector @ g - log_L - spread.log_det)
     return _Passed(GaussianInformation(0.5 * (J + J.T), spread.W @ g), G, g, R, float(score))
 
 
-def _down(
+def _to_child(
     node: _Passed, mean: FloatArray, P: FloatArray, sums: Sums, level: int, spread: Spread
 ) -> tuple[FloatArray, FloatArray]:
     """Return a node's mean and covariance from its parent's; count the difference."""
@@ -227,10 +229,10 @@ def _updated(
     return _moments(_summed([GaussianInformation(J, J @ mean), *evidence]))
 
 
-def _moments(of: GaussianInformation) -> tuple[FloatArray, FloatArray]:
-    P = np.asarray(cho_solve(cho_factor(of.precision), np.eye(len(of.vector))))
+def _moments(information: GaussianInformation) -> tuple[FloatArray, FloatArray]:
+    P = np.asarray(cho_solve(cho_factor(information.precision), np.eye(len(information.vector))))
     P = 0.5 * (P + P.T)
-    return P @ of.vector, P
+    return P @ information.vector, P
 
 
 def _summed(evidence: Sequence[GaussianInformation]) -> GaussianInformation:

@@ -63,13 +63,13 @@ def jobs(catalogue: Catalogue, *, diagnose: bool = False, maps: bool = False) ->
     """
     known = vehicles(catalogue)
 
-    def whose(row: Row) -> tuple[str, str, str]:
+    def owner(row: Row) -> tuple[str, str, str]:
         return row["vehicle"], row["deployment"], row["refit"]
 
-    rows = sorted(current_files(catalogue.rows("files")), key=whose)
+    rows = sorted(current_files(catalogue.rows("files")), key=owner)
     return [
         Job(known[vehicle], deployment, refit, tuple(files), diagnose, maps)
-        for (vehicle, deployment, refit), files in groupby(rows, whose)
+        for (vehicle, deployment, refit), files in groupby(rows, owner)
         if vehicle in known
     ]
 

@@ -47,10 +47,10 @@ def current(catalogue: Catalogue, table: str, columns: Collection[str] = ()) -> 
     ]
 
 
-def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> list[Lesson]:
+def lessons(catalogue: Catalogue, like: str, excluded: Collection[str] = ()) -> list[Lesson]:
     """Return the training records of all deployments of vehicles with the masses of the vehicle `like`.
 
-    Estimates from logs of the SHA-256 in `without` are left out. A calibration made elsewhere from logs that
+    Estimates from logs of the SHA-256 in `excluded` are left out. A calibration made elsewhere from logs that
     were also calibrated here is left out, too.
 
     WrongUse: the vehicle does not exist.
@@ -67,7 +67,7 @@ def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> l
     newest = {(one.lesson.vehicle, one.lesson.refit): one.sensor for one in taught if one.sensor}
     found = []
     for one in taught:
-        if one.inputs & set(without) or (one.given and one.inputs & here):
+        if one.inputs & set(excluded) or (one.given and one.inputs & here):
             continue
         of = one.lesson.vehicle, one.lesson.refit
         if one.sensor != newest.get(of, one.sensor) and one.sensor:  # another sensor is as good as a refit
@@ -77,13 +77,13 @@ def lessons(catalogue: Catalogue, like: str, without: Collection[str] = ()) -> l
     return found
 
 
-def fleet_of(catalogue: Catalogue, vehicle: str, without: Collection[str] = ()) -> Fleet:
-    """Return what the vehicles with the masses of this one have taught; `without` as for :func:`lessons`.
+def fleet_of(catalogue: Catalogue, vehicle: str, excluded: Collection[str] = ()) -> Fleet:
+    """Return what the vehicles with the masses of this one have taught; `excluded` as for :func:`lessons`.
 
     WrongUse: there is no such vehicle. DataError: nothing has been calibrated yet, or the columns' units
     differ.
     """
-    found = lessons(catalogue, vehicle, without)
+    found = lessons(catalogue, vehicle, excluded)
     units = {tuple(one.unit for one in lesson.parameters) for lesson in found}
     if len(units) > 1:
         both = " and ".join(", ".join(one) for one in sorted(units))

@@ -148,18 +148,18 @@ def _overview(histories: Mapping[str, History], links: Mapping[str, str]) -> Ite
     yield _table("vehicle, deployments, last, with changes, latest changes", rows)
 
 
-def _changed(one: History) -> list[tuple[float, list[str]]]:
+def _changed(history: History) -> list[tuple[float, list[str]]]:
     """Return when a vehicle changed, and in what."""
     return [
         (lesson.time, list(dict.fromkeys(change.what.rpartition(",")[0] for change in changes)))
-        for lesson, changes in zip(one.lessons, one.changes, strict=True)
+        for lesson, changes in zip(history.lessons, history.changes, strict=True)
         if changes
     ]
 
 
-def _vehicle(name: str, one: History, found: Sequence[Mapping[str, Any]], heading: str) -> Iterator[str]:
+def _vehicle(name: str, history: History, found: Sequence[Mapping[str, Any]], heading: str) -> Iterator[str]:
     yield f'<{heading} id="{escape(name)}">{escape(name)}</{heading}>'
-    if not one.lessons:
+    if not history.lessons:
         yield "<p>No deployment has been calibrated.</p>"
         return
     if heading == "h1":
@@ -168,15 +168,15 @@ def _vehicle(name: str, one: History, found: Sequence[Mapping[str, Any]], headin
         f"<tr><td>{_day(lesson.time)}</td><td>{escape(lesson.deployment)}</td><td>{escape(lesson.refit)}</td>"
         f"<td class=changed>{escape(change.what)}</td><td class=number>{change.by:+.0f} nT</td>"
         f"<td class=number>{change.sigmas:.1f}</td><td class=words>{escape(change.cause)}</td></tr>"
-        for lesson, changes in zip(one.lessons, one.changes, strict=True)
+        for lesson, changes in zip(history.lessons, history.changes, strict=True)
         for change in changes
     ]
     yield (
         _table("date, deployment, refit, what moved, by, sigmas, as if by", rows)
         if rows
-        else f"<p>{UNCHANGED if len(one.lessons) > 1 else FIRST_ONLY}</p>"
+        else f"<p>{UNCHANGED if len(history.lessons) > 1 else FIRST_ONLY}</p>"
     )
-    yield f"<div class=panels>{''.join(_panel(one, k) for k in range(len(one.names)))}</div>"
+    yield f"<div class=panels>{''.join(_panel(history, k) for k in range(len(history.names)))}</div>"
     if found:
         rows = [_found(row) for row in found]
         yield _table("deployment, verdict, cause, RMS with its correction, follows", rows)
@@ -221,26 +221,30 @@ def _survey(last: tuple[str, Path] | None) -> Iterator[str]:
     yield f'<h3>{label}</h3><img alt="{label}" src="{source}" style="max-width:100%">'
 
 
-def _panel(one: History, k: int) -> str:
+def _panel(history: History, k: int) -> str:
     """Return the picture of one coefficient from deployment to deployment."""
     with rc_context(SVG_SETTINGS):
         figure = Figure(figsize=(3.4, 2.0))
         figure.subplots_adjust(0.15, 0.2, 0.98, 0.88)
         ax = figure.subplots()
-        when = np.array([datetime.fromtimestamp(lesson.time, UTC) for lesson in one.lessons])
-        moved = np.array([any(change.what == one.names[k] for change in changes) for changes in one.changes])
+        when = np.array([datetime.fromtimestamp(lesson.time, UTC) for lesson in history.lessons])
+        moved = np.array(
+            [any(change.what == history.names[k] for change in changes) for changes in history.changes]
+        )
         # the first deployment's expectation is the fleet's: its band would hide all others
         later = slice(1, None) if len(when) > 1 else slice(None)
-        band = one.expected[later, k], 2.0 * one.expected_sigma[later, k]
+        band = history.expected[later, k], 2.0 * history.expected_sigma[later, k]
         ax.errorbar(when[later], *band, fmt="none", color=BAND, lw=7)
-        ax.errorbar(when, one.found[:, k], 2.0 * one.found_sigma[:, k], fmt="o", ms=4, lw=1.2, color=INK)
-        ax.plot(when[moved], one.found[moved, k], "o", ms=7, color=CHANGED)
-        for before, after in zip(one.lessons, one.lessons[1:], strict=False):
+        ax.errorbar(
+            when, history.found[:, k], 2.0 * history.found_sigma[:, k], fmt="o", ms=4, lw=1.2, color=INK
+        )
+        ax.plot(when[moved], history.found[moved, k], "o", ms=7, color=CHANGED)
+        for before, after in zip(history.lessons, history.lessons[1:], strict=False):
             if before.refit != after.refit:
                 middle = datetime.fromtimestamp((before.time + after.time) / 2.0, UTC)
                 ax.axvline(middle, color=REFIT, lw=0.8, ls=":")  # type: ignore[arg-type]
-        _limit(ax, one, k, later)
-        ax.set_title(f"{one.names[k]}, nT", fontsize=9, loc="left")
+        _limit(ax, history, k, later)
+        ax.set_title(f"{history.names[k]}, nT", fontsize=9, loc="left")
         aside = max(0.08 * (when[-1] - when[0]), timedelta(days=10))  # one deployment alone has no span
         ax.set_xlim(when[0] - aside, when[-1] + aside)
         ax.spines[["top", "right"]].set_visible(False)
@@ -254,15 +258,15 @@ def _panel(one: History, k: int) -> str:
     return text[text.index("<svg") :]
 
 
-def _limit(ax: Axes, one: History, k: int, later: slice) -> None:
+def _limit(ax: Axes, history: History, k: int, later: slice) -> None:
     """Set the vertical axis by the estimates where a band is far wider, and state that band."""
-    low = float((one.found[:, k] - 2.0 * one.found_sigma[:, k]).min())
-    high = float((one.found[:, k] + 2.0 * one.found_sigma[:, k]).max())
-    half = float(2.0 * one.expected_sigma[later, k].max())
+    low = float((history.found[:, k] - 2.0 * history.found_sigma[:, k]).min())
+    high = float((history.found[:, k] + 2.0 * history.found_sigma[:, k]).max())
+    half = float(2.0 * history.expected_sigma[later, k].max())
     if 2.0 * half <= MAX_BAND_RATIO * (high - low):
         return
     ax.set_ylim(low - (high - low), high + (high - low))
-    note = f"expected {one.expected[later, k][-1]:,.0f} ± {half:,.0f}"
+    note = f"expected {history.expected[later, k][-1]:,.0f} ± {half:,.0f}"
     ax.text(0.98, 0.04, note, transform=ax.transAxes, ha="right", fontsize=7, color=INK)
 
 

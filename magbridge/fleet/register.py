@@ -64,7 +64,7 @@ class Vehicle(Table, frozen=True):
     deployment: tuple[Deployment, ...] = ()
 
 
-class _File(Table, frozen=True):
+class _RegisteredFile(Table, frozen=True):
     vehicle: dict[str, Vehicle]
 
 
@@ -75,7 +75,7 @@ def read_fleet(path: Path) -> dict[str, Vehicle]:
     """
     table = load_toml(path)
     check_entries(table, "vehicle", Vehicle, path)
-    return convert(table, _File, path).vehicle
+    return convert(table, _RegisteredFile, path).vehicle
 
 
 def vehicles(catalogue: Catalogue) -> dict[str, Row]:
@@ -198,10 +198,10 @@ def is_file_name(name: str) -> bool:
     )
 
 
-def _check_name(name: str, of: str) -> None:
+def _check_name(name: str, kind: str) -> None:
     """Refuse names that cannot be a folder's: results are kept by them."""
     if not is_file_name(name):
-        raise WrongUse(f"{name!r}: expected {of}'s name without slashes, not beginning with a dot")
+        raise WrongUse(f"{name!r}: expected {kind}'s name without slashes, not beginning with a dot")
 
 
 def _described(row: Row) -> str:

@@ -51,7 +51,7 @@ def shapes_of(
     family = mounted_prior(free, exponents, parameters, mounted)
     weight = np.linalg.inv(covariance)
     for _ in range(SHAPE_ITERATIONS):
-        prior = family.at(family.centre)
+        prior = family.prior(family.centre)
         pull = prior.E.T @ weight
         z = np.asarray(np.linalg.solve(pull @ prior.E + prior.precision, pull @ (mean - prior.offset)))
         assert family.renew is not None

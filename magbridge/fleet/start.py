@@ -12,13 +12,13 @@ from magbridge.fleet.catalogue import open_catalogue
 from magbridge.fleet.memory import fleet_of, owner
 from magbridge.wording import counted
 
-__all__ = ["UNLIKE", "Start", "gained", "start"]
+__all__ = ["UNLIKE", "FleetPrediction", "gained", "start"]
 
 UNLIKE = 3.0
 """Times as wide as expected, from which on a deployment is not as its vehicle's past predicts."""
 
 
-class Start(NamedTuple):
+class FleetPrediction(NamedTuple):
     """The prior; of how many deployments of the vehicle itself, and of other vehicles."""
 
     known: Known
@@ -33,12 +33,12 @@ class Start(NamedTuple):
         return tuple(one.name for one in self.known.parameters)
 
 
-def start(where: str | Path, member: str, refit: str, digests: Collection[str]) -> Start:
+def start(location: str | Path, member: str, refit: str, digests: Collection[str]) -> FleetPrediction:
     """Return the prediction of a catalogue for logs.
 
     Parameters
     ----------
-    where : str or path
+    location : str or path
         The catalogue: a folder, or a server's URL.
     member, refit : str
         The logs' vehicle, and which refit it flew with; empty: as the catalogue has them.
@@ -52,27 +52,27 @@ def start(where: str | Path, member: str, refit: str, digests: Collection[str]) 
     DataError
         Nothing has been calibrated yet.
     """
-    catalogue = open_catalogue(where)
+    catalogue = open_catalogue(location)
     if not member:
         member, on_record = owner(catalogue, digests)
         refit = refit or on_record
-    fleet = fleet_of(catalogue, member, without=digests)
+    fleet = fleet_of(catalogue, member, excluded=digests)
     own = sum(one.vehicle == member for one in fleet.lessons)
-    return Start(fleet.known(member, refit), member, refit, own, len(fleet.lessons) - own)
+    return FleetPrediction(fleet.known(member, refit), member, refit, own, len(fleet.lessons) - own)
 
 
-def gained(found: Fit, alone: Fit | None, began: Start) -> tuple[dict[str, Any], list[str]]:
+def gained(found: Fit, single: Fit | None, began: FleetPrediction) -> tuple[dict[str, Any], list[str]]:
     """Return what the fleet was worth, for machines and as lines.
 
     Parameters
     ----------
-    found, alone : Fit
+    found, single : Fit
         With the fleet, and by its own data; None where those allow no fit.
     began : Start
         Where the first began.
     """
     with_it, without = (
-        one and one.details["expected_over_noise"] * one.calibration.noise.sensor for one in (found, alone)
+        one and one.details["expected_over_noise"] * one.calibration.noise.sensor for one in (found, single)
     )
     departure = found.details.get("widths_nT", {}).get(DEPARTURE, 1.0)
     facts = {

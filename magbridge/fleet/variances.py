@@ -103,10 +103,10 @@ NO_SHAPES = Shapes({}, np.zeros(0, np.intp))
 def renewed(sums: Sums, groups: IndexArray, shapes: Shapes) -> Variances:
     """Return the mode of the variances' posterior, from differences of each member of groups (K,)."""
 
-    def mode(squares: FloatArray, count: int, of: IndexArray, expected: FloatArray) -> FloatArray:
-        members = np.bincount(of)
-        inner = np.bincount(of, squares) + PRIOR_DIFFERENCES * np.bincount(of, expected**2) / members
-        return np.asarray((inner / (count * members + PRIOR_DIFFERENCES + 2.0))[of])
+    def mode(squares: FloatArray, count: int, member: IndexArray, expected: FloatArray) -> FloatArray:
+        members = np.bincount(member)
+        inner = np.bincount(member, squares) + PRIOR_DIFFERENCES * np.bincount(member, expected**2) / members
+        return np.asarray((inner / (count * members + PRIOR_DIFFERENCES + 2.0))[member])
 
     own = [
         mode(squares, count, groups, size)
@@ -126,14 +126,14 @@ def spreads_of(variances: Variances, shapes: Shapes, vehicle: str) -> tuple[Spre
     )
 
 
-def _spread(own: FloatArray, *shaped: tuple[FloatArray, FloatArray]) -> Spread:
-    """Return ``S = diag(own) + D diag(u) D^T`` for each u, D of `shaped`."""
-    S, W, log_det = np.diag(own), np.diag(1.0 / own), float(np.log(own).sum())
+def _spread(diagonal: FloatArray, *shaped: tuple[FloatArray, FloatArray]) -> Spread:
+    """Return ``S = diag(diagonal) + D diag(u) D^T`` for each u, D of `shaped`."""
+    S, W, log_det = np.diag(diagonal), np.diag(1.0 / diagonal), float(np.log(diagonal).sum())
     for u, D in shaped:
         S = S + (D * u) @ D.T
         factor = cho_factor(S)
         W, log_det = cho_solve(factor, np.eye(len(S))), 2.0 * float(np.log(np.diag(factor[0])).sum())
-    return Spread(S, np.asarray(W), log_det, ((own, np.eye(len(own))), *shaped))
+    return Spread(S, np.asarray(W), log_det, ((diagonal, np.eye(len(diagonal))), *shaped))
 
 
 def log_prior(variances: Variances, groups: IndexArray, shapes: Shapes) -> float:

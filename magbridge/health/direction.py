@@ -69,9 +69,9 @@ class DirectionCheck:
         if isfinite(roll + pitch + yaw):
             self._roll, self._pitch, self._yaw, self._attitude_us = roll, pitch, yaw, time_us
 
-    def expect(self, north: float, east: float, down: float) -> None:
+    def expect(self, north: float, east: float, downward: float) -> None:
         """Set the main field at the vehicle, any unit; NaN if it is not known."""
-        self._inclination = atan2(down, sqrt(north * north + east * east))
+        self._inclination = atan2(downward, sqrt(north * north + east * east))
         self._declination = atan2(east, north)
 
     def check(self, time_us: int, x: float, y: float, z: float) -> float:

@@ -122,14 +122,14 @@ class EstimatorBank:
             self._best = ahead
         return None if self.without_map is None else self._doubt_map(time, self.without_map, ahead)
 
-    def _doubt_map(self, time: float, without: Estimator, best_with: int) -> LearningAlarm | None:
+    def _doubt_map(self, time: float, mapless: Estimator, best_with: int) -> LearningAlarm | None:
         lead = self._weights[-1] - self._weights[best_with]
         if lead <= 0.0:
             self.map_doubted, self._since = False, time
         self.map_doubted = self.map_doubted or lead > ALARM_LOG_RATIO
         if not self.map_doubted:
             return None
-        return LearningAlarm(("map_error",), ("",), self._since, abs(without.crust), lead, mapless=True)
+        return LearningAlarm(("map_error",), ("",), self._since, abs(mapless.crust), lead, mapless=True)
 
     def take_over(self, strength: float) -> bool:
         """Replace the baseline by the estimator that follows the temperature; return True if it is replaced.
@@ -143,13 +143,13 @@ class EstimatorBank:
         self.all[0], self._weights[0], self._best = deepcopy(self.all[warm]), self._weights[warm], 0
         return True
 
-    def explained(self, by: FloatArray, covariance: FloatArray, strength: float) -> None:
-        """Move the baseline's state by `by` (n,), of additional covariance `covariance` (n, n).
+    def explained(self, step: FloatArray, covariance: FloatArray, strength: float) -> None:
+        """Move the baseline's state by `step` (n,), of additional covariance `covariance` (n, n).
 
-        `by` and its log-likelihood ratio `strength` come from the alarm's cause; `strength` is added to the
+        `step` and its log-likelihood ratio `strength` come from the alarm's cause; `strength` is added to the
         baseline's score.
         """
-        self.quiet.shift(by, covariance)
+        self.quiet.shift(step, covariance)
         self._weights[0] += strength
         if self._weights[0] > self._weights[self._best] + AHEAD:
             self._best = 0

@@ -83,9 +83,9 @@ class Publication:
         """Set the candidate's coefficients (K,)."""
         self._replace(CANDIDATE, self._model.weights(coefficients))
 
-    def _replace(self, which: int, weights: FloatArray) -> None:
-        self._replaced.setdefault(which, self._weights[which])
-        self._weights[which] = weights
+    def _replace(self, index: int, weights: FloatArray) -> None:
+        self._replaced.setdefault(index, self._weights[index])
+        self._weights[index] = weights
 
     def made(self, estimator: Estimator, samples: int, noise: Noise) -> Calibration:
         """Return the calibration that an estimator has learned from so many samples, with its origin."""
@@ -142,13 +142,13 @@ class Publication:
         self._replace(PUBLISHED, self._weights[FIRST])
         return self._change("rolled back: the first calibration predicts better", PUBLISHED, FIRST)
 
-    def _change(self, how: str, before: int, after: int) -> str:
+    def _change(self, how: str, previous: int, following: int) -> str:
         self.renewed = False
         rms = np.sqrt(self.judge.mean_square)
         said = f"{how} {calibration_id(self.calibration):08x}"
-        if before == FIRST and self.first.method == NO_METHOD:  # no errors to compare with
+        if previous == FIRST and self.first.method == NO_METHOD:  # no errors to compare with
             return f"{said} from nothing"
-        return f"{said}: {rms[before]:.1f} to {rms[after]:.1f} nT"
+        return f"{said}: {rms[previous]:.1f} to {rms[following]:.1f} nT"
 
 
 GONE: Final = 9.0

@@ -173,19 +173,19 @@ class Estimator:
             self.filter.mean += toward * (by / variance)
             self._kept = toward[:K] * (by / variance**2)
 
-    def open(self, variance: float, which: IndexArray | None = None) -> None:
-        """Increase the variance of the coefficients `which` (3,), by default the offsets, by `variance`."""
-        which = self.offsets if which is None else which
-        self.filter.covariance[which, which] += variance
+    def open(self, variance: float, coefficients: IndexArray | None = None) -> None:
+        """Add `variance` to the variance of `coefficients` (3,), by default the offsets."""
+        coefficients = self.offsets if coefficients is None else coefficients
+        self.filter.covariance[coefficients, coefficients] += variance
 
     def drift(self, rate: float, lasting: float) -> None:
         """Add an offset drift of `rate` (nT/s, 1-sigma an axis) with correlation time `lasting` (s)."""
         self.filter.covariance[self.slope, self.slope] += rate * rate
         self._sloping, self._lasting = True, lasting
 
-    def shift(self, by: FloatArray, covariance: FloatArray) -> None:
-        """Move the state by `by` (n,), which is known to a further `covariance` (n, n)."""
-        self.filter.mean += by
+    def shift(self, step: FloatArray, covariance: FloatArray) -> None:
+        """Move the state by `step` (n,), which is known to a further `covariance` (n, n)."""
+        self.filter.mean += step
         self.filter.covariance += covariance
         self._sloping = bool(self.filter.covariance[self.slope, self.slope].any())
 

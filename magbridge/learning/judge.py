@@ -188,9 +188,9 @@ class Judge:
         self._direction = direction
         return True
 
-    def replace(self, which: int, change: float, scale: float) -> None:
+    def replace(self, index: int, change: float, scale: float) -> None:
         """Keep the level of a calibration that is replaced, which changes the present residual, nT."""
-        self._states[:, 3, which] += scale * change
+        self._states[:, 3, index] += scale * change
 
     def judge(self, F: FloatArray, residuals: tuple[float, float, float], scale: float) -> None:
         """Compare one sample, after the reference's error moved by F.

@@ -91,17 +91,17 @@ class Knowledge:
         """Return what a field (nT) is by nine coefficients (9,)."""
         return observe(field, nine, self._field, reference)
 
-    def _by(self, one: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
+    def _observation_with(self, estimator: Estimator) -> Callable[[Vector, FloatArray, float], Observation]:
         """Return what a field, at some regressors (m,), is by an estimator's coefficients."""
         return lambda field, phi, reference: self.observe(
-            field, phi @ self._model.weights(one.coefficients), reference
+            field, phi @ self._model.weights(estimator.coefficients), reference
         )
 
     def look_back(self, time_us: int, phi: FloatArray, positions: list[float]) -> LearningAlarm | None:
         """Test whether the regressors (m,) reported now fit earlier samples better than those of then."""
         if self.start is not None:
             return None
-        return self.late_telemetry.test(time_us, phi, positions, self._by(self.bank.quiet))
+        return self.late_telemetry.test(time_us, phi, positions, self._observation_with(self.bank.quiet))
 
     def keep(self, sample: LearningSample, innovation: float) -> None:
         """Keep a sample that is wrong by an innovation (nT), to look back at."""
@@ -110,7 +110,7 @@ class Knowledge:
     def keep_faulty(self, sample: LearningSample) -> None:
         """Keep a sample that is not predicted."""
         quiet = self.bank.quiet
-        now = self._by(quiet)(sample.field, sample.phi, sample.reference)
+        now = self._observation_with(quiet)(sample.field, sample.phi, sample.reference)
         self.keep(sample, now.e - quiet.expected)
 
     def predict(self, sample: LearningSample, metres: float, seconds: float) -> tuple[Observation, Signs]:
@@ -134,15 +134,17 @@ class Knowledge:
         self.keep(sample, quiet.residual)
         now, clock = live[id(quiet)], 0.0
         if before is not None and 0.0 < seconds < 30.0:  # the residual if telemetry were a second late
-            clock = (self._by(quiet)(sample.field, before, sample.reference).e - now.e) / seconds
+            clock = (
+                self._observation_with(quiet)(sample.field, before, sample.reference).e - now.e
+            ) / seconds
         offset, level = now.by_nine[6:], -1.0 / now.s
         signs = Signs(sample.time_us * 1e-6, offset, tuple(sample.positions), sample.watched, clock, level)
         return best, signs
 
-    def _predict(self, one: Estimator, sample: LearningSample) -> Observation:
-        live = self._by(one)(sample.field, sample.phi, sample.reference)
-        one.predict(live.e, live.s, self._model.derivative(sample.phi, live.by_nine))
-        one.follow(live.s)
+    def _predict(self, estimator: Estimator, sample: LearningSample) -> Observation:
+        live = self._observation_with(estimator)(sample.field, sample.phi, sample.reference)
+        estimator.predict(live.e, live.s, self._model.derivative(sample.phi, live.by_nine))
+        estimator.follow(live.s)
         return live
 
     def outlying(self, *, learnable: bool) -> bool:
@@ -179,6 +181,6 @@ class Knowledge:
 
     def go_on(self) -> None:
         """End the batch fit and continue with the filters, if they can be linearised."""
-        if self.start is not None and self.start.over:
+        if self.start is not None and self.start.is_over:
             self.start = None
             self.bank.suppose()

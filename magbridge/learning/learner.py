@@ -197,7 +197,7 @@ class Learner:
         *,
         faulty: bool,
         reference: float,
-        where: tuple[float, float] | None,
+        position: tuple[float, float] | None,
         watched: Sequence[float],
         age: float = 0.0,
         settled: Vector | None = None,
@@ -222,7 +222,7 @@ class Learner:
             True if the sensor is at fault, or the field cannot be the Earth's.
         reference : float
             Reference field H_e, nT; NaN if the position is not known.
-        where : tuple of 2 float or None
+        position : tuple of 2 float or None
             Latitude and longitude, deg.
         watched : sequence of float
             Values of the telemetry named by :attr:`watched`; NaN if unknown.
@@ -236,13 +236,13 @@ class Learner:
             return
         self._now_us, unfit = time_us, quality & self._unfit
         fit = not (unfit or faulty)
-        if unfit & ~MOVING or isnan(reference) or where is None:
+        if unfit & ~MOVING or isnan(reference) or position is None:
             self._nothing(time_us)
             return
         if not self._intake.due(time_us, fit=fit):
             return
         if self._grid is not None:
-            reference += self._grid.look_up(where[1], where[0]).anomaly
+            reference += self._grid.look_up(position[1], position[0]).anomaly
         phi, positions = self._model.regressors(regressors, watched), self._model.scaled(values)
         if isnan(reference) or not np.isfinite(phi).all():
             self._nothing(time_us)
@@ -256,7 +256,7 @@ class Learner:
             self._nothing(time_us)
         if unfit:
             return
-        new = LearningSample(time_us, field, reference, phi, positions, where, tuple(watched), faulty)
+        new = LearningSample(time_us, field, reference, phi, positions, position, tuple(watched), faulty)
         self._intake.wait(new)
 
     def _nothing(self, time_us: int) -> None:

@@ -81,7 +81,7 @@ class LearnedTerms:
             raise CalibrationError("a calibration without a constant offset is not learned")
         self.offsets = offsets
 
-    def _extended(self, which: Sequence[int]) -> Calibration:
+    def _extended(self, terms: Sequence[int]) -> Calibration:
         """Return the calibration with further terms, whose coefficients are 0."""
         base = self._base
         effects = tuple(
@@ -90,7 +90,7 @@ class LearnedTerms:
                 channel=self.watched[k],
                 origin=0.0 if isnan(self._origins[k]) else self._origins[k],
             )
-            for k in which
+            for k in terms
         )
         own, more = base.coefficients.size, 3 * len(effects)
         covariance = np.zeros((own + more, own + more))
@@ -130,15 +130,15 @@ class LearnedTerms:
         """Return the parameters' values (the first of the calibration's channels) in their scale."""
         return [(v - one.centre) / one.scale for v, one in zip(values, self._base.parameters, strict=False)]
 
-    def regressors(self, own: Sequence[float], watched: Sequence[float]) -> FloatArray:
-        """Return all regressors (m,): the calibration's `own`, and those of the `watched` channels."""
+    def regressors(self, calibrated: Sequence[float], watched: Sequence[float]) -> FloatArray:
+        """Return all regressors (m,): the calibration's `calibrated`, and those of the `watched` channels."""
         for place, k in enumerate(self._further):
             value = watched[k]
             if not isnan(value):  # while the value is unknown, the last one holds
                 if isnan(self._origins[k]):
                     self._origins[k] = value
                 self._regressors[place] = value - self._origins[k]
-        return np.array([*own[: self._terms], *self._regressors])
+        return np.array([*calibrated[: self._terms], *self._regressors])
 
     def weights(self, coefficients: FloatArray) -> FloatArray:
         """(m, 9) what each regressor adds to the nine coefficients, nT."""

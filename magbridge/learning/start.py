@@ -119,7 +119,7 @@ class BatchFit:
         return self._next > FIRST
 
     @property
-    def over(self) -> bool:
+    def is_over(self) -> bool:
         """Whether a filter can go on alone."""
         return len(self._samples) >= LAST_FIT_SAMPLES
 

@@ -97,7 +97,7 @@ class VehicleClock:
         """Return the vehicle's clock minus ours at `t_us` (ours), in µs; 0 while unknown."""
         return self._base_us + (self._offset + self._slope * (t_us - self._middle_us))
 
-    def ours(self, vehicle_us: int, t_us: int, wrap_us: int = 0) -> int:
+    def bridge_time(self, vehicle_us: int, t_us: int, wrap_us: int = 0) -> int:
         """Return our time at which the vehicle's clock showed `vehicle_us`; at most `t_us`.
 
         Parameters

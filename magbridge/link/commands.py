@@ -120,7 +120,7 @@ class Commands:
     def _request(self, values: list[float]) -> MAV_RESULT:
         if values[0] == MESSAGE_INTERVAL:  # the successor of GET_MESSAGE_INTERVAL
             return self._get_interval(values[1:])
-        answer = self._messages.get(whole(values[0]))
+        answer = self._messages.get(to_integer(values[0]))
         if answer is None:
             return MAV_RESULT.DENIED
         return MAV_RESULT.ACCEPTED if answer() else MAV_RESULT.TEMPORARILY_REJECTED
@@ -131,13 +131,13 @@ class Commands:
             return MAV_RESULT.DENIED
         rate = None if interval == 0 else -1.0 if interval < 0 else 1e6 / interval
         try:
-            allowed = self._set_rate(whole(values[0]), rate)
+            allowed = self._set_rate(to_integer(values[0]), rate)
         except KeyError:
             allowed = False
         return MAV_RESULT.ACCEPTED if allowed else MAV_RESULT.DENIED
 
     def _get_interval(self, values: list[float]) -> MAV_RESULT:
-        number = whole(values[0])
+        number = to_integer(values[0])
         try:
             interval = self._interval_us(number)
         except KeyError:
@@ -153,6 +153,6 @@ class Commands:
         return self._request([AUTOPILOT_VERSION])
 
 
-def whole(value: float) -> int:
+def to_integer(value: float) -> int:
     """Return a float parameter as an integer, or -1 (no message has this id) if it is not finite."""
     return int(value) if isfinite(value) else -1

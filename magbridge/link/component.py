@@ -189,7 +189,7 @@ class Component:
         """
         self._begin(t_us)
         ours = []
-        messages = self.codec.parse(data, whole=self._whole)
+        messages = self.codec.parse(data, final=self._whole)
         self.genuine = [one.frame for one in messages if one.known and is_signed(one.frame)]
         self.received += self._frame_log.frames(messages, self.codec.pending)
         self._report_clock()

@@ -84,7 +84,7 @@ class Request(NamedTuple):
     data: bytes
 
     @classmethod
-    def of(cls, payload: bytes) -> Request:
+    def from_payload(cls, payload: bytes) -> Request:
         """Parse the payload of a FILE_TRANSFER_PROTOCOL."""
         sequence, session, opcode, size, _, _, offset = FTP_HEADER.unpack_from(payload)
         return cls(sequence, session, opcode, size, offset, payload[FTP_HEADER.size : FTP_HEADER.size + DATA])
@@ -95,12 +95,12 @@ class Request(NamedTuple):
         return self.data[: self.size].partition(b"\0")[0].decode("utf-8", "replace")
 
     def reply(
-        self, opcode: Opcode, data: bytes = b"", *, ahead: int = 1, session: int | None = None,
+        self, opcode: Opcode, data: bytes = b"", *, later: int = 1, session: int | None = None,
         offset: int | None = None, complete: bool = False,
     ) -> bytes:  # fmt: skip
-        """Return the payload of a reply, the `ahead`-th to this request."""
+        """Return the payload of a reply, the `later`-th to this request."""
         header = FTP_HEADER.pack(
-            (self.sequence + ahead) & 0xFFFF, self.session if session is None else session, opcode, len(data),
+            (self.sequence + later) & 0xFFFF, self.session if session is None else session, opcode, len(data),
             self.opcode, complete, self.offset if offset is None else offset,
         )  # fmt: skip
         return (header + data).ljust(FTP_HEADER.size + DATA, b"\0")
@@ -109,8 +109,8 @@ class Request(NamedTuple):
 class Session:
     """A file that a station has open."""
 
-    def __init__(self, file: BinaryIO, now: float) -> None:
-        self.file, self.used = file, now
+    def __init__(self, file: BinaryIO, now_s: float) -> None:
+        self.file, self.used = file, now_s
 
     def read(self, offset: int, size: int) -> bytes:
         """Return bytes of the file; none beyond its end."""
@@ -128,8 +128,8 @@ class FtpServer:
         A clock in s, for sessions that are no longer used.
     """
 
-    def __init__(self, tree: Tree, now: Callable[[], float]) -> None:
-        self._tree, self._now = tree, now
+    def __init__(self, tree: Tree, now_s: Callable[[], float]) -> None:
+        self._tree, self._now = tree, now_s
         self._sessions: dict[tuple[Sender, int], Session] = {}
         self._last: dict[Sender, tuple[Request, bytes]] = {}
         self._simple: dict[int, Callable[[Sender, Request], bytes]] = {
@@ -147,7 +147,7 @@ class FtpServer:
 
         A request that comes again, because its reply was lost, gets the same reply again and does nothing.
         """
-        request = Request.of(payload)
+        request = Request.from_payload(payload)
         before, reply = self._last.get(sender, (None, b""))
         if request == before:
             yield reply
@@ -249,7 +249,7 @@ class FtpServer:
             yield request.reply(
                 opcode,
                 data or bytes((Error.END_OF_FILE,)),
-                ahead=count + 1,
+                later=count + 1,
                 offset=request.offset + min(count * size, len(block)),
                 complete=complete,
             )
@@ -294,7 +294,7 @@ def _no_such_file() -> Iterator[None]:
         raise Refused(Error.FILE_NOT_FOUND) from error
 
 
-def _described(one: Entry) -> bytes:
+def _described(device: Entry) -> bytes:
     """Return an entry of a listing."""
-    text = f"D{one.name}" if one.size is None else f"F{one.name}\t{one.size}"
+    text = f"D{device.name}" if device.size is None else f"F{device.name}\t{device.size}"
     return text.encode("utf-8", "replace") + b"\0"

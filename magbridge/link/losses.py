@@ -77,7 +77,7 @@ class Losses:
             numbers = self._numbers[component] = Numbers(number)
         numbers.count(number)
 
-    def of(self, component: int) -> int:
+    def lost_frames(self, component: int) -> int:
         """Return how many frames of a component are lost."""
         numbers = self._numbers.get(component)
         return 0 if numbers is None else numbers.lost

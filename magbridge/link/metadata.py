@@ -24,9 +24,9 @@ GROUPS = {"publish": "Rates", "align": "Alignment", "telemetry": "Telemetry", "f
 MOST_PLACES = 7
 
 
-def crc32(data: bytes, before: int = 0) -> int:
+def crc32(data: bytes, initial: int = 0) -> int:
     """Return the CRC-32 of MAVLink FTP: that of zlib without the inversions at begin and end."""
-    return zlib.crc32(data, before ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+    return zlib.crc32(data, initial ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 def uri(component: int, path: str) -> str:

@@ -77,7 +77,7 @@ class Timers:
         """Call ``action(deadline)`` at `first_us` and every `period_us` (a multiple of 4) from there."""
         self._set(name, first_us, max(period_us & ~3, 4), action)
 
-    def once(self, name: str, time_us: int, action: Callable[[int], None]) -> None:
+    def run_once(self, name: str, time_us: int, action: Callable[[int], None]) -> None:
         """Call ``action(time_us)`` once."""
         self._set(name, time_us, 0, action)
 
@@ -214,7 +214,7 @@ class Announcer:
         if text == last_text and not (recurring and elapsed_us >= ANNOUNCEMENT_INTERVAL_US):
             return
         if elapsed_us < ANNOUNCEMENT_INTERVAL_US:
-            self._timers.once(
+            self._timers.run_once(
                 timer, last_us + ANNOUNCEMENT_INTERVAL_US, lambda _: self.state(key, text, severity)
             )
             return

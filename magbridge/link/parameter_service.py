@@ -75,7 +75,7 @@ class ParameterService:
         self._unasked -= 1
         if self._unasked:
             self._begin()
-            self._timers.once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
+            self._timers.run_once("parameters unasked", time_us + LIST_INTERVAL_US, self._list_unasked)
 
     def list(self, message: Message) -> None:  # noqa: ARG002 - every handler takes its message
         """Begin to send all parameters, one every `PACE_US`, after the rest of a list that is being sent."""
@@ -126,5 +126,5 @@ class ParameterService:
             self._announcer.state(f"set {name}", text, MAV_SEVERITY.NOTICE)
         self.send(name)
 
-    def _refuse(self, name: str, why: str) -> None:
-        self._announcer.state(f"refused {name}", f"{name}: {why}", MAV_SEVERITY.WARNING, recurring=True)
+    def _refuse(self, name: str, reason: str) -> None:
+        self._announcer.state(f"refused {name}", f"{name}: {reason}", MAV_SEVERITY.WARNING, recurring=True)

@@ -124,7 +124,7 @@ class Parameters:
     def __getitem__(self, name: str) -> float:
         return self._values[name]
 
-    def of(self, key: str) -> float:
+    def value_of(self, key: str) -> float:
         """Return the value that the configuration calls `key`."""
         return self._values[self._names_of[key]]
 

@@ -149,7 +149,7 @@ class StreamRequests:
             param2=1e6 / self.rate_of(number),
         )
         deadline = self._outbox.codec.now_us + ANSWER_US
-        self._timers.once("stream request", deadline, lambda _: self._ask_next())
+        self._timers.run_once("stream request", deadline, lambda _: self._ask_next())
 
     def _answered(self, result: int) -> None:
         """Report a denial and continue with the next request."""

@@ -27,10 +27,10 @@ class Extractor:
 
     __slots__ = ("field", "index", "match", "name", "offset", "scale", "texts")
 
-    def __init__(self, name: str, what: Telemetry, layout: Spec, path: Path) -> None:
+    def __init__(self, name: str, quantity: Telemetry, layout: Spec, path: Path) -> None:
         key = f"telemetry.{name}"
-        self.name, self.scale, self.offset = name, what.scale, what.offset
-        field_name, self.index = split_index(what.field)
+        self.name, self.scale, self.offset = name, quantity.scale, quantity.offset
+        field_name, self.index = split_index(quantity.field)
         self.field = find(layout, field_name, path, f"{key}.field")
         count = self.field.count
         if self.field.code == "s":
@@ -39,10 +39,10 @@ class Extractor:
             wanted = (
                 f"{field_name}[0] to {field_name}[{count - 1}]" if count else f"{field_name} without an index"
             )
-            raise ConfigError(path, f"{key}.field", f"{wanted}, not {what.field!r}")
+            raise ConfigError(path, f"{key}.field", f"{wanted}, not {quantity.field!r}")
         self.match: list[tuple[Field, float]] = []
         self.texts: list[tuple[int, bytes]] = []  # where they lie, and with the zero that ends them
-        for one, value in what.match.items():
+        for one, value in quantity.match.items():
             field = find(layout, one, path, f"{key}.match.{one}")
             if isinstance(value, str) != (field.code == "s"):
                 kind = "text" if field.code == "s" else "a number"
@@ -154,7 +154,7 @@ def sent_us(read: ReadTime | None, payload: bytes, t_us: int, clock: VehicleCloc
     vehicle_us, wrap_us = read(payload)
     if vehicle_us <= 0 or vehicle_us > YEAR_2001_US:  # not filled in, or another clock than TIMESYNC's
         return t_us
-    return clock.ours(vehicle_us, t_us, wrap_us)
+    return clock.bridge_time(vehicle_us, t_us, wrap_us)
 
 
 def own_time(layout: Spec) -> ReadTime | None:

@@ -64,7 +64,7 @@ class VehicleState:
     @property
     def frames_lost(self) -> int:
         """Number of frames missing by the autopilot's sequence numbers."""
-        return self._losses.of(self.autopilot)
+        return self._losses.lost_frames(self.autopilot)
 
     def receive(self, message: Message, t_us: int) -> bool:
         """Record a message; return True if it is telemetry of our vehicle."""
@@ -105,16 +105,16 @@ class VehicleState:
         if self.state != MAG_PORT_STATE.OK:
             self._announcer.state("autopilot", f"{who} found", MAV_SEVERITY.INFO)
         self.state = MAG_PORT_STATE.OK
-        self._timers.once("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
+        self._timers.run_once("autopilot", t_us + ABSENT_US, lambda _: self._vanish(who))
 
-    def _vanish(self, who: str) -> None:
+    def _vanish(self, sender: str) -> None:
         self.state = MAG_PORT_STATE.LOST
-        self._announcer.state("autopilot", f"{who} is silent", MAV_SEVERITY.WARNING)
+        self._announcer.state("autopilot", f"{sender} is silent", MAV_SEVERITY.WARNING)
 
     def _watch_boot(self, kind: int, boot_ms: int, t_us: int) -> None:
         """Distinguish a reboot from late packets, and from a second autopilot with its own boot clock."""
-        ahead_ms = _after(boot_ms, self._boot_ms)
-        goes_on = _after(boot_ms, self._stamps.setdefault(kind, boot_ms)) >= -BACK_MS
+        ahead_ms = _elapsed_ms(boot_ms, self._boot_ms)
+        goes_on = _elapsed_ms(boot_ms, self._stamps.setdefault(kind, boot_ms)) >= -BACK_MS
         if goes_on:
             self._stamps[kind] = boot_ms
         if self._boot_us and ahead_ms < -BACK_MS:
@@ -146,6 +146,6 @@ class VehicleState:
             )
 
 
-def _after(one_ms: int, other_ms: int) -> int:
+def _elapsed_ms(one_ms: int, other_ms: int) -> int:
     """Return the ms from another boot time to one, signed: the wrap after 50 days is a step forward."""
     return (one_ms - other_ms + (1 << 31)) % (1 << 32) - (1 << 31)

@@ -111,8 +111,8 @@ def _boots(records: dict[str, Records]) -> Iterator[dict[str, Records]]:
         yield {name: _part(one, np.searchsorted(one.at, [first, last])) for name, one in records.items()}
 
 
-def _part(records: Records, between: IndexArray) -> Records:
-    part = slice(*between.tolist())
+def _part(records: Records, bounds: IndexArray) -> Records:
+    part = slice(*bounds.tolist())
     return Records(
         records.at[part],
         {name: values[part] for name, values in records.fields.items()},

@@ -53,15 +53,15 @@ LOOKAHEAD_ROWS = 64
 """Rows looked at beyond the end of a piece: whether its last was stamped too late, they tell."""
 
 
-def increasing(file: str | Path, time: FloatArray, *, after: float = -np.inf) -> None:
-    """Check that `time` (n,), s, is finite and increases, also from `after`, the last time before it.
+def increasing(file: str | Path, time: FloatArray, *, previous: float = -np.inf) -> None:
+    """Check that `time` (n,), s, is finite and increases, also from `previous`, the last time before it.
 
     FormatError: names the first row that does not fit, counted from 1.
     """
-    wrong = _wrong(time, after)
+    wrong = _wrong(time, previous)
     if len(wrong):
         k = int(wrong[0])
-        expected = _expected(float(time[k]), float(time[k - 1]) if k else after)
+        expected = _expected(float(time[k]), float(time[k - 1]) if k else previous)
         raise FormatError(file, expected, row=k + 1, column="time")
 
 
@@ -109,9 +109,9 @@ class _Checks:
         self._last = -np.inf
         self.finish = self._faults.finish
 
-    def sound(self, dataset: xr.Dataset, rows: Sequence[int], ahead: FloatArray) -> xr.Dataset:
-        """Return the piece without impossible data. `ahead` are the times of the next piece."""
-        index, duplicates = self._times(dataset["time"].values, rows, ahead)
+    def sound(self, dataset: xr.Dataset, rows: Sequence[int], next_times: FloatArray) -> xr.Dataset:
+        """Return the piece without impossible data. `next_times` are the times of the next piece."""
+        index, duplicates = self._times(dataset["time"].values, rows, next_times)
         dropped = dataset.sizes["time"] - len(index)
         if dropped:
             dataset, rows = dataset.isel(time=index), [rows[k] for k in index.tolist()]
@@ -127,10 +127,10 @@ class _Checks:
         """Return a piece with the losses since the last one was returned."""
         return with_losses(dataset, *self._faults.since_last())
 
-    def _times(self, time: FloatArray, rows: Sequence[int], ahead: FloatArray) -> tuple[IndexArray, int]:
+    def _times(self, time: FloatArray, rows: Sequence[int], next_times: FloatArray) -> tuple[IndexArray, int]:
         """Return the indices of the rows to keep, and how many of these have the time of the one before."""
         self._faults.count("time", len(time))
-        whole = np.concatenate([time, ahead[:LOOKAHEAD_ROWS]])
+        whole = np.concatenate([time, next_times[:LOOKAHEAD_ROWS]])
         if not len(_wrong(whole, self._last)) and not (np.diff(whole) > MAX_ISOLATION_S).any():
             return np.arange(len(time)), 0
         index = _rows_to_keep(whole, self._last)
@@ -183,9 +183,9 @@ def _impossible(name: str, unit: str, values: FloatArray, time: FloatArray) -> t
     return np.zeros(len(values), bool), ""
 
 
-def _wrong(time: FloatArray, after: float) -> IndexArray:
+def _wrong(time: FloatArray, previous: float) -> IndexArray:
     """Return the indices at which `time` (n,) is not a time, or does not increase."""
-    return np.flatnonzero(~((np.diff(time, prepend=after) > 0) & (np.abs(time) < YEAR_10000)))
+    return np.flatnonzero(~((np.diff(time, prepend=previous) > 0) & (np.abs(time) < YEAR_10000)))
 
 
 def _disorder(time: FloatArray) -> str:
@@ -202,22 +202,24 @@ def _disorder(time: FloatArray) -> str:
     return ""
 
 
-def _expected(time: float, before: float, then: float = np.inf) -> str:
+def _expected(time: float, previous: float, following: float = np.inf) -> str:
     """Return the expectation between two other times, s, in place of `time`."""
     if YEAR_10000 <= abs(time) < np.inf:
         return f"expected seconds since 1970, not {time!r}"
-    if before < time and then <= time:
-        return f"expected a time before {then!r}, not {time!r}"
-    return f"expected a {f'time after {before!r}' if np.isfinite(before) else 'finite time'}, not {time!r}"
+    if previous < time and following <= time:
+        return f"expected a time before {following!r}, not {time!r}"
+    return (
+        f"expected a {f'time after {previous!r}' if np.isfinite(previous) else 'finite time'}, not {time!r}"
+    )
 
 
-def _rows_to_keep(time: FloatArray, after: float) -> IndexArray:
+def _rows_to_keep(time: FloatArray, previous: float) -> IndexArray:
     """Return the indices of the rows to keep of `time` (n,), s, in which rows at one time may remain.
 
-    They are the longest series that does not decrease, all of it after `after`, without the few rows that
+    They are the longest series that does not decrease, all of it after `previous`, without the few rows that
     are far from all others.
     """
-    index = np.flatnonzero((time > after) & (np.abs(time) < YEAR_10000))
+    index = np.flatnonzero((time > previous) & (np.abs(time) < YEAR_10000))
     if (np.diff(time[index]) < 0).any():
         index = index[in_order(time[index], strictly=False)]
     apart = np.flatnonzero(np.diff(time[index]) > MAX_ISOLATION_S) + 1

@@ -153,7 +153,7 @@ def clock_of(heading: str, unit: str, texts: Sequence[str], zone: str | None) ->
     )
     if not digits and (not present or np.isfinite(numbers).any()):
         whole = all(re.fullmatch(r"\d+", one) for one in present)
-        return _counted(heading, unit, numbers[np.isfinite(numbers)], whole=whole)
+        return _counted(heading, unit, numbers[np.isfinite(numbers)], integers=whole)
     return _written(heading, present, zone, of_day=of_day)
 
 
@@ -165,7 +165,7 @@ def _on_a_clock(heading: str, texts: Sequence[str]) -> bool:
     return bool(named) or texts[0].startswith("0") or len({text[2:4] for text in texts}) > 1
 
 
-def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> TimeFormat:
+def _counted(heading: str, unit: str, numbers: FloatArray, *, integers: bool) -> TimeFormat:
     if unit and unit != "s":
         kind, assumed = unit, ""
     else:
@@ -177,7 +177,7 @@ def _counted(heading: str, unit: str, numbers: FloatArray, *, whole: bool) -> Ti
     if (
         kind == "s"
         and not unit
-        and whole
+        and integers
         and step >= MIN_CLOCK_STEP
         and not (dated and since < UNIX_TIME_RANGE_S[1] and step < DAY)
     ):

@@ -196,24 +196,26 @@ def _chained(starts: IndexArray, ends: IndexArray, size: int) -> IndexArray:
     return np.concatenate([np.arange(0), *(np.arange(first, last + 1) for first, last in found)])
 
 
-def _gather(data: Bytes, at: IndexArray, layout: np.dtype[Any], offset: int = 0) -> NDArray[Any]:
-    """Return what stands `offset` bytes after each of `at`, read as `layout`."""
-    taken = data[at[:, None] + np.arange(offset, offset + layout.itemsize)]
-    return taken.view(layout)[:, 0] if len(at) else np.empty(0, layout)
+def _gather(data: Bytes, starts: IndexArray, layout: np.dtype[Any], offset: int = 0) -> NDArray[Any]:
+    """Return what stands `offset` bytes after each of `starts`, read as `layout`."""
+    taken = data[starts[:, None] + np.arange(offset, offset + layout.itemsize)]
+    return taken.view(layout)[:, 0] if len(starts) else np.empty(0, layout)
 
 
-def _decoded(data: Bytes, kind: _Kind, at: IndexArray, wanted: Collection[str]) -> Records:
+def _decoded(data: Bytes, kind: _Kind, starts: IndexArray, wanted: Collection[str]) -> Records:
     fields, texts, offset = {}, {}, RECORD_HEADER_BYTES
     for name, letter in zip(kind.columns, kind.letters, strict=False):
         layout = np.dtype(LETTERS.get(letter, "V1"))
         if letter not in LETTERS or offset + layout.itemsize > kind.length:
             break  # how long a field of an unknown letter is, and so where the next begins, is not known
         if name in wanted and layout.kind in "iuf":
-            fields[name] = _gather(data, at, layout, offset).astype(np.float64) / OWN_SCALE.get(letter, 1.0)
+            fields[name] = _gather(data, starts, layout, offset).astype(np.float64) / OWN_SCALE.get(
+                letter, 1.0
+            )
         elif name in wanted and layout.kind == "S":
-            texts[name] = [text.decode("latin-1") for text in _gather(data, at, layout, offset)]
+            texts[name] = [text.decode("latin-1") for text in _gather(data, starts, layout, offset)]
         offset += layout.itemsize
-    return Records(at, fields, texts)
+    return Records(starts, fields, texts)
 
 
 def _joined(first: Records, second: Records) -> Records:
@@ -267,7 +269,7 @@ def read_text(path: Path, wanted: Mapping[str, Collection[str]]) -> Flash:
 
 
 def _records(
-    at: list[int], rows: list[list[str]], letters: str, columns: tuple[str, ...], wanted: Collection[str]
+    rows_at: list[int], rows: list[list[str]], letters: str, columns: tuple[str, ...], wanted: Collection[str]
 ) -> Records:
     fields, texts = {}, {}
     for name, letter, values in zip(columns, letters, zip(*rows, strict=True), strict=False):
@@ -278,4 +280,4 @@ def _records(
                 fields[name] = np.array(values, dtype=np.float64)
             except ValueError:  # one of them is damaged
                 fields[name] = np.array([number_of(value) for value in values])
-    return Records(np.array(at, dtype=np.intp), fields, texts)
+    return Records(np.array(rows_at, dtype=np.intp), fields, texts)

@@ -176,10 +176,10 @@ class FileWriter:
             self._file.close()
 
 
-def _history(before: str) -> str:
+def _history(previous: str) -> str:
     """Return the history, one entry per line, with an entry for this file."""
     written = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ} written by magbridge {__version__}"
-    return "\n".join(line for line in (*before.splitlines(), written) if line)
+    return "\n".join(line for line in (*previous.splitlines(), written) if line)
 
 
 def _iso(time: float) -> str:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from magbridge.columns import CHANNEL_TIMES, counts_from_boot, decoded, require
 from magbridge.errors import FormatError
 from magbridge.files import existing
-from magbridge.guard import Guarded, Job, guarded
+from magbridge.guard import Guarded, GuardedJob, guarded
 from magbridge.logs.options import Options
 from magbridge.logs.registry import DECOMPRESSION_ERRORS, LEADS, Format, format_of, is_bag
 
@@ -188,7 +188,7 @@ def _read_together(paths: Sequence[Path], rows: int, options: Options) -> dict[i
         return {}
     for form in {form.module: form for form in formats.values()}.values():
         form.load()  # once here, and not in every child
-    jobs = [Job(paths[k], partial(_raw, paths[k], form, rows, options)) for k, form in formats.items()]
+    jobs = [GuardedJob(paths[k], partial(_raw, paths[k], form, rows, options)) for k, form in formats.items()]
     child = Guarded(jobs)
     return {k: child.pieces(number) for number, k in enumerate(formats)}
 
@@ -201,9 +201,9 @@ def _raw(path: Path, form: Format, rows: int, options: Options) -> Iterator[Any]
 
 
 def _chunks(
-    path: Path, rows: int, options: Options, together: Iterator[Any] | None = None
+    path: Path, rows: int, options: Options, contents: Iterator[Any] | None = None
 ) -> Iterator[xr.Dataset]:
-    """Yield one file in pieces, checked and dated; `together` are its contents, read with other files."""
+    """Yield one file in pieces, checked and dated; `contents` are its contents, read with other files."""
     from magbridge.logs.checks import checked  # noqa: PLC0415 - xarray is for ashore
     from magbridge.logs.deployment import passed_over  # noqa: PLC0415
 
@@ -214,7 +214,7 @@ def _chunks(
     pieces = partial(_raw, path, form, rows, options)
     part = None
     try:
-        numbered = _numbered(together or (guarded(path, pieces) if form.guarded else pieces()))
+        numbered = _numbered(contents or (guarded(path, pieces) if form.guarded else pieces()))
         if options.compass is not None and not form.compasses:
             from magbridge.logs.compasses import by_columns  # noqa: PLC0415 - xarray is for ashore
 

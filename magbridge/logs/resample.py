@@ -20,12 +20,12 @@ CIRCLES = {
 """Columns on a circle: its circumference and its lowest value, in deg."""
 
 
-def latest(at: FloatArray, time: FloatArray, values: FloatArray, max_age: float = MAX_AGE) -> FloatArray:
+def latest(target: FloatArray, time: FloatArray, values: FloatArray, max_age: float = MAX_AGE) -> FloatArray:
     """Return the last value at or before each time, as known live.
 
     Parameters
     ----------
-    at : (n,) array
+    target : (n,) array
         s, the rows.
     time, values : (m,) array
         s, not decreasing, and the values received then; NaN is a missing value.
@@ -40,14 +40,14 @@ def latest(at: FloatArray, time: FloatArray, values: FloatArray, max_age: float 
     known = np.isfinite(values)
     time, values = time[known], values[known]
     if not len(time):
-        return np.full(len(at), np.nan)
-    k = np.searchsorted(time, at, side="right") - 1
-    fresh = (k >= 0) & (at - time[k] <= max_age)
+        return np.full(len(target), np.nan)
+    k = np.searchsorted(time, target, side="right") - 1
+    fresh = (k >= 0) & (target - time[k] <= max_age)
     return np.where(fresh, values[k], np.nan)
 
 
 def linear(
-    at: FloatArray,
+    target: FloatArray,
     time: FloatArray,
     values: FloatArray,
     max_gap: float,
@@ -58,7 +58,7 @@ def linear(
 
     Parameters
     ----------
-    at : (n,) array
+    target : (n,) array
         s, the rows.
     time, values : (m,) array
         s, increasing, and the values measured then; NaN is a missing value.
@@ -77,14 +77,14 @@ def linear(
     known = np.isfinite(values) & np.isfinite(time)
     time, values = time[known], values[known]
     if not len(time):
-        return np.full(len(at), np.nan)
+        return np.full(len(target), np.nan)
     if period is not None:
         values = np.unwrap(values, period=period)
-    result = np.interp(at, time, values)
-    right = np.searchsorted(time, at)
+    result = np.interp(target, time, values)
+    right = np.searchsorted(time, target)
     before, after = time[np.maximum(right - 1, 0)], time[np.minimum(right, len(time) - 1)]
-    in_gap = (after - before > max_gap) & (at != after) & (at != before)
-    result[in_gap | (at - time[-1] > max_gap) | (time[0] - at > max_gap)] = np.nan
+    in_gap = (after - before > max_gap) & (target != after) & (target != before)
+    result[in_gap | (target - time[-1] > max_gap) | (time[0] - target > max_gap)] = np.nan
     return result if period is None else result - period * np.floor((result - start) / period)
 
 

@@ -239,14 +239,14 @@ def with_note(log: xr.Dataset, note: str) -> xr.Dataset:
     return log.assign_attrs({NOTES: "\n".join([*noted(log.attrs), note])})
 
 
-def _interpolated(at: FloatArray, time: FloatArray, name: str, values: FloatArray) -> FloatArray:
-    """Return a column (m,), known at `time` (m,), s, at the times `at` (n,), s, by the rule for its kind."""
+def _interpolated(target: FloatArray, time: FloatArray, name: str, values: FloatArray) -> FloatArray:
+    """Interpolate a column (m,) from `time` (m,), s, to `target` (n,), s, by the rule for its kind."""
     known = np.isfinite(values)
     time, values = time[known], values[known]
     max_gap_s = _max_gap(time)
     if name not in CIRCLES and _is_state(values):
-        return latest(at, time, values, max_gap_s)
-    return linear(at, time, values, max_gap_s, *CIRCLES.get(name, ()))
+        return latest(target, time, values, max_gap_s)
+    return linear(target, time, values, max_gap_s, *CIRCLES.get(name, ()))
 
 
 def _is_state(values: FloatArray) -> bool:

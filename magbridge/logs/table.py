@@ -159,12 +159,17 @@ class TextTable:
         return times, columns, numbers
 
     def _drop(
-        self, name: str, columns: dict[str, FloatArray], bad: BoolArray, numbers: list[int], by: str
+        self,
+        name: str,
+        columns: dict[str, FloatArray],
+        bad: BoolArray,
+        numbers: list[int],
+        validity_column: str,
     ) -> None:
         """Remove the values of a column that another one states not to be valid, and count them."""
         there = bad & np.isfinite(columns[name])
         if there.any():
-            self._note(name, there, numbers, f"not valid by {by!r}", wrong=False)
+            self._note(name, there, numbers, f"not valid by {validity_column!r}", wrong=False)
             columns[name][there] = np.nan
 
     def _complete_lines(self, lines: list[str], numbers: Sequence[int]) -> tuple[list[str], list[int]]:
@@ -196,11 +201,13 @@ class TextTable:
         return [line for line, _ in rows], [number for _, number in rows]
 
     def _note(
-        self, column: str, at: BoolArray, numbers: Sequence[int], expected: str, *, wrong: bool = True
+        self, column: str, marked: BoolArray, numbers: Sequence[int], expected: str, *, wrong: bool = True
     ) -> None:
-        """Count the values `at` (n,) of a column ("" and ``time``: rows); `expected` is of the first."""
+        """Count the values `marked` (n,) of a column ("" and ``time``: rows); `expected` is of the first."""
         counter = "rows_dropped" if column in {"", "time"} else "values_dropped"
-        self.faults.note(column, int(at.sum()), numbers[int(at.argmax())], expected, counter, wrong=wrong)
+        self.faults.note(
+            column, int(marked.sum()), numbers[int(marked.argmax())], expected, counter, wrong=wrong
+        )
 
     def _frame(self, lines: list[str], numbers: Sequence[int]) -> pd.DataFrame:
         layout = self._layout

@@ -40,7 +40,7 @@ from magbridge.logs.resample import MAX_AGE
 from magbridge.logs.telemetry_fields import SOURCES, TELEMETRY, Columns, correction, is_of_main_sensor
 from magbridge.logs.telemetry_survey import AUTOPILOT, LogContents, survey
 from magbridge.logs.telemetry_writer import FileWriter
-from magbridge.mavlink import LogReader, Message, Record, Source, spec
+from magbridge.mavlink import LogReader, Message, Source, TlogRecord, spec
 from magbridge.records import Channel
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ from magbridge.arrays import FloatArray, IndexArray
 from magbridge.logs.compasses import compass_notes, listed
 from magbridge.logs.deployment import NOTES, noted
 from magbridge.logs.telemetry_fields import IMUS
-from magbridge.mavlink.tlog import Block, blocks
+from magbridge.mavlink.tlog import RecordBlock, blocks
 
 __all__ = ["FileWriter", "chunks", "read_at_once"]
 
@@ -149,7 +149,7 @@ class TelemetryRows:
         self._to_step_us = survey.stepped_us
         self._skipped = self._damages = 0
 
-    def put(self, record: Record) -> None:
+    def put(self, record: TlogRecord) -> None:
         """Process the next record of the log."""
         message = record.message
         number = message.id
@@ -291,7 +291,7 @@ def read_at_once(
 
 
 def _telemetry(
-    block: Block, survey: LogContents, sent: np.ndarray[tuple[int], np.dtype[np.bool_]], base: int
+    block: RecordBlock, survey: LogContents, sent: np.ndarray[tuple[int], np.dtype[np.bool_]], base: int
 ) -> list[tuple[str, Part]]:
     """Return the values in a block of each column that is not the source's own field."""
     found = []
@@ -326,11 +326,11 @@ def _telemetry(
     return found
 
 
-def _last(at: IndexArray, time_us: IndexArray, parts: list[Part]) -> FloatArray:
+def _last(rows: IndexArray, time_us: IndexArray, parts: list[Part]) -> FloatArray:
     """Return the last value that the file has before each row; NaN where it is older than `MAX_AGE`."""
     place, when, values = (np.concatenate(one) for one in zip(*parts, strict=True))
     order = np.argsort(place, kind="stable")  # two messages may hold one column
-    k = np.searchsorted(place[order], at, side="right") - 1
+    k = np.searchsorted(place[order], rows, side="right") - 1
     last = order[np.maximum(k, 0)]
     fresh = (k >= 0) & (when[last] >= time_us - round(MAX_AGE * 1e6))
     return np.where(fresh, values[last], np.nan)

@@ -27,7 +27,7 @@ from magbridge.logs.telemetry_fields import (
     sample,
 )
 from magbridge.mavlink import Message, spec
-from magbridge.mavlink.tlog import Block, blocks
+from magbridge.mavlink.tlog import RecordBlock, blocks
 from magbridge.records import Channel
 
 __all__ = ["AUTOPILOT", "LogContents", "survey"]
@@ -196,7 +196,7 @@ class LogContents:
                     if code not in settled and self._look(block, number, of_kind):
                         settled.add(code)
 
-    def _tuned(self, block: Block) -> None:
+    def _tuned(self, block: RecordBlock) -> None:
         """Count how often a station has set what the alignment computes with; the bridge confirms it."""
         for k in np.flatnonzero(np.isin(block.number, (SET, VALUE))).tolist():
             message = block.message(k)
@@ -209,22 +209,22 @@ class LogContents:
                 )  # which are rates of messages
                 self.attrs[CHANGES_SETTING] = self.attrs.get(CHANGES_SETTING, 0) + aligns
 
-    def _look(self, block: Block, number: int, which: IndexArray) -> bool:
+    def _look(self, block: RecordBlock, number: int, records: IndexArray) -> bool:
         """Record new facts in messages of one kind; return whether further ones can add nothing."""
-        system, component = int(block.system[which[0]]), int(block.component[which[0]])
+        system, component = int(block.system[records[0]]), int(block.component[records[0]])
         if number in TELEMETRY:
-            return self._values((system, component, number), block.payloads(which))
+            return self._values((system, component, number), block.payloads(records))
         if number == NAMED.id:
-            letters = block.payloads(which)[:, NAMED.fields["name"].offset :]
+            letters = block.payloads(records)[:, NAMED.fields["name"].offset :]
             _, first, counts = np.unique(letters, axis=0, return_index=True, return_counts=True)
             for k, n in zip(first.tolist(), counts.tolist(), strict=True):
                 name = bytes(letters[k])
-                self._named.setdefault(system, {})[name] = block.message(int(which[k]))["name"]
+                self._named.setdefault(system, {})[name] = block.message(int(records[k]))["name"]
                 self._speakers.setdefault((system, name), Counter())[component] += n
             return False
         if number in (RAW, FIELD, COLUMN, STEP):
             known = self._known.setdefault((system, component, number), {})
-            for k in which.tolist():
+            for k in records.tolist():
                 message = block.message(k)
                 if is_of_main_sensor(number, message.payload):
                     self._declares(message, known)

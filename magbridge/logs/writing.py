@@ -97,7 +97,7 @@ class Writer:
                     self._path, "expected only columns that the first rows had", column=str(name)
                 )
         time = dataset["time"].values
-        increasing(self._path, time, after=self._last)
+        increasing(self._path, time, previous=self._last)
         if len(time):
             self._last = float(time[-1])
         self._file.append(uncounted(dataset) if first else same_columns(dataset, self._columns), first=first)

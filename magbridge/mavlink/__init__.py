@@ -8,10 +8,26 @@ from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, by_id, 
 from magbridge.mavlink.secrets import SECRET
 from magbridge.mavlink.signing import Signing, Stream, load_key, readable_by_all
 from magbridge.mavlink.source import Source
-from magbridge.mavlink.tlog import LogReader, Record, pack_record, pack_records
+from magbridge.mavlink.tlog import LogReader, TlogRecord, pack_record, pack_records
 
 __all__ = [
-    "BAD_DATA", "REFUSED", "SECRET", "Codec", "FrameLogReader", "FrameLogWriter", "LogReader", "Message",
-    "Record", "Signing", "Source", "Spec", "Stream", "by_id", "load_key", "pack_record", "pack_records",
-    "readable_by_all", "spec",
+    "BAD_DATA",
+    "REFUSED",
+    "SECRET",
+    "Codec",
+    "FrameLogReader",
+    "FrameLogWriter",
+    "LogReader",
+    "Message",
+    "Signing",
+    "Source",
+    "Spec",
+    "Stream",
+    "TlogRecord",
+    "by_id",
+    "load_key",
+    "pack_record",
+    "pack_records",
+    "readable_by_all",
+    "spec",
 ]  # fmt: skip

@@ -67,7 +67,7 @@ class Codec:
         """Bytes that came but are not yet in any message."""
         return self._rest
 
-    def parse(self, data: bytes, *, whole: bool = False) -> list[Message]:
+    def parse(self, data: bytes, *, final: bool = False) -> list[Message]:
         """Process bytes as they come; return the messages that are complete with them.
 
         Any bytes, however cut, give the same messages. Bytes that belong to no frame come back as a
@@ -79,7 +79,7 @@ class Codec:
         ----------
         data : bytes
             As they came.
-        whole : bool
+        final : bool
             No frame continues in the next bytes: remaining bytes belong to none.
         """
         data = self._rest + data
@@ -88,7 +88,7 @@ class Codec:
         while begin < len(data):
             stop = min(len(data), begin + MAX_PENDING_BYTES)
             start = find_magic(data, at, stop)
-            last = whole and stop == len(data)
+            last = final and stop == len(data)
             end = frame_end(data, start, stop, last=last) if start < stop else NEEDS_MORE
             if end > 0:
                 if begin < start:
@@ -130,13 +130,17 @@ class Codec:
         if self.signing:
             self.signing.skip(count, self.utc_us)
 
-    def _accept(self, one: Message) -> Message:
-        if one.id in SECRET:
-            frame = without_secret(one.frame)
-            return Message(REFUSED, one.system, one.component, one.sequence, b"", frame, known=False)
+    def _accept(self, message: Message) -> Message:
+        if message.id in SECRET:
+            frame = without_secret(message.frame)
+            return Message(
+                REFUSED, message.system, message.component, message.sequence, b"", frame, known=False
+            )
         if self.signing and not self.signing.accept(
-            one.frame, (one.system, one.component), one.id, self.utc_us
+            message.frame, (message.system, message.component), message.id, self.utc_us
         ):
-            return Message(REFUSED, one.system, one.component, one.sequence, b"", one.frame, known=False)
+            return Message(
+                REFUSED, message.system, message.component, message.sequence, b"", message.frame, known=False
+            )
         self.frames += 1
-        return one
+        return message

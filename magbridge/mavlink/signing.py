@@ -128,14 +128,14 @@ class Signing(MAVLinkSigning):
         """Use up the stamps that signing `count` frames would: a replay does not have these frames."""
         self.last = min(max(self.last + 1, timestamp(t_us)) + count - 1, MAX_STAMP)
 
-    def reserved(self, t_us: int, ahead: int) -> int:
-        """Return a stamp below which all stay that are used within the next `ahead` (units of 10 µs).
+    def reserved(self, t_us: int, margin: int) -> int:
+        """Return a stamp below which all stay that are used within the next `margin` (units of 10 µs).
 
         Stamps follow the clock, and count up by one a frame while they are ahead of it. The next run begins
         here if this one does not end in good order; it would drift ahead of the clock, restart by restart,
-        if `ahead` were simply added to the last stamp.
+        if `margin` were simply added to the last stamp.
         """
-        return min(max(self.last + STAMPS_PER_SECOND, timestamp(t_us) + ahead), MAX_STAMP)
+        return min(max(self.last + STAMPS_PER_SECOND, timestamp(t_us) + margin), MAX_STAMP)
 
     def accept(self, frame: bytes, stream: tuple[int, int], number: int, t_us: int) -> bool:
         """Return True if a frame of the `stream` (system, component) is genuine and new."""

@@ -21,7 +21,7 @@ from magbridge.arrays import IndexArray
 from magbridge.mavlink.framing import EXTRA, MAX_MESSAGE_ID, SIGNATURE, SIGNED, V1, V2, checksum, message
 from magbridge.mavlink.messages import Message, spec
 
-__all__ = ["Block", "LogReader", "Record", "blocks", "pack_record", "pack_records"]
+__all__ = ["LogReader", "RecordBlock", "TlogRecord", "blocks", "pack_record", "pack_records"]
 
 TLOG_STAMP: Final = Struct(">Q")
 LATEST: Final = 1 << 52
@@ -38,7 +38,7 @@ KNOWN_LENGTHS[[number for number in EXTRA if number < len(KNOWN_LENGTHS)]] = [
 """CRC_EXTRA of each message in the dialect, -1 of the others."""
 
 
-class Record(msgspec.Struct, frozen=True, gc=False):
+class TlogRecord(msgspec.Struct, frozen=True, gc=False):
     """One record of a log."""
 
     time_us: int
@@ -64,7 +64,7 @@ def pack_records(records: Iterable[tuple[int, int, bytes]]) -> bytes:
     return b"".join([pack_record(time_us, channel, frame) for time_us, channel, frame in records])
 
 
-class Block(NamedTuple):
+class RecordBlock(NamedTuple):
     """Records that follow each other."""
 
     data: bytes
@@ -84,29 +84,29 @@ class Block(NamedTuple):
     damages: int
     """`bytes_skipped`, `damages`: Bytes between them that belong to no record, and the places."""
 
-    def payloads(self, which: IndexArray) -> NDArray[np.uint8]:
+    def payloads(self, records: IndexArray) -> NDArray[np.uint8]:
         """Return the payloads (n, size) of records of one message, with the zeros that were cut off."""
-        size = spec(int(self.number[which[0]])).size
-        start, length = self.payload[which], self.end[which] - self.payload[which]
+        size = spec(int(self.number[records[0]])).size
+        start, length = self.payload[records], self.end[records] - self.payload[records]
         at = np.arange(size)
         raw = np.frombuffer(self.data, np.uint8)
         taken: NDArray[np.uint8] = raw[np.minimum(start[:, None] + at, len(raw) - 1)]
         taken[at >= length[:, None]] = 0
         return taken
 
-    def record(self, k: int) -> Record:
+    def record(self, k: int) -> TlogRecord:
         """Return one record."""
         start, end = int(self.frame[k]), int(self.end[k]) + 2
         signed = self.data[start] == V2 and self.data[start + 2] & SIGNED
         frame = self.data[start : end + (SIGNATURE if signed else 0)]
-        return Record(int(self.time_us[k]), int(self.channel[k]), frame)
+        return TlogRecord(int(self.time_us[k]), int(self.channel[k]), frame)
 
     def message(self, k: int) -> Message:
         """Return one record's message."""
         return self.record(k).message
 
 
-def blocks(file: BinaryIO, block_bytes: int = BLOCK_BYTES) -> Iterator[Block]:
+def blocks(file: BinaryIO, block_bytes: int = BLOCK_BYTES) -> Iterator[RecordBlock]:
     """Yield the records of a log, read `block_bytes` at a time; memory does not grow with the file."""
     data, broken, last = b"", False, False
     while not last:
@@ -142,7 +142,7 @@ class LogReader:
         self._blocks = blocks(file, block_bytes)
         self.records = self.bytes_skipped = self.damages = 0
 
-    def __iter__(self) -> Iterator[Record]:
+    def __iter__(self) -> Iterator[TlogRecord]:
         for block in self._blocks:
             self.bytes_skipped += block.bytes_skipped
             self.damages += block.damages
@@ -151,7 +151,7 @@ class LogReader:
                 yield block.record(k)
 
 
-def _block(data: bytes, broken: bool, *, last: bool) -> tuple[Block, int, bool]:
+def _block(data: bytes, broken: bool, *, last: bool) -> tuple[RecordBlock, int, bool]:
     """Return the records in `data`, where the undecided ones begin, and whether that is damage."""
     stop = len(data) if last else max(len(data) - MAX_RECORD_BYTES, 0)
     start, found = _candidates(data, stop)
@@ -174,7 +174,7 @@ def _block(data: bytes, broken: bool, *, last: bool) -> tuple[Block, int, bool]:
         skipped, broken, at = skipped + stop - at, True, stop
     which = np.concatenate([np.arange(*one) for one in taken]) if taken else np.empty(0, dtype=np.int64)
     fields = {name: values[which] for name, values in found.items()}
-    return Block(data=data, **fields, bytes_skipped=skipped, damages=damages), at, broken
+    return RecordBlock(data=data, **fields, bytes_skipped=skipped, damages=damages), at, broken
 
 
 def _candidates(data: bytes, stop: int) -> tuple[IndexArray, dict[str, IndexArray]]:

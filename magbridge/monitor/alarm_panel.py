@@ -9,7 +9,7 @@ from nicegui import ui
 
 from magbridge.monitor.alarms import AlarmGroup
 from magbridge.monitor.link import StationLink
-from magbridge.monitor.state import State
+from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import AMBER, MUTED, RED, Changes, button, card, clock, nothing
 
 __all__ = ["AlarmPanel"]
@@ -36,7 +36,7 @@ class Row:
         self._text.set_text(alarm.text)
         times = f", {alarm.count} times" if alarm.count > 1 else ""
         over = "since" if alarm.active else "over; at"
-        self._times.set_text(f"{over} {clock(alarm.since)} UTC{times}")
+        self._times.set_text(f"{over} {clock(alarm.started_s)} UTC{times}")
         if alarm.acknowledged and self._seen is not None:
             self._seen.delete()
             self._seen = None
@@ -53,7 +53,7 @@ class Row:
 class AlarmPanel:
     """The alarms of one vehicle."""
 
-    def __init__(self, station: StationLink, state: State, *, sound: bool) -> None:
+    def __init__(self, station: StationLink, state: BridgeState, *, sound: bool) -> None:
         self._station, self._state, self._changes = station, state, Changes()
         self._sounded = -REPEAT
         with card("Alarms"):
@@ -71,11 +71,11 @@ class AlarmPanel:
         """True if this browser sounds."""
         return bool(self._sound.value)
 
-    def show(self, state: State, now: float) -> None:
+    def show(self, state: BridgeState, now_s: float) -> None:
         """Show the alarms; sound while one was not acknowledged."""
         alarms = state.alarms.groups
-        if state.alarms.unseen and self.sound and now - self._sounded >= REPEAT:
-            self._sounded = now
+        if state.alarms.unseen and self.sound and now_s - self._sounded >= REPEAT:
+            self._sounded = now_s
             ui.run_javascript("magbridge.beep()")
         if not self._changes.new(
             "alarms", [(a.cause, a.text, a.active, a.acknowledged, a.count) for a in alarms]

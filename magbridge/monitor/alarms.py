@@ -78,7 +78,7 @@ class AlarmGroup:
         return all(alarm.acknowledged for alarm in self.alarms)
 
     @property
-    def since(self) -> float:
+    def started_s(self) -> float:
         """When the last of them began, s of the receiver's clock."""
         return self.alarms[0].since
 
@@ -111,21 +111,21 @@ class Alarms:
         """Number of causes with an alarm that has not been acknowledged."""
         return len({alarm.cause for alarm in self._alarms.values() if not alarm.acknowledged})
 
-    def update(self, conditions: Mapping[str, str], now: float) -> None:
-        """Update with all faults at `now`, its keys and its words; the other conditions are over."""
+    def update(self, conditions: Mapping[str, str], now_s: float) -> None:
+        """Update with all faults at `now_s`, its keys and its words; the other conditions are over."""
         for key, alarm in self._alarms.items():
             alarm.active = alarm.active and key in conditions
         for key, text in conditions.items():
             known = self._alarms.get(key)
             if known is None or not known.active:
-                self.announce(key, text, now, active=True)
+                self.announce(key, text, now_s, active=True)
             else:
-                known.text, known.last = text, now
+                known.text, known.last = text, now_s
 
-    def announce(self, key: str, text: str, now: float, *, active: bool = False) -> None:
+    def announce(self, key: str, text: str, now_s: float, *, active: bool = False) -> None:
         """Begin an alarm, or restart it; one that is not `active` is an event, over at once."""
         count = self._alarms.pop(key).count + 1 if key in self._alarms else 1
-        self._alarms[key] = Alarm(key, text, now, now, active, count)
+        self._alarms[key] = Alarm(key, text, now_s, now_s, active, count)
         while len(self._alarms) > MAX_ALARMS:
             del self._alarms[next(iter(self._alarms))]
 

@@ -12,7 +12,7 @@ from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
 from magbridge.mavlink import spec
-from magbridge.monitor.state import State
+from magbridge.monitor.state import BridgeState
 from magbridge.monitor.words import health, measured, whereabouts
 from magbridge.version import __version__
 
@@ -21,25 +21,25 @@ __all__ = ["bundle"]
 LIBRARIES = ("nicegui", "numpy", "msgspec", "pyserial")
 
 
-def bundle(state: State, now: float, link: str) -> bytes:
+def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
     """Return a ZIP file of versions, condition, status texts, alarms, parameters and the last samples.
 
     Parameters
     ----------
     state : State
         Of the bridge that it is about.
-    now : float
+    now_s : float
         s, of the receiver's clock.
     link : str
         Where the bridge was heard.
     """
-    wall = time.time() - now
+    wall = time.time() - now_s
 
-    def utc(when: float) -> str:
-        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall + when))
+    def utc(moment: float) -> str:
+        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(wall + moment))
 
     about: dict[str, Any] = {
-        "made": utc(now),
+        "made": utc(now_s),
         "magbridge": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
@@ -47,8 +47,8 @@ def bundle(state: State, now: float, link: str) -> bytes:
         "link": link,
         "bridge": state.bridge,
         "measured": measured(state),
-        "health": {name: text for name, (text, _) in health(state, now).items()},
-        "navigation": {name: text for name, (text, _) in whereabouts(state, now).items()},
+        "health": {name: text for name, (text, _) in health(state, now_s).items()},
+        "navigation": {name: text for name, (text, _) in whereabouts(state, now_s).items()},
         "flags": {name: utc(since) for name, (since, _) in state.flags.items()},
         "MAG_STATUS": {name: repr(value) for name, value in state.status.items()},
     }

@@ -8,12 +8,12 @@ from nicegui import ui
 
 from magbridge.monitor.chart import drawn, options
 from magbridge.monitor.history import TIERS, Series
-from magbridge.monitor.state import TEMPERATURE_SERIES, State
+from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
 from magbridge.monitor.track import Background, series
 from magbridge.monitor.track import options as map_options
 from magbridge.monitor.widgets import GRID, Changes, card, nothing
 
-__all__ = ["Telemetry", "TotalField", "TrackMap"]
+__all__ = ["TelemetryChart", "TotalField", "TrackMap"]
 
 KEYS = "; keys: plus and minus zoom, arrows pan, 0 shows all, S saves it as PNG"
 MAX_CHART_INTERVAL_S = 3.0
@@ -60,12 +60,12 @@ class TotalField:
                 choice.props["aria-label"] = "Window of time"
             self._curve = Curve("Total field", "total_field", "nT")
 
-    def show(self, state: State, tier: str) -> None:
+    def show(self, state: BridgeState, tier: str) -> None:
         """Draw it."""
         self._curve.show(state.total, tier)
 
 
-class Telemetry:
+class TelemetryChart:
     """A chart each for the positions of the masses, whatever else the vehicle names, and the temperature."""
 
     def __init__(self) -> None:
@@ -73,11 +73,11 @@ class Telemetry:
         with card("Masses, other telemetry, and temperature"):
             self._box = ui.element().classes(f"{GRID} md:grid-cols-2 xl:grid-cols-3")
 
-    def show(self, state: State, tier: str, now: float) -> None:
+    def show(self, state: BridgeState, tier: str, now_s: float) -> None:
         """Draw them, now and then."""
         names = sorted(state.telemetry, key=lambda name: (name == TEMPERATURE_SERIES, name))
         if self._changes.new("names", names, self._box):
-            self._drawn = now - MAX_CHART_INTERVAL_S
+            self._drawn = now_s - MAX_CHART_INTERVAL_S
             with self._box:
                 if not names:
                     nothing(
@@ -88,9 +88,9 @@ class Telemetry:
                     with ui.column().classes("gap-0 w-full"):
                         ui.label(name).classes("text-sm font-medium")
                         self._curves[name] = Curve(name, name, "", small=True)
-        if now - self._drawn < MAX_CHART_INTERVAL_S and not self._changes.new("tier", tier):
+        if now_s - self._drawn < MAX_CHART_INTERVAL_S and not self._changes.new("tier", tier):
             return
-        self._drawn = now
+        self._drawn = now_s
         for name, curve in self._curves.items():
             curve.show(state.telemetry[name], tier)
 
@@ -107,7 +107,7 @@ class TrackMap:
         with ui.element().classes("w-full") as self._box, card(title), frame("Track"):
             self._chart = ui.echart(map_options()).classes("w-full aspect-[4/3]")
 
-    def show(self, state: State) -> None:
+    def show(self, state: BridgeState) -> None:
         """Draw the track, if the vehicle has moved on."""
         added = state.reported_track.added, state.estimated.added
         self._box.set_visibility(bool(sum(added)) or self._background is not None)

@@ -7,7 +7,7 @@ from functools import partial
 from nicegui import ui
 
 from magbridge.monitor.link import StationLink
-from magbridge.monitor.state import State
+from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import GRID, INK, RED, button, card, fact
 from magbridge.monitor.words import learned_worth, learnt
 
@@ -25,7 +25,7 @@ LEARNING_COMMANDS = {
 class LearningPanel:
     """What one bridge learns; hidden where it does not."""
 
-    def __init__(self, station: StationLink, state: State) -> None:
+    def __init__(self, station: StationLink, state: BridgeState) -> None:
         self._station, self._state = station, state
         self._box = ui.element().classes("w-full").props(f'role=region aria-label="{TITLE}"')
         with self._box, card(TITLE):
@@ -38,7 +38,7 @@ class LearningPanel:
                 ]
             self._answer = ui.label().classes("text-xs").style(f"color: {RED}").props("role=status")
 
-    def show(self, state: State, _now: float) -> None:
+    def show(self, state: BridgeState, _now_s: float) -> None:
         """Show the last MAG_LEARNING."""
         self._box.set_visibility(bool(state.learning))
         for label, (text, well) in zip(self._labels, learnt(state).values(), strict=True):

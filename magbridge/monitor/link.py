@@ -9,15 +9,15 @@ from threading import Lock, Thread
 from magbridge.bridge.port import Port
 from magbridge.errors import PortError
 from magbridge.mavlink import Codec, Signing
-from magbridge.monitor.fleet import Fleet
+from magbridge.monitor.fleet import ReceivedBridges
 
-__all__ = ["StationLink", "now"]
+__all__ = ["StationLink", "monotonic_s"]
 
 ASLEEP = getattr(time, "CLOCK_BOOTTIME", None)
 """A clock that goes on while the computer sleeps, where there is one."""
 
 
-def now() -> float:
+def monotonic_s() -> float:
     """Return s of a monotonic clock."""
     return time.monotonic() if ASLEEP is None else time.clock_gettime(ASLEEP)
 
@@ -40,7 +40,7 @@ class StationLink:
     """
 
     def __init__(self, port: Port, key: bytes | None = None) -> None:
-        self.port, self.fleet, self.lock, self.trouble = port, Fleet(), Lock(), ""
+        self.port, self.fleet, self.lock, self.trouble = port, ReceivedBridges(), Lock(), ""
         self._signing = Signing(key) if key else None
         self._codec = Codec(255, 190, self._signing)
 
@@ -69,7 +69,7 @@ class StationLink:
         ready, _, _ = select.select(self.port.fds(), [], [], 0.1)
         self._codec.now_us = time.time_ns() // 1000
         messages = self._codec.parse(self.port.read()) if ready else []
-        moment = now()
+        moment = monotonic_s()
         with self.lock:
             for message in messages:
                 self.fleet.receive(message, moment)

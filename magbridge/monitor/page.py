@@ -10,13 +10,13 @@ from nicegui import ui
 
 from magbridge.monitor.alarm_panel import AlarmPanel
 from magbridge.monitor.bundle import bundle
-from magbridge.monitor.charts import Telemetry, TotalField, TrackMap
+from magbridge.monitor.charts import TelemetryChart, TotalField, TrackMap
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.learning_panel import LearningPanel
-from magbridge.monitor.link import StationLink, now
-from magbridge.monitor.panels import Figures, Flags, Health, Navigation, Parameters, Texts
+from magbridge.monitor.link import StationLink, monotonic_s
+from magbridge.monitor.panels import Figures, Flags, Health, NavigationPanel, ParameterPanel, Texts
 from magbridge.monitor.rose import CompassRose
-from magbridge.monitor.state import State
+from magbridge.monitor.state import BridgeState
 from magbridge.monitor.track import Background
 from magbridge.monitor.widgets import AMBER, GREEN, GRID, INK, MONITOR_STYLE, RED, Changes, slanted
 from magbridge.monitor.words import measured, silence
@@ -38,7 +38,7 @@ class Page:
     def __init__(self, station: StationLink, background: Background | None = None) -> None:
         self._station, self._background = station, background
         self._bridge: Bridge | None = None
-        self._state = State()
+        self._state = BridgeState()
         self._tier, self._sound = next(iter(TIERS)), False
         self._changes = Changes()
         ui.add_css(MONITOR_STYLE)
@@ -67,8 +67,8 @@ class Page:
     def _choose(self, bridge: Bridge | None) -> None:
         """Show another vehicle: everything is made again."""
         self._bridge = bridge
-        self._state = self._station.fleet.states.get(bridge) or State() if bridge else State()
-        moment, state = now(), self._state
+        self._state = self._station.fleet.states.get(bridge) or BridgeState() if bridge else BridgeState()
+        moment, state = monotonic_s(), self._state
         self._body.clear()
         with self._body:
             with ui.element().classes(f"{GRID} md:grid-cols-[18rem_minmax(0,1fr)]"):
@@ -82,14 +82,14 @@ class Page:
                     self._flags = Flags()
                 with ui.element().classes(f"{GRID} sm:grid-cols-2 content-start"):
                     self._health = Health(state, moment)
-            self._navigation = Navigation(state, moment)
+            self._navigation = NavigationPanel(state, moment)
             self._learning = LearningPanel(self._station, state)
             with ui.element().classes(f"{GRID} lg:grid-cols-[minmax(0,2fr)_minmax(0,3fr)] items-start"):
                 self._track = TrackMap(self._background)
-                self._telemetry = Telemetry()
+                self._telemetry = TelemetryChart()
             with ui.element().classes(f"{GRID} lg:grid-cols-2"):
                 self._texts = Texts()
-                self._parameters = Parameters(self._station, state)
+                self._parameters = ParameterPanel(self._station, state)
 
     def _set_tier(self, tier: str) -> None:
         self._tier = tier
@@ -104,7 +104,7 @@ class Page:
         if self._bridge not in states and states:
             self._choose(next(iter(states)))
         self._offer(list(states))
-        state, moment = self._state, now()
+        state, moment = self._state, monotonic_s()
         self._show_stream(state, moment)
         panels = self._figures, self._rose, self._flags, self._health, self._navigation, self._learning
         for panel in (*panels, self._texts, self._parameters):
@@ -140,7 +140,7 @@ class Page:
             self._choose(bridge)
             self._show()
 
-    def _show_stream(self, state: State, moment: float) -> None:
+    def _show_stream(self, state: BridgeState, moment: float) -> None:
         quiet = silence(state, moment)
         if quiet and self._station.refused:
             quiet += f"; frames refused for their signature: {self._station.refused}"
@@ -171,5 +171,5 @@ class Page:
     def _report(self) -> None:
         """Hand out a bug report."""
         with self._station.lock:
-            data = bundle(self._state, now(), self._station.port.name)
+            data = bundle(self._state, monotonic_s(), self._station.port.name)
         ui.download.content(data, f"{self._name()}.zip", "application/zip")

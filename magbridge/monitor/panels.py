@@ -12,7 +12,7 @@ from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS
 from magbridge.link.parameters import alignment, file_rate, learning, rates, telemetry_ages
 from magbridge.mavlink.enums import MAV_SEVERITY
 from magbridge.monitor.link import StationLink
-from magbridge.monitor.state import State
+from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import (
     AMBER,
     GREEN,
@@ -27,9 +27,9 @@ from magbridge.monitor.widgets import (
     nothing,
     slanted,
 )
-from magbridge.monitor.words import FLAG_TEXTS, ago, health, measured, silence, whereabouts
+from magbridge.monitor.words import FLAG_TEXTS, duration, health, measured, silence, whereabouts
 
-__all__ = ["Figures", "Flags", "Health", "Navigation", "Parameters", "Texts"]
+__all__ = ["Figures", "Flags", "Health", "NavigationPanel", "ParameterPanel", "Texts"]
 
 TUNABLES = {
     one.name: one
@@ -43,7 +43,7 @@ TUNABLES = {
 class Figures:
     """The field in nT."""
 
-    def __init__(self, state: State) -> None:
+    def __init__(self, state: BridgeState) -> None:
         with card("Field, nT ± 2σ") as self.box:
             self._labels = [self._quantity(name) for name in measured(state)]
 
@@ -55,12 +55,12 @@ class Figures:
                 size = "text-3xl" if name == "Total field" else "text-xl"
                 return ui.label().classes(f"{size} tabular-nums"), ui.label().classes(f"{MUTED} tabular-nums")
 
-    def show(self, state: State, now: float) -> None:
+    def show(self, state: BridgeState, now_s: float) -> None:
         """Show the present figures."""
         for labels, texts in zip(self._labels, measured(state).values(), strict=True):
             for label, text in zip(labels, texts, strict=True):
                 label.set_text(text)
-        self.box.style(slanted("no field" in silence(state, now)))
+        self.box.style(slanted("no field" in silence(state, now_s)))
 
 
 class Flags:
@@ -71,9 +71,9 @@ class Flags:
         with card("Flags"):
             self._box = ui.column().classes("gap-2")
 
-    def show(self, state: State, now: float) -> None:
+    def show(self, state: BridgeState, now_s: float) -> None:
         """Show the flags that stand."""
-        flags = {name: f"since {clock(t)}, {ago(now - t)}" for name, (t, _) in state.flags.items()}
+        flags = {name: f"since {clock(t)}, {duration(now_s - t)}" for name, (t, _) in state.flags.items()}
         if not self._changes.new("flags", flags or bool(state.field), self._box):
             return
         with self._box:
@@ -89,38 +89,38 @@ class Flags:
 class Health:
     """The bridge's condition and its losses."""
 
-    def __init__(self, state: State, now: float) -> None:
-        facts = list(health(state, now))
+    def __init__(self, state: BridgeState, now_s: float) -> None:
+        facts = list(health(state, now_s))
         with card("Bridge"):
             self._labels = [fact(name) for name in facts[:8]]
         with card("Losses"):
             self._labels += [fact(name) for name in facts[8:]]
 
-    def show(self, state: State, now: float) -> None:
+    def show(self, state: BridgeState, now_s: float) -> None:
         """Show the last status."""
-        old = "no status" in silence(state, now)
-        for label, (text, well) in zip(self._labels, health(state, now).values(), strict=True):
+        old = "no status" in silence(state, now_s)
+        for label, (text, well) in zip(self._labels, health(state, now_s).values(), strict=True):
             label.set_text(text if state.status else "–")
             label.style(slanted(old))
             if not old:
                 label.style(f"color: {INK if well or not state.status else RED}")
 
 
-class Navigation:
+class NavigationPanel:
     """The position filter's condition; hidden where there is none."""
 
-    def __init__(self, state: State, now: float) -> None:
+    def __init__(self, state: BridgeState, now_s: float) -> None:
         with (
             ui.element().classes("w-full") as self._box,
             card("Position by the field; innovation and bias in nT"),
             ui.element().classes(f"{GRID} md:grid-cols-3 gap-y-1"),
         ):
-            self._labels = [fact(name) for name in whereabouts(state, now)]
+            self._labels = [fact(name) for name in whereabouts(state, now_s)]
 
-    def show(self, state: State, now: float) -> None:
+    def show(self, state: BridgeState, now_s: float) -> None:
         """Show the last MAG_NAVIGATION."""
         self._box.set_visibility(bool(state.navigation))
-        for label, (text, well) in zip(self._labels, whereabouts(state, now).values(), strict=True):
+        for label, (text, well) in zip(self._labels, whereabouts(state, now_s).values(), strict=True):
             label.set_text(text)
             label.style(f"color: {INK if well else RED}")
 
@@ -134,7 +134,7 @@ class Texts:
             self._box = ui.column().classes("w-full max-h-60 gap-1 overflow-auto flex-nowrap")
             self._box.props('tabindex=0 role=log aria-label="Messages"')
 
-    def show(self, state: State, _now: float) -> None:
+    def show(self, state: BridgeState, _now_s: float) -> None:
         """Show the texts, the newest first."""
         if not self._changes.new("texts", list(state.texts), self._box):
             return
@@ -151,10 +151,10 @@ class Texts:
                     ui.label(received.text).style(f"color: {RED if bad else AMBER if warned else INK}")
 
 
-class Parameters:
+class ParameterPanel:
     """The bridge's parameters, which can be set."""
 
-    def __init__(self, station: StationLink, state: State) -> None:
+    def __init__(self, station: StationLink, state: BridgeState) -> None:
         self._station, self._state = station, state
         self._changes, self._inputs = Changes(), dict[str, ui.number]()
         with card("Parameters (Enter sets one)"):
@@ -163,7 +163,7 @@ class Parameters:
             )
             self._box.props('tabindex=0 role=group aria-label="Parameters"')
 
-    def show(self, state: State, _now: float) -> None:
+    def show(self, state: BridgeState, _now_s: float) -> None:
         """Show values and refusals."""
         known = state.parameters
         if self._changes.new("names", sorted(known), self._box):

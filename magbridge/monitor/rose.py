@@ -7,7 +7,7 @@ from typing import Any
 
 from nicegui import ui
 
-from magbridge.monitor.state import State
+from magbridge.monitor.state import BridgeState
 from magbridge.monitor.widgets import MUTED, Changes, card, slanted
 from magbridge.monitor.words import silence
 
@@ -89,10 +89,10 @@ class CompassRose:
             self._picture = ui.html("", sanitize=False).classes("w-full flex justify-center")
             self._text = ui.label().classes(f"tabular-nums {MUTED}")
 
-    def show(self, state: State, now: float) -> None:
+    def show(self, state: BridgeState, now_s: float) -> None:
         """Show the heading of the last sample."""
         picture = rose_picture(state.field)
         if self._changes.new("rose", picture):
             self._picture.set_content(picture)
             self._text.set_text(heading_text(state.field))
-        self.box.style(slanted("no field" in silence(state, now)))
+        self.box.style(slanted("no field" in silence(state, now_s)))

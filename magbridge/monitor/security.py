@@ -119,7 +119,7 @@ class Guard:
     def _refusal(self, scope: Scope, headers: Mapping[str, str]) -> tuple[int, str] | None:
         """Return status and reason for a request that does not come from the page itself."""
         host = headers.get("host", "")
-        if not self._ours(host):
+        if not self._is_this_page(host):
             return 421, "not a name of this page: use its address"
         if "origin" in headers and not _same_place(headers["origin"], host):
             return 403, "asked for by another site"
@@ -129,7 +129,7 @@ class Guard:
             return 403, "asked for by another site"
         return None
 
-    def _ours(self, host: str) -> bool:
+    def _is_this_page(self, host: str) -> bool:
         """Return True if a Host header names this page."""
         parts = _parts(f"//{host}")
         if parts is None:
@@ -175,9 +175,9 @@ async def _answer(send: Send, status: int, text: bytes, **headers: str) -> None:
     await send({"type": "http.response.body", "body": text})
 
 
-def _same(one: str, other: str) -> bool:
+def _same(secret: str, expected: str) -> bool:
     """Compare two secrets in a time that does not tell where they differ."""
-    return compare_digest(one.encode("utf-8", "replace"), other.encode("utf-8", "replace"))
+    return compare_digest(secret.encode("utf-8", "replace"), expected.encode("utf-8", "replace"))
 
 
 def _same_place(origin: str, host: str) -> bool:

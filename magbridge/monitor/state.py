@@ -13,7 +13,7 @@ from magbridge.monitor.alarms import Alarms
 from magbridge.monitor.history import Series, TrackPoint, Trail
 from magbridge.records import Quality
 
-__all__ = ["TEMPERATURE_SERIES", "Parameter", "State", "Text"]
+__all__ = ["TEMPERATURE_SERIES", "BridgeState", "RemoteParameter", "Text"]
 
 HOLD = 3.0
 """s for which a flag is still shown after it was last set."""
@@ -41,7 +41,7 @@ class Text(NamedTuple):
 
 
 @dataclass
-class Parameter:
+class RemoteParameter:
     """A parameter: value last received, value requested (and when), and why the request was not granted."""
 
     index: int
@@ -51,7 +51,7 @@ class Parameter:
     error: str = ""
 
 
-class State:
+class BridgeState:
     """All that a page shows of one bridge.
 
     Times are the receiver's, s of a monotonic clock.
@@ -108,7 +108,7 @@ class State:
         self.estimated, self.reported_track = Trail(), Trail()
         self.alarms = Alarms()
         self.texts: deque[Text] = deque(maxlen=200)
-        self.parameters: dict[str, Parameter] = {}
+        self.parameters: dict[str, RemoteParameter] = {}
         self._count = self._lost_before = 0
         self._sequence = sequence
         self._piece = (0, -1)
@@ -121,43 +121,43 @@ class State:
         place = dict.fromkeys(("GLOBAL_POSITION_INT", "GPS_RAW_INT"), self._position)
         self._others = by_id(NAMED_VALUE_FLOAT=self._named_value, **place)
 
-    def receive(self, message: Message, now: float) -> None:
-        """Take a message of the bridge that came at `now`."""
+    def receive(self, message: Message, now_s: float) -> None:
+        """Take a message of the bridge that came at `now_s`."""
         gap = (message.sequence - self._sequence - 1) % 256
         self.lost += gap if gap < 128 else 0  # a larger step is a message that comes late
-        self._sequence, self.received_at = message.sequence, now
-        self.began = min(self.began, now)
+        self._sequence, self.received_at = message.sequence, now_s
+        self.began = min(self.began, now_s)
         self.received += 1
         if handle := self._handlers.get(message.id):
-            handle(message, now)
+            handle(message, now_s)
 
-    def receive_other(self, message: Message, now: float) -> None:
+    def receive_other(self, message: Message, now_s: float) -> None:
         """Take a message of another component of the same vehicle, such as its autopilot."""
         if handle := self._others.get(message.id):
-            handle(message, now)
+            handle(message, now_s)
 
-    def due(self, now: float) -> list[tuple[str, dict[str, Any]]]:
-        """Return the requests to send at `now`: those not yet answered."""
+    def due(self, now_s: float) -> list[tuple[str, dict[str, Any]]]:
+        """Return the requests to send at `now_s`: those not yet answered."""
         if self.bridge is None:
             return []
         requests: list[tuple[str, dict[str, Any]]] = []
         target = dict(zip(("target_system", "target_component"), self.bridge, strict=True))
         known = {one.index for one in self.parameters.values()}
         missing = [index for index in range(min(self._count, PARAMETERS)) if index not in known]
-        if now - self._asked > REQUEST_RETRY_S and (missing or not known):
-            self._asked = now
+        if now_s - self._asked > REQUEST_RETRY_S and (missing or not known):
+            self._asked = now_s
             requests += [("PARAM_REQUEST_READ", {**target, "param_index": index}) for index in missing[:10]]
             requests += [("PARAM_REQUEST_LIST", target)] if not known else []
         for name, one in self.parameters.items():
-            if one.asked is not None and now - one.when > REQUEST_RETRY_S:
-                one.error, one.when = WAITING if isfinite(one.when) else "", now
+            if one.asked is not None and now_s - one.when > REQUEST_RETRY_S:
+                one.error, one.when = WAITING if isfinite(one.when) else "", now_s
                 value = {"param_id": name, "param_value": one.asked, "param_type": MAV_PARAM_TYPE.REAL32}
                 requests.append(("PARAM_SET", {**target, **value}))
         return requests
 
-    def time(self, now: float) -> float:
+    def time(self, now_s: float) -> float:
         """Return the bridge's own time, s since 1970, of a moment of the receiver's clock; NaN before any."""
-        return self.field["time_usec"] * 1e-6 + now - self.sampled if self.field else nan
+        return self.field["time_usec"] * 1e-6 + now_s - self.sampled if self.field else nan
 
     def set(self, name: str, value: float) -> None:
         """Ask for another value of a parameter; the answer, or the refusal, appears in `parameters`."""
@@ -167,25 +167,25 @@ class State:
         else:
             one.error = "expected a number"
 
-    def _field(self, message: Message, now: float) -> None:
+    def _field(self, message: Message, now_s: float) -> None:
         if message["sensor_id"]:  # the page shows the main sensor
             return
-        self.interval = now - self.sampled if self.field else 0.0
-        self.field, self.sampled = message.fields, now
+        self.interval = now_s - self.sampled if self.field else 0.0
+        self.field, self.sampled = message.fields, now_s
         for name in Quality(self.field["flags"]).names().split():
-            self.flags[name] = self.flags.get(name, (now, now))[0], now
-        self.flags = {name: times for name, times in self.flags.items() if now - times[1] <= HOLD}
+            self.flags[name] = self.flags.get(name, (now_s, now_s))[0], now_s
+        self.flags = {name: times for name, times in self.flags.items() if now_s - times[1] <= HOLD}
         self.samples.append(self.field)
         self.total.add(
             self.field["time_usec"] * 1e-6, self.field["total_field"], 2 * self.field["total_field_sigma"]
         )
 
-    def _raw(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
+    def _raw(self, message: Message, now_s: float) -> None:  # noqa: ARG002 - handlers are alike
         if not message["sensor_id"]:
             self._measured(TEMPERATURE_SERIES, message["time_usec"] * 1e-6, message["temperature"])
 
-    def _named_value(self, message: Message, now: float) -> None:
-        self._measured(message["name"], self.time(now), message["value"])
+    def _named_value(self, message: Message, now_s: float) -> None:
+        self._measured(message["name"], self.time(now_s), message["value"])
 
     def _measured(self, name: str, time: float, value: float) -> None:
         if isfinite(value) and name not in self.telemetry and len(self.telemetry) < TELEMETRY:
@@ -193,13 +193,13 @@ class State:
         if name in self.telemetry:
             self.telemetry[name].add(time, value)
 
-    def _position(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
+    def _position(self, message: Message, now_s: float) -> None:  # noqa: ARG002 - handlers are alike
         if message.fields.get("fix_type", FIX_2D) >= FIX_2D and (message["lat"] or message["lon"]):
             self.reported_track.add(TrackPoint(message["lat"] * 1e-7, message["lon"] * 1e-7))
 
-    def _status(self, message: Message, now: float) -> None:
-        self.report_interval = now - self.reported if self.status else 0.0
-        self.reported = now
+    def _status(self, message: Message, now_s: float) -> None:
+        self.report_interval = now_s - self.reported if self.status else 0.0
+        self.reported = now_s
         before, self.status = self.status.get("uptime", 0), message.fields
         if self.status["uptime"] < before:  # the bridge restarted, perhaps with other parameters
             self.parameters.clear()
@@ -208,19 +208,19 @@ class State:
             self.lost = self._lost_before  # its sequence numbers restarted
         self._lost_before = self.lost
 
-    def _navigation(self, message: Message, now: float) -> None:
-        self.navigation, self.navigated = message.fields, now
+    def _navigation(self, message: Message, now_s: float) -> None:
+        self.navigation, self.navigated = message.fields, now_s
         if self.navigation["state"] in LOCATED:
             nn, ne, ee = (self.navigation[f"covariance_{axes}"] for axes in ("nn", "ne", "ee"))
             latitude, longitude = message["lat"] * 1e-7, message["lon"] * 1e-7
             self.estimated.add(TrackPoint(latitude, longitude, (nn, ne, ee)))
 
-    def _learning(self, message: Message, now: float) -> None:  # noqa: ARG002 - handlers are alike
+    def _learning(self, message: Message, now_s: float) -> None:  # noqa: ARG002 - handlers are alike
         self.learning = message.fields
 
-    def _text(self, message: Message, now: float) -> None:
+    def _text(self, message: Message, now_s: float) -> None:
         number, piece = message["id"], message["chunk_seq"]
-        statustext = Text(now, message["severity"], message["text"])
+        statustext = Text(now_s, message["severity"], message["text"])
         if piece and self._piece == (number, piece - 1):
             beginning = self.texts.popleft().text
             self.alarms.withdraw(f"text: {beginning}")
@@ -228,17 +228,17 @@ class State:
         self._piece = number, piece
         self.texts.appendleft(statustext)
         if statustext.severity <= MAV_SEVERITY.ERROR:
-            self.alarms.announce(f"text: {statustext.text}", statustext.text, now)
+            self.alarms.announce(f"text: {statustext.text}", statustext.text, now_s)
         name, _, reason = statustext.text.partition(": ")
         if name in self.parameters and statustext.severity <= MAV_SEVERITY.WARNING:
             self.parameters[name].error = reason
 
-    def _value(self, message: Message, now: float) -> None:
+    def _value(self, message: Message, now_s: float) -> None:
         name, value = message["param_id"], message["param_value"]
-        self._asked, self._count = now, message["param_count"]
+        self._asked, self._count = now_s, message["param_count"]
         if name not in self.parameters and len(self.parameters) >= PARAMETERS:
             return
-        one = self.parameters.setdefault(name, Parameter(message["param_index"], value))
+        one = self.parameters.setdefault(name, RemoteParameter(message["param_index"], value))
         one.value = value
         if one.asked is None:
             return

@@ -9,7 +9,7 @@ from typing import Any
 
 from nicegui import ui
 
-from magbridge.monitor.link import now
+from magbridge.monitor.link import monotonic_s
 
 __all__ = [
     "AMBER",
@@ -94,6 +94,6 @@ def button(text: str, order: Callable[[], None]) -> ui.button:
     return made.props("dense no-caps outline size=sm padding='4px 10px'")
 
 
-def clock(when: float) -> str:
+def clock(moment: float) -> str:
     """Return the UTC of a moment on the station's clock."""
-    return time.strftime("%H:%M:%S", time.gmtime(time.time() - (now() - when)))
+    return time.strftime("%H:%M:%S", time.gmtime(time.time() - (monotonic_s() - moment)))

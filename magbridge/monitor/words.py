@@ -16,10 +16,17 @@ from magbridge.mavlink.enums import (
     MAG_NAVIGATION_STATE,
     MAG_PORT_STATE,
 )
-from magbridge.monitor.state import State
+from magbridge.monitor.state import BridgeState
 
 __all__ = [
-    "FLAG_TEXTS", "ago", "conditions", "health", "learned_worth", "learnt", "measured", "silence",
+    "FLAG_TEXTS",
+    "conditions",
+    "duration",
+    "health",
+    "learned_worth",
+    "learnt",
+    "measured",
+    "silence",
     "whereabouts",
 ]  # fmt: skip
 
@@ -60,34 +67,36 @@ LOSS_TEXTS = {
 }
 
 
-def ago(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Return a duration in the unit that suits it."""
     unit, size = next(((u, s) for u, s in (("h", 3600), ("min", 60)) if seconds >= 2 * s), ("s", 1))
     return f"{max(seconds, 0.0) / size:.0f} {unit}"
 
 
-def silence(state: State, now: float) -> str:
+def silence(state: BridgeState, now_s: float) -> str:
     """Return the fault of the stream; an empty text while messages, field and status come."""
-    if _late(state.received_at, 0.0, now):
-        return _unheard("nothing", state.received_at, now)
+    if _late(state.received_at, 0.0, now_s):
+        return _unheard("nothing", state.received_at, now_s)
     missing = []
-    if _late(state.sampled, state.interval, now):
-        missing.append(_unheard("no field", state.sampled, now))
-    if state.status and _late(state.reported, state.report_interval, now):  # a bridge need not send it at all
-        missing.append(_unheard("no status", state.reported, now))
+    if _late(state.sampled, state.interval, now_s):
+        missing.append(_unheard("no field", state.sampled, now_s))
+    if state.status and _late(
+        state.reported, state.report_interval, now_s
+    ):  # a bridge need not send it at all
+        missing.append(_unheard("no status", state.reported, now_s))
     return "; ".join(missing)
 
 
-def _late(when: float, interval: float, now: float) -> bool:
+def _late(received: float, interval: float, now_s: float) -> bool:
     """Return True if more than a message or two of such an interval (s) have not come."""
-    return now - when > max(SILENT, min(3 * interval, SLOW))
+    return now_s - received > max(SILENT, min(3 * interval, SLOW))
 
 
-def _unheard(what: str, when: float, now: float) -> str:
-    return f"{what} heard for {ago(now - when)}" if isfinite(when) else f"{what} heard yet"
+def _unheard(stream: str, received: float, now_s: float) -> str:
+    return f"{stream} heard for {duration(now_s - received)}" if isfinite(received) else f"{stream} heard yet"
 
 
-def measured(state: State) -> dict[str, tuple[str, str]]:
+def measured(state: BridgeState) -> dict[str, tuple[str, str]]:
     """Return the field in nT: name of each quantity to its value and its 2-sigma, as texts."""
     get = state.field.get
     shown = {"Total field": _number(get("total_field", nan), ".2f", 2 * get("total_field_sigma", nan))}
@@ -97,10 +106,10 @@ def measured(state: State) -> dict[str, tuple[str, str]]:
     return shown
 
 
-def health(state: State, now: float) -> dict[str, tuple[str, bool]]:
+def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
     """Return the bridge's condition: name of each item to its text, and whether it is in order."""
     # of a field that no longer comes, neither latency nor age is the present one
-    field = ({} if _late(state.sampled, state.interval, now) else state.field).get
+    field = ({} if _late(state.sampled, state.interval, now_s) else state.field).get
     get = state.status.get
     sensor, autopilot, log = (get(f"{line}_state", 0) for line in ("sensor", "autopilot", "log"))
     losses = {name: get(counter, 0) for name, counter in LOSS_TEXTS.items()}
@@ -118,7 +127,7 @@ def health(state: State, now: float) -> dict[str, tuple[str, bool]]:
             f"{state.field['calibration_id']:08x}".replace("0" * 8, "none") if state.field else "–",
             True,
         ),
-        "Uptime": (ago(get("uptime", 0)), True),
+        "Uptime": (duration(get("uptime", 0)), True),
         "Messages lost on the link": (
             f"{_figure(state.lost)} of {_figure(state.lost + state.received)}",
             not state.lost,
@@ -128,7 +137,7 @@ def health(state: State, now: float) -> dict[str, tuple[str, bool]]:
     }
 
 
-def whereabouts(state: State, now: float) -> dict[str, tuple[str, bool]]:
+def whereabouts(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
     """Return the position filter's condition: name of each item to its text, and whether it is in order."""
     get = state.navigation.get
     mode = get("state", 0)
@@ -145,11 +154,11 @@ def whereabouts(state: State, now: float) -> dict[str, tuple[str, bool]]:
         ),
         "Bias ± 2σ": (" ".join(_number(get("bias", nan), "+.1f", 2.0 * get("bias_sigma", nan))), True),
         "Current": (_figure(hypot(get("current_north", nan), get("current_east", nan)), ".2f", "m/s"), True),
-        "Last update": (f"{ago(now - state.navigated)} ago" if state.navigation else "–", True),
+        "Last update": (f"{duration(now_s - state.navigated)} ago" if state.navigation else "–", True),
     }
 
 
-def learnt(state: State) -> dict[str, tuple[str, bool]]:
+def learnt(state: BridgeState) -> dict[str, tuple[str, bool]]:
     """Return what the bridge says of its learning: each item's name to its text, and whether all is well."""
     get = state.learning.get
     causes = [cause for cause in MAG_CAUSE if get("causes", 0) & cause]
@@ -201,14 +210,14 @@ def _calibration(published: int, first: int) -> str:
     return f"{published:08x}" + (", the first" if published == first else f"; the first is {first:08x}")
 
 
-def conditions(state: State, now: float) -> dict[str, str]:
+def conditions(state: BridgeState, now_s: float) -> dict[str, str]:
     """Return what a person should look at, as :meth:`Alarms.update` takes it: key and words of each."""
     wrong = {name: FLAG_TEXTS[name] for name in state.flags if name not in ROUTINE}
-    starting = now - state.began < STARTING
-    if (quiet := silence(state, now)) and not starting:
+    starting = now_s - state.began < STARTING
+    if (quiet := silence(state, now_s)) and not starting:
         wrong["silence"] = quiet.split(" for ")[0].capitalize()
     for line in ("Sensor", "Autopilot", "Log"):
-        text, _ = health(state, now)[line]
+        text, _ = health(state, now_s)[line]
         if state.status and not starting and text in {"silent", "lost", "failed"}:
             wrong[line] = f"{line}: {text}"
     if state.navigation.get("state") == MAG_NAVIGATION_STATE.LOST:

@@ -19,7 +19,7 @@ Without a map :mod:`.own_survey` localises a whole log in the field that it met 
 
 from magbridge.navigate.bound import Bound, position_bound
 from magbridge.navigate.navigator import Navigator
-from magbridge.navigate.options import Options
-from magbridge.navigate.record import Record, State
+from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.record import NavigationState, Record
 
-__all__ = ["Bound", "Navigator", "Options", "Record", "State", "position_bound"]
+__all__ = ["Bound", "NavigationOptions", "NavigationState", "Navigator", "Record", "position_bound"]

@@ -157,14 +157,14 @@ class Bank:
             )
 
     def _observe(
-        self, y: FloatArray, gain: FloatArray, s: FloatArray, off: BoolArray
+        self, y: FloatArray, gain: FloatArray, s: FloatArray, rejected: BoolArray
     ) -> tuple[float, float, float]:
         """Update with innovations (n,) of variances (n,) and ``P H'`` (6, n); return as :meth:`update`."""
         z2 = y * y / s
         likelihood = -0.5 * (np.minimum(z2, self._gate) + np.log(s) + log(2.0 * pi))
         mean = float(self.w @ y)
         spread = float(self.w @ (s + (y - mean) ** 2))
-        gain = np.where((z2 <= self._gate) & ~off, gain, 0.0)
+        gain = np.where((z2 <= self._gate) & ~rejected, gain, 0.0)
         scaled = gain / s
         self.x = self.x + scaled * y
         self.P = self.P - gain[:, None] * scaled

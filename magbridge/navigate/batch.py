@@ -18,7 +18,7 @@ from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.deadreckoning import GLIDE
 from magbridge.navigate.findings import findings_of
 from magbridge.navigate.navigator import NO_POSITION_FLAGS, Navigator
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 from magbridge.navigate.record import Record
 from magbridge.navigate.reference_track import REFERENCES, reference_track, with_errors
 from magbridge.progress import track
@@ -47,7 +47,7 @@ COLUMN_UNITS = {
 def navigate(
     deployment: xr.Dataset,
     grid: AnomalyGrid,
-    options: Options | None = None,
+    options: NavigationOptions | None = None,
     *,
     start: tuple[float, float] | None = None,
 ) -> xr.Dataset:
@@ -80,7 +80,7 @@ def navigate(
         A date that the IGRF does not cover.
     """
     source = str(deployment.attrs.get("source", "deployment"))
-    options = options or Options()
+    options = options or NavigationOptions()
     time, field, sigma = samples_of(deployment, source)
     motion = motion_of(deployment, source)
     navigator = Navigator(grid, options)

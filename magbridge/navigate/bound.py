@@ -15,7 +15,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.depth import lasting_errors
 from magbridge.navigate.model import N_STATES, block_length, measurement_row, prior, transition
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,7 +46,7 @@ def position_bound(
     time: ArrayLike,
     latitude: ArrayLike,
     longitude: ArrayLike,
-    options: Options | None = None,
+    options: NavigationOptions | None = None,
     sigma: float = 1.0,
     depth: float = 0.0,
     every: float = 4.0,
@@ -86,7 +86,7 @@ def position_bound(
     it is the covariance of a Kalman filter that knows where to linearise,
     ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map, measurements are missing.
     """
-    grid, o = lasting_errors(grid, options or Options())
+    grid, o = lasting_errors(grid, options or NavigationOptions())
     corners = np.asarray(time, float)
     lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
     along = _along(corners, lat, lon)

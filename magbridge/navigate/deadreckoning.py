@@ -36,7 +36,7 @@ class MotionNoise(NamedTuple):
     turns: float = 0.0
     """Sum of the squared changes of velocity in turns, (m/s)²."""
 
-    def since(self, earlier: MotionNoise) -> MotionNoise:
+    def growth_since(self, earlier: MotionNoise) -> MotionNoise:
         """Return the uncertainty of the motion since an earlier moment."""
         return MotionNoise(*(a - b for a, b in zip(self, earlier, strict=True)))
 
@@ -107,7 +107,7 @@ class DeadReckoning:
             self._move(self._velocity[0] * elapsed, self._velocity[1] * elapsed)
         self.time = time
 
-    def ahead(self, time: float) -> tuple[float, float]:
+    def extrapolate(self, time: float) -> tuple[float, float]:
         """Return latitude and longitude at `time`, along the last known velocity, without moving there."""
         elapsed = time - self.time
         if not 0.0 < elapsed < MAX_TELEMETRY_GAP_S:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from magbridge.field.continuation import continued
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.options import Options, with_level
+from magbridge.navigate.options import NavigationOptions, with_level
 
 __all__ = ["at_depth", "lasting_errors"]
 
@@ -18,7 +18,9 @@ NEGLIGIBLE = 0.1
 """Share of the map error below which what lies between the nodes changes it by less than 1 %."""
 
 
-def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[AnomalyGrid, Options]:
+def at_depth(
+    grid: AnomalyGrid, options: NavigationOptions, depth: ArrayLike
+) -> tuple[AnomalyGrid, NavigationOptions]:
     """Return the map at the vehicle's depth, and options whose map error includes what that and nodes cost.
 
     Parameters
@@ -44,7 +46,7 @@ def at_depth(grid: AnomalyGrid, options: Options, depth: ArrayLike) -> tuple[Ano
     return lasting_errors(there.grid, _added(options, errors) if errors else options)
 
 
-def lasting_errors(grid: AnomalyGrid, options: Options) -> tuple[AnomalyGrid, Options]:
+def lasting_errors(grid: AnomalyGrid, options: NavigationOptions) -> tuple[AnomalyGrid, NavigationOptions]:
     """Return the map and options whose map error has the sigma that lasts from sample to sample.
 
     A sigma with a ``sigma_length`` is correlated along the track, as the filter's map error is, and the noise
@@ -63,7 +65,7 @@ def lasting_errors(grid: AnomalyGrid, options: Options) -> tuple[AnomalyGrid, Op
     return grid.replaced(sigma=sigma, sigma_length=0.0, typical_error=known.map_sigma), known
 
 
-def _added(options: Options, errors: list[tuple[float, float]]) -> Options:
+def _added(options: NavigationOptions, errors: list[tuple[float, float]]) -> NavigationOptions:
     """Return options whose map error includes others, of a sigma, nT, and a length, m."""
     whole = [*errors, (options.map_sigma, options.map_length)]
     sigma = hypot(*(sigma for sigma, _ in whole))

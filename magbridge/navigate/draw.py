@@ -17,7 +17,7 @@ from magbridge.field.geodesy import metres_per_degree, signed_longitude
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
 from magbridge.navigate.bound import Bound
-from magbridge.navigate.record import State
+from magbridge.navigate.record import NavigationState
 from magbridge.navigate.reference_track import errors
 from magbridge.pictures import save
 
@@ -26,7 +26,11 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_bound", "draw_navigation", "measured_on_track"]
 
-SHADES = {State.SEARCHING: "#f5d76e", State.DEAD_RECKONING: "#d5d8dc", State.LOST: "#e59a93"}
+SHADES = {
+    NavigationState.SEARCHING: "#f5d76e",
+    NavigationState.DEAD_RECKONING: "#d5d8dc",
+    NavigationState.LOST: "#e59a93",
+}
 
 
 def draw_navigation(result: xr.Dataset, grid: AnomalyGrid | None, path: str | Path) -> None:
@@ -188,7 +192,7 @@ def _tracks(axis: Axes, result: xr.Dataset) -> list[RealArray]:
     longitude = np.unwrap(result["longitude"].to_numpy(), period=360.0)
     per_latitude, per_longitude = metres_per_degree(latitude)
 
-    def back(north: str, east: str) -> RealArray:
+    def shifted(north: str, east: str) -> RealArray:
         return np.stack([longitude - result[east] / per_longitude, latitude - result[north] / per_latitude])
 
     here = np.stack([longitude, latitude])
@@ -197,14 +201,14 @@ def _tracks(axis: Axes, result: xr.Dataset) -> list[RealArray]:
         [np.unwrap(result["smoothed_longitude"].to_numpy(), period=360.0), result["smoothed_latitude"]]
     )
     smoothed[0] += 360.0 * np.round((longitude.mean() - smoothed[0].mean()) / 360.0)
-    reckoned = back("north", "east")
+    reckoned = shifted("north", "east")
     axis.plot(*reckoned, color="0.35", ls="--", lw=1, label="dead reckoning")
     axis.plot(*here, ".", color="0.35", ms=1.5, label="filter, not valid")
     axis.plot(*sure, color="k", lw=1.5, label="filter, valid")
     axis.plot(*smoothed, color="C2", lw=1.5, label="smoothed")
     tracks = [reckoned, sure, smoothed]
     if "error_north" in result:
-        known = back("error_north", "error_east")
+        known = shifted("error_north", "error_east")
         name = result.attrs["reference_track"].rstrip("_")
         axis.plot(*known, color="C3", lw=1.2, ls=(0, (4, 2)), label=f"known position ({name})")
         tracks.append(known)
@@ -216,7 +220,7 @@ def _shade(axis: Axes, hours: Any, state: Any) -> None:
     edges = np.flatnonzero(np.diff(state)) + 1
     seen = set()
     for piece in np.split(np.arange(state.size), edges):
-        kind = State(int(state[piece[0]]))
+        kind = NavigationState(int(state[piece[0]]))
         if kind in SHADES:
             label = None if kind in seen else kind.name.lower().replace("_", " ")
             end = hours[min(piece[-1] + 1, state.size - 1)]

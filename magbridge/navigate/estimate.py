@@ -13,8 +13,8 @@ from magbridge.navigate.bank import Bank, Innovation, Tracker, widest
 from magbridge.navigate.deadreckoning import MotionNoise, Step
 from magbridge.navigate.integrity import IntegrityMonitor, Unmapped, Verdict, squared_mahalanobis
 from magbridge.navigate.model import NO_MOTION_NOISE, Block, prior, resolution, transition
-from magbridge.navigate.options import Options, any_level
-from magbridge.navigate.record import Jump, State
+from magbridge.navigate.options import NavigationOptions, any_level
+from magbridge.navigate.record import Jump, NavigationState
 
 __all__ = ["Estimate"]
 
@@ -66,9 +66,9 @@ class Estimate:
         Motion between the last two measurements on the map.
     """
 
-    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+    def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.grid, self.options, self._claimed = grid, options, options
-        self.state = State.OFF
+        self.state = NavigationState.OFF
         self.x, self.P = prior(options)
         self.valid = False
         self.moved = np.eye(6), np.zeros((6, 6))
@@ -111,9 +111,9 @@ class Estimate:
         self.x, self.P = prior(self.options, sigma)
         self.alone = self.P[:4, :4].copy()
         self._confirmed = sigma >= self._reach()
-        self.state = State.SEARCHING
+        self.state = NavigationState.SEARCHING
 
-    def correct(self, there: FloatArray, sigma: float, fused_sigma: float | None = None) -> None:
+    def correct(self, fix: FloatArray, sigma: float, fused_sigma: float | None = None) -> None:
         """Update with a fix that holds at the time of the last prediction.
 
         The fix confirms the place, but does not end :attr:`State.LOST`: the map must describe the field
@@ -121,7 +121,7 @@ class Estimate:
 
         Parameters
         ----------
-        there : ndarray, (2,)
+        fix : ndarray, (2,)
             m, north and east of the dead-reckoned position.
         sigma : float
             m, of the fix, each axis.
@@ -130,13 +130,13 @@ class Estimate:
         """
         assert self._filter is not None
         self._read()
-        if squared_mahalanobis(there - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
+        if squared_mahalanobis(fix - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
             _, start = prior(self.options, sigma)
             start[2:, 2:] += self.P[2:, 2:]
-            self._begin(np.concatenate([there, self.x[2:]]), start, "a fix contradicts the filter")
+            self._begin(np.concatenate([fix, self.x[2:]]), start, "a fix contradicts the filter")
             self._nowhere = 0.0
         else:
-            self._filter.update_position(float(there[0]), float(there[1]), fused_sigma or sigma)
+            self._filter.update_position(float(fix[0]), float(fix[1]), fused_sigma or sigma)
             self._read()
         if self._lost and not self._fixed:
             self._described, self._nowhere = False, 0.0
@@ -185,7 +185,7 @@ class Estimate:
                 self._level = float(self.P[4, 4]), block.time_us
             then_us, before, earlier = self._measured
             seconds = max((block.time_us - then_us) * 1e-6, 0.0)
-            self.step = Step(seconds, travelled - before, motion.since(earlier))
+            self.step = Step(seconds, travelled - before, motion.growth_since(earlier))
             self._measured = block.time_us, travelled, motion
             self._judge(block, seen)
         self._choose(on_the_map)
@@ -193,7 +193,7 @@ class Estimate:
         doubted = (
             self.odds > DOUBTFUL_LOG_ODDS or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
         )
-        self.valid = self.state is State.TRACKING and proven and not doubted
+        self.valid = self.state is NavigationState.TRACKING and proven and not doubted
         return seen
 
     def predict(self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> None:
@@ -204,7 +204,7 @@ class Estimate:
         """
         time_us = max(time_us, self.time_us)
         seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self.travelled
-        F, Q = transition(self.options, seconds, metres, motion.since(self.motion))
+        F, Q = transition(self.options, seconds, metres, motion.growth_since(self.motion))
         self.time_us, self.travelled, self.motion = time_us, travelled, motion
         self.alone = F[:4, :4] @ self.alone @ F[:4, :4].T + Q[:4, :4]
         self.moved = F, Q
@@ -357,12 +357,12 @@ class Estimate:
             self._filter = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
             self._monitor = None
         if self._lost:
-            self.state = State.LOST
+            self.state = NavigationState.LOST
         elif not self._compact(width):
-            self.state = State.SEARCHING
+            self.state = NavigationState.SEARCHING
         elif self._near_fix():
-            self.state = State.TRACKING
+            self.state = NavigationState.TRACKING
         elif not on_the_map or not self.informed:
-            self.state = State.DEAD_RECKONING
+            self.state = NavigationState.DEAD_RECKONING
         else:
-            self.state = State.TRACKING
+            self.state = NavigationState.TRACKING

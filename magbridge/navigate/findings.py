@@ -13,8 +13,8 @@ from magbridge.arrays import BoolArray, RealArray
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate.options import Options
-from magbridge.navigate.record import Jump, State
+from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.record import Jump, NavigationState
 
 __all__ = ["findings_of"]
 
@@ -43,7 +43,7 @@ EXPLAINED = 0.5
 def findings_of(
     result: xr.Dataset,
     grid: AnomalyGrid,
-    options: Options,
+    options: NavigationOptions,
     jumps: Sequence[Jump],
     reference_track: xr.Dataset | None,
 ) -> list[str]:
@@ -69,7 +69,7 @@ def findings_of(
             f"off the map for {100.0 * off.mean():.0f} % of the track, first after {hours[off][0]:.1f} h:"
             " dead reckoning only"
         )
-    silent = (state == State.DEAD_RECKONING) & ~off
+    silent = (state == NavigationState.DEAD_RECKONING) & ~off
     if silent.mean() > 0.5:
         known = hypot(options.bias_sigma, options.map_sigma)
         findings.append(
@@ -82,14 +82,14 @@ def findings_of(
             )
         )
     findings += _jumps(jumps, float(result["time"][0]))
-    if (lost := (state == State.LOST)).any():
+    if (lost := (state == NavigationState.LOST)).any():
         findings.append(
             f"lost for {100.0 * lost.mean():.0f} % of the track, first after {hours[lost][0]:.1f} h"
         )
     findings += _level(result, options)
     if reference_track is not None:
         findings += _positions(grid, reference_track, options)
-    if state[-1] == State.SEARCHING and not off[-1]:
+    if state[-1] == NavigationState.SEARCHING and not off[-1]:
         findings.append("several positions still explain the field at the end of the log")
     return findings
 
@@ -117,9 +117,9 @@ def _jumps(jumps: Sequence[Jump], start: float) -> list[str]:
     return sentences
 
 
-def _level(result: xr.Dataset, options: Options) -> list[str]:
+def _level(result: xr.Dataset, options: NavigationOptions) -> list[str]:
     """Report the bias at the end, if no calibration would leave it."""
-    tracked = result.where(result["state"] == State.TRACKING, drop=True)
+    tracked = result.where(result["state"] == NavigationState.TRACKING, drop=True)
     if not tracked.sizes["time"]:
         return []
     last = tracked.isel(time=slice(-max(1, tracked.sizes["time"] // 4), None))
@@ -174,7 +174,7 @@ def _best_shift(
     return _Shift(*best, origin)
 
 
-def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Options) -> list[str]:
+def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: NavigationOptions) -> list[str]:
     """Compare the map with the field at known positions: its place, and whether it is this field's map."""
     latitude, longitude = reference_track["latitude"].to_numpy(), reference_track["longitude"].to_numpy()
     depth = np.broadcast_to(np.nan_to_num(reference_track.get("depth", 0.0)), latitude.shape)

@@ -32,7 +32,7 @@ from magbridge.navigate.bank import Tracker
 from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.integrity import Unmapped, squared_mahalanobis
 from magbridge.navigate.model import Block, prior, transition
-from magbridge.navigate.options import Options, any_level
+from magbridge.navigate.options import NavigationOptions, any_level
 
 __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 
@@ -160,7 +160,7 @@ class GnssMonitor:
         m, mean deviation over the last 20 s.
     """
 
-    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+    def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.state, self.reason = GnssState.NONE, GnssReason.NONE
         self.deviation = self.drift = 0.0
         self._grid, self._options = grid, options
@@ -383,7 +383,7 @@ class _FieldTest:
         Of the map at the position against the map at the navigator's.
     """
 
-    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+    def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self.limit = log(options.doubt)
         self.log_odds_of_map = self.log_odds_of_position = 0.0
         self._against = 0.0  # cumulative sum of the odds against the map, never negative (Page 1954)

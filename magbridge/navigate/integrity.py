@@ -23,7 +23,7 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.bank import Bank, widest
 from magbridge.navigate.deadreckoning import Step
 from magbridge.navigate.model import Block, average, block_length, transition
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
 
@@ -59,7 +59,7 @@ class Unmapped:
     (Hartikainen & Särkkä 2010, sec. 4).
     """
 
-    def __init__(self, grid: AnomalyGrid, options: Options) -> None:
+    def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
         self._options = options
         self._rate = sqrt(3.0) / grid.correlation_length
         self._mean = float(np.nanmean(grid.anomaly))
@@ -122,7 +122,7 @@ class IntegrityMonitor:
     def __init__(
         self,
         grid: AnomalyGrid,
-        options: Options,
+        options: NavigationOptions,
         x: FloatArray,
         P: FloatArray,
         time_us: int,

@@ -31,7 +31,7 @@ from magbridge.field.geodesy import wrap
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.nearby import NearbyField
 from magbridge.navigate.deadreckoning import DeadReckoning, MotionNoise
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 __all__ = [
     "NO_MOTION_NOISE",
@@ -86,7 +86,7 @@ def average(blocks: Sequence[Block] | FloatArray) -> Block:
     return Block(*where, anomaly, 1.0 / float(precision.sum()), *rest)
 
 
-def prior(options: Options, position_sigma: float | None = None) -> tuple[FloatArray, FloatArray]:
+def prior(options: NavigationOptions, position_sigma: float | None = None) -> tuple[FloatArray, FloatArray]:
     """Return mean (6,) and covariance (6, 6) before anything was measured."""
     o = options
     sigma = o.start_sigma if position_sigma is None else position_sigma
@@ -95,7 +95,7 @@ def prior(options: Options, position_sigma: float | None = None) -> tuple[FloatA
 
 
 def transition(
-    options: Options, seconds: float, metres: float, motion: MotionNoise = NO_MOTION_NOISE
+    options: NavigationOptions, seconds: float, metres: float, motion: MotionNoise = NO_MOTION_NOISE
 ) -> tuple[FloatArray, FloatArray]:
     """Return F and Q (6, 6) over a time and a distance through the water.
 
@@ -140,7 +140,7 @@ def block_length(grid: AnomalyGrid) -> float:
     return 0.02 * grid.correlation_length
 
 
-def resolution(grid: AnomalyGrid, options: Options, variance: float) -> float:
+def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -> float:
     """Return the position spread, m, within which the map is linear to the noise of one measurement.
 
     Parameters
@@ -190,7 +190,7 @@ class Collector:
     the filter's bias is subtracted, because the filter has a state for it.
     """
 
-    def __init__(self, options: Options, step: float) -> None:
+    def __init__(self, options: NavigationOptions, step: float) -> None:
         self._interval_us, self._step, self._lasts = options.interval * 1e6, step, 2.0 * options.noise_time
         self._white = inf if options.noise is None else options.noise**2
         self._bias = options.bias_sigma**2
@@ -200,7 +200,7 @@ class Collector:
         self._last: tuple[float, float] | None = None  # the sample before: when, and m travelled until then
 
     def add(
-        self, time_us: int, where: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
+        self, time_us: int, reckoning: DeadReckoning, total_field: float, sigma: float, utc_offset_us: int = 0
     ) -> Block | None:
         """Add a sample; return the block that it fills, or the one that it is too far away to join.
 
@@ -208,17 +208,17 @@ class Collector:
         ----------
         time_us, utc_offset_us : int
             Monotonic time and its offset to UNIX time, µs: the main field depends on the date.
-        where : DeadReckoning
+        reckoning : DeadReckoning
             Dead reckoning at the sample's place.
         total_field, sigma : float
             Total field and its 1-sigma, nT.
         """
-        main, slope_north, slope_east = self._main_field.at(
-            where.latitude, where.longitude, where.depth, (time_us + utc_offset_us) * 1e-6
+        main, slope_north, slope_east = self._main_field.field_and_slopes(
+            reckoning.latitude, reckoning.longitude, reckoning.depth, (time_us + utc_offset_us) * 1e-6
         )
-        there = time_us, where.travelled
+        there = time_us, reckoning.travelled
         apart = self._rows and (
-            time_us - self._start_us > self._interval_us or where.travelled - self._begun > self._step
+            time_us - self._start_us > self._interval_us or reckoning.travelled - self._begun > self._step
         )
         block = self.flush() if apart else None
         if not self._rows:
@@ -227,11 +227,11 @@ class Collector:
         wait, step = (there[0] - self._last[0], there[1] - self._last[1]) if self._last else (inf, inf)
         self._last = there
         anomaly, variance = total_field - main, max(sigma, MIN_SIGMA_NT) ** 2
-        place = where.latitude, where.longitude
-        self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, where.depth))
+        place = reckoning.latitude, reckoning.longitude
+        self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, reckoning.depth))
         full = (
             time_us - self._start_us + wait > self._interval_us
-            or where.travelled - self._begun + step > self._step
+            or reckoning.travelled - self._begun + step > self._step
         )
         return self.flush() if full and block is None else block
 

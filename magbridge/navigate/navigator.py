@@ -23,8 +23,8 @@ from magbridge.navigate.depth import lasting_errors
 from magbridge.navigate.estimate import Estimate
 from magbridge.navigate.gnss import GnssMonitor, GnssState, Prediction
 from magbridge.navigate.model import Block, Collector, block_length, transition
-from magbridge.navigate.options import Options
-from magbridge.navigate.record import Reckoned, Record, State
+from magbridge.navigate.options import NavigationOptions
+from magbridge.navigate.record import NavigationState, Reckoned, Record
 from magbridge.records import Corrected, Quality
 
 __all__ = ["NO_POSITION_FLAGS", "Navigator"]
@@ -51,8 +51,8 @@ class Navigator:
         µs to be added to the samples' times for UNIX time, where the host's clock was set since the start.
     """
 
-    def __init__(self, grid: AnomalyGrid, options: Options | None = None) -> None:
-        grid, options = lasting_errors(grid, options or Options())
+    def __init__(self, grid: AnomalyGrid, options: NavigationOptions | None = None) -> None:
+        grid, options = lasting_errors(grid, options or NavigationOptions())
         self.estimate = Estimate(grid, options)
         self.gnss = GnssMonitor(grid, options)
         self.dropped = self.utc_offset_us = 0
@@ -115,7 +115,7 @@ class Navigator:
         alone = (F[:4, :4] @ now.alone @ F[:4, :4].T + Q[:4, :4])[:2, :2]
         return Prediction(
             x[:2], P[:2, :2], alone, x[2:4], float(current_sigma), where.travelled, where.speed,
-            where.noise.turns, now.state is State.LOST, now.informed,
+            where.noise.turns, now.state is NavigationState.LOST, now.informed,
         )  # fmt: skip
 
     def _correct(
@@ -160,7 +160,7 @@ class Navigator:
         A sample is ignored if it is NaN, not later than the previous one, older than the dead-reckoned
         position by more than :data:`MAX_SAMPLE_AGE_S`, or before any position.
         """
-        if self.estimate.state is State.OFF or not isfinite(total_field + sigma):
+        if self.estimate.state is NavigationState.OFF or not isfinite(total_field + sigma):
             return None
         where = self._reckoning
         if time_us <= self._latest_us or time_us * 1e-6 < where.time - MAX_SAMPLE_AGE_S:
@@ -195,7 +195,7 @@ class Navigator:
 
     def reckoned(self, time_us: int) -> tuple[float, float]:
         """Return latitude and longitude by dead reckoning alone, at a time from the last one on."""
-        return self._reckoning.ahead(time_us * 1e-6)
+        return self._reckoning.extrapolate(time_us * 1e-6)
 
     def _update(self, block: Block) -> Record:
         now, where = self.estimate, self._reckoning

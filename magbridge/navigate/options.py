@@ -11,7 +11,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.config import NotNegative, Positive
 from magbridge.field.grid import AnomalyGrid
 
-__all__ = ["Options", "any_level", "informed", "with_level"]
+__all__ = ["NavigationOptions", "any_level", "informed", "with_level"]
 
 MAX_NOISE_INTERVALS = 3.0
 """Intervals: noise with a longer correlation time becomes a bias."""
@@ -19,7 +19,7 @@ LEG = 1_800.0
 """s, between turns or from dive to climb."""
 
 
-class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How well things are known beforehand; all 1-sigma."""
 
     start_sigma: Positive = 50.0
@@ -56,7 +56,7 @@ class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """Odds at which another explanation of the field replaces the filter's."""
 
 
-def informed(options: Options, calibration: Calibration, sigma: float) -> Options:
+def informed(options: NavigationOptions, calibration: Calibration, sigma: float) -> NavigationOptions:
     """Return options that include a calibration's own errors.
 
     Parameters
@@ -95,17 +95,17 @@ def informed(options: Options, calibration: Calibration, sigma: float) -> Option
     return with_level(known, level)
 
 
-def with_level(options: Options, sigma: float) -> Options:
+def with_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
     """Return options with a level that is uncertain by a further `sigma`, nT, and changes as before."""
     return _wider_level(options, hypot(options.bias_sigma, sigma)) if sigma else options
 
 
-def any_level(options: Options, grid: AnomalyGrid) -> Options:
+def any_level(options: NavigationOptions, grid: AnomalyGrid) -> NavigationOptions:
     """Return options with which the field's level carries no information, its changes as much as before."""
     return _wider_level(options, grid.rms)
 
 
-def _wider_level(options: Options, sigma: float) -> Options:
+def _wider_level(options: NavigationOptions, sigma: float) -> NavigationOptions:
     """Return options with a level of at least `sigma`, nT, whose changes are as large as before.
 
     Notes

@@ -40,7 +40,7 @@ from magbridge.logs.deployment import deployment as made
 from magbridge.navigate.batch import COLUMN_UNITS, MOTIONS, columns_of, first_position, motion_of, samples_of
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.model import Block, Collector, transition
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 from magbridge.navigate.particles import Particles, sample
 from magbridge.navigate.reference_track import reference_track, with_errors
 
@@ -78,7 +78,7 @@ class _Found:
     lost: bool
 
     @classmethod
-    def of(cls, field: OwnField, particles: Particles) -> _Found:
+    def from_particles(cls, field: OwnField, particles: Particles) -> _Found:
         moved = field.moved(particles.u)
         kind = int(np.bincount(particles.kind, minlength=len(COVARIANCE_KINDS)).argmax())
         off = ((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2))
@@ -100,7 +100,10 @@ def _lost(field: OwnField, u: FloatArray, count: int | None = None) -> bool:
 
 
 def localise(
-    deployment: xr.Dataset, options: Options | None = None, *, start: tuple[float, float] | None = None
+    deployment: xr.Dataset,
+    options: NavigationOptions | None = None,
+    *,
+    start: tuple[float, float] | None = None,
 ) -> xr.Dataset:
     """Return the track that the field gives which the vehicle met itself.
 
@@ -127,7 +130,7 @@ def localise(
         No total field, no motion, no start, or no usable sample.
     """
     source = str(deployment.attrs.get("source", "deployment"))
-    options = options or Options()
+    options = options or NavigationOptions()
     motion = motion_of(deployment, source)
     origin = start if start is not None else first_position(deployment, source)
     blocks, step = _blocks(deployment, options, motion, origin, source)
@@ -138,7 +141,7 @@ def localise(
         particles = sample(
             field.log_likelihood, field.q, len(COVARIANCE_KINDS), counts, PARTICLES, partial(_lost, field)
         )
-        found = _Found.of(field, particles)
+        found = _Found.from_particles(field, particles)
         known = reference_track(deployment, frozenset(MOTIONS[motion]))
         result = with_errors(_dataset(field, found, options, origin, rows[:, 7]), known)
         if known is not None:
@@ -155,7 +158,7 @@ def _unaided(field: OwnField) -> FloatArray:
 
 
 def _blocks(
-    deployment: xr.Dataset, options: Options, motion: str, start: tuple[float, float], source: str
+    deployment: xr.Dataset, options: NavigationOptions, motion: str, start: tuple[float, float], source: str
 ) -> tuple[list[Block], int]:
     """Return the blocks, and of how many each is one."""
     time, field, sigma = samples_of(deployment, source)
@@ -176,7 +179,7 @@ def _blocks(
 
 
 def _dataset(
-    field: OwnField, found: _Found, options: Options, origin: tuple[float, float], depth: FloatArray
+    field: OwnField, found: _Found, options: NavigationOptions, origin: tuple[float, float], depth: FloatArray
 ) -> xr.Dataset:
     """Return mean and covariance over the tracks, and the field that a typical one finds."""
     moved = found.moved.mean(axis=0)
@@ -262,7 +265,7 @@ IMPOSSIBLE_LOG_LIKELIHOOD = -1e300
 """Log likelihood of an impossible track."""
 
 
-def drift_functions(time: FloatArray, options: Options) -> FloatArray:
+def drift_functions(time: FloatArray, options: NavigationOptions) -> FloatArray:
     """Return functions (n, r), m, whose sum with weights N(0, 1) is the error of dead reckoning on one axis.
 
     `time` (n,) is in s. They are Karhunen-Loeve's: eigenvectors of the covariance that the state of
@@ -309,7 +312,7 @@ class OwnField:
         Number of unknowns.
     """
 
-    def __init__(self, blocks: list[Block], place: FloatArray, options: Options) -> None:
+    def __init__(self, blocks: list[Block], place: FloatArray, options: NavigationOptions) -> None:
         rows = np.array(blocks)
         self.time, self.place = rows[:, 0] * 1e-6, place
         self.anomaly, self.variance, self.slope = rows[:, 3], rows[:, 4], rows[:, 5:7]

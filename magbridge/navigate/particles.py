@@ -47,7 +47,7 @@ class _Seen:
     before: tuple[float, FloatArray]
     now: tuple[float, FloatArray]
 
-    def at(self, share: float, u: FloatArray) -> tuple[float, FloatArray]:
+    def log_posterior(self, share: float, u: FloatArray) -> tuple[float, FloatArray]:
         """Return log posterior and gradient, the prior being N(0, 1)."""
         (a, da), (b, db) = self.before, self.now
         return (1.0 - share) * a + share * b - 0.5 * float(u @ u), (1.0 - share) * da + share * db - u
@@ -130,7 +130,9 @@ class _Mover:
             for i in range(len(u)):
                 other = int(kind[i] + self.rng.integers(1, self.kinds)) % self.kinds
                 there = self._seen(u[i], other)
-                if self._better(there.at(self.share, u[i])[0] - seen[i].at(self.share, u[i])[0]):
+                if self._better(
+                    there.log_posterior(self.share, u[i])[0] - seen[i].log_posterior(self.share, u[i])[0]
+                ):
                     kind[i], seen[i] = other, there
                 accepted += self._leaped(u, int(kind[i]), seen, i)
             self.leap = min(self.leap * float(np.exp(0.5 * (accepted / len(u) - ACCEPTED))), LONGEST)
@@ -140,13 +142,13 @@ class _Mover:
         leap = self.leap * float(self.rng.uniform(0.7, 1.3))
         x, here = u[i], seen[i]
         p = np.asarray(self.rng.normal(size=u.shape[1]))
-        value, slope = here.at(self.share, x)
+        value, slope = here.log_posterior(self.share, x)
         begun = value - 0.5 * float(p @ p)
         for _ in range(LEAPS):
             p = p + 0.5 * leap * (self.root.T @ slope)
             x = x + leap * (self.root @ p)
             here = self._seen(x, kind)
-            value, slope = here.at(self.share, x)
+            value, slope = here.log_posterior(self.share, x)
             if not value - begun > -DIVERGED:
                 return False
             p = p + 0.5 * leap * (self.root.T @ slope)

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import msgspec
 
-__all__ = ["Jump", "Reckoned", "Record", "State"]
+__all__ = ["Jump", "NavigationState", "Reckoned", "Record"]
 
 
-class State(IntEnum):
+class NavigationState(IntEnum):
     """State of the filter; the values are those sent over the link."""
 
     OFF = 0
@@ -30,7 +30,7 @@ class Record(msgspec.Struct, frozen=True, gc=False):
 
     time_us: int
     """µs since 1970 UTC, at which the rest holds: the mean time of the samples that went in."""
-    state: State
+    state: NavigationState
     valid: bool
     """The position can be used: it may be sent as a fix."""
     latitude: float

@@ -203,7 +203,7 @@ class Ascii(FramedDriver):
 
         Return the configured commands.
         """
-        self._framer.begin(inside=not (self._prefix or self._options.checksum))
+        self._framer.begin(inside_frame=not (self._prefix or self._options.checksum))
         return tuple(command.encode(ENCODING) for command in self._options.start)
 
     def is_bad(self, frame: bytes) -> bool:

@@ -81,7 +81,7 @@ class DeviceClock:
         self._arrival_us = self._out_us = 0
 
     @classmethod
-    def of(cls, driver: Driver) -> DeviceClock:
+    def for_driver(cls, driver: Driver) -> DeviceClock:
         """Return the clock that a driver's readings need."""
         return cls(
             time_modulo=driver.time_modulo, sequence_modulo=driver.sequence_modulo, period=driver.period
@@ -202,7 +202,7 @@ class DeviceClock:
         floor = self._floor
         x = device_time + self._turned - self._zero
         y = arrival_us - origin_us - 1e6 * x
-        above = y - floor.at(x)
+        above = y - floor.value_at(x)
         fell_back = device_time < 0.5 * self._device_time
         restarted = fell_back and (step < 0.0 or abs(above) > RESTART)
         tolerance = floor.tolerance(x)
@@ -212,7 +212,7 @@ class DeviceClock:
         late = floor.add(x, y, above, tolerance) if informative else 0.0
         if late:
             floor.restart(*floor.lowest)
-        return origin_us + 1e6 * x + floor.at(x), False, late > 0.0
+        return origin_us + 1e6 * x + floor.value_at(x), False, late > 0.0
 
     def _by_count(
         self, arrival_us: int, origin_us: int, missing: int, informative: bool
@@ -222,7 +222,7 @@ class DeviceClock:
         self._count += 1 + missing
         x = self._count * self._period
         y = arrival_us - origin_us - 1e6 * x
-        above = y - floor.at(x)
+        above = y - floor.value_at(x)
         limit = max(HALF * period_us, TOLERANCE)
         if -limit <= above <= limit + 10.0 * floor.delay:
             above = floor.add(x, y, above, HALF * period_us + 20.0 * floor.scatter) if informative else 0.0
@@ -233,4 +233,4 @@ class DeviceClock:
             y -= beats * period_us
             if not 0 < beats <= KEEP_PHASE:
                 floor.restart(x, y)
-        return origin_us + 1e6 * x + floor.at(x), beats < 0, max(beats, 0)
+        return origin_us + 1e6 * x + floor.value_at(x), beats < 0, max(beats, 0)

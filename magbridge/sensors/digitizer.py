@@ -132,7 +132,7 @@ class Digitizer(FramedDriver):
             (x, y, z),
             sequence,
             time_x * 1e-6,
-            (0.0, _after(time_y, time_x), _after(time_z, time_x)),
+            (0.0, _elapsed(time_y, time_x), _elapsed(time_z, time_x)),
             nan if temperature == NO_TEMPERATURE else temperature * 0.01,
             nan if supply == NO_SUPPLY else supply * 1e-3,
             cycle,
@@ -145,6 +145,6 @@ def _count(low: int, high: int) -> int:
     return low | high << 16
 
 
-def _after(time: int, start: int) -> float:
+def _elapsed(time: int, start: int) -> float:
     """Return `time` - `start` in s, both in µs on the wrapping clock, with a difference below half a turn."""
     return ((time - start + WRAP_US // 2) % WRAP_US - WRAP_US // 2) * 1e-6

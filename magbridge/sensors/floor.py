@@ -61,7 +61,7 @@ class Floor:
         self._began, self._least, self.lowest = x, inf, (x, y)
         self._late_from = inf
 
-    def at(self, x: float) -> float:
+    def value_at(self, x: float) -> float:
         """Return the line at `x`, in µs."""
         return self._y + self.slope * (x - self._x) + self._drop
 

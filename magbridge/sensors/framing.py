@@ -44,16 +44,16 @@ class Framer:
         self._overlong = False
         self.skipped = 0
 
-    def begin(self, *, inside: bool) -> None:
+    def begin(self, *, inside_frame: bool) -> None:
         """Restart: bytes that wait for their delimiter are skipped.
 
         Parameters
         ----------
-        inside : bool
+        inside_frame : bool
             The next byte may be in the middle of a frame: all up to the first delimiter is skipped.
         """
         self.skipped += len(self._rest)
-        self._rest, self._overlong = b"", inside
+        self._rest, self._overlong = b"", inside_frame
 
     def split(self, data: bytes) -> list[bytes]:
         """Process bytes; return the frames that they complete, empty ones left out."""
@@ -108,7 +108,7 @@ class FramedDriver:
 
     def start(self) -> tuple[bytes, ...]:
         """Discard half a frame; return no commands."""
-        self._framer.begin(inside=False)
+        self._framer.begin(inside_frame=False)
         return ()
 
     def feed(self, data: bytes) -> list[Reading]:

@@ -220,7 +220,7 @@ class _JointFit:
 
     def _problem(self, chosen: IndexArray, shift: FloatArray, blocks: tuple[ParameterBlock, ...]) -> Rows:
         samples = replace(self.rows.samples, place=self.place(shift)).part(chosen)
-        return Rows(samples, blocks, Roughness.even())
+        return Rows(samples, blocks, Roughness.uniform())
 
     def _weighed(self, blocks: tuple[ParameterBlock, ...], length: float) -> Weighed:
         family = with_blocks(NO_COEFFICIENTS, blocks)
@@ -298,7 +298,7 @@ class _JointFit:
             reduced = eliminate_field(sums, self.choice.field, self.choice.ratio, self.choice.rho)
             sigma = self._weighed(joint, self.choice.field.length).sigma
             widths = maximise_evidence(reduced.quadratic, family, family.centre, sigma)
-            prior = family.at(widths.eta).precision
+            prior = family.prior(widths.eta).precision
             # The prior of the shift is about zero, and the step's about minus the shift so far.
             mean = np.zeros(len(prior))
             moved = len(self.free) if slopes is not None else 0
@@ -321,7 +321,7 @@ class _JointFit:
     def _slopes(self, chosen: IndexArray, w: FloatArray) -> FloatArray:
         """Return the change of samples with the free components of the shift, (n, k), nT/s and nT/m."""
         place, field = self.place(self.shift)[chosen], self.choice.field
-        inside = field.nodes.inside(place)
+        inside = field.nodes.covers(place)
         gradient = np.zeros((len(place), 2))
         gradient[inside] = np.stack([part @ w for part in field.slopes(place[inside])], axis=1)
         return np.asarray(np.einsum("knj,nj->nk", self.directions[self.free][:, chosen], gradient))

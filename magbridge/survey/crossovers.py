@@ -33,11 +33,11 @@ class Crossovers:
     def misties(self, value: FloatArray) -> FloatArray:
         """Return the difference (m,) of `value` (n,) between the lines, the first minus the second."""
 
-        def at(start: IndexArray, share: FloatArray) -> FloatArray:
+        def interpolate(start: IndexArray, share: FloatArray) -> FloatArray:
             end = np.minimum(start + self.step, len(value) - 1)
             return np.asarray((1.0 - share) * value[start] + share * value[end])
 
-        return at(self.first, self.share[:, 0]) - at(self.second, self.share[:, 1])
+        return interpolate(self.first, self.share[:, 0]) - interpolate(self.second, self.share[:, 1])
 
 
 def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
@@ -54,7 +54,7 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
     start = np.arange(0, len(place) - step, step)
     start = start[line[start] == line[start + step]]
     a, way = place[start], place[start + step] - place[start]
-    i, j = _near(a, way, line[start])
+    i, j = _nearby_pairs(a, way, line[start])
     cross = way[i, 0] * way[j, 1] - way[i, 1] * way[j, 0]
     off = a[j] - a[i]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -65,7 +65,7 @@ def crossovers(place: FloatArray, line: IndexArray) -> Crossovers:
     return Crossovers(a[i] + s[:, None] * way[i], start[i], start[j], np.stack([s, t], axis=1), step)
 
 
-def _near(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray, IndexArray]:
+def _nearby_pairs(a: FloatArray, way: FloatArray, line: IndexArray) -> tuple[IndexArray, IndexArray]:
     """Return pairs of segments, from `a` (m, 2) along `way` (m, 2), in a cell, not adjacent on a line."""
     cell = max(float(np.quantile(np.abs(way).max(axis=1, initial=0.0), 0.99)), 1.0) if len(a) else 1.0
     keys: list[IndexArray] = []

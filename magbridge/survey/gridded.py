@@ -44,7 +44,7 @@ class Posterior:
     mean: float
     """Mean of the field over the samples, nT: a level, which no survey determines and the sigma excludes."""
 
-    def at(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
+    def evaluate(self, B: csr_array) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance, (n,) each, of splines B (n, nodes)."""
         return B @ self.w, self.sigma**2 * self.inverse.variances(B) + ((B @ self.follow) ** 2).sum(axis=1)
 
@@ -97,7 +97,9 @@ class Gridded:
         """(n,), nT, subtracted from each sample: its line's level and the slow part."""
         return np.asarray(sum(one.weight * one.levels for one in self.posteriors))
 
-    def at(self, place: FloatArray, depth: FloatArray | float | None = None) -> tuple[FloatArray, FloatArray]:
+    def evaluate(
+        self, place: FloatArray, depth: FloatArray | float | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the anomaly and its 1-sigma (n,) each, nT, at places (n, 2), m, and depths (n,), m.
 
         The depth is the map's own if not given; where the samples are kriged it is that of those around.
@@ -105,11 +107,11 @@ class Gridded:
         if self.kriged is not None:
             return self._beside_samples(place)
         deeper = 0.0 if depth is None else np.asarray(depth, float) - self.middle
-        scale = self.roughness.at(place)
-        outside = ~self.field.nodes.inside(place)
+        scale = self.roughness.evaluate(place)
+        outside = ~self.field.nodes.covers(place)
         mean, square = np.zeros(len(place)), np.zeros(len(place))
         for one in self.posteriors:
-            here, variance = one.at(csr_array(diags_array(scale) @ one.field.basis(place, deeper)))
+            here, variance = one.evaluate(csr_array(diags_array(scale) @ one.field.basis(place, deeper)))
             variance[outside] = (one.size * scale[outside]) ** 2
             here = here - one.mean
             mean += one.weight * here
@@ -119,13 +121,13 @@ class Gridded:
     def _beside_samples(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the same from the nearest samples; what levels and calibration do to it is the nodes'."""
         assert self.kriged is not None
-        mean, variance = self.kriged.at(place)
-        B = csr_array(diags_array(self.roughness.at(place)) @ self.field.basis(place))
+        mean, variance = self.kriged.evaluate(place)
+        B = csr_array(diags_array(self.roughness.evaluate(place)) @ self.field.basis(place))
         return mean, np.sqrt(variance + ((B @ self.posteriors[0].follow) ** 2).sum(axis=1))
 
     def draw(self, place: FloatArray, number: int) -> Iterator[FloatArray]:
         """Yield about `number` equally probable anomalies (n,), nT, at places (n, 2), m."""
-        rng, rough = np.random.default_rng(0), self.roughness.at(place)
+        rng, rough = np.random.default_rng(0), self.roughness.evaluate(place)
         for one in self.posteriors:
             B = one.field.basis(place)
             for w in one.draw(rng, round(one.weight * number)).T:
@@ -133,9 +135,9 @@ class Gridded:
 
     def at_samples(self, samples: Samples) -> FloatArray:
         """Return the anomaly (n,), nT, at the samples' own places and depths."""
-        deeper, rough = np.nan_to_num(samples.depth - self.middle), self.roughness.at(samples.place)
+        deeper, rough = np.nan_to_num(samples.depth - self.middle), self.roughness.evaluate(samples.place)
 
-        def some(rows: slice) -> FloatArray:
+        def evaluate_rows(rows: slice) -> FloatArray:
             parts = [
                 one.weight
                 * (rough[rows] * (one.field.basis(samples.place[rows], deeper[rows]) @ one.w) - one.mean)
@@ -143,4 +145,4 @@ class Gridded:
             ]
             return np.asarray(self.mean + sum(parts))
 
-        return in_chunks(len(rough), some)
+        return in_chunks(len(rough), evaluate_rows)

@@ -120,9 +120,9 @@ def gridded(samples: Samples, *, local: bool = True, start: Choice | None = None
 def _left_open(choice: Choice, sums: SampleSums, weighed: Weighed) -> list[tuple[float, Choice]]:
     """Return the plausible sizes and lengths of the field, with their weights."""
 
-    def score(one: Choice) -> float:
-        reduced = eliminate_field(sums, one.field, one.ratio, one.rho)
-        return weighed.score(reduced, one.field, one.ratio)
+    def score(choice: Choice) -> float:
+        reduced = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
+        return weighed.score(reduced, choice.field, choice.ratio)
 
     return plausible(score, choice)
 
@@ -143,7 +143,7 @@ def _posterior(
     w, mean = reduced.field(z), problem.mean_over_samples(choice.field)
     levels = problem.D @ z
     return Posterior(
-        weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, _apart(follow, mean),
+        weight, choice.field, choice.ratio * widths.sigma, widths.sigma, w, _without_level(follow, mean),
         reduced.precision, inverse_blocks(reduced.precision, choice.field.edges),
         levels - levels[problem.kept].mean(), float(mean @ w),
     )  # fmt: skip
@@ -191,7 +191,7 @@ def _searched(
     groups, rows = level_blocks(few), np.arange(len(few.value))
     family = with_blocks(NO_COEFFICIENTS, groups)
     weighed = Weighed(family, family.centre, sigma, float(np.median(ladder(few.place))))
-    even = Roughness.even()
+    even = Roughness.uniform()
     problem = Rows(few, groups, even)
     size = max(robust_scale(few.value - problem.mean), 5.0)
     uniform = not local or _few_lengths(samples, start)
@@ -210,7 +210,7 @@ def _searched(
         rho = best.rho ** (1.0 / step) if samples.rho is None else samples.rho
     if uniform or _few_lengths(samples, best):
         return replace(best, rho=rho), even
-    uneven = Roughness.of(samples, best.field.length)
+    uneven = Roughness.from_samples(samples, best.field.length)
     problem = Rows(few, groups, uneven)
     other = climb(problem.sums(best.field, rows), best, weighed, move_rho=False, steps=16)
     best, chosen = (other, uneven) if other.score > best.score + LIKELIER else (best, even)
@@ -227,7 +227,7 @@ def _solved(
     reduced: FieldEliminated, widths: Hyperparameters, family: PriorFamily
 ) -> tuple[FloatArray, FloatArray]:
     """Return z (q,) and its covariance (q, q)."""
-    precision = reduced.quadratic.precision / widths.sigma**2 + family.at(widths.eta).precision
+    precision = reduced.quadratic.precision / widths.sigma**2 + family.prior(widths.eta).precision
     z = np.linalg.solve(precision, reduced.quadratic.vector / widths.sigma**2)
     return np.asarray(z, float), covariance_of(precision)
 
@@ -245,10 +245,10 @@ def _considered(
     sums = problem.sums(choice.field, rows, modes=True)
     all_in = eliminate_field(sums, choice.field, choice.ratio, choice.rho)
     H = all_in.quadratic.precision / widths.sigma**2
-    own = np.linalg.solve(H[:q, :q] + family.at(widths.eta).precision, H[:q, q:])
+    own = np.linalg.solve(H[:q, :q] + family.prior(widths.eta).precision, H[:q, q:])
     return np.asarray(all_in.follow[:, q:] - reduced.follow @ own)
 
 
-def _apart(follow: FloatArray, mean: FloatArray) -> FloatArray:
+def _without_level(follow: FloatArray, mean: FloatArray) -> FloatArray:
     """Subtract from the uncertain shifts of the field (nodes, r) their mean over the samples: the level."""
     return np.asarray(follow - (mean @ follow)[None, :] / max(mean.sum(), 1e-9))

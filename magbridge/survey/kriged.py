@@ -64,7 +64,7 @@ class Kriged:
     share: FloatArray
     """(lines,): g, what each alone reads, over the field."""
 
-    def at(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def evaluate(self, place: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the field and its variance (n,) each, nT and nT², at places (n, 2), m."""
         out = np.empty((len(place), 2))
         for start in range(0, len(place), KRIGED_PLACES):
@@ -74,17 +74,17 @@ class Kriged:
 
     def of_a_line(self, place: FloatArray) -> FloatArray:
         """Return 1-sigma (n,), nT, of a line's own part, which is not the field, at places (n, 2), m."""
-        return np.asarray(np.hypot(rms(self.share) * self.size * self.roughness.at(place), self.noise))
+        return np.asarray(np.hypot(rms(self.share) * self.size * self.roughness.evaluate(place), self.noise))
 
-    def given(self, place: FloatArray, near: IndexArray, line: IndexArray | None = None) -> FloatArray:
-        """Return the field and its variance (n, 2) at places (n, 2) given the samples `near` them (n, k).
+    def given(self, place: FloatArray, neighbours: IndexArray, line: IndexArray | None = None) -> FloatArray:
+        """Return the field and its variance (n, 2) at places (n, 2) given the samples `neighbours` (n, k).
 
         The mean about a place is known only to the spread of all samples. With `line` (n,) it is the
         field as that line reads it.
         """
-        x, lines, here = self.place[near], self.line[near], self.roughness.at(place)
-        there = self.roughness.at(x.reshape(-1, 2)).reshape(near.shape)
-        wide, own, k = float(self.value.var()), self.share[lines] ** 2, np.arange(near.shape[1])
+        x, lines, here = self.place[neighbours], self.line[neighbours], self.roughness.evaluate(place)
+        there = self.roughness.evaluate(x.reshape(-1, 2)).reshape(neighbours.shape)
+        wide, own, k = float(self.value.var()), self.share[lines] ** 2, np.arange(neighbours.shape[1])
         among = self._covariance(x[:, :, None] - x[:, None]) * there[:, :, None] * there[:, None]
         among = among * (1.0 + own[:, :, None] * (lines[:, :, None] == lines[:, None])) + wide
         among[:, k, k] += self.noise**2
@@ -93,16 +93,16 @@ class Kriged:
         if line is not None:
             to = to * (1.0 + own * (line[:, None] == lines))
             variance = variance * (1.0 + self.share[line] ** 2)
-        mean = self.value[near].mean(axis=1)
-        off = self.value[near] - mean[:, None]
+        mean = self.value[neighbours].mean(axis=1)
+        off = self.value[neighbours] - mean[:, None]
         solved = np.linalg.solve(among, np.stack([off, to + wide], axis=2))
         value, known = np.einsum("nk,nkc->cn", to + wide, solved)
         return np.stack([mean + value, np.maximum(variance + wide - known, 0.0)], axis=1)
 
-    def _covariance(self, apart: FloatArray) -> FloatArray:
-        """Return that of places `apart` (..., 2), m, where the roughness is 1: nT²."""
+    def _covariance(self, separation: FloatArray) -> FloatArray:
+        """Return that of places `separation` (..., 2), m, where the roughness is 1: nT²."""
         h = 2.0 * self.below
-        return np.asarray(self.size**2 * h**3 / ((apart**2).sum(axis=-1) + h * h) ** 1.5)
+        return np.asarray(self.size**2 * h**3 / ((separation**2).sum(axis=-1) + h * h) ** 1.5)
 
 
 def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
@@ -120,10 +120,10 @@ def kriged(samples: Samples, value: FloatArray, length: float) -> Kriged:
     tree, size = cKDTree(samples.place), float(np.std(value))
     share = np.zeros(int(samples.line.max()) + 1)
     even, score = _likeliest(Kriged(
-        samples.place, value, samples.line, Roughness.even(), tree, length / 2.0, size,
+        samples.place, value, samples.line, Roughness.uniform(), tree, length / 2.0, size,
         0.02 * size, share,
     ))  # fmt: skip
-    rough = Roughness.of(samples, 2.0 * even.below)
+    rough = Roughness.from_samples(samples, 2.0 * even.below)
     uneven, other = _likeliest(replace(even, roughness=rough))
     best = uneven if other > score + VARYING_LOG_RATIO else even
     share = np.array([_share(best, line) for line in range(len(share))])
@@ -139,12 +139,12 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
     some = some[whole]
     first = np.log([start.below, start.size, start.noise])
 
-    def at(x: FloatArray) -> Kriged:
+    def kriged_with(x: FloatArray) -> Kriged:
         below, size, noise = np.exp(x).tolist()
         return replace(start, below=below, size=size, noise=noise)
 
     def downhill(x: FloatArray) -> float:
-        one = at(x)
+        one = kriged_with(x)
         mean, variance = one.given(one.place[some], near, one.line[some]).T
         return -_likelihood(one.value[some] - mean, variance + one.noise**2)
 
@@ -155,34 +155,38 @@ def _likeliest(start: Kriged) -> tuple[Kriged, float]:
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "maxfev": MAX_SEARCH_STEPS},
     )
-    return at(found.x), -float(found.fun)
+    return kriged_with(found.x), -float(found.fun)
 
 
-def _share(of: Kriged, line: int) -> float:
+def _share(kriged: Kriged, line: int) -> float:
     """Return the likeliest g of a line, by what the others around predict; as expected where none are."""
-    rows = np.flatnonzero(of.line == line)
-    step = float(np.median(np.linalg.norm(np.diff(of.place[rows], axis=0), axis=1))) if len(rows) > 1 else 1.0
-    rows = rows[:: max(round(SAMPLE_SPACING_DEPTHS * of.below / max(step, 1e-3)), 1)]
-    near = of.tree.query(of.place[rows], AMONG)[1]
-    near, whole = _first(near, of.line[near] != line)
+    rows = np.flatnonzero(kriged.line == line)
+    step = (
+        float(np.median(np.linalg.norm(np.diff(kriged.place[rows], axis=0), axis=1)))
+        if len(rows) > 1
+        else 1.0
+    )
+    rows = rows[:: max(round(SAMPLE_SPACING_DEPTHS * kriged.below / max(step, 1e-3)), 1)]
+    near = kriged.tree.query(kriged.place[rows], AMONG)[1]
+    near, whole = _first(near, kriged.line[near] != line)
     if not whole.any():
         return SHARE
     rows = rows[whole]
-    mean, variance = of.given(of.place[rows], near).T
-    size2 = (of.size * of.roughness.at(of.place[rows])) ** 2
+    mean, variance = kriged.given(kriged.place[rows], near).T
+    size2 = (kriged.size * kriged.roughness.evaluate(kriged.place[rows])) ** 2
     scores = [
-        _likelihood(of.value[rows] - mean, variance + g**2 * size2 + of.noise**2)
+        _likelihood(kriged.value[rows] - mean, variance + g**2 * size2 + kriged.noise**2)
         - 0.5 * (np.log(g / SHARE) / SPREAD) ** 2
         for g in SHARES
     ]
     return float(SHARES[int(np.argmax(scores))])
 
 
-def _first(near: IndexArray, before: BoolArray) -> tuple[IndexArray, BoolArray]:
-    """Return the first :data:`GIVEN` of `near` (n, k) that come `before`, and whether as many do (n,)."""
-    whole = np.asarray(before.sum(axis=1) >= GIVEN)
-    order = np.argsort(~before[whole], axis=1, kind="stable")[:, :GIVEN]
-    return np.take_along_axis(near[whole], order, axis=1), whole
+def _first(neighbours: IndexArray, earlier: BoolArray) -> tuple[IndexArray, BoolArray]:
+    """Return the first :data:`GIVEN` of the `earlier` `neighbours` (n, k), and whether as many exist (n,)."""
+    whole = np.asarray(earlier.sum(axis=1) >= GIVEN)
+    order = np.argsort(~earlier[whole], axis=1, kind="stable")[:, :GIVEN]
+    return np.take_along_axis(neighbours[whole], order, axis=1), whole
 
 
 def _likelihood(error: FloatArray, variance: FloatArray) -> float:

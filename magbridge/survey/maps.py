@@ -47,16 +47,16 @@ def anomaly_map(
         Of the map.
     """
     places = gridded.field.nodes.places
-    inner = places[gridded.field.nodes.inside(places)]
+    inner = places[gridded.field.nodes.covers(places)]
     low, high = inner.min(axis=0), inner.max(axis=0)
     step = spacing or max(
         gridded.field.length / A_LENGTH, float(np.sqrt(np.prod(np.maximum(high - low, 1.0)) / MAX_MAP_NODES))
     )
     north, east = (np.arange(low[k], max(high[k], low[k] + 3.5 * step) + step, step) for k in range(2))
     at = np.stack(np.meshgrid(north, east, indexing="ij"), axis=-1).reshape(-1, 2)
-    anomaly, sigma = gridded.at(at)
-    size = gridded.size * gridded.roughness.at(at)
-    hole = ~gridded.field.nodes.inside(at) | (sigma > MAX_SIGMA_FRACTION * size)
+    anomaly, sigma = gridded.evaluate(at)
+    size = gridded.size * gridded.roughness.evaluate(at)
+    hole = ~gridded.field.nodes.covers(at) | (sigma > MAX_SIGMA_FRACTION * size)
     anomaly[hole] = sigma[hole] = np.nan
     shape = len(north), len(east)
     origin = samples.origin
@@ -74,8 +74,8 @@ def anomaly_map(
     return grid if altitude is None else _continued(grid, gridded, at, altitude)
 
 
-def _continued(grid: AnomalyGrid, gridded: Gridded, at: FloatArray, altitude: float) -> AnomalyGrid:
-    """Return a map at another altitude, m; `at` (n, 2) are its nodes' places, m.
+def _continued(grid: AnomalyGrid, gridded: Gridded, nodes: FloatArray, altitude: float) -> AnomalyGrid:
+    """Return a map at another altitude, m; `nodes` (n, 2) are its nodes' places, m.
 
     Its sigma is the spread of fields that the data leave open, each continued: errors smaller than the height
     cancel, and what lies beyond the survey's edge comes in from as far as the height.
@@ -83,6 +83,7 @@ def _continued(grid: AnomalyGrid, gridded: Gridded, at: FloatArray, altitude: fl
     there, missing, _ = continued(grid, -altitude)
     rise = raised(grid, altitude)
     drawn = [
-        (rise(one.reshape(grid.anomaly.shape)) - there.anomaly) ** 2 for one in gridded.draw(at, DRAWN_FIELDS)
+        (rise(one.reshape(grid.anomaly.shape)) - there.anomaly) ** 2
+        for one in gridded.draw(nodes, DRAWN_FIELDS)
     ]
     return there.replaced(sigma=np.hypot(np.sqrt(np.mean(drawn, axis=0)), missing))

@@ -156,7 +156,7 @@ def without_creep(ds: xr.Dataset, creep: Creep | None) -> xr.Dataset:
     """Return a log without the creep of its sensor's offset that was found together with the calibration."""
     if creep is None or not set(CHANNELS) <= set(ds):
         return ds
-    offset = creep.at(ds["time"].to_numpy().astype(float))
+    offset = creep.offset_at(ds["time"].to_numpy().astype(float))
     return ds.assign({name: ds[name] - one for name, one in zip(CHANNELS, offset.T, strict=True)})
 
 
@@ -182,11 +182,11 @@ def joined(parts: Sequence[Samples]) -> Samples:
     )
     return Samples(
         np.concatenate(places), depth, time, value, np.concatenate(lines), tie, origin, weight,
-        _together([one.rho for one in parts]), modes, max(one.level_sigma for one in parts),
+        _common_rho([one.rho for one in parts]), modes, max(one.level_sigma for one in parts),
     )  # fmt: skip
 
 
-def _together(rho: Sequence[float | None]) -> float | None:
+def _common_rho(rho: Sequence[float | None]) -> float | None:
     known = [one for one in rho if one is not None]
     return max(known) if len(known) == len(rho) else None
 
@@ -222,8 +222,8 @@ def _modes(calibration: Calibration, field: FloatArray, channels: FloatArray, ti
     def total(calibration: Calibration, rows: slice) -> FloatArray:
         return correct(calibration, field[rows], channels[rows], time[rows]).total
 
-    def moved(by: FloatArray, rows: slice, unmoved: FloatArray) -> FloatArray:
-        shifted = replace(calibration, coefficients=calibration.coefficients + by)
+    def moved(step: FloatArray, rows: slice, unmoved: FloatArray) -> FloatArray:
+        shifted = replace(calibration, coefficients=calibration.coefficients + step)
         return np.nan_to_num(total(shifted, rows) - unmoved)
 
     values, vectors = np.linalg.eigh(calibration.covariance)

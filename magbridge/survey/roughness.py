@@ -39,12 +39,12 @@ class Roughness:
     """(a, b)."""
 
     @classmethod
-    def even(cls) -> Roughness:
+    def uniform(cls) -> Roughness:
         """Return one that is the same everywhere."""
         return cls(np.zeros(2), 1.0, np.ones((1, 1)))
 
     @classmethod
-    def of(cls, samples: Samples, length: float) -> Roughness:
+    def from_samples(cls, samples: Samples, length: float) -> Roughness:
         """Return that of a survey whose field has a `length`, m."""
         place = samples.place
         low, extent = place.min(axis=0), np.ptp(place, axis=0)
@@ -52,7 +52,7 @@ class Roughness:
         bent = _bends(samples, LAG * length)
         known = np.isfinite(bent)
         if known.sum() < 50:
-            return cls.even()
+            return cls.uniform()
         at = np.floor((place[known] - low) / cell).astype(int)
         shape = np.floor(extent / cell).astype(int) + 1
         power, count = np.zeros(shape), np.zeros(shape)
@@ -66,7 +66,7 @@ class Roughness:
         scale = np.sqrt((power + few * typical2) / ((count + few) * max(typical2, 1e-12)))
         return cls(low, cell, np.clip(scale, LEAST, LARGEST))
 
-    def at(self, place: FloatArray) -> FloatArray:
+    def evaluate(self, place: FloatArray) -> FloatArray:
         """Return the roughness (n,) at places (n, 2), m."""
         if min(self.scale.shape) < 2:
             return np.full(len(place), float(self.scale.mean()))

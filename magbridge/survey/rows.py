@@ -26,7 +26,7 @@ class Rows:
         self.middle = float(np.nanmedian(samples.depth))
         self.deeper = np.nan_to_num(samples.depth - self.middle)
         self.D = BlockColumns(groups)
-        self.scale = roughness.at(samples.place)
+        self.scale = roughness.evaluate(samples.place)
         self.kept = np.ones(len(samples.value), bool)
 
     def basis(self, field: GaussianField, rows: IndexArray | slice) -> csr_array:

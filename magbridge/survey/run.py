@@ -202,21 +202,21 @@ def _gridded(samples: Samples, start: Choice | None) -> Gridded:
     return gridded(replace(apart, modes=modes))
 
 
-def _misplaced(samples: Samples, at: IndexArray, found: Gridded) -> FloatArray:
-    """Return the errors (n, r), nT, that jumps of the track `at` (m,) ends of lines may cause in the samples.
+def _misplaced(samples: Samples, line_ends: IndexArray, found: Gridded) -> FloatArray:
+    """Return the errors (n, r), nT, in the samples that jumps of the track at `line_ends` (m,) may cause.
 
     After a jump by d, either the stretch before or the one after is wrong by d: each has an error of
     N(0, d²/2). Places and fields are drawn; their mean square is the variance.
     """
     rng, field = np.random.default_rng(0), found.posteriors[0].field
-    stretch, steps = samples.line, samples.place[at + 1] - samples.place[at]
+    stretch, steps = samples.line, samples.place[line_ends + 1] - samples.place[line_ends]
     here, drawn = field.basis(samples.place), []
     for w in found.posteriors[0].draw(rng, DRAWN_TRACKS).T:
         off = np.zeros((stretch[-1] + 1, 2))
-        for side in (at, at + 1):
-            np.add.at(off, stretch[side], rng.normal(size=(len(at), 1)) * steps / 2.0**0.5)
+        for side in (line_ends, line_ends + 1):
+            np.add.at(off, stretch[side], rng.normal(size=(len(line_ends), 1)) * steps / 2.0**0.5)
         drawn.append(field.basis(samples.place + off[stretch]) @ w - here @ w)
-    rough = found.roughness.at(samples.place)[:, None]
+    rough = found.roughness.evaluate(samples.place)[:, None]
     return np.asarray(rough * np.stack(drawn, axis=1) / DRAWN_TRACKS**0.5)
 
 

@@ -26,7 +26,7 @@ from magbridge.wording import counted
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["COMPENSATION", "BoxRows", "ScalarRows", "Term", "scalar_rows"]
+__all__ = ["COMPENSATION", "AlignmentTerm", "BoxRows", "ScalarRows", "scalar_rows"]
 
 COMPENSATION = "compensation"
 """Name of the term that holds the uncertain combinations of a calibration's coefficients."""
@@ -37,7 +37,7 @@ MAX_SPEED_GAP_INTERVALS = 3.0
 MIN_SURVEY_SAMPLES = 10
 
 
-class Term(NamedTuple):
+class AlignmentTerm(NamedTuple):
     """A disturbance whose effect is fitted."""
 
     name: str
@@ -55,7 +55,7 @@ class BoxRows(NamedTuple):
     """Anomaly as read, nT."""
     value: FloatArray
     """Anomaly after compensation by the calibration, nT."""
-    terms: tuple[Term, ...]
+    terms: tuple[AlignmentTerm, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class ScalarRows:
     """Heading, or course where no heading is known, rad, (n,)."""
     velocity: FloatArray
     """North and east, m/s, (n, 2)."""
-    terms: tuple[Term, ...]
+    terms: tuple[AlignmentTerm, ...]
     """Channels, or uncertain combinations of the compensation's coefficients."""
     compensated: dict[str, float]
     """Standard deviation of each part of the calibration's compensation, nT."""
@@ -133,7 +133,7 @@ def _joined(parts: Sequence[ScalarRows]) -> ScalarRows:
         np.concatenate([part.raw for part in parts]),
         np.concatenate([part.heading for part in parts]),
         np.concatenate([part.velocity for part in parts]),
-        tuple(Term(name, columns) for (name, _), columns in blocks.items()),
+        tuple(AlignmentTerm(name, columns) for (name, _), columns in blocks.items()),
         parts[0].compensated,
         tuple(box for part in parts for box in part.boxes),
     )
@@ -158,7 +158,7 @@ def _log_rows(
         log = log.sel(time=corrected["time"]) if log.sizes["time"] != corrected.sizes["time"] else log
         found = compensate(corrected, log, sensor)
         value, compensated = found.field, found.contribution
-        terms: tuple[Term, ...] = (Term(COMPENSATION, found.modes),)
+        terms: tuple[AlignmentTerm, ...] = (AlignmentTerm(COMPENSATION, found.modes),)
     else:
         value, terms = scalar_reading(log, column), _channel_terms(log, names)
     log = moved_to_sensor(log, lever) if lever else log
@@ -184,7 +184,7 @@ def _log_rows(
         known &= ~box_rows.box.rows(len(known))
     line, tie = _lines(log)
     samples = Samples(place, depth, time, value, line, tie, origin, rho=None).part(known)
-    used = tuple(Term(name, columns[known]) for name, columns in terms)
+    used = tuple(AlignmentTerm(name, columns[known]) for name, columns in terms)
     return ScalarRows(column, samples, raw[known], heading[known], velocity[known], used, compensated, boxes)
 
 
@@ -213,7 +213,7 @@ def _boxes(
     heading: FloatArray,
     raw: FloatArray,
     value: FloatArray,
-    terms: tuple[Term, ...],
+    terms: tuple[AlignmentTerm, ...],
 ) -> tuple[BoxRows, ...]:
     """Return the log's box flight, if it holds one."""
     if not {"roll", "pitch", "heading"} <= set(log.variables):
@@ -234,7 +234,7 @@ def _lines(log: xr.Dataset) -> tuple[IndexArray, BoolArray]:
     return line, np.char.upper(log["line_type"].to_numpy().astype(str)) == "TIE"
 
 
-def _channel_terms(log: xr.Dataset, names: Sequence[str]) -> tuple[Term, ...]:
+def _channel_terms(log: xr.Dataset, names: Sequence[str]) -> tuple[AlignmentTerm, ...]:
     """Return each channel's columns: its value, and times cosine and sine of the heading where that is known.
 
     A channel is centred and divided by its swing (2 to 98 %).
@@ -250,5 +250,5 @@ def _channel_terms(log: xr.Dataset, names: Sequence[str]) -> tuple[Term, ...]:
         if "heading" in log:
             angle = np.radians(log["heading"].to_numpy().astype(float))
             columns += [z * np.cos(angle), z * np.sin(angle)]
-        terms.append(Term(name, np.stack(columns, axis=1)))
+        terms.append(AlignmentTerm(name, np.stack(columns, axis=1)))
     return tuple(terms)

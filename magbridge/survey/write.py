@@ -70,9 +70,9 @@ def write_tracks(samples: Samples, path: Path) -> None:
 
 
 def write_crossovers(
-    found: Crossovers, samples: Samples, before: FloatArray, after: FloatArray, path: Path
+    found: Crossovers, samples: Samples, old_misties: FloatArray, new_misties: FloatArray, path: Path
 ) -> None:
-    """Write a row for each crossover: where, of which lines, its mis-ties (m,), nT, `before` and `after`."""
+    """Write a row for each crossover: place, lines, and its mis-ties (m,), nT, before and after."""
     latitude, longitude = offset(*samples.origin, found.place[:, 0], found.place[:, 1])
     lines: list[IndexArray] = [samples.line[found.first], samples.line[found.second]]
     heads = ["longitude", "latitude", "line", "crossed", "before [nT]", "after [nT]"]
@@ -80,8 +80,8 @@ def write_crossovers(
         longitude.round(7),
         latitude.round(7),
         *lines,
-        before.round(3),
-        after.round(3),
+        old_misties.round(3),
+        new_misties.round(3),
     ]
     _write_csv(path, heads, columns)
 

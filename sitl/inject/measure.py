@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from sitl.inject.catalogue import EFFECTS
-from sitl.inject.scene import Array, Effect, Hidden, Scene, furnish
+from sitl.inject.scene import Array, Effect, HiddenEffect, Scene, furnish
 from sitl.instrument import Samples, rotation
 from sitl.trajectory import Track
 from sitl.twin import Twin
@@ -22,7 +22,7 @@ FINER = 5
 """Factor by which the simulation's grid is refined if the instrument has a filter or channel delays."""
 
 
-def _between(scene: Scene) -> tuple[Array, Array, float]:
+def _interpolate(scene: Scene) -> tuple[Array, Array, float]:
     """Return field, water temperature and step on a finer grid.
 
     The Earth's part of the field turns with the vehicle and is interpolated by a spline, because a delayed
@@ -46,7 +46,7 @@ def _samples(scene: Scene, rng: np.random.Generator) -> Samples:
         scene.field = scene.field + turn.apply(scene.earth, inverse=True)
     field, water, step = scene.field, scene.water, track.step
     if scene.instrument.corner or any(scene.instrument.channel_delay):
-        field, water, step = _between(scene)
+        field, water, step = _interpolate(scene)
     samples = scene.instrument.measure(field, water, step, scene.when, rng)
     for bend in scene.bend:
         samples = replace(samples, channels=bend(samples.channels))
@@ -55,9 +55,9 @@ def _samples(scene: Scene, rng: np.random.Generator) -> Samples:
 
 def disturb(
     twin: Twin,
-    hidden: tuple[Hidden, ...],
+    hidden: tuple[HiddenEffect, ...],
     track: Track,
-    when: Array,
+    time: Array,
     seed: int = 0,
     effects: Mapping[str, Effect] = EFFECTS,
 ) -> xr.Dataset:
@@ -71,7 +71,7 @@ def disturb(
         By their names in `effects`.
     track : Track
         As :meth:`~sitl.twin.Twin.fly` returns it.
-    when : array (m,)
+    time : array (m,)
         s after the track's start; a few seconds short of its end.
     seed : int
         Of the telemetry that has nothing to do with the effects.
@@ -87,21 +87,21 @@ def disturb(
     ambient = twin.ambient(track)
     scene = Scene(
         track,
-        when,
+        time,
         field=ambient.field,
         earth=np.zeros_like(ambient.field),
         water=ambient.water,
         instrument=twin.scenario.instrument,
-        reference=np.zeros(len(when)),
+        reference=np.zeros(len(time)),
     )
     furnish(scene, np.random.default_rng([seed, 77]))
     for one in hidden:
         effects[one.name](scene, one.size, np.random.default_rng([one.seed, 78]))
-    out = twin.log(track, when, ambient.earth, _samples(scene, twin.instrument_rng()))
+    out = twin.log(track, time, ambient.earth, _samples(scene, twin.instrument_rng()))
     if "reference_field" in out:  # `reference` is by how much the true field exceeds it
         known = out["reference_field"]
         out["reference_field"] = "time", known.to_numpy() - scene.reference, known.attrs
-    seen = np.clip(when - scene.late, 0.0, None)
+    seen = np.clip(time - scene.late, 0.0, None)
     logged = dict(scene.logged)
     if scene.late:
         logged |= {name: (values, out[name].attrs["units"]) for name, values in track.parameters.items()}

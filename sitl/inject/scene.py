@@ -14,7 +14,17 @@ from sitl.instrument import Instrument
 from sitl.signals import autoregressive, first_order
 from sitl.trajectory import Track
 
-__all__ = ["Array", "Effect", "Generator", "Hidden", "Scene", "direction", "furnish", "relays", "soaked"]
+__all__ = [
+    "Array",
+    "Effect",
+    "Generator",
+    "HiddenEffect",
+    "Scene",
+    "direction",
+    "furnish",
+    "relays",
+    "soaked",
+]
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
@@ -62,7 +72,7 @@ class Scene:
 Effect = Callable[[Scene, float, Generator], None]
 
 
-class Hidden(msgspec.Struct, frozen=True):
+class HiddenEffect(msgspec.Struct, frozen=True):
     """One hidden effect: its name, as in :data:`~.catalogue.EFFECTS`, size, seed."""
 
     name: str

@@ -19,7 +19,7 @@ def ionosphere(scene: Scene, size: float, rng: Generator) -> None:
 
 def bad_map(scene: Scene, size: float, rng: Generator) -> None:
     """The map lacks some bodies: bumps a kilometre or so across; size in nT."""
-    seen = scene.track.at(scene.when)
+    seen = scene.track.pose_at(scene.when)
     north, east = scene.track.local(seen["latitude"], seen["longitude"])
     width = 0.35 * max(np.ptp(north), np.ptp(east))
     for _ in range(3):

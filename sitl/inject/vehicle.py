@@ -37,12 +37,12 @@ def magnet_on_fin(scene: Scene, size: float, rng: Generator) -> None:
     arm, m = np.array([0.08, 0.0, 0.0]), direction(rng)
     place = np.array([-0.5, 0.1, 0.1]) + 0.1 * rng.normal(size=3)
 
-    def own(angle: Array) -> Array:
+    def own_columns(angle: Array) -> Array:
         turn = rotation(0.0, 0.0, np.degrees(angle))
         return dipole_field(-(place + turn.apply(arm)), turn.apply(m))
 
-    low, middle, high = own(np.array([-FIN, 0.0, FIN]))
-    moved = own(np.radians(scene.logged["p17"][0])) - middle
+    low, middle, high = own_columns(np.array([-FIN, 0.0, FIN]))
+    moved = own_columns(np.radians(scene.logged["p17"][0])) - middle
     scene.field = scene.field + size * moved / (0.5 * float(np.linalg.norm(high - low)))
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from magbridge.bridge.drive import drive, set_up
-from magbridge.bridge.events import Event, Start, port_number
+from magbridge.bridge.events import Event, StartEvent, port_number
 from magbridge.bridge.links import open_link
 from magbridge.bridge.port import Port
 from magbridge.bridge.serial_port import SerialPort
@@ -41,10 +41,10 @@ class ScriptedEdge:
         self._unread = {number: bytearray() for number in ports}
         self._unsent = bytearray()
 
-    def start(self) -> Start:
+    def start(self) -> StartEvent:
         """Return the start that the timetable begins with."""
         *_, data = next(self._entries)
-        return msgspec.json.decode(data, type=Start)
+        return msgspec.json.decode(data, type=StartEvent)
 
     def events(self, _deadline: Callable[[], int]) -> Iterator[Event]:
         """Yield the events of the timetable; the bytes come through the ports."""

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.errors import FormatError
 from magbridge.link.component import TIMESYNC_US
-from magbridge.mavlink import FrameLogReader, LogReader, Record, Stream, spec
+from magbridge.mavlink import FrameLogReader, LogReader, Stream, TlogRecord, spec
 from magbridge.records import Channel
 
 __all__ = ["Recorded", "is_own_log", "runs"]
@@ -94,9 +94,9 @@ class Recorded:
         late_us = first.time_us - first.message["time_usec"]
         self.late = late_us * 1e-6
         start_us = first.time_us - late_us % TIMESYNC_US
-        self.start = Start(start_us, parameters, first.message["signing_timestamp"], streams)
+        self.start = StartEvent(start_us, parameters, first.message["signing_timestamp"], streams)
 
-    def _records(self) -> Iterator[Record]:
+    def _records(self) -> Iterator[TlogRecord]:
         for path in self._paths:
             with path.open("rb") as file:
                 reader = LogReader(file)
@@ -119,7 +119,7 @@ class Recorded:
         # timers that fired after the last input
         yield Event(max(time_us, self._last_us), Channel.STATE, b"")
 
-    def _went_out(self, record: Record) -> bool:
+    def _went_out(self, record: TlogRecord) -> bool:
         self._last_us = record.time_us
         if record.channel != Channel.SENT:
             return False
@@ -128,18 +128,18 @@ class Recorded:
         return True
 
 
-def _event_key(record: Record) -> tuple[int, int, int]:
+def _event_key(record: TlogRecord) -> tuple[int, int, int]:
     """Return time (µs), channel and sensor id of the event that a record belongs to."""
     sensor_id = record.message["sensor_id"] if record.channel == Channel.SENSOR else 0
     return record.time_us, record.channel, sensor_id
 
 
-def _is_event(record: Record) -> bool:
+def _is_event(record: TlogRecord) -> bool:
     """Return whether a record is an input; other records may lie between two pieces that came together."""
     return record.channel != Channel.STATE or record.message.id not in NOT_EVENTS
 
 
-def _sensor_bytes(records: Iterable[Record]) -> bytes:
+def _sensor_bytes(records: Iterable[TlogRecord]) -> bytes:
     """Return the bytes that came at one time; the log may hold them in several records."""
     messages = (record.message for record in records)
     return b"".join(message["data"][: message["length"]] for message in messages)

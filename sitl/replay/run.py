@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from magbridge.arrays import FloatArray, IndexArray
-from magbridge.bridge.events import Start
+from magbridge.bridge.events import StartEvent
 from magbridge.columns import CHANNELS
 from magbridge.config import load
 from magbridge.errors import DataError, WrongUse
@@ -131,12 +131,14 @@ def _received(stream: bytearray) -> dict[str, FloatArray]:
     return listener.field()
 
 
-def _first_difference(one: bytearray, other: bytearray) -> int | None:
+def _first_difference(first: bytearray, second: bytearray) -> int | None:
     """Return the first byte at which two streams differ; None where they do not."""
-    if one == other:
+    if first == second:
         return None
-    size = min(len(one), len(other))
-    different = np.flatnonzero(np.frombuffer(one[:size], np.uint8) != np.frombuffer(other[:size], np.uint8))
+    size = min(len(first), len(second))
+    different = np.flatnonzero(
+        np.frombuffer(first[:size], np.uint8) != np.frombuffer(second[:size], np.uint8)
+    )
     return int(different[0]) if len(different) else size
 
 
@@ -150,7 +152,7 @@ def _play(
     stage = Stage(config, listener.receive, log)
     begun = time.monotonic()
     events = track(emulate(deployment, load(config)), "replaying")
-    stage.play(Start(start_us(deployment)), events, speed)
+    stage.play(StartEvent(start_us(deployment)), events, speed)
     seconds = time.monotonic() - begun
     field = listener.field()
     if not len(field["time"]):

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import msgspec
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.config import load
 from magbridge.errors import MagbridgeError, PortError, WrongUse
 from magbridge.records import Channel
@@ -117,7 +117,7 @@ class Stage:
             return WrongUse(words)
         return PortError("replay", words or otherwise or f"the bridge ended with {self._bridge.returncode}")
 
-    def play(self, start: Start, events: Iterable[Event], speed: float = float("inf")) -> None:
+    def play(self, start: StartEvent, events: Iterable[Event], speed: float = float("inf")) -> None:
         """Play events in order, and wait until the bridge has dealt with all of them.
 
         Parameters
@@ -144,7 +144,7 @@ class Stage:
         finally:
             self._opened.close()
 
-    def _send(self, start: Start, events: Iterable[Event], speed: float) -> None:
+    def _send(self, start: StartEvent, events: Iterable[Event], speed: float) -> None:
         times = self._times_due
         begin = msgspec.json.encode(start)
         times += Entry.pack(start.time_us | Channel.STATE, len(begin), 0) + begin

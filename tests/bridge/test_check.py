@@ -15,7 +15,7 @@ from magbridge.bridge import live_check
 from magbridge.bridge.check import findings
 from magbridge.bridge.live_check import Arrived, LiveCheck
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Calibration, Parameter, Sensor, identity
+from magbridge.calibration.model import CalibratedSensor, Calibration, Parameter, identity
 from magbridge.calibration.terms import Polynomial
 from magbridge.cli import main
 from magbridge.config import load
@@ -44,7 +44,7 @@ def of(*names: str) -> Calibration:
     """Return a calibration that needs these parameters, in inches."""
     parameters = tuple(Parameter(name, "in", -1.0, 1.0, 0.0, 1.0) for name in names)
     terms = (Polynomial(exponents=((0,) * len(names),)),)
-    return replace(identity(), sensor=Sensor("hmr2300"), parameters=parameters, terms=terms)
+    return replace(identity(), sensor=CalibratedSensor("hmr2300"), parameters=parameters, terms=terms)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from small import START, small_bridge
 
 from magbridge import logs
 from magbridge.bridge import states
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import load as load_calibration
 from magbridge.calibration.model import Parameter
 from magbridge.cli import main
@@ -33,7 +33,7 @@ def test_what_was_set_in_the_course_of_the_log_is_reported(
     tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Neither refused values nor the rate of a message are corrected again."""
-    pipeline = small_bridge(tmp_path, Start(START), BATTERY, ["MAG_FIELD"])
+    pipeline = small_bridge(tmp_path, StartEvent(START), BATTERY, ["MAG_FIELD"])
     station = Codec(1, 1)
     log, out = tmp_path / f"converted.{suffix}", tmp_path / "out.nc"
     asked = {10: ("MB_SETTLE_TIME", 4.0), 20: ("MB_SETTLE_TIME", -1.0), 30: ("MB_R_HIGHRES_IMU", 1.0)}
@@ -56,7 +56,7 @@ def test_what_was_set_in_the_course_of_the_log_is_reported(
 def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, precision: float) -> None:
     """Telemetry comes every few seconds, once not for a minute, once as not known."""
     rng = np.random.default_rng(1)
-    pipeline = small_bridge(tmp_path, Start(START, KEPT), BATTERY, ["MAG_FIELD"])
+    pipeline = small_bridge(tmp_path, StartEvent(START, KEPT), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
     with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for k in range(400):
@@ -86,7 +86,7 @@ def test_flags_and_sigmas_are_those_of_the_bridge(tmp_path: Path, suffix: str, p
 
 def test_what_a_bridge_has_flagged_as_late_stays_so(tmp_path: Path) -> None:
     """The rows of a log do not tell that the bridge stood still for 5 s, while the mass moved."""
-    pipeline = small_bridge(tmp_path, Start(START), BATTERY, ["MAG_FIELD"])
+    pipeline = small_bridge(tmp_path, StartEvent(START), BATTERY, ["MAG_FIELD"])
     autopilot = Codec(1, 1)
     with closing(TlogWriter(tmp_path / "logs", header=pipeline.declarations)) as log:
         for k in range(20):

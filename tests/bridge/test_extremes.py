@@ -9,7 +9,7 @@ import pytest
 from extremes import events, feed, make_bridge
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.file_server import FileServer
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.position import Position
@@ -51,7 +51,7 @@ def parsed(frame: bytes) -> Message:
 def test_a_position_that_is_unknown_or_impossible_is_ignored(place: tuple[int, int]) -> None:
     position = Position(print)
     position.update(parsed(global_position(lat=place[0], lon=place[1])), START)
-    assert position.where is None
+    assert position.last_position is None
     assert isnan(position.main_field(START, START))
 
 
@@ -68,7 +68,9 @@ def test_a_jump_gives_no_main_field_until_the_vehicle_is_back() -> None:
 
 
 def bridge_of(folder: Path) -> Pipeline:
-    return small_bridge(folder, Start(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"])
+    return small_bridge(
+        folder, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"]
+    )
 
 
 def sent(bridge: Pipeline, second: int) -> list[Message]:

@@ -13,7 +13,7 @@ from referee.receiver import Receiver, carried_off, frozen, honest, jammed, jump
 from vehicle import Bench
 
 from magbridge.navigate.gnss import GnssState
-from magbridge.navigate.record import State
+from magbridge.navigate.record import NavigationState
 
 BEGIN, END = 180.0, 420.0
 """s: GPS is wrong or absent between these times, of a flight of 9 minutes."""
@@ -101,7 +101,7 @@ def test_an_hour_without_gps_with_turns_at_stock_rates() -> None:
     hour = window(run, lost, back)
     assert np.percentile(run.error[hour], 90) <= 50.0
     far = hour & (run.error > 200.0)
-    assert (run.state[far] == State.LOST).all()
+    assert (run.state[far] == NavigationState.LOST).all()
     standardised = np.sqrt(np.mean(run.error[hour] ** 2 / 2.0 / run.sigma[hour] ** 2))
     assert standardised <= 1.25
     assert run.sent[run.seconds == lost + 10.0] > 0, "the first fix comes within 10 s"

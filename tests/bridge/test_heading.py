@@ -19,7 +19,7 @@ from small import bridge_text
 
 from magbridge.bridge.check import findings
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Boresight, Calibration, Noise, Reference
@@ -109,7 +109,7 @@ def level_flight(stack: int = ARDUPILOT, seconds: int = 3) -> list[Event]:
 
 
 def test_heading_of_the_corrected_field_whatever_the_autopilots_yaw(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), Start(START))
+    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
     messages = fly(bridge, level_flight())
     field = last(messages, "MAG_FIELD")
     declination = degrees(atan2(MAIN[1], MAIN[0]))
@@ -122,7 +122,7 @@ def test_heading_of_the_corrected_field_whatever_the_autopilots_yaw(tmp_path: Pa
 
 
 def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path, "tilt_sigma = 0.5")), Start(START))
+    bridge = set_up(load(write_bridge(tmp_path, "tilt_sigma = 0.5")), StartEvent(START))
     rng, ratios = np.random.default_rng(4), []
     fly(bridge, begin())
     for tenth in range(400):
@@ -137,7 +137,7 @@ def test_heading_sigma_covers_errors_of_tilt(tmp_path: Path) -> None:
 
 
 def test_no_heading_without_attitude_or_with_an_old_one(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), Start(START))
+    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
     field = last(fly(bridge, [*begin(), sample(START + 100_000, body_field())]), "MAG_FIELD")
     assert field["heading_sigma"] == 0.0
     known = last(fly(bridge, [attitude(START + 150_000), sample(START + 200_000, body_field())]), "MAG_FIELD")
@@ -147,7 +147,7 @@ def test_no_heading_without_attitude_or_with_an_old_one(tmp_path: Path) -> None:
 
 
 def test_a_turning_vehicle_is_levelled_at_the_time_of_the_sample(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), Start(START))
+    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
     fly(bridge, level_flight())
     rate, late = radians(30.0), 0.2
     events = [attitude(START + 4_000_000, rollspeed=rate)]
@@ -158,7 +158,7 @@ def test_a_turning_vehicle_is_levelled_at_the_time_of_the_sample(tmp_path: Path)
 
 
 def test_magnetic_heading_alone_where_the_position_is_unknown(tmp_path: Path) -> None:
-    bridge = set_up(load(write_bridge(tmp_path)), Start(START))
+    bridge = set_up(load(write_bridge(tmp_path)), StartEvent(START))
     field = last(fly(bridge, level_flight()[1:]), "MAG_FIELD")
     assert field["heading"] != field["heading"]
     assert field["magnetic_heading"] == pytest.approx(130.0 - degrees(atan2(MAIN[1], MAIN[0])), abs=0.05)
@@ -168,7 +168,7 @@ def test_magnetic_heading_alone_where_the_position_is_unknown(tmp_path: Path) ->
 @pytest.mark.parametrize("send", ["odometry", "vision_position_estimate"])
 def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stack: int) -> None:
     """ArduPilot: GCS_Common.cpp, cbrt of the sum of squares; PX4: mavlink_receiver.cpp, entry 20."""
-    bridge = set_up(load(write_bridge(tmp_path, f'send = "{send}"')), Start(START))
+    bridge = set_up(load(write_bridge(tmp_path, f'send = "{send}"')), StartEvent(START))
     messages = fly(bridge, level_flight(stack))
     message, sigma = last(messages, send.upper()), radians(last(messages, "MAG_FIELD")["heading_sigma"])
     is_odometry = send == "odometry"
@@ -192,7 +192,7 @@ def test_autopilots_read_the_sigma_that_was_sent(tmp_path: Path, send: str, stac
 
 def test_nothing_goes_to_the_autopilot_without_boresight(tmp_path: Path) -> None:
     path = write_bridge(tmp_path, 'send = "odometry"', boresight=False)
-    messages = fly(set_up(load(path), Start(START)), level_flight())
+    messages = fly(set_up(load(path), StartEvent(START)), level_flight())
     assert not any(one.name == "ODOMETRY" for one in messages)
     assert any("no boresight: no heading is sent" in one.text for one in findings(path))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from small import START, small_bridge
 
-from magbridge.bridge.events import Start
+from magbridge.bridge.events import StartEvent
 from magbridge.bridge.keeper import SAVE_US, Keeper
 from magbridge.calibration.model import Parameter
 from magbridge.config import load
@@ -14,7 +14,7 @@ from magbridge.link.store import load as kept
 
 
 def test_a_flood_of_parameters_is_kept_once_a_second(tmp_path: Path) -> None:
-    pipeline = small_bridge(tmp_path, Start(START), Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5), [])
+    pipeline = small_bridge(tmp_path, StartEvent(START), Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5), [])
     keeper, file = Keeper(load(tmp_path / "bridge.toml")), tmp_path / "bridge.parameters.json"
     values = [2.0 + 0.125 * k for k in range(10)]
     on_disk = []

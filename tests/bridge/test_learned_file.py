@@ -11,7 +11,7 @@ import pytest
 from disks import full_disk
 from turning import bridge, events, named, received
 
-from magbridge.bridge.learning import Learning, keep, kept_path
+from magbridge.bridge.learning import LearningService, keep, kept_path
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import calibration_id, load
 from magbridge.config import load as load_config
@@ -29,7 +29,7 @@ learned = load(sys.argv[1])
 Path.write_bytes = half
 save(learned, sys.argv[2])
 """
-Flown = tuple[Path, Pipeline, Learning]
+Flown = tuple[Path, Pipeline, LearningService]
 
 
 @pytest.fixture

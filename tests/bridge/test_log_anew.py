@@ -10,7 +10,7 @@ from pathlib import Path
 
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.log_header import declarations
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.model import Parameter
@@ -24,7 +24,7 @@ from sitl.replay.summary import summary
 BOOT = START - 77_000_000
 
 
-def bridge(folder: Path, start: Start) -> Pipeline:
+def bridge(folder: Path, start: StartEvent) -> Pipeline:
     return small_bridge(folder, start, Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"])
 
 
@@ -47,7 +47,7 @@ def events(pipeline: Pipeline, begin: int, end: int) -> Iterator[Event]:
 
 
 def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> None:
-    pipeline = bridge(tmp_path, Start(START, {"MB_GAP_FACTOR": 2.0}))
+    pipeline = bridge(tmp_path, StartEvent(START, {"MB_GAP_FACTOR": 2.0}))
     folder, aside = tmp_path / "logs", tmp_path / "aside"
     now = {"MB_GAP_FACTOR": 3.0}
     with closing(TlogWriter(folder, beginning=pipeline.beginning(now), max_size=0.05)) as log:
@@ -91,7 +91,7 @@ def test_a_log_after_a_loss_is_replayed_as_far_as_it_can_be(tmp_path: Path) -> N
 
 def test_a_file_may_end_in_the_middle_of_what_came_at_once(tmp_path: Path) -> None:
     """As after a bridge stood still: the sensor's bytes of a second, in one read, are many records."""
-    pipeline = bridge(tmp_path, Start(START))
+    pipeline = bridge(tmp_path, StartEvent(START))
     fed = list(events(pipeline, 0, 60))
     lines = b"".join(event.data for event in fed if event.channel == Channel.SENSOR)
     header = declarations(1, 191, pipeline._config.telemetry, 0.0)

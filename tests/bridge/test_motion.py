@@ -9,7 +9,7 @@ import pytest
 from passages import PLACE
 from vehicle import ARDUPILOT, PX4, Bench
 
-from magbridge.bridge.motion import Source, rotate
+from magbridge.bridge.motion import MotionSource, rotate
 from magbridge.field.geodesy import separation
 
 
@@ -26,7 +26,7 @@ def moved(bench: Bench) -> tuple[float, float]:
     return separation(*PLACE, *bench.navigation.navigator.reckoned(bench.now_us))
 
 
-def source(bench: Bench) -> Source:
+def source(bench: Bench) -> MotionSource:
     return bench.navigation.motion.source
 
 
@@ -41,7 +41,7 @@ def test_speed_is_preferred_to_the_autopilots_position() -> None:
         local(bench, k, 50.0 * k, vx=50.0)
         bench.receive("ATTITUDE", yaw=np.pi / 2)
         bench.receive("VFR_HUD", airspeed=2.0)
-    assert source(bench) is Source.SPEED
+    assert source(bench) is MotionSource.SPEED
     assert moved(bench) == pytest.approx((0.0, 18.0), abs=1.0)
 
 
@@ -50,13 +50,13 @@ def test_the_autopilots_position_until_a_fix_is_sent_then_the_last_speed() -> No
     for k in range(1, 11):
         local(bench, k, float(k))
         bench.receive("ATTITUDE", yaw=0.0)
-    assert source(bench) is Source.TRACK
+    assert source(bench) is MotionSource.TRACK
     assert moved(bench)[0] == pytest.approx(9.0, abs=0.1)
     bench.fix()
     for k in range(11, 21):
         local(bench, k, 40.0 * k, vx=40.0)  # the fix comes back
         bench.receive("ATTITUDE", yaw=0.0)
-    assert source(bench) is Source.LAST
+    assert source(bench) is MotionSource.LAST
     assert moved(bench)[0] == pytest.approx(18.0, abs=1.5)
     assert bench.texts_with("dead reckoning by") == [
         "dead reckoning by the autopilot's position",
@@ -69,7 +69,7 @@ def test_a_reset_leaves_ardupilots_velocity_alone() -> None:
     for k in range(1, 11):
         local(bench, k, float(k) + 100.0 * (k > 5))
         bench.fix()
-    assert source(bench) is Source.TRACK
+    assert source(bench) is MotionSource.TRACK
     assert moved(bench)[0] == pytest.approx(9.0, abs=0.1)
 
 
@@ -93,7 +93,7 @@ def test_the_position_of_another_component_stays() -> None:
         )
         bench.receive("LOCAL_POSITION_NED", x=500.0 * k, vx=500.0)
         bench.fix()
-    assert source(bench) is Source.OTHER
+    assert source(bench) is MotionSource.OTHER
     assert moved(bench)[0] == pytest.approx(18.0, abs=0.1)
 
 
@@ -133,14 +133,14 @@ def test_speed_that_ends_is_not_followed_for_ever() -> None:
         bench.to(k)
         bench.receive("ATTITUDE", yaw=0.0)
         bench.receive("VFR_HUD", airspeed=0.0)  # not measured
-    assert source(bench) is Source.LAST
+    assert source(bench) is MotionSource.LAST
     assert moved(bench)[0] == pytest.approx(1.5 * 59, abs=3.0)
 
 
 def test_without_any_motion_no_fix_is_sent() -> None:
     bench = made()
     bench.receive("GLOBAL_POSITION_INT", alt=-1000)
-    assert source(bench) is Source.NONE
+    assert source(bench) is MotionSource.NONE
 
 
 def test_depth_counts_from_the_sea_on_high_ground() -> None:
@@ -163,11 +163,11 @@ def test_an_airspeed_that_is_the_speed_over_ground_is_not_used() -> None:
         bench.receive("GPS_RAW_INT", fix_type=1, vel=331)
         bench.receive("VFR_HUD", airspeed=3.3125, groundspeed=3.2)
         bench.receive("VFR_HUD", airspeed=3.2, groundspeed=3.2)
-    assert source(bench) is Source.NONE
+    assert source(bench) is MotionSource.NONE
     bench.to(12)
     assert bench.texts_with("airspeed") == ["VFR_HUD.airspeed is the speed over ground: not used"]
     bench.receive("VFR_HUD", airspeed=2.9, groundspeed=3.2)
-    assert source(bench) is Source.SPEED
+    assert source(bench) is MotionSource.SPEED
 
 
 @pytest.mark.parametrize(
@@ -178,10 +178,10 @@ def test_a_velocity_that_the_autopilot_does_not_vouch_for_is_not_used(report: st
     bench = made()
     bench.receive(report, flags=flags)
     local(bench, 1, 1.0)
-    assert source(bench) is Source.NONE
+    assert source(bench) is MotionSource.NONE
     bench.receive(report, flags=1 | 2 | 8)
     local(bench, 2, 2.0)
-    assert source(bench) is Source.TRACK
+    assert source(bench) is MotionSource.TRACK
 
 
 def test_a_turn_between_two_reports_is_averaged_and_uncertain() -> None:

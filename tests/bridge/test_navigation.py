@@ -16,7 +16,7 @@ import pytest
 from small import bridge_text
 
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
@@ -105,7 +105,7 @@ def glide(grid: AnomalyGrid) -> Iterator[Event]:
 def bridge(folder: Path, fix: str) -> Pipeline:
     path = folder / f"{fix}.toml"
     path.write_text(CONFIG.replace("FIX", fix))
-    return set_up(load(path), Start(START))
+    return set_up(load(path), StartEvent(START))
 
 
 def feed(pipeline: Pipeline, given: Iterable[Event]) -> list[tuple[int, bytes]]:
@@ -240,4 +240,4 @@ def test_a_wrong_key_is_one_line(folder: Path, tmp_path: Path, old: str, new: st
     path = folder / f"{tmp_path.name}.toml"
     path.write_text(CONFIG.replace(old, new).replace('"FIX"', '"ODOMETRY"'))
     with pytest.raises(ConfigError, match=re.escape(line)):
-        set_up(load(path), Start(START))
+        set_up(load(path), StartEvent(START))

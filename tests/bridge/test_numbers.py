@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from small import START, small_bridge
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.states import clock_step
 from magbridge.calibration.model import Parameter
@@ -25,7 +25,7 @@ TELEMETRY = (-9999.0, 65535.0, 1e9, 1e15, 3.4e38, -3.4e38, nan, inf)
 def pipeline(tmp_path: Path) -> Pipeline:
     battery = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
     published = ["MAG_RAW", "MAG_FIELD", "HIGHRES_IMU", "NAMED_VALUE_FLOAT", "DEBUG_VECT"]
-    return small_bridge(tmp_path, Start(START), battery, published)
+    return small_bridge(tmp_path, StartEvent(START), battery, published)
 
 
 @pytest.mark.parametrize("column", range(6))
@@ -68,7 +68,7 @@ def test_of_a_host_whose_clock_was_never_set(tmp_path: Path) -> None:
     """It begins at 1970, where a filter's delay leads to before it: one line, and no main field."""
     battery = Parameter("battpos", "", -0.4, 0.6, 0.1, 0.5)
     published = ["MAG_RAW", "MAG_FIELD", "HIGHRES_IMU", "DEBUG_VECT"]
-    pipeline = small_bridge(tmp_path, Start(0), battery, published)
+    pipeline = small_bridge(tmp_path, StartEvent(0), battery, published)
     settings = Align(filter_delay=0.5)
     pipeline._correction.aligner.tune(settings, {})
     autopilot = Codec(1, 1)

@@ -68,7 +68,7 @@ def test_a_header_swallows_nothing_of_another_peer() -> None:
             wrong_device.sendto(header(20 + k), place)
             autopilot.sendto(beat(), place)
             while select.select(port.fds(), [], [], 0.02)[0]:
-                received += bridge.parse(port.read(), whole=True)
+                received += bridge.parse(port.read(), final=True)
     assert [one.name for one in received].count("HEARTBEAT") == 30
 
 
@@ -81,7 +81,7 @@ def test_frames_come_first_and_a_frame_in_pieces_is_whole() -> None:
     data = both.drain()
     assert data.startswith(frame * 2)
     assert len(data) == 2 * len(frame) + 4096
-    messages = Codec(1, 191).parse(data, whole=True)
+    messages = Codec(1, 191).parse(data, final=True)
     assert [one.name for one in messages[:2]] == ["HEARTBEAT"] * 2
     assert b"".join(one.frame for one in messages) == data
     assert both.drain() == b""
@@ -160,7 +160,7 @@ def test_a_flood_costs_its_sender_not_the_autopilot() -> None:
         both.receive("station", beat(190, 255) * 20)
     for _ in range(1000):
         both.receive("autopilot", beat())
-    frames = [one for one in Codec(1, 191).parse(both.drain(), whole=True) if one.known]
+    frames = [one for one in Codec(1, 191).parse(both.drain(), final=True) if one.known]
     assert sum(one.component == 1 for one in frames) == 1000
     assert sum(one.component == 190 for one in frames) <= PEER_READ_BYTES / len(beat())
     assert both.ignored > 10 * MAX_PARSED_PEERS * 900

@@ -184,7 +184,7 @@ def test_what_waits_for_a_slow_reader(key: bytes | None) -> None:
 def test_a_backlog_of_a_line_is_read_at_once() -> None:
     """Without a clock only the last reading of a backlog tells when it was sent: none is missing."""
     driver = open_driver("ascii", {"columns": ["x", "y", "z"], "rate": 100.0})
-    clock = DeviceClock.of(driver)
+    clock = DeviceClock.for_driver(driver)
     master, slave = pty.openpty()
     tty.setraw(slave)
     port = SerialPort(os.ttyname(slave), 9600)

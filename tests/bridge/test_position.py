@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from small import small_bridge
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.position import Position
 from magbridge.bridge.states import clock_step
 from magbridge.calibration.model import Parameter
@@ -61,7 +61,7 @@ def test_the_field_is_that_of_the_day_to_which_the_clock_was_set() -> None:
 
 def test_the_anomaly_follows_when_the_host_s_clock_is_set(tmp_path: Path) -> None:
     bridge = small_bridge(
-        tmp_path, Start(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"]
+        tmp_path, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_FIELD"]
     )
     place = {"lat": 495_000_000, "lon": -579_000_000}
     bridge.feed(Event(START, Channel.LINK, Codec(1, 1).pack("GLOBAL_POSITION_INT", **place)))

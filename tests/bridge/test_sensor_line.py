@@ -8,7 +8,7 @@ import pytest
 from small import START, small_bridge
 
 from magbridge.bridge import states
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.model import Parameter
@@ -25,7 +25,7 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.bridge: Pipeline = small_bridge(
-            folder, Start(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_RAW"]
+            folder, StartEvent(START), Parameter("battpos", "", -1.0, 1.0, 0.0, 1.0), ["MAG_RAW"]
         )
         self._ear = Codec(0, 0)
         self.raw: list[float] = []

@@ -15,7 +15,7 @@ from devices import TRUTH
 from rig import OPTIONS, Rig, calibration
 
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Sensor
+from magbridge.calibration.model import CalibratedSensor
 from magbridge.records import Quality
 
 SLOPE = np.array([300.0, -200.0, 100.0])
@@ -37,7 +37,7 @@ def test_a_standstill_just_before_a_mass_moves(
     make_rig: Callable[..., Rig], table: Row, sensor: tuple[str, str], answers: bool, still: float
 ) -> None:
     rig = make_rig(sensor=sensor, hz=4.0)
-    moved = replace(calibration(tuple(SLOPE.tolist())), sensor=Sensor(sensor[0]))
+    moved = replace(calibration(tuple(SLOPE.tolist())), sensor=CalibratedSensor(sensor[0]))
     save(moved, rig.folder / "cal.json")
     moves = [np.inf]
 

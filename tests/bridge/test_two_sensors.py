@@ -17,9 +17,9 @@ from devices import open_line
 from magbridge.bridge import states
 from magbridge.bridge.check import findings
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, Start, port_number
+from magbridge.bridge.events import Event, StartEvent, port_number
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Boresight, Calibration, Noise, Reference, Sensor
+from magbridge.calibration.model import Boresight, CalibratedSensor, Calibration, Noise, Reference
 from magbridge.calibration.scalar import (
     PLATFORM_TERMS,
     ScalarNoise,
@@ -94,7 +94,7 @@ def calibration(*sensors: ScalarSensor) -> Calibration:
         covariance=np.eye(9),
         noise=Noise(1.0),
         reference=Reference(FIELD_NT),
-        sensor=Sensor("ascii"),
+        sensor=CalibratedSensor("ascii"),
         boresight=Boresight((0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6))),
         method="made for a test",
         sensors=sensors,
@@ -109,7 +109,7 @@ class Bench:
         save(calibration(), folder / "other.json")
         self.config = folder / "bridge.toml"
         self.config.write_text(CONFIG.format(name=name, columns=columns, settings=settings), encoding="utf-8")
-        self.bridge = set_up(load(self.config), Start(START))
+        self.bridge = set_up(load(self.config), StartEvent(START))
         self.messages: list[Message] = []
         self._ear = Codec(0, 0)
         for sensor_id in (0, 1):
@@ -223,7 +223,7 @@ def test_a_scalar_alone_needs_no_calibration(tmp_path: Path) -> None:
     )
     path.write_text(text, encoding="utf-8")
     assert [fault for fault in findings(path) if fault.fatal] == []
-    bridge = set_up(load(path), Start(START))
+    bridge = set_up(load(path), StartEvent(START))
     ear, messages = Codec(0, 0), []
     for k in range(20):
         event = Event(START + k * 1_000_000, Channel.SENSOR, b"%.4f\n" % (50_000.1234 + 0.1 * (k % 3)))

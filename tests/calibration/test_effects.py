@@ -18,7 +18,7 @@ from magbridge.calibration.effects import (
 )
 from magbridge.calibration.instrument_effects import RateEffect, ResponseEffect, TimeEffect
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import MAX_ORDER, TERMS, Effect, Polynomial, Series, term_class
+from magbridge.calibration.terms import MAX_ORDER, TERMS, Effect, LogSeries, Polynomial, term_class
 from magbridge.errors import CalibrationError
 from magbridge.estimation.residual import symmetric
 
@@ -49,7 +49,7 @@ def stepped(
     if values is not None:
         channels[cal.channels[-1]] = values
     field = np.full((n, 3), 3e4) if field is None else field
-    series = Series(START + time, field, channels, cal.kernel)
+    series = LogSeries(START + time, field, channels, cal.kernel)
     one_by_one = Effect.batch(effect, series)
     np.testing.assert_allclose(effect.batch(series), one_by_one, rtol=1e-6, atol=1e-9)
     return one_by_one.T

@@ -27,12 +27,12 @@ from magbridge.calibration.file import (
 )
 from magbridge.calibration.model import (
     Boresight,
+    CalibratedSensor,
     Calibration,
     Noise,
     Parameter,
     Reference,
     Run,
-    Sensor,
     identity,
 )
 from magbridge.calibration.paper import facts, to_paper
@@ -55,7 +55,7 @@ def cal() -> Calibration:
         covariance=root @ root.T,
         noise=Noise(1.0, 0.0, 0.3, 4.0),
         reference=Reference(51_000.0, "IGRF"),
-        sensor=Sensor("digitizer", 3),
+        sensor=CalibratedSensor("digitizer", 3),
         boresight=Boresight((0.0, 0.1, 0.2), ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-4))),
         runs=(Run("1", 225, 1.1, (0.3,)),),
         method="auto",

@@ -25,7 +25,7 @@ from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.noise import Whitening, estimate_noise, fit_slow_and_white, whiten
 from magbridge.estimation.optimise import normal_equations
 from magbridge.estimation.priors import polynomial_prior
-from magbridge.estimation.residual import Samples, residuals
+from magbridge.estimation.residual import ResidualSamples, residuals
 
 
 def survey_error(calibration: Calibration, glider: Glider) -> tuple[float, float]:
@@ -50,10 +50,10 @@ def rms_on_survey(calibration: Calibration, glider: Glider) -> float:
 
 
 @pytest.fixture
-def some_samples() -> Samples:
+def some_samples() -> ResidualSamples:
     rng = np.random.default_rng(1)
     n = 60
-    return Samples(
+    return ResidualSamples(
         rng.normal(size=(n, 3)) * 3e4,
         np.full(n, 5e4),
         rng.normal(size=(n, 3)),
@@ -63,7 +63,7 @@ def some_samples() -> Samples:
     )
 
 
-def test_jacobian_is_the_derivative(some_samples: Samples) -> None:
+def test_jacobian_is_the_derivative(some_samples: ResidualSamples) -> None:
     c = np.random.default_rng(2).normal(size=27) * 2000.0
     _, g = residuals(some_samples, c)
     J = (some_samples.phi[:, :, None] * g[:, None, :]).reshape(len(g), -1)
@@ -75,7 +75,7 @@ def test_jacobian_is_the_derivative(some_samples: Samples) -> None:
 
 @pytest.mark.parametrize("memory", [0.0, 0.7])
 def test_normal_equations_in_pieces_are_those_of_all(
-    some_samples: Samples, memory: float, monkeypatch: pytest.MonkeyPatch
+    some_samples: ResidualSamples, memory: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     c = np.random.default_rng(3).normal(size=27) * 500.0
     whole = normal_equations(some_samples, c, None, memory)

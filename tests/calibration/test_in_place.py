@@ -388,16 +388,18 @@ def test_creep_of_the_offset_goes_neither_into_the_field_nor_into_the_map() -> N
     seen = replace(data, field=data.field + creep)
     found = fit(seen)
     assert found.creep is not None
-    assert np.sqrt(np.mean((found.creep.at(data.time) - creep) ** 2)) < 0.4 * np.sqrt(np.mean(creep**2))
+    assert np.sqrt(np.mean((found.creep.offset_at(data.time) - creep) ** 2)) < 0.4 * np.sqrt(
+        np.mean(creep**2)
+    )
     still = found.creep.calibration
-    value = correct(still, seen.field - found.creep.at(data.time), data.parameters, data.time).total
+    value = correct(still, seen.field - found.creep.offset_at(data.time), data.parameters, data.time).total
     n = len(data)
     assert data.place is not None
     samples = Samples(
         data.place[:, :2], np.zeros(n), data.time, value - true.mean(), np.zeros(n, int), np.zeros(n, bool),
         (0.0, 0.0),
     )  # fmt: skip
-    drawn, _ = gridded(samples).at(samples.place)
+    drawn, _ = gridded(samples).evaluate(samples.place)
     assert np.std(drawn - true) < 1.5 * NOISE
     error, sigma = error_of(found, seen, true)
     assert error > 2.0 * NOISE
@@ -413,7 +415,9 @@ def test_an_offset_that_jumps_is_found_and_counted_in_the_sigma() -> None:
     found = fit(replace(data, field=data.field + jump))
     assert found.creep is not None
     moved = jump - jump.mean(axis=0)
-    assert np.sqrt(np.mean((found.creep.at(data.time) - moved) ** 2)) < 0.5 * np.sqrt(np.mean(moved**2))
+    assert np.sqrt(np.mean((found.creep.offset_at(data.time) - moved) ** 2)) < 0.5 * np.sqrt(
+        np.mean(moved**2)
+    )
     assert 350.0 < found.details["rock"]["length_m"] < 1400.0
     error, sigma = error_of(found, data, true)
     assert error > 2.0 * NOISE

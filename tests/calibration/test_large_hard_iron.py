@@ -7,13 +7,13 @@ import pytest
 
 from magbridge.calibration.fitting.nominal import check_scales
 from magbridge.errors import CalibrationError
-from magbridge.estimation.residual import Samples
+from magbridge.estimation.residual import ResidualSamples
 
 
-def samples(directions: np.ndarray, offset: float) -> Samples:
+def samples(directions: np.ndarray, offset: float) -> ResidualSamples:
     field = 5e4 * directions + np.array([0.0, 0.0, offset])
     reference = np.full(len(field), 5e4)
-    return Samples(field, reference, np.ones((len(field), 1)), np.ones(len(field)), 5e4)
+    return ResidualSamples(field, reference, np.ones((len(field), 1)), np.ones(len(field)), 5e4)
 
 
 def test_it_is_the_attitudes_that_decide() -> None:

@@ -30,7 +30,7 @@ from sitl.mission import TABLE_1
 def test_expected_error_is_what_comes(glider: Gliders) -> None:
     one = glider(1, 2)
     calibration = fit(one.runs).calibration
-    expected = expected_error(calibration, Mission.of(one.survey))
+    expected = expected_error(calibration, Mission.from_observations(one.survey))
     total = correct(calibration, one.quiet, one.survey.parameters, one.survey.time).total
     assert np.sqrt(np.mean((total - one.survey.reference) ** 2)) < 3.0 * np.sqrt(np.mean(expected**2))
 
@@ -40,7 +40,7 @@ def test_planned_runs_beat_table_1(glider: Gliders) -> None:
     one = glider(2, 2)
     parameters = one.runs.ranges()
     before = expected_calibration(parameters, 52_000.0)
-    mission = Mission.of(one.survey)
+    mission = Mission.from_observations(one.survey)
     ned = one.runs.reference_ned[0]
     paper = evaluate_runs(
         before, mission, ned,

@@ -14,7 +14,7 @@ from disks import full_disk
 
 from magbridge.calibration.file import save as save_calibration
 from magbridge.calibration.fitting.fit import METHODS
-from magbridge.calibration.model import Parameter, Sensor, identity
+from magbridge.calibration.model import CalibratedSensor, Parameter, identity
 from magbridge.columns import CHANNELS
 from magbridge.logs import read, write
 
@@ -69,7 +69,7 @@ def test_a_log_in_another_unit_is_not_corrected(
 
 def test_a_log_of_another_sensor_is_not_corrected(deployment: Path, command: Command) -> None:
     write(read(deployment).isel(time=slice(0, 60)).assign_attrs(sensor="hmr2300"), "log.nc")
-    save_calibration(replace(identity(), sensor=Sensor("digitizer")), "cal.json")
+    save_calibration(replace(identity(), sensor=CalibratedSensor("digitizer")), "cal.json")
     line = command.refuses("correct", "log.nc", "--calibration", "cal.json", "-o", "x.nc")
     assert line.endswith(": sensor 'hmr2300', but the calibration is of 'digitizer'")
     assert not Path("x.nc").exists()

@@ -17,7 +17,7 @@ from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration, Sensor
+from magbridge.calibration.model import CalibratedSensor, Calibration
 from magbridge.diagnose.assessment import DiagnosisResult
 from magbridge.diagnose.report import page
 from magbridge.diagnose.run import diagnose
@@ -127,7 +127,7 @@ def test_a_sample_that_is_given_twice_is_one(plain: tuple[xr.Dataset, Calibratio
 def test_one_line(
     plain: tuple[xr.Dataset, Calibration], change: Callable[[xr.Dataset], xr.Dataset], message: str
 ) -> None:
-    calibration = replace(plain[1], sensor=Sensor("one"))
+    calibration = replace(plain[1], sensor=CalibratedSensor("one"))
     with pytest.raises(DataError, match=message) as caught:
         diagnose([change(plain[0])], calibration)
     assert "\n" not in str(caught.value)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magbridge.diagnose.evidence import certainty
-from magbridge.diagnose.noise import MAX_NOISE_ORDER, Noise, autoregressive_order, fit_noise
+from magbridge.diagnose.noise import MAX_NOISE_ORDER, ResidualNoise, autoregressive_order, fit_noise
 from magbridge.diagnose.survey import MAX_LAG, Past
 
 
@@ -114,7 +114,7 @@ def test_least_squares_of_the_filtered_is_generalised_least_squares(
     steps = np.where(np.diff(stretch, prepend=-1) > 0, MAX_LAG, np.diff(place, prepend=0))
     rng = np.random.default_rng(3)
     X = rng.normal(size=(n, 2)).cumsum(axis=0)
-    noise = Noise(a, np.ones(n), 1e6, Past(steps, p), 0.0, np.zeros(n))
+    noise = ResidualNoise(a, np.ones(n), 1e6, Past(steps, p), 0.0, np.zeros(n))
     apart = np.abs(np.subtract.outer(place, place))
     C = covariance(a, 200)[apart] * np.equal.outer(stretch, stretch)
     A = noise.filter(X)

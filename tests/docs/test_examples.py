@@ -19,7 +19,7 @@ from magbridge.config import load
 from magbridge.fleet.register import read_fleet
 from magbridge.logs.mapping import declared
 from magbridge.logs.og import read_metadata
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 from magbridge.toml import convert
 
 SHELL = blocks("sh", "bash")
@@ -113,7 +113,7 @@ def test_a_block_of_toml_is_read_by_what_reads_such_a_file(block: Block, here: P
             (here / name).touch()
         config = load(file)
         if config.navigation:
-            assert convert(config.navigation.options, Options, file)
+            assert convert(config.navigation.options, NavigationOptions, file)
 
 
 @pytest.mark.parametrize("block", blocks("json"), ids=str)

@@ -14,7 +14,7 @@ from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import NoiseModel
 from magbridge.estimation.optimise import gauss_newton
 from magbridge.estimation.priors import Prior
-from magbridge.estimation.residual import Samples, residuals
+from magbridge.estimation.residual import ResidualSamples, residuals
 
 FIELD = 5e4
 NOISE = NoiseModel(5.0)
@@ -22,7 +22,7 @@ FREE = Prior(np.diag(np.full(9, 1e-8)), np.eye(9))
 
 
 @pytest.fixture
-def samples() -> Samples:
+def samples() -> ResidualSamples:
     """A sensor with soft and hard iron that is turned to anywhere, 5 nT of noise."""
     rng = np.random.default_rng(1)
     b = rng.normal(size=(300, 3))
@@ -30,10 +30,10 @@ def samples() -> Samples:
     A = np.eye(3) + 0.03 * np.array([[1.0, 0.4, -0.2], [0.4, -0.6, 0.3], [-0.2, 0.3, 0.8]])
     field = b @ np.linalg.inv(A).T + [3000.0, -2000.0, 1000.0] + rng.normal(0.0, 5.0, b.shape)
     steps = np.r_[np.inf, np.ones(299)]
-    return Samples(field, np.full(300, FIELD), np.ones((300, 1)), steps, FIELD)
+    return ResidualSamples(field, np.full(300, FIELD), np.ones((300, 1)), steps, FIELD)
 
 
-def slope(samples: Samples, z: FloatArray) -> FloatArray:
+def slope(samples: ResidualSamples, z: FloatArray) -> FloatArray:
     """What the objective changes by along each coefficient over the width that the data leave it."""
 
     def value(c: FloatArray) -> float:
@@ -43,7 +43,7 @@ def slope(samples: Samples, z: FloatArray) -> FloatArray:
     return np.array([(value(z + h) - value(z - h)) / 2.0 for h in np.eye(9)])
 
 
-def test_it_ends_where_an_independent_optimiser_ends(samples: Samples) -> None:
+def test_it_ends_where_an_independent_optimiser_ends(samples: ResidualSamples) -> None:
     found = gauss_newton(samples, FREE, NOISE, np.zeros(9))
     independent = least_squares(
         lambda c: np.append(residuals(samples, c)[0] / NOISE.sigma, 1e-4 * c), np.zeros(9), x_scale=1000.0
@@ -56,7 +56,7 @@ def test_it_ends_where_an_independent_optimiser_ends(samples: Samples) -> None:
     assert np.sqrt(found.normal.cost / 300.0) == pytest.approx(5.0, rel=0.1)
 
 
-def test_a_fit_that_is_cut_short_has_not_settled(samples: Samples) -> None:
+def test_a_fit_that_is_cut_short_has_not_settled(samples: ResidualSamples) -> None:
     short = gauss_newton(samples, FREE, NOISE, np.zeros(9), steps=1)
     assert (short.settled, short.steps) == (False, 1)
     begun = np.sum(residuals(samples, np.zeros(9))[0] ** 2)
@@ -65,7 +65,7 @@ def test_a_fit_that_is_cut_short_has_not_settled(samples: Samples) -> None:
     assert (done.settled, done.steps) == (True, 0)
 
 
-def test_from_far_away_steps_are_shortened_and_never_lead_uphill(samples: Samples) -> None:
+def test_from_far_away_steps_are_shortened_and_never_lead_uphill(samples: ResidualSamples) -> None:
     far = np.r_[np.full(6, 3e4), np.full(3, -6e4)]
     best = gauss_newton(samples, FREE, NOISE, np.zeros(9)).normal.cost
     costs = [gauss_newton(samples, FREE, NOISE, far, steps=k).normal.cost for k in range(12)]
@@ -73,7 +73,7 @@ def test_from_far_away_steps_are_shortened_and_never_lead_uphill(samples: Sample
     assert gauss_newton(samples, FREE, NOISE, far, steps=200).normal.cost == pytest.approx(best, rel=1e-3)
 
 
-def test_along_what_nothing_determines_it_does_not_move(samples: Samples) -> None:
+def test_along_what_nothing_determines_it_does_not_move(samples: ResidualSamples) -> None:
     """Two numbers that do the same, and one that does nothing: without any prior."""
     E = np.hstack([np.eye(9), np.eye(9)[:, :1], np.zeros((9, 1))])
     found = gauss_newton(samples, Prior(np.zeros((11, 11)), E), NOISE, np.r_[np.zeros(10), 7.0])

@@ -32,7 +32,7 @@ def places() -> Places:
 
 def test_passes_through_its_nodes(grid: AnomalyGrid) -> None:
     x, y = np.meshgrid(LON, LAT)
-    np.testing.assert_allclose(grid.at(x.ravel(), y.ravel()), hills(x, y).ravel(), atol=1e-9)
+    np.testing.assert_allclose(grid.anomaly_at(x.ravel(), y.ravel()), hills(x, y).ravel(), atol=1e-9)
 
 
 def test_agrees_with_scipys_spline_inside(grid: AnomalyGrid) -> None:
@@ -72,7 +72,7 @@ def test_one_place_and_many_are_the_same(grid: AnomalyGrid, places: Places) -> N
 def test_a_descending_axis_is_the_same_map(grid: AnomalyGrid, places: Places, flip: tuple[int, int]) -> None:
     y, x = flip
     turned = AnomalyGrid(LON[::x], LAT[::y], grid.anomaly[::y, ::x], sigma=2.0)
-    np.testing.assert_allclose(turned.at(*places), grid.at(*places), atol=1e-10)
+    np.testing.assert_allclose(turned.anomaly_at(*places), grid.anomaly_at(*places), atol=1e-10)
 
 
 @pytest.mark.parametrize("start", [179.8, -180.2, 359.9])
@@ -83,9 +83,11 @@ def test_longitude_goes_round(grid: AnomalyGrid, places: Places, start: float) -
         moved = AnomalyGrid(stored, LAT, grid.anomaly)
         lon = places[0] - 10.0 + start
         for asked in (lon, (lon + 180) % 360 - 180, lon % 360):
-            np.testing.assert_allclose(moved.at(asked, places[1]), grid.at(*places), atol=1e-6)
+            np.testing.assert_allclose(
+                moved.anomaly_at(asked, places[1]), grid.anomaly_at(*places), atol=1e-6
+            )
             assert moved.look_up(float(asked[0]), float(places[1][0])).anomaly == pytest.approx(
-                grid.at(*places)[0], abs=1e-6
+                grid.anomaly_at(*places)[0], abs=1e-6
             )
 
 
@@ -113,7 +115,7 @@ def test_off_the_map_is_nan_or_refused(grid: AnomalyGrid) -> None:
     assert np.isnan(grid.look_up(9.99, 54.1).north)
     assert np.isnan(grid.look_up(np.nan, 54.1).north)
     with pytest.raises(OutOfRange, match=r"position = 54.41000 10.10000: grid \(latitude"):
-        grid.at([10.1, 10.1], [54.1, 54.41])
+        grid.anomaly_at([10.1, 10.1], [54.1, 54.41])
 
 
 def test_sigma_lies_between_its_nodes() -> None:

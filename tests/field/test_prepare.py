@@ -64,9 +64,9 @@ def test_a_dive_is_followed_through_the_map() -> None:
     there = continued(AnomalyGrid(LON, LAT, monopole(0.0), altitude=0.0), np.linspace(0.0, 120.0))
     lon, lat = (axis[15:-15:5, 20:-20:5].ravel() for axis in np.meshgrid(LON, LAT))
     for depth in (0.0, 120.0):
-        truth = AnomalyGrid(LON, LAT, monopole(-depth)).at(lon, lat)
+        truth = AnomalyGrid(LON, LAT, monopole(-depth)).anomaly_at(lon, lat)
         followed = there.grid.evaluate(lon, lat, depth).anomaly
-        assert np.std(followed - truth) < 0.3 * np.std(there.grid.at(lon, lat) - truth)
+        assert np.std(followed - truth) < 0.3 * np.std(there.grid.anomaly_at(lon, lat) - truth)
         one = there.grid.look_up(lon[7], lat[7], depth)
         np.testing.assert_allclose(one.anomaly, followed[7], rtol=1e-12)
 
@@ -149,7 +149,7 @@ def test_merge_across_the_antimeridian() -> None:
     west = AnomalyGrid(LON[:50] + 238.0, LAT, values)
     east = AnomalyGrid(LON[:50] + 238.1 - 360.0, LAT, values)
     both, _ = merge([west, east])
-    np.testing.assert_allclose(both.at([179.95, -179.9], 49.5), 5.0, atol=1e-9)
+    np.testing.assert_allclose(both.anomaly_at([179.95, -179.9], 49.5), 5.0, atol=1e-9)
 
 
 def test_nothing_is_smoothed_unless_asked_for() -> None:

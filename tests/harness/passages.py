@@ -12,17 +12,17 @@ from voyages import Map, synthetic
 from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate import Options
+from magbridge.navigate import NavigationOptions
 
 PLACE = (49.5, -57.9)
 START = 1_780_000_000.0
 LOST, BACK, LAST = 60.0, 840.0, 900.0
 """s: GPS is lost, and comes back; the end."""
-AIRCRAFT = Options(
+AIRCRAFT = NavigationOptions(
     start_sigma=50.0, current_sigma=4.0, current_time=3600.0, bias_sigma=2.0, map_sigma=2.0, interval=5.0
 )
 """Options for a plane, with a wind of 4 m/s."""
-OPTIONS = Options(start_sigma=200.0, current_sigma=0.1, bias_sigma=1.0, map_sigma=0.5, interval=4.0)
+OPTIONS = NavigationOptions(start_sigma=200.0, current_sigma=0.1, bias_sigma=1.0, map_sigma=0.5, interval=4.0)
 
 
 @cache

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.model import Calibration, Noise, Parameter, Reference
-from magbridge.calibration.terms import Effect, Polynomial, Series
+from magbridge.calibration.terms import Effect, LogSeries, Polynomial
 from magbridge.diagnose.columns import Candidate
 from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.survey import MAX_LAG, Survey, TelemetryChannel
@@ -71,7 +71,7 @@ def regressors_of(survey: Survey, calibration: Calibration, effect: Effect) -> F
     """(r, n) regressors of one effect along the survey, computed sample by sample as the bridge does."""
     channels = dict.fromkeys((*calibration.units, *effect.channels()))
     values = {name: survey.channels[name].values for name in channels}
-    return Effect.batch(effect, Series(survey.time, survey.field, values, calibration.kernel))
+    return Effect.batch(effect, LogSeries(survey.time, survey.field, values, calibration.kernel))
 
 
 def right(rows: int) -> Problem:

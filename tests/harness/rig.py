@@ -21,7 +21,7 @@ from devices import SENSOR_HZ, TRUTH, TURN, Autopilot, Fluxgate
 from standstill import standstill
 
 from magbridge.calibration.file import save
-from magbridge.calibration.model import Boresight, Calibration, Noise, Parameter, Reference, Sensor
+from magbridge.calibration.model import Boresight, CalibratedSensor, Calibration, Noise, Parameter, Reference
 from magbridge.calibration.terms import Polynomial
 from magbridge.config import load
 from magbridge.mavlink import Codec, Message, Signing
@@ -312,7 +312,7 @@ def calibration(slope: tuple[float, float, float] = (30.0, -20.0, 10.0)) -> Cali
         covariance=np.eye(18),
         noise=Noise(1.0),
         reference=Reference(float(np.linalg.norm(TRUTH))),
-        sensor=Sensor("digitizer"),
+        sensor=CalibratedSensor("digitizer"),
         boresight=Boresight((0.0, 0.0, 0.0), ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6))),
         method="made for a test",
     )

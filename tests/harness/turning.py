@@ -8,7 +8,7 @@ import numpy as np
 from small import ASCII_OPTIONS, START, bridge_text
 
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.calibration.file import load, save
 from magbridge.calibration.model import Calibration, Noise, Reference
@@ -43,7 +43,7 @@ def bridge(folder: Path, learning: str = LEARNING, *, known: bool = True) -> Pip
     options = f'unit = "counts", scale = {COUNT}, {ASCII_OPTIONS}'
     text = bridge_text(options=options, masses={}, calibration=known, publish={"MAG_FIELD": 0}, more=learning)
     config.write_text(text, encoding="utf-8")
-    return set_up(load_config(config), Start(START))
+    return set_up(load_config(config), StartEvent(START))
 
 
 def events(folder: Path) -> list[Event]:

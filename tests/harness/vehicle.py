@@ -6,7 +6,7 @@ from typing import Any
 
 from passages import OPTIONS, PLACE, hills
 
-from magbridge.bridge.navigation import Navigation
+from magbridge.bridge.navigation import NavigationService
 from magbridge.config import Link
 from magbridge.link.component import Component
 from magbridge.link.fixes import FIX_MESSAGES
@@ -25,7 +25,9 @@ class Bench:
         self.component = Component(
             Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=START_US
         )
-        self.navigation = Navigation(hills(), OPTIONS, FIX_MESSAGES[kind]._replace(rate=0.0), self.component)
+        self.navigation = NavigationService(
+            hills(), OPTIONS, FIX_MESSAGES[kind]._replace(rate=0.0), self.component
+        )
         self.texts: list[str] = []
         self._autopilot = {number: Codec(1, number) for number in (1, 197)}
         self.now_us = START_US

@@ -90,7 +90,7 @@ def learn(
             flags[n],
             faulty=faulty is not None and bool(faulty[n]),
             reference=FIELD,
-            where=world.where[n],
+            position=world.where[n],
             watched=(nan,) if watched is None else watched[n].tolist(),
             settled=None if settled is None or n == 0 else tuple(settled[n - 1].tolist()),
         )

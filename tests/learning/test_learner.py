@@ -10,7 +10,7 @@ from worlds import FIELD, World, calibration, error_of, grid_of, learn
 
 from magbridge.calibration.model import Calibration, Noise
 from magbridge.estimation.noise import whiten
-from magbridge.estimation.residual import Samples, residuals
+from magbridge.estimation.residual import ResidualSamples, residuals
 from magbridge.learning import Learner
 from magbridge.learning.estimator import Nuisance
 from magbridge.learning.samples import observe
@@ -22,7 +22,7 @@ def test_one_sample_is_the_fits_own_residual() -> None:
     rng = np.random.default_rng(2)
     nine = rng.normal(size=9) * 500.0
     field = rng.normal(size=(5, 3)) * 30_000.0
-    samples = Samples(field, np.full(5, FIELD), np.ones((5, 1)), np.ones(5), 48_000.0, 0.3)
+    samples = ResidualSamples(field, np.full(5, FIELD), np.ones((5, 1)), np.ones(5), 48_000.0, 0.3)
     e, g = residuals(samples, nine)
     for n in range(5):
         x, y, z = field[n].tolist()

@@ -68,7 +68,7 @@ def test_a_month_without_a_fix_changes_nothing() -> None:
     for hour in range(24 * 30):
         learner.sample(
             2_400_000_000 + hour * 3_600_000_000, field, [1.0, 0.5, 0.25], (0.5,), 0,
-            faulty=False, reference=nan, where=None, watched=(nan,),
+            faulty=False, reference=nan, position=None, watched=(nan,),
         )  # fmt: skip
     assert learner.calibration is before
     reported = [notice.text for notice in learner.notices if "hour" in notice.text]

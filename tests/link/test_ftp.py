@@ -244,7 +244,7 @@ def test_whatever_is_asked_is_answered(requests: list[tuple[tuple[int, int], byt
     for sender, payload in requests:
         replies = list(server.handle(sender, payload))
         assert 1 <= len(replies) <= BURST
-        assert {Request.of(one).opcode for one in replies} <= {Opcode.ACK, Opcode.NAK}
+        assert {Request.from_payload(one).opcode for one in replies} <= {Opcode.ACK, Opcode.NAK}
     assert len(server._sessions) <= SESSIONS
 
 

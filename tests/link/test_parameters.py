@@ -63,7 +63,7 @@ def test_set(link: Line) -> None:
     text, value = write(link, "MB_GAP_FACTOR", 4.0)
     assert text.text == "MB_GAP_FACTOR = 4, set by 255:190"
     assert value.param_value == 4.0
-    assert link.component.parameters.of("align.gap_factor") == 4.0
+    assert link.component.parameters.value_of("align.gap_factor") == 4.0
     assert link.component.parameters.revision == before + 1
     assert link.component.parameters.changed() == {"MB_GAP_FACTOR": 4.0}
 

@@ -57,7 +57,7 @@ def test_timers_fire_in_order_at_their_own_times() -> None:
     begun: list[int] = []
     timers.every("a", 300, lambda t: fired.append(("a", t)), 0)
     timers.every("b", 500, lambda t: fired.append(("b", t)), 100)
-    timers.once("c", 600, lambda t: timers.once("d", t + 1, lambda t: fired.append(("d", t))))
+    timers.run_once("c", 600, lambda t: timers.run_once("d", t + 1, lambda t: fired.append(("d", t))))
     timers.advance(1000, begun.append)
     assert fired == [("a", 0), ("b", 100), ("a", 300), ("a", 600), ("b", 600), ("d", 601), ("a", 900)]
     assert begun == [0, 100, 300, 600, 600, 600, 601, 900]

@@ -6,7 +6,7 @@ import pytest
 
 from magbridge.mavlink import Codec
 from magbridge.monitor.alarms import MAX_ALARMS, Alarms
-from magbridge.monitor.fleet import Fleet
+from magbridge.monitor.fleet import ReceivedBridges
 from magbridge.monitor.words import learned_worth
 from magbridge.records import Quality
 
@@ -39,7 +39,7 @@ def test_alarms_are_bounded_and_newest_first() -> None:
 
 def test_which_received_messages_raise_an_alarm() -> None:
     """A moving mass raises no alarm; a stale parameter, a lost sensor, an error and silence do."""
-    fleet, bridge = Fleet(), Codec(1, 191)
+    fleet, bridge = ReceivedBridges(), Codec(1, 191)
 
     def feed(now: float, name: str, **fields: object) -> None:
         for message in Codec(255, 190).parse(bridge.pack(name, **fields)):

@@ -11,7 +11,7 @@ import pytest
 from magbridge.bridge.links import open_link
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAG_PORT_STATE
-from magbridge.monitor.fleet import Fleet
+from magbridge.monitor.fleet import ReceivedBridges
 from magbridge.monitor.track import read_background
 
 live = pytest.importorskip("sitl.live", reason="the analysis extra is not installed")
@@ -21,7 +21,7 @@ def test_a_glider_is_flown_into_the_page(tmp_path: Path) -> None:
     """Corrected field, masses and track arrive, and the parameters can be read."""
     texts: list[str] = []
     with live.flying(tmp_path, 1, texts.append) as link:
-        port, fleet, codec = open_link(link, 0, "test", "LINK"), Fleet(), Codec(255, 190)
+        port, fleet, codec = open_link(link, 0, "test", "LINK"), ReceivedBridges(), Codec(255, 190)
         port.open()
         deadline = time.monotonic() + 60.0
         while not (state := fleet.states.get((1, 191))) or len(state.samples) < 3 or not state.parameters:

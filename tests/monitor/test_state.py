@@ -17,12 +17,12 @@ from magbridge.link.parameters import alignment
 from magbridge.mavlink import Codec, spec
 from magbridge.monitor.bundle import bundle
 from magbridge.monitor.chart import drawn
-from magbridge.monitor.fleet import MOST, Fleet
+from magbridge.monitor.fleet import MOST, ReceivedBridges
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.rose import heading_text, rose_picture
-from magbridge.monitor.state import TEMPERATURE_SERIES, State
+from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
 from magbridge.monitor.track import series as track_series
-from magbridge.monitor.words import ago, health, learnt, measured, silence, whereabouts
+from magbridge.monitor.words import duration, health, learnt, measured, silence, whereabouts
 from magbridge.records import Quality
 from magbridge.version import __version__
 
@@ -35,12 +35,12 @@ class Air:
     """A bridge's codec and a station's ear."""
 
     def __init__(self) -> None:
-        self.fleet, self.bridge, self.codec = Fleet(), Codec(1, 191), Codec(255, 190)
+        self.fleet, self.bridge, self.codec = ReceivedBridges(), Codec(1, 191), Codec(255, 190)
 
     @property
-    def state(self) -> State:
+    def state(self) -> BridgeState:
         """The state of the bridge that sends."""
-        return self.fleet.states.get((self.bridge.system, self.bridge.component), State())
+        return self.fleet.states.get((self.bridge.system, self.bridge.component), BridgeState())
 
     def feed(self, now: float, name: str, /, **fields: object) -> None:
         self.give(self.bridge.pack(name, **fields), now)
@@ -83,7 +83,7 @@ def test_silence_is_reported(air: Air) -> None:
     assert silence(air.state, NOW + 12) == "nothing heard for 12 s"
     air.feed(NOW + 12, "MAG_STATUS", uptime=17)
     assert silence(air.state, NOW + 13) == "no field heard for 13 s"
-    assert [ago(s) for s in (-1, 0, 119, 121, 7200)] == ["0 s", "0 s", "119 s", "2 min", "2 h"]
+    assert [duration(s) for s in (-1, 0, 119, 121, 7200)] == ["0 s", "0 s", "119 s", "2 min", "2 h"]
 
 
 def test_a_slow_sensor_is_not_silent(air: Air) -> None:
@@ -144,7 +144,7 @@ def test_figures(air: Air) -> None:
     assert shown["Forward"] == ("-4\u202f203.0", "± 2.2")
     assert shown["Anomaly"][0] == shown["Starboard"][0] == "–"
     air.feed(NOW, "MAG_STATUS", sensor_state=3, autopilot_state=1, log_state=2, samples_lost=7, uptime=4)
-    assert health(State(), NOW)["Calibration"] == ("–", True)
+    assert health(BridgeState(), NOW)["Calibration"] == ("–", True)
     items = health(air.state, NOW)
     assert items["Sensor"] == ("lost", False)
     assert items["Autopilot"] == ("ok", True)

@@ -6,12 +6,12 @@ import pytest
 from voyages import Map, synthetic
 
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 
 @pytest.fixture(scope="session")
-def options() -> Options:
-    return Options(start_sigma=200.0, current_sigma=0.05, bias_sigma=1.0, map_sigma=1.0)
+def options() -> NavigationOptions:
+    return NavigationOptions(start_sigma=200.0, current_sigma=0.05, bias_sigma=1.0, map_sigma=1.0)
 
 
 @pytest.fixture(scope="session")

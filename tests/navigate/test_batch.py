@@ -16,18 +16,18 @@ from magbridge.errors import FormatError
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate import Navigator, Options
+from magbridge.navigate import NavigationOptions, Navigator
 from magbridge.navigate.batch import navigate
 from magbridge.navigate.draw import draw_navigation, measured_on_track
 
 
 @pytest.fixture(scope="module")
-def ds(grid: AnomalyGrid, options: Options) -> xr.Dataset:
+def ds(grid: AnomalyGrid, options: NavigationOptions) -> xr.Dataset:
     return track_over(grid, options, 6, hours=4.0)
 
 
 @pytest.fixture(scope="module")
-def result(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> xr.Dataset:
+def result(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> xr.Dataset:
     return navigate(ds, grid, options, start=PLACE)
 
 
@@ -46,7 +46,7 @@ def test_the_track_and_the_backward_pass(result: xr.Dataset) -> None:
 
 
 def test_a_batch_is_the_live_filter(
-    ds: xr.Dataset, grid: AnomalyGrid, options: Options, result: xr.Dataset
+    ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions, result: xr.Dataset
 ) -> None:
     nav = Navigator(grid, options)
     time_us = np.round(ds["time"].to_numpy() * 1e6).astype(int)
@@ -83,13 +83,15 @@ def test_what_is_drawn_is_the_anomaly_on_the_filters_track(result: xr.Dataset) -
     assert 5.0 < abs(other) < 30.0
 
 
-def test_a_shifted_map_is_recognised(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
+def test_a_shifted_map_is_recognised(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> None:
     shifted = AnomalyGrid(grid.longitude + 300 / 72_400, grid.latitude + 400 / 111_200, grid.anomaly)
     findings = navigate(ds, shifted, options, start=PLACE).attrs["findings"]
     assert "the map fits best when moved 500 m (SW)" in findings
 
 
-def test_a_map_of_another_epoch_is_recognised(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
+def test_a_map_of_another_epoch_is_recognised(
+    ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions
+) -> None:
     other = AnomalyGrid(grid.longitude, grid.latitude, grid.anomaly - 85.0)
     findings = navigate(ds, other, options, start=PLACE).attrs["findings"]
     assert "the map does not explain the field" in findings
@@ -97,7 +99,7 @@ def test_a_map_of_another_epoch_is_recognised(ds: xr.Dataset, grid: AnomalyGrid,
     assert "above the map's level: its main field may be of another epoch, or at another altitude" in findings
 
 
-def test_another_map_altogether_is_recognised(ds: xr.Dataset, options: Options) -> None:
+def test_another_map_altogether_is_recognised(ds: xr.Dataset, options: NavigationOptions) -> None:
     wrong = synthetic(Map(30, 1500), 4)
     result = navigate(ds, wrong, options, start=PLACE)
     assert "lost for" in result.attrs["findings"]
@@ -105,7 +107,7 @@ def test_another_map_altogether_is_recognised(ds: xr.Dataset, options: Options) 
 
 
 def test_what_is_known_badly_says_nothing_about_the_map(
-    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+    ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions
 ) -> None:
     """While a mass moves the error is hundreds of nT, and so is the sigma."""
     moving = np.arange(ds.sizes["time"]) % 25 == 0
@@ -116,7 +118,7 @@ def test_what_is_known_badly_says_nothing_about_the_map(
     assert navigate(off, grid, options, start=PLACE).attrs["findings"] == ""
 
 
-def test_a_flat_map_is_recognised(options: Options) -> None:
+def test_a_flat_map_is_recognised(options: NavigationOptions) -> None:
     flat = synthetic(Map(0.2, 1500), 4)
     result = navigate(track_over(flat, options, 5, hours=3.0), flat, options, start=PLACE)
     findings = result.attrs["findings"]
@@ -127,7 +129,7 @@ def test_a_flat_map_is_recognised(options: Options) -> None:
 
 
 def test_a_map_that_the_vehicle_leaves_is_reported(
-    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+    ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions
 ) -> None:
     edge = int(np.searchsorted(grid.longitude, float(ds["truth_longitude"].quantile(0.6))))
     west = AnomalyGrid(grid.longitude[:edge], grid.latitude, grid.anomaly[:, :edge])
@@ -136,7 +138,7 @@ def test_a_map_that_the_vehicle_leaves_is_reported(
 
 
 def test_a_map_of_another_place_gives_one_message(
-    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+    ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions
 ) -> None:
     elsewhere = AnomalyGrid(grid.longitude + 5.0, grid.latitude, grid.anomaly)
     unsure = replace(options, start_sigma=5_000.0)
@@ -144,7 +146,7 @@ def test_a_map_of_another_place_gives_one_message(
     assert findings == "off the map for 100 % of the track, first after 0.0 h: dead reckoning only"
 
 
-def test_motion_from_what_the_log_has(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
+def test_motion_from_what_the_log_has(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> None:
     inertial = ds.drop_vars(["velocity_north", "velocity_east"]).assign(
         dr_latitude=ds["truth_latitude"] - ds["away_north"] / 111_200,
         dr_longitude=ds["truth_longitude"] - ds["away_east"] / 72_400,
@@ -155,7 +157,7 @@ def test_motion_from_what_the_log_has(ds: xr.Dataset, grid: AnomalyGrid, options
 
 
 def test_a_gliders_log_is_distinguished_from_another_vehicles(
-    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+    ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions
 ) -> None:
     """Depth, pitch and heading make a motion only where pitch makes the depth; else the log's track does."""
     depth = 40.0 + 30.0 * np.sin(np.arange(900) * 4 / 150)
@@ -189,7 +191,7 @@ def test_a_gliders_log_is_distinguished_from_another_vehicles(
 def test_one_clear_line(
     ds: xr.Dataset,
     grid: AnomalyGrid,
-    options: Options,
+    options: NavigationOptions,
     change: Callable[[xr.Dataset], xr.Dataset],
     message: str,
 ) -> None:
@@ -197,12 +199,12 @@ def test_one_clear_line(
         navigate(change(ds.isel(time=slice(0, 50))), grid, options, start=PLACE)
 
 
-def test_a_start_is_needed(ds: xr.Dataset, grid: AnomalyGrid, options: Options) -> None:
+def test_a_start_is_needed(ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions) -> None:
     with pytest.raises(FormatError, match="expected a position to start from"):
         navigate(ds.isel(time=slice(0, 50)), grid, options)
 
 
-def test_ten_thousand_samples_take_seconds(grid: AnomalyGrid, options: Options) -> None:
+def test_ten_thousand_samples_take_seconds(grid: AnomalyGrid, options: NavigationOptions) -> None:
     long = track_over(grid, replace(options, start_sigma=50.0), 5, hours=10_000 / 3600, every=1.0)
     known = replace(options, start_sigma=50.0)
     assert cost(lambda: navigate(long, grid, known, start=PLACE)) < 1000.0  # 270 when nothing else runs
@@ -216,7 +218,7 @@ def test_magnavs_published_flight(real_data: Path) -> None:
     harm over so short a time, and that the innovations agree with the claimed sigma.
     """
     grid, ds = magnav_flight(real_data / "magnav_example")
-    options = Options(start_sigma=10.0, current_sigma=0.5, bias_sigma=5.0, map_sigma=3.0, drift=0.1)
+    options = NavigationOptions(start_sigma=10.0, current_sigma=0.5, bias_sigma=5.0, map_sigma=3.0, drift=0.1)
     result = navigate(ds, grid, options)
     assert rms(result) < 60.0
     assert result["accepted"].mean() > 0.95

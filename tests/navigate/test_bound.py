@@ -9,12 +9,12 @@ import pytest
 
 from magbridge.errors import OutOfRange
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate import Options, position_bound
+from magbridge.navigate import NavigationOptions, position_bound
 from magbridge.navigate.bound import as_dataset
 from magbridge.navigate.draw import draw_bound
 
 TRACK = ([1.4e9, 1.4e9 + 7200, 1.4e9 + 14400], [49.48, 49.5, 49.5], [-57.95, -57.9, -57.85])
-STILL = Options(start_sigma=100.0, current_sigma=1e-9, drift=1e-9, bias_sigma=1e-9, map_sigma=1e-9)
+STILL = NavigationOptions(start_sigma=100.0, current_sigma=1e-9, drift=1e-9, bias_sigma=1e-9, map_sigma=1e-9)
 
 
 def slope(grid: AnomalyGrid, per_degree: float) -> AnomalyGrid:
@@ -35,21 +35,21 @@ def test_on_a_plane_it_is_the_line_fit(grid: AnomalyGrid) -> None:
     assert across == pytest.approx(100.0, rel=0.01)
 
 
-def test_a_map_helps_and_noise_hurts(grid: AnomalyGrid, options: Options) -> None:
+def test_a_map_helps_and_noise_hurts(grid: AnomalyGrid, options: NavigationOptions) -> None:
     good = position_bound(grid, *TRACK, options, 1.0)
     poor = position_bound(grid, *TRACK, options, 10.0)
     assert good.sigma[-1] < poor.sigma[-1] < poor.unaided[-1]
     assert (good.sigma <= good.unaided + 1e-9).all()
 
 
-def test_off_the_map_it_is_dead_reckoning(grid: AnomalyGrid, options: Options) -> None:
+def test_off_the_map_it_is_dead_reckoning(grid: AnomalyGrid, options: NavigationOptions) -> None:
     moved = AnomalyGrid(grid.longitude + 10.0, grid.latitude, grid.anomaly)
     bound = position_bound(moved, *TRACK, options)
     np.testing.assert_allclose(bound.sigma, bound.unaided)
 
 
 @pytest.mark.parametrize("way", [1, -1], ids=["east", "west"])
-def test_across_the_date_line(grid: AnomalyGrid, options: Options, way: int) -> None:
+def test_across_the_date_line(grid: AnomalyGrid, options: NavigationOptions, way: int) -> None:
     """The bound equals that of any other place, except for the main field."""
     turn = 180.0 - 57.9
     there = AnomalyGrid(grid.longitude - turn, grid.latitude, grid.anomaly)
@@ -71,7 +71,7 @@ def test_time_must_increase(grid: AnomalyGrid) -> None:
         position_bound(grid, [0.0, 3.0], [49.48] * 2, [-57.95] * 2)
 
 
-def test_its_sentence_says_when_it_is_best(grid: AnomalyGrid, options: Options) -> None:
+def test_its_sentence_says_when_it_is_best(grid: AnomalyGrid, options: NavigationOptions) -> None:
     bound = position_bound(grid, *TRACK, options)
     for sigma, words in (
         (np.linspace(50.0, 90.0, bound.time.size), "at best 50 m at the start, at the end 90 m"),
@@ -80,12 +80,12 @@ def test_its_sentence_says_when_it_is_best(grid: AnomalyGrid, options: Options) 
         assert as_dataset(bound._replace(sigma=sigma), grid).attrs["findings"].startswith(words)
 
 
-def test_its_picture(grid: AnomalyGrid, options: Options, tmp_path: Path) -> None:
+def test_its_picture(grid: AnomalyGrid, options: NavigationOptions, tmp_path: Path) -> None:
     draw_bound(position_bound(grid, *TRACK, options), grid, tmp_path / "bound.png")
     assert (tmp_path / "bound.png").stat().st_size > 20_000
 
 
-def test_more_samples_allow_a_smaller_error(grid: AnomalyGrid, options: Options) -> None:
+def test_more_samples_allow_a_smaller_error(grid: AnomalyGrid, options: NavigationOptions) -> None:
     """Twenty times as many of the same noise: a filter at 5 Hz must not beat the bound that was printed."""
     slow, fast = (position_bound(grid, *TRACK, options, 50.0, every=every).sigma[-1] for every in (4.0, 0.2))
     assert fast < 0.8 * slow

@@ -7,14 +7,14 @@ import pytest
 
 from magbridge.navigate.deadreckoning import DeadReckoning
 from magbridge.navigate.model import Block, Collector
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 T0 = 1_600_000_000
 
 
 def blocks(times: list[float], speed: float, step: float = 80.0, interval: float = 20.0) -> list[Block]:
     """Return the blocks of a straight leg eastward, sampled at `times` (s)."""
-    collector, where = Collector(Options(interval=interval), step), DeadReckoning()
+    collector, where = Collector(NavigationOptions(interval=interval), step), DeadReckoning()
     where.advance(float(T0))
     where.place(54.0, 10.0)
     where.telemetry(float(T0), {"velocity_north": 0.0, "velocity_east": speed})

@@ -16,7 +16,7 @@ from magbridge.calibration.file import save
 from magbridge.calibration.model import Noise, identity
 from magbridge.field.grid import AnomalyGrid
 from magbridge.logs import read, write
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 PLAN = """time,latitude,longitude
 1386201600,49.48,-57.95
@@ -29,7 +29,7 @@ CALIBRATED = ("--calibration", "cal.json")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options: Options) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, grid: AnomalyGrid, options: NavigationOptions) -> Path:
     """A log of two hours whose channels are the field itself, its map, a calibration that changes nothing."""
     path = tmp_path_factory.mktemp("navigate")
     ds = track_over(grid, options, 6, hours=2.0)

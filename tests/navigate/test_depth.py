@@ -14,13 +14,16 @@ from magbridge.cli.navigate import _continued
 from magbridge.field.continuation import continued, smoothed
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.depth import at_depth, lasting_errors
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 
 def test_errors_of_the_map_add_up() -> None:
     drawn = synthetic(Map(30, 1500), 3)
     flown = AnomalyGrid(drawn.longitude, drawn.latitude, drawn.anomaly, altitude=90.0)
-    depth, options = np.append(np.linspace(0.0, 120.0, 50), np.nan), Options(map_sigma=1.5, map_length=800.0)
+    depth, options = (
+        np.append(np.linspace(0.0, 120.0, 50), np.nan),
+        NavigationOptions(map_sigma=1.5, map_length=800.0),
+    )
     there, known = at_depth(flown, options, depth)
     left = continued(flown, depth[:-1])
     assert there.altitude == pytest.approx(-60.0)
@@ -37,7 +40,7 @@ def test_a_level_is_reported_on_its_side_of_the_surface(
 ) -> None:
     drawn = synthetic(Map(30, 1500), 3)
     flown = AnomalyGrid(drawn.longitude, drawn.latitude, drawn.anomaly, altitude=90.0)
-    _continued(flown, Options(), xr.Dataset({"depth": ("time", [depth] * 9)}))
+    _continued(flown, NavigationOptions(), xr.Dataset({"depth": ("time", [depth] * 9)}))
     assert f"continued to {texts}" in capsys.readouterr().err
 
 
@@ -56,7 +59,7 @@ def test_what_lies_between_nodes_counts_as_map_error() -> None:
     values = np.fft.ifft2(np.fft.fft2(rng.normal(size=(n, n))) * np.exp(-k)).real
     axis = 0.01 * np.arange(n)
     coarse = AnomalyGrid(10.0 + axis, 54.0 + axis, values * 100.0 / values.std())
-    there, known = at_depth(coarse, Options(map_sigma=0.0), 0.0)
+    there, known = at_depth(coarse, NavigationOptions(map_sigma=0.0), 0.0)
     assert there is coarse
     assert known.map_sigma == pytest.approx(coarse.interpolation_sigma)
     assert known.map_sigma > 1.0
@@ -65,7 +68,7 @@ def test_what_lies_between_nodes_counts_as_map_error() -> None:
 
 def test_a_map_whose_level_is_uncertain_leaves_the_bias_open() -> None:
     surveyed = synthetic(Map(40, 1000), 0).replaced(level_sigma=100.0)
-    there, known = lasting_errors(surveyed, Options(bias_sigma=5.0))
+    there, known = lasting_errors(surveyed, NavigationOptions(bias_sigma=5.0))
     assert known.bias_sigma == pytest.approx(hypot(100.0, 5.0))
     assert lasting_errors(there, known) == (there, known), "counted once"
 
@@ -76,7 +79,7 @@ def test_what_was_smoothed_away_is_a_map_error_that_lasts_and_a_flight_holds_its
     """
     raw = synthetic(Map(40, 1000, rough=True), 0)
     less = smoothed(raw, 1_000.0)
-    lasting, known = lasting_errors(less, Options(map_sigma=0.0))
+    lasting, known = lasting_errors(less, NavigationOptions(map_sigma=0.0))
     assert known.map_sigma == pytest.approx(float(np.std(less.anomaly - raw.anomaly)), rel=0.3)
     assert known.map_length == pytest.approx(less.sigma_length)
     assert lasting.error(4.0 * known.map_sigma**2)[0] == pytest.approx(2.0)

@@ -13,25 +13,25 @@ from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.estimate import SPREADS, Estimate
 from magbridge.navigate.integrity import Verdict
 from magbridge.navigate.model import Block
-from magbridge.navigate.options import Options, with_level
-from magbridge.navigate.record import State
+from magbridge.navigate.options import NavigationOptions, with_level
+from magbridge.navigate.record import NavigationState
 
 HOUR_US = 3_600_000_000
 
 
-def begun(grid: AnomalyGrid, options: Options, first: Block, sigma: float) -> Estimate:
+def begun(grid: AnomalyGrid, options: NavigationOptions, first: Block, sigma: float) -> Estimate:
     estimate = Estimate(grid, options)
     estimate.start(first.time_us - 1, sigma)
     return estimate
 
 
 @pytest.fixture(scope="module")
-def measured(grid: AnomalyGrid, options: Options) -> list[tuple[Block, float]]:
+def measured(grid: AnomalyGrid, options: NavigationOptions) -> list[tuple[Block, float]]:
     return list(blocks(track_over(grid, options, 3, hours=1.0), grid, options))
 
 
 def test_a_start_forgets_what_dead_reckoning_had_gathered(
-    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]]
+    grid: AnomalyGrid, options: NavigationOptions, measured: list[tuple[Block, float]]
 ) -> None:
     first = measured[0][0]
     fresh = begun(grid, options, first, 30.0)
@@ -53,7 +53,11 @@ def test_a_start_forgets_what_dead_reckoning_had_gathered(
 
 @pytest.mark.parametrize(("metres", "speed"), [(3.0, 0.05), (300.0, 0.1)])
 def test_fixes_that_were_wrong_have_moved_the_current_as_well(
-    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]], metres: float, speed: float
+    grid: AnomalyGrid,
+    options: NavigationOptions,
+    measured: list[tuple[Block, float]],
+    metres: float,
+    speed: float,
 ) -> None:
     estimate = begun(grid, replace(options, current_sigma=0.1), measured[0][0], 5.0)
     estimate.update(*measured[0])
@@ -65,7 +69,12 @@ def test_fixes_that_were_wrong_have_moved_the_current_as_well(
 
 @pytest.mark.parametrize(("sigma", "many"), [(5.0, False), (2_000.0, True)])
 def test_a_wide_start_has_many_hypotheses_and_a_narrow_one_has_one(
-    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]], sigma: float, *, many: bool
+    grid: AnomalyGrid,
+    options: NavigationOptions,
+    measured: list[tuple[Block, float]],
+    sigma: float,
+    *,
+    many: bool,
 ) -> None:
     estimate = begun(grid, options, measured[0][0], sigma)
     block, metres = measured[0]
@@ -79,7 +88,7 @@ def test_a_wide_start_has_many_hypotheses_and_a_narrow_one_has_one(
 
 
 def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
-    grid: AnomalyGrid, options: Options
+    grid: AnomalyGrid, options: NavigationOptions
 ) -> None:
     """Over a field five times as rough as the map, which the map does not explain at any place or level."""
     elsewhere = synthetic(Map(150, 1500), 9)
@@ -91,7 +100,7 @@ def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
         assert not estimate.valid
         if len(estimate.jumps) > jumps:
             assert estimate.jumps[-1].cause == Verdict.NOWHERE.value
-            assert estimate.state is State.LOST
+            assert estimate.state is NavigationState.LOST
             widths.append((float(estimate.P[0, 0]) ** 0.5, estimate.jumps[-1].allowed))
         if len(widths) == len(SPREADS):
             break
@@ -104,7 +113,7 @@ def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
 
 
 def test_rivals_of_a_filter_that_was_confirmed_begin_half_as_far_away(
-    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]]
+    grid: AnomalyGrid, options: NavigationOptions, measured: list[tuple[Block, float]]
 ) -> None:
     """A start wider than they reach confirms it; either way they reach what dead reckoning may be off."""
     first = measured[0][0]
@@ -123,7 +132,7 @@ def test_rivals_of_a_filter_that_was_confirmed_begin_half_as_far_away(
 
 
 def test_other_places_have_the_level_that_was_met_where_the_position_was_known(
-    grid: AnomalyGrid, options: Options, measured: list[tuple[Block, float]]
+    grid: AnomalyGrid, options: NavigationOptions, measured: list[tuple[Block, float]]
 ) -> None:
     """A level known to 145 nT fits many places; met at a known start, it is the same at all of them."""
     levels = {}

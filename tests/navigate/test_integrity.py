@@ -10,8 +10,8 @@ from voyages import OUTSIDE, PLACE, Map, misled, sail, track_over
 from magbridge.field.geodesy import metres_per_degree
 from magbridge.field.grid import AnomalyGrid
 from magbridge.navigate.model import transition
-from magbridge.navigate.options import Options, any_level
-from magbridge.navigate.record import State
+from magbridge.navigate.options import NavigationOptions, any_level
+from magbridge.navigate.record import NavigationState
 
 PERIOD = 700.0
 
@@ -29,7 +29,7 @@ def alike() -> AnomalyGrid:
     )
 
 
-def test_indistinguishable_places_are_never_valid(alike: AnomalyGrid, options: Options) -> None:
+def test_indistinguishable_places_are_never_valid(alike: AnomalyGrid, options: NavigationOptions) -> None:
     """The filter tracks, and is right, but has only its claim to know in which of the twins it is."""
     claimed = replace(options, start_sigma=40.0)
     run = sail(track_over(alike, claimed, 3, hours=2.0), alike, claimed)
@@ -37,11 +37,11 @@ def test_indistinguishable_places_are_never_valid(alike: AnomalyGrid, options: O
     assert not run.valid.any()
 
 
-def test_a_start_as_wide_as_its_rivals_needs_none(grid: AnomalyGrid, options: Options) -> None:
+def test_a_start_as_wide_as_its_rivals_needs_none(grid: AnomalyGrid, options: NavigationOptions) -> None:
     """What narrows it down is then the field alone: it is valid as soon as one place is left."""
     wide = replace(options, start_sigma=1500.0)
     run = sail(track_over(grid, wide, 4, hours=3.0), grid, wide)
-    tracking = run.state == State.TRACKING
+    tracking = run.state == NavigationState.TRACKING
     assert run.valid.any()
     assert run.valid.sum() > 0.9 * tracking.sum()
     assert not (run.valid & (run.nees > OUTSIDE)).any()
@@ -49,12 +49,12 @@ def test_a_start_as_wide_as_its_rivals_needs_none(grid: AnomalyGrid, options: Op
 
 @pytest.mark.parametrize("level", [60.0, -60.0])
 def test_a_calibration_that_is_off_is_not_answered_by_another_place(
-    grid: AnomalyGrid, options: Options, level: float
+    grid: AnomalyGrid, options: NavigationOptions, level: float
 ) -> None:
     """60 nT where 1 nT is claimed: lost at once, and the level found with the place, not instead of it."""
     ds = track_over(grid, options, 11, hours=3.0)
     run = sail(ds.assign(total_field=ds["total_field"] + level), grid, options)
-    assert State.LOST in run.state
+    assert NavigationState.LOST in run.state
     assert not (run.valid & (run.nees > OUTSIDE)).any()
 
 
@@ -64,7 +64,7 @@ def test_a_misled_filter_does_not_stand_by_it() -> None:
     assert hours_valid < 0.5
 
 
-def test_a_level_that_may_be_any_wanders_no_faster(grid: AnomalyGrid, options: Options) -> None:
+def test_a_level_that_may_be_any_wanders_no_faster(grid: AnomalyGrid, options: NavigationOptions) -> None:
     loose = any_level(options, grid)
     assert loose.bias_sigma == grid.rms
     assert any_level(loose, grid) == loose

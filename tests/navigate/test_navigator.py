@@ -11,7 +11,7 @@ from voyages import PLACE, Map, carried, sail, synthetic, track_over
 from magbridge.field.geodesy import offset
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.igrf import total_field
-from magbridge.navigate import Navigator, Options, Record, State
+from magbridge.navigate import NavigationOptions, NavigationState, Navigator, Record
 from magbridge.records import Corrected, Quality
 
 START_US = 1_386_201_600_000_000
@@ -35,19 +35,19 @@ def feed(navigator: Navigator, ds: xr.Dataset, rows: slice = slice(None)) -> Fol
 
 
 @pytest.fixture(scope="module")
-def ds(grid: AnomalyGrid, options: Options) -> xr.Dataset:
+def ds(grid: AnomalyGrid, options: NavigationOptions) -> xr.Dataset:
     return track_over(grid, options, 11, hours=3.0)
 
 
 @pytest.fixture(scope="module")
-def followed(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> Followed:
+def followed(grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset) -> Followed:
     navigator = Navigator(grid, options)
     navigator.fix(START_US, *PLACE)
     return feed(navigator, ds)
 
 
 def test_five_lines(grid: AnomalyGrid) -> None:
-    nav = Navigator(grid, Options(start_sigma=100.0, interval=4.0))
+    nav = Navigator(grid, NavigationOptions(start_sigma=100.0, interval=4.0))
     nav.fix(START_US, *PLACE)
     nav.telemetry(START_US, heading=90.0, speed=0.35, depth=40.0)
     corrected = Corrected(52_300.0, 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0)
@@ -57,33 +57,33 @@ def test_five_lines(grid: AnomalyGrid) -> None:
 
 
 def test_it_holds_the_position(
-    grid: AnomalyGrid, options: Options, ds: xr.Dataset, followed: Followed
+    grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset, followed: Followed
 ) -> None:
     records, error = followed
     score = sail(ds, grid, options).score()
     assert score.drms < 2.0 * score.bound  # one track: errors follow each other
     assert score.drms < 0.5 * score.unaided
-    assert sum(r.state is State.TRACKING for r in records) > 0.7 * len(records)
+    assert sum(r.state is NavigationState.TRACKING for r in records) > 0.7 * len(records)
     sigma = np.array([np.sqrt(r.covariance_nn + r.covariance_ee) for r in records])
     assert np.mean(error < 3 * sigma) > 0.95
     z = np.array([r.innovation**2 / r.innovation_variance for r in records])
     assert 0.7 < z.mean() < 1.3
 
 
-def _fresh(grid: AnomalyGrid, options: Options) -> Navigator:
+def _fresh(grid: AnomalyGrid, options: NavigationOptions) -> Navigator:
     navigator = Navigator(grid, options)
     navigator.fix(START_US, *PLACE)
     return navigator
 
 
-def test_a_wide_start_is_found(grid: AnomalyGrid, options: Options) -> None:
+def test_a_wide_start_is_found(grid: AnomalyGrid, options: NavigationOptions) -> None:
     wide = replace(options, start_sigma=1500.0)
     run = sail(track_over(grid, wide, 4, hours=4.0), grid, wide)
     assert run.error[0] > 300.0
     assert run.score().drms < 200.0
-    assert run.state[0] == State.SEARCHING or run.state[0] == State.DEAD_RECKONING
-    assert run.state[-1] == State.TRACKING
-    assert State.LOST not in run.state
+    assert run.state[0] == NavigationState.SEARCHING or run.state[0] == NavigationState.DEAD_RECKONING
+    assert run.state[-1] == NavigationState.TRACKING
+    assert NavigationState.LOST not in run.state
 
 
 def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again() -> None:
@@ -92,7 +92,7 @@ def test_carried_off_it_says_that_it_is_lost_and_finds_itself_again() -> None:
     assert hours_valid < 0.5
 
 
-def test_samples_that_cannot_be_used(grid: AnomalyGrid, options: Options) -> None:
+def test_samples_that_cannot_be_used(grid: AnomalyGrid, options: NavigationOptions) -> None:
     nav = _fresh(grid, options)
     nav.telemetry(START_US, heading=0.0, speed=0.35)
     bad = Corrected(9e4, 1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), int(Quality.SATURATED))
@@ -106,7 +106,9 @@ def test_samples_that_cannot_be_used(grid: AnomalyGrid, options: Options) -> Non
     assert nav.dropped == 1
 
 
-def test_samples_from_before_a_fix_keep_the_covariance_positive(grid: AnomalyGrid, options: Options) -> None:
+def test_samples_from_before_a_fix_keep_the_covariance_positive(
+    grid: AnomalyGrid, options: NavigationOptions
+) -> None:
     """A sensor hands over what it has stored, or its clock stands still, while GPS positions come."""
     nav = _fresh(grid, options)
     nav.telemetry(START_US, heading=0.0, speed=0.35)
@@ -126,15 +128,15 @@ def test_samples_from_before_a_fix_keep_the_covariance_positive(grid: AnomalyGri
 
 def test_nothing_before_a_start(grid: AnomalyGrid) -> None:
     nav = Navigator(grid)
-    assert nav.estimate.state is State.OFF
+    assert nav.estimate.state is NavigationState.OFF
     nav.telemetry(START_US, heading=0.0, speed=0.35)
     nav.fix(START_US, np.nan, 1.0)
     assert nav.measure(START_US + 4_000_000, 52_300.0, 1.0) is None
-    assert nav.estimate.state is State.OFF
+    assert nav.estimate.state is NavigationState.OFF
 
 
 def test_a_fix_is_taken_in_and_a_contradiction_believed(
-    grid: AnomalyGrid, options: Options, ds: xr.Dataset
+    grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset
 ) -> None:
     nav = _fresh(grid, options)
     records, _ = feed(nav, ds, slice(0, 600))
@@ -151,17 +153,17 @@ def test_a_fix_is_taken_in_and_a_contradiction_believed(
     )
 
 
-def test_off_the_map_it_reckons(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> None:
+def test_off_the_map_it_reckons(grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset) -> None:
     small = AnomalyGrid(grid.longitude[:70], grid.latitude, grid.anomaly[:, :70])
     nav = _fresh(small, options)
     records, _ = feed(nav, ds, slice(0, 200))
     assert np.isnan(small.look_up(PLACE[1], PLACE[0]).anomaly)
-    assert {r.state for r in records} <= {State.DEAD_RECKONING, State.SEARCHING}
+    assert {r.state for r in records} <= {NavigationState.DEAD_RECKONING, NavigationState.SEARCHING}
     assert not any(r.valid for r in records)
     assert nav.estimate.P[0, 0] > options.start_sigma**2
 
 
-def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: Options, ds: xr.Dataset) -> None:
+def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: NavigationOptions, ds: xr.Dataset) -> None:
     flat = AnomalyGrid(grid.longitude, grid.latitude, np.zeros_like(grid.anomaly))
     records, _ = feed(
         _fresh(flat, options), ds.assign(total_field=ds["total_field"] * 0 + 52_300.0), slice(0, 300)
@@ -169,7 +171,7 @@ def test_a_flat_map_says_nothing(grid: AnomalyGrid, options: Options, ds: xr.Dat
     assert not any(r.valid for r in records)
 
 
-def test_across_the_antimeridian(grid: AnomalyGrid, options: Options) -> None:
+def test_across_the_antimeridian(grid: AnomalyGrid, options: NavigationOptions) -> None:
     """Map and track moved to 180 degrees: only the main field differs."""
     moved = AnomalyGrid(grid.longitude - PLACE[1] + 180.0, grid.latitude, grid.anomaly)
     nav = Navigator(moved, replace(options, start_sigma=20.0))
@@ -180,7 +182,7 @@ def test_across_the_antimeridian(grid: AnomalyGrid, options: Options) -> None:
     for k in range(1, 300):
         where = offset(*where, 0.0, 4.0)
         t = START_US + 4_000_000 * k
-        z = float(total_field(where[1], where[0], 0.0, t * 1e-6)[0] + moved.at(where[1], where[0])[0])
+        z = float(total_field(where[1], where[0], 0.0, t * 1e-6)[0] + moved.anomaly_at(where[1], where[0])[0])
         if record := nav.measure(t, z, 1.0):
             records.append(record)
     assert records[-1].longitude < -179.9
@@ -189,7 +191,7 @@ def test_across_the_antimeridian(grid: AnomalyGrid, options: Options) -> None:
 
 
 def test_the_main_field_is_that_of_the_day_to_which_the_clock_was_set(
-    ds: xr.Dataset, grid: AnomalyGrid, options: Options
+    ds: xr.Dataset, grid: AnomalyGrid, options: NavigationOptions
 ) -> None:
     """A computer without a clock of its own wakes up in 1970; the field there has lost 1.8 µT since."""
     innovations = []
@@ -204,17 +206,17 @@ def test_the_main_field_is_that_of_the_day_to_which_the_clock_was_set(
     assert innovations[1] == pytest.approx(innovations[0], abs=1e-3)
 
 
-def test_lost_is_not_ended_by_the_next_fix(grid: AnomalyGrid, options: Options) -> None:
+def test_lost_is_not_ended_by_the_next_fix(grid: AnomalyGrid, options: NavigationOptions) -> None:
     """Over an unrelated field five times as rough, fixes give the position, but the navigator stays lost."""
     elsewhere = synthetic(Map(150, 1500), 9)
     unrelated = track_over(elsewhere, options, 5, hours=1.0)
     nav = _fresh(grid, options)
     feed(nav, unrelated, slice(0, 600))
-    assert nav.estimate.state is State.LOST
+    assert nav.estimate.state is NavigationState.LOST
     for row in range(600, 900, 10):
         time_us = round(1e6 * float(unrelated["time"][row])) - 1_000_000
         latitude, longitude = (float(unrelated[f"truth_{name}"][row]) for name in ("latitude", "longitude"))
         nav.fix(time_us, latitude, longitude, 5.0)
         more, _ = feed(nav, unrelated, slice(row, row + 10))
         assert not any(record.valid for record in more)
-        assert {record.state for record in more} <= {State.LOST}
+        assert {record.state for record in more} <= {NavigationState.LOST}

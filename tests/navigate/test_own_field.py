@@ -8,11 +8,11 @@ from scipy.stats import multivariate_normal
 
 from magbridge.arrays import FloatArray
 from magbridge.navigate.model import Block
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 from magbridge.navigate.own_survey import COVARIANCE_KINDS, OwnField, drift_functions, own_bound
 from magbridge.navigate.particles import sample
 
-OPTIONS = Options(start_sigma=30.0, current_sigma=0.05, bias_sigma=2.0, bias_time=3600.0)
+OPTIONS = NavigationOptions(start_sigma=30.0, current_sigma=0.05, bias_sigma=2.0, bias_time=3600.0)
 COUNT = 40
 
 

@@ -12,7 +12,7 @@ from magbridge.field.geodesy import metres_per_degree, offset
 from magbridge.field.grid import AnomalyGrid, Local
 from magbridge.navigate.bank import Bank, Tracker, widest
 from magbridge.navigate.model import Block, prior, transition
-from magbridge.navigate.options import Options
+from magbridge.navigate.options import NavigationOptions
 
 Moments = tuple[np.ndarray, np.ndarray]
 
@@ -31,7 +31,7 @@ def around(
 @pytest.fixture
 def correlated() -> Moments:
     rng = np.random.default_rng(0)
-    x, P = prior(Options(start_sigma=60.0))
+    x, P = prior(NavigationOptions(start_sigma=60.0))
     root = np.linalg.cholesky(P) @ (np.eye(6) + 0.2 * rng.normal(size=(6, 6)))
     return x + 0.3 * np.sqrt(np.diag(P)) * rng.normal(size=6), root @ root.T
 
@@ -70,7 +70,7 @@ def test_the_tracker_is_the_second_order_filter(grid: AnomalyGrid, correlated: M
 
 def test_shapes_stay_fixed_and_the_covariance_stays_one(grid: AnomalyGrid, correlated: Moments) -> None:
     tracker = Tracker(grid, *correlated, gate=1e9)
-    moved = transition(Options(), 20.0, 7.0)
+    moved = transition(NavigationOptions(), 20.0, 7.0)
     rng = np.random.default_rng(1)
     for _ in range(500):
         tracker.predict(*moved)
@@ -98,7 +98,7 @@ def test_off_the_map_nothing_is_compared(grid: AnomalyGrid, correlated: Moments)
 
 def test_a_bank_of_one_is_the_tracker(grid: AnomalyGrid, correlated: Moments) -> None:
     tracker, bank = Tracker(grid, *correlated, gate=16.0), Bank(grid, *correlated, resolution=1e4, gate=16.0)
-    moved = transition(Options(), 20.0, 7.0)
+    moved = transition(NavigationOptions(), 20.0, 7.0)
     rng = np.random.default_rng(2)
     for _ in range(50):
         z = float(around(grid, 0.0, 0.0).anomaly[0] + rng.normal())
@@ -148,7 +148,7 @@ def test_the_bank_is_bayes_on_a_wide_start(grid: AnomalyGrid) -> None:
     measurements share, are integrated out. Two measurements 900 m apart; tolerance 3 % of the posterior's
     spread, and 3 % of the evidence.
     """
-    options = Options(start_sigma=600.0, bias_sigma=2.0, map_sigma=0.5)
+    options = NavigationOptions(start_sigma=600.0, bias_sigma=2.0, map_sigma=0.5)
     bank = Bank(grid, *prior(options), resolution=40.0, gate=1e9)
     places = options.start_sigma * np.random.default_rng(3).normal(size=(200_000, 2))
     truth = np.array([250.0, -420.0])
@@ -173,7 +173,7 @@ def test_the_bank_is_bayes_on_a_wide_start(grid: AnomalyGrid) -> None:
 
 def test_hypotheses_off_the_map_stay_in_the_running(grid: AnomalyGrid) -> None:
     """A vehicle at the edge: those outside expect anything, so they neither win nor vanish at once."""
-    x, P = prior(Options(start_sigma=800.0))
+    x, P = prior(NavigationOptions(start_sigma=800.0))
     bank = Bank(grid, x + 16_000.0 * np.eye(6)[0], P, resolution=200.0, gate=16.0)
     bank.update(block(float(np.nanmean(grid.anomaly))))
     off = np.isnan(around(grid, bank.x[0], bank.x[1]).anomaly)

@@ -237,7 +237,7 @@ def test_a_backlog_in_pieces_is_dated_as_before(piece: int) -> None:
 
 
 def test_the_clock_of_a_driver() -> None:
-    clock = DeviceClock.of(open_driver("hmr2300", {"rate": 10}))
+    clock = DeviceClock.for_driver(open_driver("hmr2300", {"rate": 10}))
     assert [clock.update(nan, EPOCH + k * 100_000 + 7_000 * (k % 2)).time_us - EPOCH for k in range(4)] == [
         0,
         100_000,

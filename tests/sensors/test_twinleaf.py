@@ -201,5 +201,5 @@ def test_a_nan_is_a_lost_sample_and_not_a_saturated_one() -> None:
     assert [reading.field for reading in readings] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
     assert [reading.saturated for reading in readings] == [False, False]
     assert twinleaf.frames_bad == 1
-    stamps = DeviceClock.of(twinleaf).stamp(readings, 10**15)
+    stamps = DeviceClock.for_driver(twinleaf).stamp(readings, 10**15)
     assert [stamp.missing for stamp in stamps] == [0, 1]

@@ -16,7 +16,7 @@ from foreign import FOREIGN
 import sitl.inject
 from sitl import Twin, load
 from sitl.dataset import channels
-from sitl.inject import EFFECTS, Hidden, disturb
+from sitl.inject import EFFECTS, HiddenEffect, disturb
 from sitl.inject.scene import soaked
 from sitl.mission import CrissCross
 from sitl.trajectory import Track
@@ -62,13 +62,13 @@ def clean(flight: Flight) -> xr.Dataset:
     return seen(flight)
 
 
-def seen(flight: Flight, *hidden: Hidden) -> xr.Dataset:
+def seen(flight: Flight, *hidden: HiddenEffect) -> xr.Dataset:
     return disturb(flight[0], hidden, *flight[1:], seed=3, effects=EFFECTS | FOREIGN)
 
 
 def effect(flight: Flight, clean: xr.Dataset, name: str, times: float = 1.0) -> tuple[np.ndarray, xr.Dataset]:
     """Return the change of the channels (n, 3), and the log."""
-    ds = seen(flight, Hidden(name, times * SIZE.get(name, 5.0), 11))
+    ds = seen(flight, HiddenEffect(name, times * SIZE.get(name, 5.0), 11))
     return channels(ds) - channels(clean), ds
 
 
@@ -98,7 +98,7 @@ def test_a_filter_shows_a_turning_field_as_it_was(flight: Flight) -> None:
     still = {name: np.full_like(values, values[0]) for name, values in track.parameters.items()}
     track = replace(track, parameters=still, roll=0.0 * track.roll, pitch=0.0 * track.pitch)
     turning, late = (replace(track, heading=rate * (track.elapsed - t)) for t in (0.0, delay))
-    filtered = channels(disturb(twin, (Hidden("filter_lag", delay, 11),), turning, when, 3))
+    filtered = channels(disturb(twin, (HiddenEffect("filter_lag", delay, 11),), turning, when, 3))
     np.testing.assert_allclose(filtered[1:], channels(disturb(twin, (), late, when, 3))[1:], atol=0.2)
 
 
@@ -124,7 +124,7 @@ def test_twice_the_size_does_twice_as_much_and_the_seed_decides_the_rest(
 
 
 def test_several_add_up(flight: Flight, clean: xr.Dataset) -> None:
-    a, b = Hidden("current_field", 3.0, 1), Hidden("offset_step", 4.0, 2)
+    a, b = HiddenEffect("current_field", 3.0, 1), HiddenEffect("offset_step", 4.0, 2)
     both, *each = (channels(seen(flight, *hidden)) - channels(clean) for hidden in ((a, b), (a,), (b,)))
     np.testing.assert_allclose(both, sum(each), atol=1e-3)
 
@@ -155,7 +155,7 @@ def test_a_late_clock_shifts_the_telemetry_only(flight: Flight, clean: xr.Datase
 
 def test_skew_reads_each_channel_in_its_own_time(flight: Flight) -> None:
     size = 0.5  # the simulation's own step
-    ds = seen(flight, Hidden("channel_skew", size, 11))
+    ds = seen(flight, HiddenEffect("channel_skew", size, 11))
     truth = json.loads(ds.attrs["truth"])
     twin, track, when = flight
     for axis in "xyz":

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import MAIN_FIELD_SIGMA_NT
 from magbridge.calibration.model import Noise, identity
@@ -259,7 +259,7 @@ def test_more_than_a_pty_holds_is_read_at_once(tmp_path: Path) -> None:
     """A bridge that was stopped for a while has a backlog in its line, as a replay of its log has."""
     received = Listener()
     stage = Stage(config(tmp_path, "ascii", 'columns = ["x", "y", "z"]'), received.receive)
-    stage.play(Start(1_700_000_000_000_000), [lines(4000)])
+    stage.play(StartEvent(1_700_000_000_000_000), [lines(4000)])
     assert received.counts["MAG_FIELD"] == 4000
 
 
@@ -273,7 +273,7 @@ def test_a_bridge_that_dies_does_not_block_the_replay(tmp_path: Path) -> None:
         yield lines(4000)
 
     with pytest.raises(PortError, match="the bridge ended with -9"):
-        stage.play(Start(1_700_000_000_000_000), events())
+        stage.play(StartEvent(1_700_000_000_000_000), events())
 
 
 def test_a_value_that_its_message_cannot_hold_ends_the_replay(survey: Path, tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_the_map_reference_is_the_igrf_and_a_map_without_fine_structure() -> Non
         igrf(*(deployment[name] for name in ("longitude", "latitude", "depth", "time"))), axis=1
     )
     anomaly = Twin.draw(scenario, 5).anomaly_map()
-    there = anomaly.at(deployment["longitude"], deployment["latitude"])
+    there = anomaly.anomaly_at(deployment["longitude"], deployment["latitude"])
     np.testing.assert_allclose(deployment["reference_field"] - main, there, atol=1e-6)
 
 

@@ -76,7 +76,7 @@ def test_sigma_between_lines_is_consistent_also_next_to_a_wrong_line(
     assert np.median(one.share) < 0.1 < one.share[ASTRAY]
     for astray in (False, True):
         place = between(astray=astray)
-        mean, variance = one.at(place)
+        mean, variance = one.evaluate(place)
         assert 0.4 < rms((mean - rock.at(place)) / np.sqrt(variance)) < 1.25
 
 
@@ -95,8 +95,8 @@ def test_a_map_is_kriged_where_its_nodes_are_too_coarse(
     assert coarse.kriged is not None
     place = between(astray=False)
     place = place[place[:, 1] < 6.0 * APART]
-    mean, sigma = coarse.at(place)
+    mean, sigma = coarse.evaluate(place)
     error = mean - rock.at(place)
-    assert rms(error) < 1.2 * rms(fine.at(place)[0] - rock.at(place))
+    assert rms(error) < 1.2 * rms(fine.evaluate(place)[0] - rock.at(place))
     assert 0.4 < rms(error / sigma) < 1.25
     assert coarse.sigma == pytest.approx(NOISE, rel=0.3)  # and not what the nodes leave out

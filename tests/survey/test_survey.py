@@ -72,7 +72,7 @@ def test_map_is_right_within_its_sigma(done: tuple[Rock, Result]) -> None:
     """Between the lines, without the common level of all lines."""
     rock, result = done
     at = np.random.default_rng(7).uniform(-2500, 2500, (400, 2))
-    anomaly, sigma = result.gridded.at(at)
+    anomaly, sigma = result.gridded.evaluate(at)
     error = anomaly - rock.at(at)
     error -= error.mean()
     assert np.sqrt(np.mean(error**2)) < 6.0
@@ -82,9 +82,9 @@ def test_map_is_right_within_its_sigma(done: tuple[Rock, Result]) -> None:
 
 def test_far_from_the_lines_nothing_is_known(done: tuple[Rock, Result]) -> None:
     _, result = done
-    _, sigma = result.gridded.at(np.array([[40_000.0, 0.0]]))
+    _, sigma = result.gridded.evaluate(np.array([[40_000.0, 0.0]]))
     assert sigma[0] == pytest.approx(
-        result.gridded.size * result.gridded.roughness.at(np.array([[4e4, 0.0]]))
+        result.gridded.size * result.gridded.roughness.evaluate(np.array([[4e4, 0.0]]))
     )
 
 
@@ -132,9 +132,9 @@ def test_map_of_a_vehicle_that_dives_is_right_between_its_tracks() -> None:
     found = survey(Samples(place, depth, np.arange(4.0, 4 * n + 4, 4), value, zero, zero > 0, ORIGIN)).gridded
     assert found.field.harmonic
     at = place[rng.integers(n, size=400)] + rng.normal(0.0, 250.0, (400, 2))
-    anomaly, sigma = found.at(at)
+    anomaly, sigma = found.evaluate(at)
     error = anomaly - rock(at, middle)
-    error -= np.mean(found.at(place[::10])[0] - rock(place[::10], middle))
+    error -= np.mean(found.evaluate(place[::10])[0] - rock(place[::10], middle))
     assert np.sqrt(np.mean((error / sigma) ** 2)) < 1.4
     assert np.sqrt(np.mean(error**2)) < 2.2
 
@@ -157,7 +157,7 @@ def test_a_field_along_a_track_without_crossings_is_not_a_change_with_time() -> 
     """One is as likely as the other there: with changes of any size the map was off by 6 nT."""
     samples, rock, _ = zigzag(np.random.default_rng(4), back=False)
     done = survey(samples)
-    anomaly, sigma = done.gridded.at(samples.place)
+    anomaly, sigma = done.gridded.evaluate(samples.place)
     assert np.std(anomaly - rock) < 0.3
     assert np.std(anomaly - rock) < 1.25 * np.median(sigma)
     assert any("never crosses itself" in line for line in done.warnings)
@@ -167,7 +167,7 @@ def test_a_change_with_time_that_crossings_show_is_not_in_the_map() -> None:
     samples, rock, change = zigzag(np.random.default_rng(4), back=True)
     done = survey(replace(samples, value=samples.value + change))
     found = done.gridded
-    anomaly, sigma = found.at(samples.place)
+    anomaly, sigma = found.evaluate(samples.place)
     assert not done.warnings
     assert np.std(found.levels - change) < 0.2 * np.std(change)
     assert np.std(anomaly - rock) < 1.25 * np.median(sigma)
@@ -179,7 +179,7 @@ def test_where_a_track_jumps_the_map_is_as_uncertain_as_its_places() -> None:
     place = samples.place.copy()
     place[500:, 0] += 600.0
     found = survey(replace(samples, place=place)).gridded
-    anomaly, sigma = found.at(samples.place)
+    anomaly, sigma = found.evaluate(samples.place)
     error = anomaly - rock
     assert np.std(error[:500]) < 0.5
     assert np.std(error[500:]) > 5.0
@@ -296,14 +296,14 @@ def test_a_vehicle_finds_itself_on_the_map_that_its_own_survey_drew() -> None:
     longitude, latitude = flown["truth_longitude"].to_numpy(), flown["truth_latitude"].to_numpy()
     n = len(latitude)
     level = -70.0
-    value = rock.at(longitude, latitude) + level + np.random.default_rng(9).normal(0.0, 1.0, n)
+    value = rock.anomaly_at(longitude, latitude) + level + np.random.default_rng(9).normal(0.0, 1.0, n)
     place = np.stack(separation(*PLACE, latitude, longitude), axis=1)
     samples = Samples(
         place, np.zeros(n), flown["time"].to_numpy(), value, np.zeros(n, int), np.zeros(n, bool), PLACE,
         level_sigma=100.0,
     )  # fmt: skip
     drawn = anomaly_map(survey(samples).gridded, samples)
-    assert np.mean(drawn.at(longitude, latitude)) == pytest.approx(np.mean(value), abs=0.3)
+    assert np.mean(drawn.anomaly_at(longitude, latitude)) == pytest.approx(np.mean(value), abs=0.3)
     found = sail(flown, drawn, structs.replace(GLIDER, start_sigma=50.0)).score()
     assert not found.lost
     assert found.drms < 0.4 * found.unaided

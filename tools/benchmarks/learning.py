@@ -13,7 +13,7 @@ from benchmarks.row import Row, processor_time
 from benchmarks.workload import BEGIN_US, Feed, write_config
 
 from magbridge.bridge.drive import set_up
-from magbridge.bridge.events import Start
+from magbridge.bridge.events import StartEvent
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.config import load
 
@@ -30,7 +30,7 @@ def learning(folder: Path, repetitions: int) -> list[Row]:
     pipelines = {}
     for more in ("", LEARNING):
         path = write_config(folder, more=more)
-        pipelines[more] = set_up(load(path), Start(BEGIN_US))
+        pipelines[more] = set_up(load(path), StartEvent(BEGIN_US))
     feed, times = Feed(), {more: list[float]() for more in pipelines}
     longest: list[float] = []
     gc.collect()

@@ -18,7 +18,7 @@ from benchmarks.row import Row, processor_time
 from benchmarks.workload import BEGIN_US, Feed, write_config
 
 from magbridge.bridge.drive import drive, set_up
-from magbridge.bridge.events import Event, Start
+from magbridge.bridge.events import Event, StartEvent
 from magbridge.config import load
 from magbridge.logs.tlog import TlogWriter
 from magbridge.records import Channel
@@ -80,7 +80,7 @@ def _measure(folder: Path, repetitions: int, *, moving: bool) -> list[Row]:
 
 def _times(folder: Path, repetitions: int, *, moving: bool) -> dict[str, list[float]]:
     """Return the processor time of a sample in each repetition, µs, by kind of work."""
-    pipeline = set_up(load(write_config(folder)), Start(BEGIN_US))
+    pipeline = set_up(load(write_config(folder)), StartEvent(BEGIN_US))
     feed, peer, log = Feed(moving=moving), Peer(), TlogWriter(folder / "logs")
     samples = SECONDS * HERTZ
     times: dict[str, list[float]] = {"bridge": [], "decode": [], "encode": [], "encode_log": []}

@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from magbridge.arrays import FloatArray
-from magbridge.bridge.navigation import Navigation
+from magbridge.bridge.navigation import NavigationService
 from magbridge.config import Link
 from magbridge.field.geodesy import offset, separation
 from magbridge.field.grid import AnomalyGrid
 from magbridge.link.component import Component
 from magbridge.link.fixes import FIX_MESSAGES
 from magbridge.link.requests import needed_rates
-from magbridge.navigate import Options
+from magbridge.navigate import NavigationOptions
 from magbridge.records import Corrected
 from referee.autopilot import GPS_SIGMA, Autopilot, Truth
 from referee.receiver import Receiver, honest
@@ -99,14 +99,14 @@ class Run(NamedTuple):
 def sail(
     passage: Passage,
     grid: AnomalyGrid,
-    options: Options,
+    options: NavigationOptions,
     kind: str,
     make: Callable[[tuple[float, float, float], int], Autopilot],
     seed: int = 0,
     *,
     step_s: float = 1.0,
     requests: bool = False,
-) -> tuple[Run, Autopilot, Navigation]:
+) -> tuple[Run, Autopilot, NavigationService]:
     """Sail a passage with the autopilot that ``make(origin, start_us)`` returns, by fixes of one `kind`.
 
     The autopilot sends its telemetry every `step_s`, at most; with `requests`, the bridge requests rates.
@@ -116,7 +116,7 @@ def sail(
     component = Component(
         Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us, streams=needed
     )
-    navigation = Navigation(grid, options, FIX_MESSAGES[kind], component)
+    navigation = NavigationService(grid, options, FIX_MESSAGES[kind], component)
     origin = float(passage.latitude[0]), float(passage.longitude[0]), 3.0
     autopilot = make(origin, start_us)
     rows: list[tuple[float, ...]] = []
@@ -162,7 +162,7 @@ def exchange(component: Component, autopilot: Autopilot) -> bytes:
     return b"".join([autopilot.receive(frame, time_us) for time_us, frame in component.outbox.drain()])
 
 
-def own_error(navigation: Navigation, now_us: int, truth: Truth) -> float:
+def own_error(navigation: NavigationService, now_us: int, truth: Truth) -> float:
     """Return m between the bridge's position and the true one."""
     navigator = navigation.navigator
     if not navigator.estimate.begun:

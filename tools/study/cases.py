@@ -18,7 +18,7 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from sitl.dataset import corrected
-from sitl.inject import EFFECTS, Hidden
+from sitl.inject import EFFECTS, HiddenEffect
 from study.deployment import (
     CHARTS,
     DAY,
@@ -210,7 +210,7 @@ def _scores(found: Row, names: tuple[str, ...], whole: xr.Dataset) -> list[float
 
 
 def harm(
-    hidden: tuple[Hidden, ...], background: Background, ds: xr.Dataset, result: Diagnosis
+    hidden: tuple[HiddenEffect, ...], background: Background, ds: xr.Dataset, result: Diagnosis
 ) -> dict[str, float]:
     """Return mean square errors (nT²) against the true field, as calibrated and extended.
 

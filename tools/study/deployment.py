@@ -19,11 +19,11 @@ from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.diagnose.problem import floor
-from magbridge.estimation.residual import Samples, jacobian, residuals
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 from magbridge.field.grid import AnomalyGrid
 from magbridge.field.reference import reference_field
 from sitl import Twin, load, simulate
-from sitl.inject import EFFECTS, Hidden, disturb
+from sitl.inject import EFFECTS, HiddenEffect, disturb
 from sitl.mission import CrissCross, Spirals
 from sitl.signals import correlated, first_order
 from sitl.trajectory import Track
@@ -92,7 +92,7 @@ class Deployment(NamedTuple):
     learned: tuple[xr.Dataset, ...] = ()
     chart: AnomalyGrid | None = None
 
-    def measure(self, hidden: tuple[Hidden, ...], number: int) -> xr.Dataset:
+    def measure(self, hidden: tuple[HiddenEffect, ...], number: int) -> xr.Dataset:
         """The log with effects, before its noise and its losses."""
         ds = disturb(self.twin, hidden, self.track, self.when, number, EFFECTS | FOREIGN)
         return ds if self.chart is None else charted(ds, self.chart)
@@ -184,7 +184,9 @@ def compare(ds: xr.Dataset, calibration: Calibration) -> tuple[FloatArray, Float
     W = calibration.kernel.weights.copy()
     W[0, :3] -= 1.0
     W[:, :6] *= calibration.reference.field
-    samples = Samples(H, ds["reference_field"].to_numpy(), phi, np.ones(len(H)), calibration.reference.field)
+    samples = ResidualSamples(
+        H, ds["reference_field"].to_numpy(), phi, np.ones(len(H)), calibration.reference.field
+    )
     e, g = residuals(samples, W.ravel())
     return e, jacobian(phi, g)
 
@@ -213,7 +215,7 @@ def size_of(name: str, d: FloatArray, A: FloatArray, covariance: FloatArray) -> 
 class Injected(NamedTuple):
     """A hidden effect of the wanted size, its whitened signature in the residual, and the log with it."""
 
-    hidden: Hidden
+    hidden: HiddenEffect
     signature: FloatArray
     ds: xr.Dataset
 
@@ -239,11 +241,11 @@ class Background(NamedTuple):
         e, J = compare(clean, deployment.calibration)
         return cls(deployment, number, noise, rows, e, whiten(J[rows], noise, rows))
 
-    def measure(self, *hidden: Hidden) -> xr.Dataset:
+    def measure(self, *hidden: HiddenEffect) -> xr.Dataset:
         """The log with effects, before its noise and its losses."""
         return self.deployment.measure(hidden, self.number)
 
-    def show(self, hidden: Hidden) -> Injected:
+    def show(self, hidden: HiddenEffect) -> Injected:
         """Return an effect's signature and log here."""
         ds = self.measure(hidden)
         d = compare(ds, self.deployment.calibration)[0] - self.residual
@@ -257,7 +259,7 @@ class Background(NamedTuple):
         """Find the size at which the effect has the signal-to-noise that is wanted."""
         size = 1.0
         for _ in range(6):
-            made = self.show(Hidden(name, size, seed))
+            made = self.show(HiddenEffect(name, size, seed))
             found = size_of(name, made.signature, self.columns, self.deployment.prior)
             if abs(found / wanted - 1.0) < 0.02:
                 return made

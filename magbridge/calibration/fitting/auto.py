@@ -33,7 +33,7 @@ from magbridge.estimation.hyperparameters import is_maximum
 from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, fit_slow_and_white
 from magbridge.estimation.priors import PriorFamily
-from magbridge.estimation.residual import Samples, residuals_of, robust_scale
+from magbridge.estimation.residual import ResidualSamples, residuals_of, robust_scale
 
 __all__ = ["fit_auto", "flown"]
 
@@ -60,10 +60,10 @@ def flown(residual: FloatArray) -> BoolArray:
     return kept if kept.sum() > len(kept) / 2 else np.ones(len(off), bool)
 
 
-def _end(off: BoolArray) -> int:
+def _end(outlier: BoolArray) -> int:
     """Return how many samples of the start are mostly outliers; 0 if those are few."""
-    share = np.cumsum(off) / np.arange(1, len(off) + 1)
-    until = np.flatnonzero((share > MIN_OUTLIER_FRACTION) & off)
+    share = np.cumsum(outlier) / np.arange(1, len(outlier) + 1)
+    until = np.flatnonzero((share > MIN_OUTLIER_FRACTION) & outlier)
     return int(until[-1]) + 1 if until.size and until[-1] + 1 >= MIN_END_SAMPLES else 0
 
 
@@ -99,7 +99,7 @@ def fit_auto(
     posed = pose(data, order, vehicle, known)
     samples, family = posed.samples, posed.family
     best = _best(samples, family)
-    kept = flown(residuals_of(samples, best.family.at(best.widths.eta).coefficients(best.solution.z)))
+    kept = flown(residuals_of(samples, best.family.prior(best.widths.eta).coefficients(best.solution.z)))
     if not kept.all():
         found = fit_auto(data.part(kept), order, vehicle=vehicle, known=known)
         inner = found.details.pop("flown", None)
@@ -107,7 +107,7 @@ def fit_auto(
             kept[kept] = inner
         return replace(found, details={**found.details, "flown": kept})
     best = _remembering(samples, best)
-    prior = best.family.at(best.widths.eta)
+    prior = best.family.prior(best.widths.eta)
     precision = best.solution.normal.hessian / best.noise.sigma**2 + prior.precision
     coefficients = prior.coefficients(best.solution.z)
     check_scales(samples, coefficients)
@@ -143,7 +143,7 @@ def _simpler(data: Observations, found: Fit, best: Climbed) -> Fit | None:
     except CalibrationError:
         return None
     samples, white = nominal_samples(data), one.weighted
-    prior, z, noise = best.family.at(best.widths.eta), best.solution.z, best.noise
+    prior, z, noise = best.family.prior(best.widths.eta), best.solution.z, best.noise
     forward = carried_forward(samples, one.prior, one.z, white) / found.details["forward_nT"]
     simpler.details["forward_nT"] = forward * found.details["forward_nT"]
     if data.names:  # to first order is enough to compare fits that differ by their parameters
@@ -176,12 +176,12 @@ def _gained(data: Observations, order: int, vehicle: Vehicle | None) -> float:
     return scores[1] - scores[0]
 
 
-def _best(samples: Samples, family: PriorFamily) -> Climbed:
+def _best(samples: ResidualSamples, family: PriorFamily) -> Climbed:
     """Return the answer with the largest evidence among several starts."""
     few = thinned(samples)
     answers = []
     for start in starts(few):
-        z = family.near(start)
+        z = family.nearest_latent(start)
         answers += [climb(few, family, z, family.centre + shift * family.spread) for shift in (0.0, 1.5)]
     for answer in sorted(answers, key=lambda answer: -answer.score):
         last = answer
@@ -193,10 +193,10 @@ def _best(samples: Samples, family: PriorFamily) -> Climbed:
     raise NoSolutionError("auto: no start reached a maximum of the evidence; the data contradict themselves")
 
 
-def _remembering(samples: Samples, answer: Climbed) -> Climbed:
+def _remembering(samples: ResidualSamples, answer: Climbed) -> Climbed:
     """Return the answer with slow and white noise if the residuals have both."""
     for _ in range(2):
-        e = residuals_of(samples, answer.family.at(answer.widths.eta).coefficients(answer.solution.z))
+        e = residuals_of(samples, answer.family.prior(answer.widths.eta).coefficients(answer.solution.z))
         noise = fit_slow_and_white(e, samples.steps, answer.noise)
         if noise is answer.noise:
             break

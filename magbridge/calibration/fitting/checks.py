@@ -18,7 +18,7 @@ from magbridge.calibration.fitting.offset_terms import in_words
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Polynomial
 from magbridge.errors import CalibrationError
-from magbridge.estimation.residual import Samples, jacobian, residuals
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Combinations:
     """(rank, K): Each a unit vector over the coefficients, scaled by the norms of their Jacobian columns."""
 
 
-def combinations(samples: Samples, coefficients: FloatArray, sigma: float) -> Combinations:
+def combinations(samples: ResidualSamples, coefficients: FloatArray, sigma: float) -> Combinations:
     """Find the estimable combinations, from the singular values of the Jacobian over the noise.
 
     Parameters
@@ -115,7 +115,7 @@ def _positions(calibration: Calibration, data: Observations) -> Iterator[str]:
             )
 
 
-def _together(calibration: Calibration, data: Observations) -> Iterator[str]:
+def _moved_together(calibration: Calibration, data: Observations) -> Iterator[str]:
     names = [parameter.name for parameter in calibration.parameters]
     if len(names) < 2:
         return
@@ -182,7 +182,7 @@ def _runs(calibration: Calibration, data: Observations) -> Iterator[str]:
 
 CHECKS: tuple[Callable[[Calibration, Observations], Iterator[str]], ...] = (
     _positions,
-    _together,
+    _moved_together,
     _attitudes,
     _runs,
 )

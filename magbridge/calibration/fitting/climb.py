@@ -12,7 +12,7 @@ from magbridge.estimation.information import GaussianInformation, covariance_of
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, Whitening, estimate_noise
 from magbridge.estimation.optimise import Solution, gauss_newton
 from magbridge.estimation.priors import Prior, PriorFamily
-from magbridge.estimation.residual import Samples, jacobian, residuals, residuals_of
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of
 
 __all__ = ["Climbed", "climb", "thinned", "thinned_rows"]
 
@@ -42,7 +42,7 @@ def thinned_rows(n: int) -> IndexArray:
     return (first[:, None] + np.arange(BLOCK)).ravel()
 
 
-def thinned(samples: Samples) -> Samples:
+def thinned(samples: ResidualSamples) -> ResidualSamples:
     """Return blocks of neighbours, spread evenly over all samples, to choose a start."""
     n = len(samples.field)
     if n <= ENOUGH:
@@ -53,7 +53,7 @@ def thinned(samples: Samples) -> Samples:
 
 
 def climb(
-    samples: Samples,
+    samples: ResidualSamples,
     family: PriorFamily,
     z: FloatArray,
     eta: FloatArray,
@@ -68,12 +68,12 @@ def climb(
     score, white = -np.inf, noise is None
     shape = noise.shape if noise is not None and shaped else None
     if noise is None:
-        z, noise = _approach(samples, family.at(eta), z)
+        z, noise = _approach(samples, family.prior(eta), z)
     for step in range(MAX_START_ITERATIONS):
         if family.renew is not None and step:
             family = family.renew(z)
         # the first widths are a guess, and not worth settling at
-        solution = gauss_newton(samples, family.at(eta), noise, z, steps=50 if step else 3)
+        solution = gauss_newton(samples, family.prior(eta), noise, z, steps=50 if step else 3)
         kept = len(samples.field) - noise.rejected
         quadratic = GaussianInformation.from_derivatives(solution.z, *solution.normal, kept)
         widths = maximise_evidence(quadratic, family, eta, noise.sigma)
@@ -87,7 +87,7 @@ def climb(
         white = white and not still and step < MAX_START_ITERATIONS // 2
         # at last the noise's autocorrelation and outliers are kept, so that the rest converges
         if step < MAX_START_ITERATIONS - 4:
-            prior = family.at(eta)
+            prior = family.prior(eta)
             e = residuals_of(samples, prior.coefficients(z))
             doubt = (0.0, 0.0) if white or shape else _doubt(samples, prior, solution, noise)
             steps = np.where(white, np.inf, samples.steps)
@@ -96,7 +96,9 @@ def climb(
     return Climbed(solution, widths, noise, family, quadratic, score)
 
 
-def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel) -> tuple[float, float]:
+def _doubt(
+    samples: ResidualSamples, prior: Prior, solution: Solution, noise: NoiseModel
+) -> tuple[float, float]:
     """Variance of the model at a sample, and its covariance with the next one's, nT² (mean of all)."""
     few = thinned(samples)
     _, g = residuals(few, prior.coefficients(solution.z))
@@ -107,7 +109,7 @@ def _doubt(samples: Samples, prior: Prior, solution: Solution, noise: NoiseModel
     return float(np.mean((JP * J).sum(axis=1))), float(np.mean((JP[1:] * J[:-1]).sum(axis=1)[next_one]))
 
 
-def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
+def _approach(samples: ResidualSamples, prior: Prior, z: FloatArray) -> tuple[FloatArray, NoiseModel]:
     """Approach the solution: after each Gauss-Newton step, set the noise to the bulk of the residuals."""
     apart = np.full(len(samples.field), np.inf)
     noise = estimate_noise(residuals_of(samples, prior.coefficients(z)), apart, 0.0)
@@ -119,7 +121,7 @@ def _approach(samples: Samples, prior: Prior, z: FloatArray) -> tuple[FloatArray
     return z, noise
 
 
-def _score(widths: Hyperparameters, noise: NoiseModel, samples: Samples) -> float:
+def _score(widths: Hyperparameters, noise: NoiseModel, samples: ResidualSamples) -> float:
     """Log evidence of all samples: an outlier counts as one just at the limit, whitening by its Jacobian."""
     outlier = np.log(widths.sigma) + 0.5 * OUTLIER_SIGMA**2
     variance = Whitening(samples.steps, noise.autocorrelation, noise.white).variance

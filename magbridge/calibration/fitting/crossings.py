@@ -59,14 +59,14 @@ def tells_rock(data: Observations) -> bool:
     whole = np.isfinite(data.place[:, :2]).all(axis=1)
     place, course = courses(data.place[whole & ~far_off(data.place[:, :2]), :2])
 
-    def often(cell: float) -> bool:
+    def revisits_cells(cell: float) -> bool:
         places = len(np.unique(np.floor(place / cell), axis=0))
         return sum(crossed(place, course, cell)) >= max(OFTEN * places, TWICE)
 
     if not len(place) or np.hypot(*np.ptp(place, axis=0)) < AREA:
         return False
     legs = len(np.unique(np.floor(place / PLACES[-1]), axis=0)) >= LEGS
-    return (legs and abs(np.exp(1j * course).mean()) < AHEAD) or any(map(often, PLACES))
+    return (legs and abs(np.exp(1j * course).mean()) < AHEAD) or any(map(revisits_cells, PLACES))
 
 
 def left_open(data: Observations, length: float) -> Iterator[str]:

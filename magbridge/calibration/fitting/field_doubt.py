@@ -47,13 +47,13 @@ def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[floa
     if best.field.nodes.size > MAX_UNCERTAIN_NODES:
         return [(1.0, best)]
 
-    def at(x: FloatArray) -> Choice:
+    def choice_at(x: FloatArray) -> Choice:
         field = replace(best.field, length=best.field.length * float(np.exp(x[1])))
         return replace(best, field=field, ratio=best.ratio * float(np.exp(x[0])))
 
     def value(x: FloatArray) -> float:
         try:
-            return score(at(x))
+            return score(choice_at(x))
         except np.linalg.LinAlgError:
             return -np.inf
 
@@ -63,7 +63,7 @@ def plausible(score: Callable[[Choice], float], best: Choice) -> list[tuple[floa
     for (g, p), (h, q) in product(RULE, RULE):
         x = axes @ (spreads * np.array([g, h]))
         gained = (value(x) if x.any() else top) - top + 0.5 * (g * g + h * h)
-        points.append((p * q * float(np.exp(min(gained, 5.0))), at(x)))
+        points.append((p * q * float(np.exp(min(gained, 5.0))), choice_at(x)))
     total = sum(weight for weight, _ in points)
     kept = [(weight, one) for weight, one in points if weight > MIN_WEIGHT * total]
     total = sum(weight for weight, _ in kept)

@@ -106,7 +106,7 @@ def choose(
     """
     move_rho, memory = rho is None, 0.3 if rho is None else rho
 
-    def down(alpha: int) -> tuple[Choice, bool]:
+    def search_lengths(alpha: int) -> tuple[Choice, bool]:
         """Return the best of the lengths, from the longest on, and whether shorter ones are worse."""
         best: Choice | None = None
         worse, ratio, rho = 0, start, memory
@@ -117,7 +117,7 @@ def choose(
             field = GaussianField(nodes, float(length), alpha, harmonic)
             found = climb(
                 sums_of(field), Choice(field, ratio, rho), weighed,
-                move_length=False, move_rho=move_rho, steps=int(24 * effort), near=1.0,
+                move_length=False, move_rho=move_rho, steps=int(24 * effort), tolerance=1.0,
             )  # fmt: skip
             ratio, rho = found.ratio, found.rho
             if best is None or found.score > best.score:
@@ -127,16 +127,16 @@ def choose(
         assert best is not None
         return best, worse > 0
 
-    best, enclosed = down(SMOOTH)
+    best, enclosed = search_lengths(SMOOTH)
     if not enclosed:  # the crustal field is rougher than every candidate
-        rough, _ = down(SMOOTHNESS_POWERS[0])
+        rough, _ = search_lengths(SMOOTHNESS_POWERS[0])
         best = rough if rough.score > best.score else best
 
-    def tried(one: Choice, alpha: int, harmonic: bool, buried: bool = False) -> Choice:
-        length = one.field.length * ((one.field.alpha - 1) / (alpha - 1)) ** BENDS
+    def tried(choice: Choice, alpha: int, harmonic: bool, buried: bool = False) -> Choice:
+        length = choice.field.length * ((choice.field.alpha - 1) / (alpha - 1)) ** BENDS
         nodes = nodes_for(place, length, alpha, most if alpha <= SMOOTH else FEWER)
         field = GaussianField(nodes, length, alpha, harmonic, buried)
-        begin = replace(one, field=field)
+        begin = replace(choice, field=field)
         return climb(sums_of(field), begin, weighed, move_rho=move_rho, steps=int(36 * effort))
 
     kinds = [tried(best, best.field.alpha, kind) for kind in ((True, False) if harmonic else (False,))]
@@ -181,7 +181,7 @@ def climb(
     move_length: bool = True,
     move_rho: bool = True,
     steps: int = 40,
-    near: float = 0.1,
+    tolerance: float = 0.1,
 ) -> Choice:
     """Maximise the evidence from a choice, its nodes kept, to within so much log evidence of the maximum.
 
@@ -191,7 +191,7 @@ def climb(
     moves = [0] + [1] * move_rho + [2] * move_length
     first = np.array([0.0, np.log(share / (1.0 - share)), 0.0])
 
-    def at(moved: FloatArray) -> Choice:
+    def choice_at(moved: FloatArray) -> Choice:
         x = first.copy()
         x[moves] = moved
         rho = MAX_FIT_AUTOCORRELATION / (1.0 + np.exp(-np.clip(x[1], -30.0, 30.0))) if move_rho else start.rho
@@ -201,7 +201,7 @@ def climb(
         return Choice(field, start.ratio * float(np.exp(np.clip(x[0], -6.0, 6.0))), float(rho))
 
     def downhill(x: FloatArray) -> float:
-        one = at(x)
+        one = choice_at(x)
         try:
             return -weighed.score(eliminate_field(sums, one.field, one.ratio, one.rho), one.field, one.ratio)
         except np.linalg.LinAlgError:
@@ -211,9 +211,9 @@ def climb(
     simplex = begin + np.vstack([np.zeros(len(moves)), np.diag(np.array([0.7, 0.8, 0.3])[moves])])
     found = minimize(
         downhill, begin, method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": steps, "xatol": 0.05, "fatol": near},
+        options={"initial_simplex": simplex, "maxfev": steps, "xatol": 0.05, "fatol": tolerance},
     )  # fmt: skip
-    best = at(found.x)
+    best = choice_at(found.x)
     rho = best.rho if best.rho > WHITE_AUTOCORRELATION or not move_rho else 0.0
     return replace(best, rho=rho, score=-float(found.fun))
 

@@ -98,7 +98,7 @@ def fit_in_place(
         found, survey = _settled(survey, posed.family)
     except np.linalg.LinAlgError as problem:
         raise NoSolutionError("the fit to the survey has no solution: the crustal field is free") from problem
-    prior, z = found.family.at(found.widths.eta), found.z
+    prior, z = found.family.prior(found.widths.eta), found.z
     coefficients = prior.coefficients(z)
     check_scales(samples, coefficients)
     covariance = found.covariance()
@@ -145,7 +145,7 @@ def _groups(data: Observations, level: float) -> tuple[ParameterBlock, ...]:
     return tuple(groups)
 
 
-def _settled(survey: SurveySamples, own: PriorFamily) -> tuple[Answer, SurveySamples]:
+def _settled(survey: SurveySamples, family: PriorFamily) -> tuple[Answer, SurveySamples]:
     """Return the converged fit, and the samples with the optional terms that the log needs.
 
     A long log converges with every second or tenth sample first, and then with all. Optional terms that are
@@ -158,12 +158,12 @@ def _settled(survey: SurveySamples, own: PriorFamily) -> tuple[Answer, SurveySam
         The fit does not converge.
     """
     step = max(len(survey.kept) // FIRST_SAMPLES, 1)
-    best = Rounds(survey.thinned(step), own)
+    best = Rounds(survey.thinned(step), family)
     answer = best.settle()
     for one in sorted(best.unsure):
         few = survey.thinned(step)
         few.keep(tuple(group for group in few.groups if group.name in best.names - {one}))
-        other = Rounds(few, own)
+        other = Rounds(few, family)
         try:
             found = other.settle()
         except (CalibrationError, np.linalg.LinAlgError):

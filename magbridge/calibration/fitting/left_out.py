@@ -31,7 +31,7 @@ from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import OUTLIER_SIGMA, NoiseModel, effective_fraction
 from magbridge.estimation.optimise import NormalEquations, gauss_newton, normal_equations
 from magbridge.estimation.priors import Prior
-from magbridge.estimation.residual import Samples, jacobian, residuals, residuals_of, robust_scale
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, residuals_of, robust_scale
 
 __all__ = ["LeftOut", "carried_forward", "leave_out", "refitted"]
 
@@ -68,7 +68,7 @@ class LeftOut:
 
 
 def leave_out(
-    samples: Samples,
+    samples: ResidualSamples,
     prior: Prior,
     z: FloatArray,
     noise: NoiseModel,
@@ -108,7 +108,7 @@ def leave_out(
 
 
 def _left_out(
-    samples: Samples,
+    samples: ResidualSamples,
     prior: Prior,
     z: FloatArray,
     noise: NoiseModel,
@@ -145,7 +145,7 @@ def _left_out(
 
 
 def refitted(
-    samples: Samples, prior: Prior, z: FloatArray, noise: NoiseModel, runs: NDArray[np.generic]
+    samples: ResidualSamples, prior: Prior, z: FloatArray, noise: NoiseModel, runs: NDArray[np.generic]
 ) -> float:
     """Return the RMS error of the parts left out, nT, each predicted by a fit without it.
 
@@ -164,7 +164,7 @@ def refitted(
     return float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
 
 
-def carried_forward(samples: Samples, prior: Prior, z: FloatArray, noise: NoiseModel) -> float:
+def carried_forward(samples: ResidualSamples, prior: Prior, z: FloatArray, noise: NoiseModel) -> float:
     """Return the RMS error, nT, of parts of a log that a fit to the earlier parts alone is carried to.
 
     Forward chaining (Hyndman & Athanasopoulos 2021, Forecasting, section 5.10): the first k of
@@ -214,14 +214,14 @@ def _parts(runs: NDArray[np.generic]) -> list[IndexArray]:
     return [np.flatnonzero(part == k) for k in range(part.max() + 1)]
 
 
-def _alike(samples: Samples) -> list[IndexArray]:
+def _alike(samples: ResidualSamples) -> list[IndexArray]:
     """Return the places of each group of samples in which the field has like directions, by k-means."""
     u = samples.field / np.linalg.norm(samples.field, axis=1)[:, None]
     _, group = kmeans2(u, ATTITUDES, minit="++", rng=np.random.default_rng(1))
     return [rows for k in range(ATTITUDES) if len(rows := np.flatnonzero(group == k))]
 
 
-def _normal(samples: Samples, c: FloatArray, noise: NoiseModel, rows: IndexArray) -> NormalEquations:
+def _normal(samples: ResidualSamples, c: FloatArray, noise: NoiseModel, rows: IndexArray) -> NormalEquations:
     part = samples.part(rows)
     part.steps[0] = np.inf
     part.steps[1:][np.diff(rows) > 1] = np.inf

@@ -15,7 +15,7 @@ import numpy as np
 from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import correct
 from magbridge.calibration.model import LEVEL_STEP_SIGMA, Calibration, Reference
-from magbridge.estimation.residual import Samples, jacobian, residuals, symmetric
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals, symmetric
 
 __all__ = ["apart_from_level", "contradicts", "level_of", "sizes", "with_level"]
 
@@ -25,7 +25,9 @@ LEVEL_ROWS = 5_000
 """Samples that the mean is taken over, at most."""
 
 
-def with_level(calibration: Calibration, samples: Samples, bias: float, bias_sigma: float) -> Calibration:
+def with_level(
+    calibration: Calibration, samples: ResidualSamples, bias: float, bias_sigma: float
+) -> Calibration:
     """Compute how much of a calibration's covariance is level.
 
     A level beyond :data:`CONTRADICTS` sigmas of its prior does not come from the log: a fit that claims to
@@ -88,7 +90,7 @@ def level_of(
     return np.abs(up - here) / LEVEL_STEP_SIGMA
 
 
-def sizes(samples: Samples, coefficients: FloatArray) -> FloatArray:
+def sizes(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
     """Return ``sqrt(kappa^2 + |A u|^2)`` (n,): nT of the corrected field in one of the sensor's."""
     theta = samples.phi @ coefficients.reshape(-1, 9)
     A = np.eye(3) + symmetric(theta[:, :6] / samples.F_0)

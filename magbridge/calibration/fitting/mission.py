@@ -33,7 +33,7 @@ class Mission:
     """(n, k): Actuator positions at the same samples, in their units."""
 
     @classmethod
-    def of(cls, data: Observations) -> Mission:
+    def from_observations(cls, data: Observations) -> Mission:
         """Return the mission with the attitudes and positions of a deployment.
 
         CalibrationError: attitude or place is missing.

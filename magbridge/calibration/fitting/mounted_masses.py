@@ -85,13 +85,13 @@ class _Mass:
 
 
 def mass_columns(
-    at: FloatArray, travel: FloatArray, parameter: Parameter, order: int, latent: FloatArray
+    place: FloatArray, travel: FloatArray, parameter: Parameter, order: int, latent: FloatArray
 ) -> FloatArray:
     """Return ``dc/dl`` (order + 1, 9, 12) of a mass: its coefficients, the constant first, by latent numbers.
 
     Parameters
     ----------
-    at, travel : (3,) arrays
+    place, travel : (3,) arrays
         m, and m per unit of the parameter.
     parameter : Parameter
         That moves it.
@@ -103,9 +103,9 @@ def mass_columns(
     moment, pulled, shift, stretch = latent.reshape(4, 3)
     induced = gain_rotation() @ pulled
     p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * order + 4)
-    r = at + shift + p[:, None] * (travel + stretch)
+    r = place + shift + p[:, None] * (travel + stretch)
     # moments stay scaled by the measured distance, or a shift would change them too
-    by = dipole_columns(r, moment, induced, float(np.linalg.norm(at)))
+    by = dipole_columns(r, moment, induced, float(np.linalg.norm(place)))
     by[3:6] = np.tensordot(gain_rotation().T, by[3:6], 1)
     by = np.concatenate([by, by[6:] * p[:, None]])
     return np.moveaxis(expand_dipole(by, order), 0, -1)
@@ -187,11 +187,11 @@ def _mass(
     return _Mass(np.array(rows), np.array(mounting.at), travel, mounting.at_sigma, parameter)
 
 
-def _linearised(whole: PriorFamily, masses: list[_Mass], latent: FloatArray) -> PriorFamily:
+def _linearised(family: PriorFamily, masses: list[_Mass], latent: FloatArray) -> PriorFamily:
     """Return the prior with the dipoles linearised about `latent`: ``c(l) ~ c(l_0) + J (l - l_0)``."""
-    size, q = whole.E.shape
+    size, q = family.E.shape
     J = np.zeros((size, q + LATENT * len(masses)))
-    J[:, :q] = whole.E
+    J[:, :q] = family.E
     offset = np.zeros(size)
     for i, (mass, at) in enumerate(zip(masses, latent, strict=True)):
         by, value = mass.columns(at)
@@ -200,6 +200,6 @@ def _linearised(whole: PriorFamily, masses: list[_Mass], latent: FloatArray) -> 
         offset[place] += (value - by @ at).ravel()
 
     def renew(z: FloatArray) -> PriorFamily:
-        return _linearised(whole, masses, z[q:].reshape(-1, LATENT))
+        return _linearised(family, masses, z[q:].reshape(-1, LATENT))
 
-    return replace(whole, E=J, offset=offset, renew=renew)
+    return replace(family, E=J, offset=offset, renew=renew)

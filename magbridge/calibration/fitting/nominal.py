@@ -23,7 +23,7 @@ from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import CLIP_SIGMA, NoiseModel, estimate_noise, samples_per_independent
 from magbridge.estimation.optimise import Solution, gauss_newton
 from magbridge.estimation.priors import GAIN_SIGMA, SOFT_IRON_SIGMA, WIDE_HARD_IRON_SIGMA, Prior
-from magbridge.estimation.residual import Samples, residuals, scales_and_offsets
+from magbridge.estimation.residual import ResidualSamples, residuals, scales_and_offsets
 
 __all__ = ["check_scales", "fit_nominal", "nominal", "nominal_samples", "starts"]
 
@@ -67,9 +67,9 @@ def fit_nominal(data: Observations, order: int = 0, **options: Any) -> Fit:  # n
     return assemble(data, samples, (), ((),), one.coefficients, one.covariance, one.noise, "nominal", left)
 
 
-def nominal_samples(data: Observations) -> Samples:
+def nominal_samples(data: Observations) -> ResidualSamples:
     """Return the samples of `data` with the constant monomial only."""
-    return Samples(
+    return ResidualSamples(
         data.field, data.reference, np.ones((len(data), 1)), data.steps, float(data.reference.mean())
     )
 
@@ -146,7 +146,7 @@ def _chosen(
     ), best[1]
 
 
-def _every(samples: Samples, step: int) -> Samples:
+def _every(samples: ResidualSamples, step: int) -> ResidualSamples:
     """Return every so many samples, with their intervals counted in units of that."""
     if step == 1:
         return samples
@@ -159,14 +159,14 @@ def _every(samples: Samples, step: int) -> Samples:
     return part
 
 
-def _fitted(samples: Samples, prior: Prior, near: FloatArray | None = None) -> Ellipsoid:
-    """Return the fit with a prior, from the better one of two starts or from `near` (q,) its minimum.
+def _fitted(samples: ResidualSamples, prior: Prior, start_z: FloatArray | None = None) -> Ellipsoid:
+    """Return the fit with a prior, from the better one of two starts or from `start_z` (q,) its minimum.
 
     NoSolutionError: the fit collapsed or did not converge.
     """
     best = None
     begun = [np.asarray(np.linalg.lstsq(prior.E, start, rcond=None)[0], float) for start in starts(samples)]
-    for first in begun if near is None else [near]:
+    for first in begun if start_z is None else [start_z]:
         z = first
         noise = weighted = NoiseModel(1e-3 * samples.F_0)  # wide at first: residuals are not noise yet
         for _ in range(WEIGHT_ITERATIONS):
@@ -190,7 +190,7 @@ def _fitted(samples: Samples, prior: Prior, near: FloatArray | None = None) -> E
 
 
 def _weighted(
-    samples: Samples, prior: Prior, found: Solution, weighted: NoiseModel
+    samples: ResidualSamples, prior: Prior, found: Solution, weighted: NoiseModel
 ) -> tuple[NoiseModel, NoiseModel]:
     """Return the noise of a sample, and the noise with which each is weighed in the next fit.
 
@@ -215,7 +215,7 @@ def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArr
     return np.asarray(E.T @ np.linalg.inv(covariance) @ E)
 
 
-def starts(samples: Samples) -> list[FloatArray]:
+def starts(samples: ResidualSamples) -> list[FloatArray]:
     """Return two starts (9,), nT: without iron, and the best sphere by linear least squares.
 
     ``|h|^2 = 2 h^T T + (F^2 - |T|^2)`` is linear in T and one constant.
@@ -231,7 +231,7 @@ def starts(samples: Samples) -> list[FloatArray]:
     return [np.zeros(9), sphere]
 
 
-def check_scales(samples: Samples, coefficients: FloatArray) -> None:
+def check_scales(samples: ResidualSamples, coefficients: FloatArray) -> None:
     """Refuse a collapsed fit; `coefficients` are (9 m,), nT.
 
     NoSolutionError: where the samples are, a scale of A outside 0.5 to 2; or a T above twice the field,

@@ -14,7 +14,7 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.model import CalibratedRange, Calibration, Parameter
 from magbridge.calibration.terms import Exponents
 from magbridge.errors import CalibrationError
-from magbridge.estimation.residual import Samples
+from magbridge.estimation.residual import ResidualSamples
 from magbridge.records import MAX_MEASURED_NT
 
 __all__ = ["TEMPERATURE", "Observations", "monomials", "polynomial_samples"]
@@ -191,15 +191,15 @@ class Observations:
 
 def _enough(
     n: int,
-    whole: BoolArray,
+    complete: BoolArray,
     field: FloatArray,
     parameters: FloatArray,
     names: Sequence[str],
     reference: FloatArray,
 ) -> None:
     """Refuse data that cannot be fitted; name the responsible column."""
-    if whole.sum() >= 10:
-        if not (reference[whole] > 0).all():
+    if complete.sum() >= 10:
+        if not (reference[complete] > 0).all():
             raise CalibrationError("reference field: expected positive numbers (nT)")
         return
     columns = zip(
@@ -213,7 +213,7 @@ def _enough(
     if n >= 10 and not reasons:
         because = " (the columns have theirs in different rows: interpolate all to the times of mag_x)"
     raise CalibrationError(
-        f"only {int(whole.sum())} of {n} samples have every value{because}: at least 10 needed"
+        f"only {int(complete.sum())} of {n} samples have every value{because}: at least 10 needed"
     )
 
 
@@ -242,10 +242,10 @@ def polynomial_samples(
     exponents: tuple[Exponents, ...],
     kappa: float = 0.0,
     ranges: Sequence[Parameter] | None = None,
-) -> Samples:
+) -> ResidualSamples:
     """Return the samples of `data` with the monomials of their positions; `kappa` as in Samples.
 
     The positions are scaled to the range seen, unless `ranges` are given.
     """
     phi = monomials(data.parameters, data.ranges() if ranges is None else ranges, exponents)
-    return Samples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)
+    return ResidualSamples(data.field, data.reference, phi, data.steps, float(data.reference.mean()), kappa)

@@ -43,7 +43,7 @@ class Creep:
     calibration: Calibration
     """Calibration without the walk; beyond the survey the offset may have any value of it."""
 
-    def at(self, time: FloatArray) -> FloatArray:
+    def offset_at(self, time: FloatArray) -> FloatArray:
         """Return the offset (m, 3), nT, at times (m,), s since 1970 UTC."""
         return np.stack([np.interp(time, self.time, one) for one in self.offset.T], axis=1)
 

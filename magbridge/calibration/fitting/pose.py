@@ -17,7 +17,7 @@ from magbridge.calibration.model import Parameter
 from magbridge.calibration.terms import Exponents, full_order
 from magbridge.errors import CalibrationError
 from magbridge.estimation.priors import PriorFamily, polynomial_prior
-from magbridge.estimation.residual import Samples
+from magbridge.estimation.residual import ResidualSamples
 
 __all__ = ["Posed", "Vehicle", "pose"]
 
@@ -30,7 +30,7 @@ class Posed:
 
     ranges: tuple[Parameter, ...]
     exponents: tuple[Exponents, ...]
-    samples: Samples
+    samples: ResidualSamples
     family: PriorFamily
 
 

@@ -12,12 +12,12 @@ from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.left_out import LeftOut
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.calibration.fitting.offset_terms import Creep
-from magbridge.calibration.model import Calibration, Noise, Parameter, Reference, Run, Sensor
+from magbridge.calibration.model import CalibratedSensor, Calibration, Noise, Parameter, Reference, Run
 from magbridge.calibration.terms import Polynomial
 from magbridge.estimation.information import GaussianInformation
 from magbridge.estimation.noise import NoiseModel
 from magbridge.estimation.priors import Prior
-from magbridge.estimation.residual import Samples, residuals_of, rms, scales_and_offsets
+from magbridge.estimation.residual import ResidualSamples, residuals_of, rms, scales_and_offsets
 from magbridge.version import __version__
 from magbridge.wording import counted
 
@@ -36,7 +36,7 @@ class Fit:
     details: dict[str, Any]
     """Numbers of the method: evidence, widths, how many numbers were determined; rank, and the 1-sigma of
     each estimable combination from the data alone (nT)."""
-    samples: Samples
+    samples: ResidualSamples
     """The data as fitted, for :mod:`.checks`."""
     open: tuple[str, ...] = ()
     """What the track leaves open, which is a reason for an error that is large."""
@@ -79,7 +79,7 @@ class Fit:
 
 def assemble(
     data: Observations,
-    samples: Samples,
+    samples: ResidualSamples,
     parameters: tuple[Parameter, ...],
     exponents: tuple[tuple[int, ...], ...],
     coefficients: FloatArray,
@@ -129,7 +129,7 @@ def assemble(
             noise.white,
         ),
         reference=Reference(samples.F_0, data.model),
-        sensor=Sensor(data.sensor, filter_cutoff=data.filter_cutoff),
+        sensor=CalibratedSensor(data.sensor, filter_cutoff=data.filter_cutoff),
         runs=_runs(data, e),
         method=method,
         inputs=dict(data.inputs),

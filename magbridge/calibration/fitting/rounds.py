@@ -29,7 +29,7 @@ from magbridge.estimation.information import covariance_of
 from magbridge.estimation.noise import NoiseModel
 from magbridge.estimation.optimise import gauss_newton
 from magbridge.estimation.priors import PriorFamily
-from magbridge.estimation.residual import Samples, residuals_of, robust_scale
+from magbridge.estimation.residual import ResidualSamples, residuals_of, robust_scale
 from magbridge.estimation.select import BLOCK_LOG_EVIDENCE_PRICE, select_blocks
 
 __all__ = ["FIRST_SAMPLES", "SEARCHED", "WIDE", "Answer", "Rounds", "start"]
@@ -55,11 +55,11 @@ class Answer:
     def covariance(self) -> FloatArray:
         """Return that of z (q, q), with what the data leave open of the field's size and length."""
         s2 = self.widths.sigma**2
-        precision = self.family.at(self.widths.eta).precision
+        precision = self.family.prior(self.widths.eta).precision
         weighed = Weighed(self.family, self.widths.eta, self.widths.sigma, self.middle)
 
-        def reduced(one: Choice) -> FieldEliminated:
-            return eliminate_field(self.sums, one.field, one.ratio, one.rho)
+        def reduced(choice: Choice) -> FieldEliminated:
+            return eliminate_field(self.sums, choice.field, choice.ratio, choice.rho)
 
         total = np.zeros_like(precision)
         for weight, one in plausible(
@@ -74,10 +74,10 @@ class Answer:
 
 def start(survey: SurveySamples, family: PriorFamily) -> tuple[FloatArray, float]:
     """Return z (q,) near the solution, with the crustal field as noise, and the RMS of that noise."""
-    samples, prior = survey.samples, family.at(family.centre)
+    samples, prior = survey.samples, family.prior(family.centre)
     found: list[tuple[float, FloatArray]] = []
     for one in starts(samples):
-        z = family.near(one)
+        z = family.nearest_latent(one)
         sigma = np.inf
         for _ in range(5):
             e = residuals_of(samples, prior.coefficients(z))
@@ -118,11 +118,11 @@ MAX_SAMPLE_NODES = 40_000
 class Rounds:
     """Alternate coefficients, widths and the field until no residual moves."""
 
-    def __init__(self, survey: SurveySamples, own: PriorFamily) -> None:
-        self.survey, self.own, self.q = survey, own, own.E.shape[1]
+    def __init__(self, survey: SurveySamples, family: PriorFamily) -> None:
+        self.survey, self.own, self.q = survey, family, family.E.shape[1]
         self.until = INITIAL_ITERATIONS + SEARCHES
         self.offers = any(one.offered for one in survey.groups)
-        self.family = with_blocks(own, survey.groups)
+        self.family = with_blocks(family, survey.groups)
         self.part = about_the_middle(survey.place, SEARCHED, WIDE)
         self.step = max(int(self.part.sum()) // SEARCHED, 1)
         self.harmonic = bool(np.ptp(survey.deeper) > 5.0)
@@ -198,7 +198,7 @@ class Rounds:
         )
         widths = maximise_evidence(reduced.quadratic, self.family, self.eta, self.sigma)
         self.eta, self.sigma = widths.eta, widths.sigma
-        precision = reduced.quadratic.precision / self.sigma**2 + self.family.at(self.eta).precision
+        precision = reduced.quadratic.precision / self.sigma**2 + self.family.prior(self.eta).precision
         step = np.linalg.solve(precision, reduced.quadratic.vector / self.sigma**2) - self.z
         self.z, lacking = self._damped(np.asarray(step, float), reduced, choice.field)
         self.w, self.nodes = reduced.field(self.z), choice.field.nodes
@@ -266,7 +266,7 @@ class Rounds:
 
         A track that bends from the last answer's to that of z meets the field's slopes on its way.
         """
-        precision, survey = self.family.at(self.eta).precision, self.survey
+        precision, survey = self.family.prior(self.eta).precision, self.survey
         here, change = survey.rock(field, np.column_stack([reduced.field(self.z), reduced.follow @ step])).T
         here, change = here + self._slow(self.z), change + self._slow(step)
         if survey.slopes.size:
@@ -300,7 +300,7 @@ class Rounds:
 
     def _residuals(self, z: FloatArray, lacking: FloatArray) -> FloatArray:
         samples = self.survey.samples
-        known: Samples = replace(
+        known: ResidualSamples = replace(
             samples,
             reference=samples.reference + lacking,
             field=samples.field - self.survey.offset(z[self.q :]),

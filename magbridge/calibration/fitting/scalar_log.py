@@ -148,21 +148,21 @@ def scalar_reading(ds: xr.Dataset, column: str) -> FloatArray:
     return reading
 
 
-def merit_of(ds: xr.Dataset, before: FloatArray, after: FloatArray) -> dict[str, Any] | None:
+def merit_of(ds: xr.Dataset, measured: FloatArray, compensated: FloatArray) -> dict[str, Any] | None:
     """Return the figure of merit of a log's box flight; None if it holds none, or no attitude.
 
     Parameters
     ----------
     ds : Dataset
         The log, n samples.
-    before, after : (n,) array
+    measured, compensated : (n,) array
         nT, the scalar minus its reference, before and after compensation.
     """
     if not {"roll", "pitch", "heading"} <= set(ds.variables):
         return None
     roll, pitch, heading = (ds[name].to_numpy().astype(float) for name in ("roll", "pitch", "heading"))
     box = box_flight(np.asarray(ds["time"].to_numpy(), float), roll, pitch, heading)
-    return None if box is None else figure_of_merit(box, before, after)
+    return None if box is None else figure_of_merit(box, measured, compensated)
 
 
 def with_scalar(corrected: xr.Dataset, log: xr.Dataset, sensors: Sequence[ScalarSensor]) -> xr.Dataset:

@@ -25,7 +25,7 @@ from magbridge.estimation.blocks import (
 from magbridge.estimation.elimination import LinearisedRows
 from magbridge.estimation.gaussian_field import GaussianField
 from magbridge.estimation.priors import PriorFamily
-from magbridge.estimation.residual import Samples, jacobian, residuals
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 
 __all__ = ["Drift", "SurveySamples", "beside_motion"]
 
@@ -85,7 +85,7 @@ class SurveySamples:
     def __init__(
         self,
         data: Observations,
-        samples: Samples,
+        samples: ResidualSamples,
         groups: tuple[ParameterBlock, ...],
         drift: Drift | None = None,
     ) -> None:
@@ -111,7 +111,7 @@ class SurveySamples:
         few, rows = copy(self), np.arange(0, len(self.kept), step)
         for name in ("unmapped", "place", "as_logged", "deeper", "at_rest", "kept"):
             setattr(few, name, getattr(self, name)[rows])
-        few.samples = replace(self.samples.part(rows), steps=np.append(np.inf, self._apart(rows)) / step)
+        few.samples = replace(self.samples.part(rows), steps=np.append(np.inf, self._intervals(rows)) / step)
         if self.drift is not None:
             few.drift = self.drift._replace(waves=self.drift.waves[rows])
         few.keep(tuple(replace(group, functions=group.functions[rows]) for group in self.groups))
@@ -131,16 +131,16 @@ class SurveySamples:
         """Return the missing part of the reference except the crustal field (n,), nT: level, slow changes."""
         return (self.steady @ latent[: len(self.steady)]) * self.unmapped
 
-    def offset(self, latent: FloatArray, of: Sequence[OffsetBlock] | None = None) -> FloatArray:
+    def offset(self, latent: FloatArray, blocks: Sequence[OffsetBlock] | None = None) -> FloatArray:
         """Return the sensor's offset (n, 3), nT, without its dependence on the positions.
 
-        `latent` (p,) are the unknowns of all groups; `of` are the offsets that count, by default all.
+        `latent` (p,) are the unknowns of all groups; `blocks` are the offsets that count, by default all.
         """
         out, start = np.zeros((len(self.kept), 3)), len(self.steady)
         for group in self.offsets:
             d = latent[start : start + len(group.shape)]
             start += len(d)
-            if of is None or group in of:
+            if blocks is None or group in blocks:
                 out += group.functions @ d.reshape(3, -1).T
         return out
 
@@ -179,7 +179,7 @@ class SurveySamples:
         latent = z[family.E.shape[1] - sum(len(group.shape) for group in self.groups) :]
         slow, offset = self.slow(latent), self.offset(latent)
         follows = np.zeros(len(rows), bool)
-        follows[1:] = self._apart(rows) == step
+        follows[1:] = self._intervals(rows) == step
         c = family.E @ z + family.offset
         E = family.E[:, : len(z) - len(latent)]
         for start in range(0, len(rows), BLOCK_ROWS):
@@ -200,7 +200,7 @@ class SurveySamples:
                 np.column_stack([e - D @ z - here @ w, D]), here, follows[part], overlap=start > 0
             )
 
-    def _apart(self, rows: IndexArray) -> FloatArray:
+    def _intervals(self, rows: IndexArray) -> FloatArray:
         """Return sampling intervals between successive `rows`; infinite across runs."""
         steps = np.where(np.isfinite(self.samples.steps), self.samples.steps, 1e9)
         steps[0] = 0.0

@@ -49,7 +49,13 @@ def flight_plan(calibration: Calibration, mission: xr.Dataset, *, runs: int = 10
         raise CalibrationError("the mission needs latitude and longitude, to know the Earth's field there")
     flown = settled(data, calibration.parameters) if names else None
     limits = Limits(roll=(-roll, roll), pitch_at=trim_of(data), flown=flown)
-    return plan(calibration, Mission.of(data), np.nanmean(data.reference_ned, axis=0), limits, runs=runs)
+    return plan(
+        calibration,
+        Mission.from_observations(data),
+        np.nanmean(data.reference_ned, axis=0),
+        limits,
+        runs=runs,
+    )
 
 
 def survey_plan(

@@ -31,7 +31,7 @@ from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.errors import CalibrationError
 from magbridge.estimation.noise import effective_fraction
 from magbridge.estimation.priors import polynomial_prior
-from magbridge.estimation.residual import Samples, jacobian, residuals
+from magbridge.estimation.residual import ResidualSamples, jacobian, residuals
 
 __all__ = [
     "Design", "Limits", "Plan", "PlannedRun", "evaluate_runs", "expected_calibration", "plan", "settled",
@@ -112,7 +112,7 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
     rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
     found = []
     for positions in product(*(np.linspace(low, high, levels) for low, high in ends)):
-        if limits.flown is not None and not _near(np.array(positions), limits.flown, parameters):
+        if limits.flown is not None and not _is_near_flown(np.array(positions), limits.flown, parameters):
             continue
         if limits.pitch_at is None:
             steep = np.linspace(*limits.pitch, 3)
@@ -129,7 +129,7 @@ def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: in
     return found
 
 
-def _near(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
+def _is_near_flown(positions: FloatArray, flown: FloatArray, parameters: tuple[Parameter, ...]) -> bool:
     """Return True if some flown positions differ by no more than REACH in any parameter."""
     off = np.abs(positions - flown) / [parameter.scale for parameter in parameters]
     return bool((off.max(axis=1) <= MAX_POSITION_DIFFERENCE).any())
@@ -199,7 +199,7 @@ class Design:
         phi = monomials(positions, calibration.parameters, self.exponents)
         reading = forward(calibration, truth, positions, np.zeros(len(truth)))
         size, alone = np.linalg.norm(truth, axis=1), np.full(len(truth), np.inf)
-        samples = Samples(reading, size, phi, alone, calibration.reference.field)
+        samples = ResidualSamples(reading, size, phi, alone, calibration.reference.field)
         return phi, residuals(samples, calibration.coefficients)[1]
 
     def factor(self, run: PlannedRun) -> FloatArray:
@@ -218,7 +218,7 @@ class Design:
         """Return the variance (n,), nT², at the mission's points."""
         return np.asarray(np.einsum("ij,jk,ik->i", self.points, C, self.points))
 
-    def after(self, C: FloatArray, F: FloatArray) -> FloatArray:
+    def covariance_after(self, C: FloatArray, F: FloatArray) -> FloatArray:
         """Return C' (K, K), the covariance after one more run."""
         CF = C @ F
         return np.asarray(C - CF @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ CF, CF.T))
@@ -242,7 +242,7 @@ def evaluate_runs(
     C = calibration.covariance
     course = [design.variances(C)]
     for run in runs:
-        C = design.after(C, design.factor(run))
+        C = design.covariance_after(C, design.factor(run))
         course.append(np.maximum(design.variances(C), 0.0))
     return Plan(
         tuple(runs),
@@ -284,13 +284,13 @@ def plan(
         C = calibration.covariance
         for _ in range(runs):
             chosen.append(int(np.argmin(design.scores(C, factors))))
-            C = design.after(C, factors[chosen[-1]])
+            C = design.covariance_after(C, factors[chosen[-1]])
         for _ in range(3):  # exchanges: each run against all others, given the rest
             changed = False
             for i in range(len(chosen)):
                 C = calibration.covariance
                 for j in chosen[:i] + chosen[i + 1 :]:
-                    C = design.after(C, factors[j])
+                    C = design.covariance_after(C, factors[j])
                 scores = design.scores(C, factors)
                 best = int(np.argmin(scores))
                 if scores[best] < (1.0 - 1e-6) * scores[chosen[i]]:

@@ -82,7 +82,7 @@ def propose(
     speed = float(np.median(np.hypot(*np.diff(place, axis=0).T) / np.maximum(np.diff(time), 1e-3)))
     if not speed > 0.0:
         raise CalibrationError("the mission does not move: no survey can be flown like it")
-    mission = Mission.of(data)
+    mission = Mission.from_observations(data)
     field = np.asarray(ned.mean(axis=0))
     count = int(hours * 3600.0 / float(np.median(np.diff(time))))
     rows = np.arange(0, count, max(count // PATTERN_SAMPLES, 1))
