@@ -19,9 +19,9 @@ from scipy.signal import butter, sosfiltfilt
 
 from magbridge.arrays import BoolArray, FloatArray
 
-__all__ = ["AXES", "BoxFlight", "Manoeuvre", "box_flight", "figure_of_merit", "merit_text"]
+__all__ = ["MANOEUVRE_AXES", "BoxFlight", "Manoeuvre", "box_flight", "figure_of_merit", "merit_text"]
 
-AXES = ("roll", "pitch", "yaw")
+MANOEUVRE_AXES = ("roll", "pitch", "yaw")
 BAND_HZ = (0.1, 0.6)
 """Band of the manoeuvres, Hz."""
 USUAL_AMPLITUDE_DEG = (10.0, 5.0, 5.0)
@@ -97,7 +97,7 @@ def box_flight(
     axis[np.append(np.diff(time) > 3.0 * interval, False)] = -1
     edges = [0, *(np.flatnonzero(np.diff(axis)) + 1).tolist(), len(axis)]
     found = [
-        Manoeuvre(AXES[axis[begin]], float(turned[begin:end].mean() % 360.0), slice(begin, end))
+        Manoeuvre(MANOEUVRE_AXES[axis[begin]], float(turned[begin:end].mean() % 360.0), slice(begin, end))
         for begin, end in pairwise(edges)
         if axis[begin] >= 0 and time[end - 1] - time[begin] >= MIN_DURATION_S
     ]
@@ -119,7 +119,9 @@ def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
         key = round((one.heading - first) / QUARTER_TURN_DEG) % 4, one.axis
         if key not in longest or _length(one) > _length(longest[key]):
             longest[key] = one
-    return tuple(longest[key] for key in sorted(longest, key=lambda key: (key[0], AXES.index(key[1]))))
+    return tuple(
+        longest[key] for key in sorted(longest, key=lambda key: (key[0], MANOEUVRE_AXES.index(key[1])))
+    )
 
 
 def figure_of_merit(box: BoxFlight, measured: FloatArray, compensated: FloatArray) -> dict[str, Any]:

@@ -34,7 +34,7 @@ SPEED_SMOOTHING_S = 2.0
 """Time over which the velocity is averaged, s."""
 MAX_SPEED_GAP_INTERVALS = 3.0
 """Intervals without a sample after which the velocity starts again."""
-MIN_SURVEY_SAMPLES = 10
+MIN_PLACED_READINGS = 10
 
 
 class AlignmentTerm(NamedTuple):
@@ -170,7 +170,7 @@ def _log_rows(
     known = np.isfinite(value) & np.isfinite(place).all(axis=1) & placed(log)
     for term in terms:
         known &= np.isfinite(term.columns).all(axis=1)
-    if known.sum() < MIN_SURVEY_SAMPLES:
+    if known.sum() < MIN_PLACED_READINGS:
         source, many = log.attrs.get("source", "the log"), counted(int(known.sum()), "sample")
         raise FormatError(source, f"only {many} with {column} and a position")
     time = np.asarray(log["time"].to_numpy(), float)
