@@ -73,7 +73,7 @@ def demo(
     print_result(result, demonstration.summary(result), json)
 
 
-def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
+def _live(folder: Path, seed: int, port: int, *, show: bool) -> None:
     """Fly the demonstration's glider into the page until interrupted."""
     from magbridge.monitor.serve import serve
     from sitl.live import MAP, flying
@@ -81,10 +81,10 @@ def _live(out: Path, seed: int, port: int, *, show: bool) -> None:
     def notify(text: str) -> None:
         print(text, file=sys.stderr)
 
-    with new_folder(out):
-        out.mkdir(parents=True, exist_ok=True)
-        with flying(out, seed, notify) as link:
-            serve(link, 0, "127.0.0.1", port, grid=out / MAP, show=show)
+    with new_folder(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with flying(folder, seed, notify) as link:
+            serve(link, 0, "127.0.0.1", port, grid=folder / MAP, show=show)
 
 
 @command("run --config bridge.toml [--check [--live]]")

@@ -98,7 +98,7 @@ class Fleet:
     observed: tuple[Observed, ...]
     """Information of z."""
 
-    def known(self, vehicle: str, refit: str, until: float = np.inf) -> Known:
+    def known(self, vehicle: str, refit: str, before_time: float = np.inf) -> Known:
         """Return the prediction of a vehicle's next deployment.
 
         Parameters
@@ -107,13 +107,13 @@ class Fleet:
             May be new to the fleet.
         refit : str
             The refit it flies with: one it had before, or a new one.
-        until : float
+        before_time : float
             s since 1970: only its own deployments that began before count.
         """
         past = [
             seen
             for lesson, seen in zip(self.lessons, self.observed, strict=True)
-            if lesson.vehicle == vehicle and lesson.time < until
+            if lesson.vehicle == vehicle and lesson.time < before_time
         ]
         mean, P = self.population.expected(vehicle, past, refit)
         E = self.basis

@@ -24,7 +24,7 @@ MAX_PROBABILITY: Final = 1e-9
 MIN_STUCK_FRACTION: Final = 1e-3
 MIN_RUN: Final = 4
 MIN_COMMON_RUN: Final = 3
-AXIS_NAMES: Final = "xyz"
+AXIS_LETTERS: Final = "xyz"
 
 
 class Repetition:
@@ -105,5 +105,7 @@ class RepetitionCheck:
         elif not axis.repeat(0.0, MIN_RUN):
             return False
         axis.limit, self._has_limit = abs(value), True
-        self._messages.report("axis", f"axis {AXIS_NAMES[number]} stuck at {value:.0f} nT, or clipped there")
+        self._messages.report(
+            "axis", f"axis {AXIS_LETTERS[number]} stuck at {value:.0f} nT, or clipped there"
+        )
         return True

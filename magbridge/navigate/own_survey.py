@@ -49,7 +49,7 @@ __all__ = ["COVARIANCE_KINDS", "OwnField", "drift_functions", "localise", "own_b
 STEP, LASTS, BLOCKS = 60.0, 100.0, 400
 """m that a block of samples covers at most, the share of the log that it lasts at most is one in so many, and
 the number of blocks at most: of more, every second or third is used."""
-MIN_BLOCKS = 12
+MIN_TRACK_BLOCKS = 12
 """Blocks."""
 STAGES, PARTICLES = 10, 80
 """Parts in which the track is processed, and number of tracks (particles)."""
@@ -172,7 +172,7 @@ def _blocks(
         if np.isfinite(field[i]) and np.isfinite(sigma[i]):
             found.append(collector.add(round(t * 1e6), reckoning, float(field[i]), float(sigma[i])))
     whole = [one for one in (*found, collector.flush()) if one is not None]
-    if len(whole) < MIN_BLOCKS:
+    if len(whole) < MIN_TRACK_BLOCKS:
         raise FormatError(source, "expected samples of the total field at known times: too few are usable")
     step = ceil(len(whole) / BLOCKS)
     return whole[::step], step

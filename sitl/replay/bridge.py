@@ -27,7 +27,7 @@ from sitl.replay.timetable import read_entries
 
 __all__ = ["ScriptedEdge"]
 
-BATCH = 8192
+EVENTS_PER_BATCH = 8192
 """Bytes to the autopilot that may wait to be sent together."""
 
 
@@ -75,7 +75,7 @@ class ScriptedEdge:
         if number != Channel.LINK:
             return
         self._unsent += data
-        if len(self._unsent) >= BATCH:
+        if len(self._unsent) >= EVENTS_PER_BATCH:
             self.flush()
 
     def credit(self, frames: list[bytes]) -> None:
