@@ -16,8 +16,8 @@ from magbridge.estimation.hyperparameters import log_evidence
 from magbridge.estimation.priors import PriorFamily
 
 __all__ = [
-    "DECISIVE_LOG_RATIO",
-    "Choice", "Weighed", "choose", "climb", "first_guess", "refined", "same_noise",
+    "BENDS", "DECISIVE_LOG_RATIO", "Choice", "Weighed", "choose", "climb", "first_guess", "refined",
+    "same_noise",
 ]  # fmt: skip
 
 RESOLVED = 2.0
