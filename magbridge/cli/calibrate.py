@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.observations import Observations
     from magbridge.calibration.model import Calibration
 
+__all__ = ["scalar_options"]
+
 MAX_LISTED_CONTRIBUTIONS = 5
 """Contributions to a scalar's reading that the summary lists."""
 ALL_COMPASSES = "all"

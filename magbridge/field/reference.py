@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MAIN_FIELD_RANGE_NT", "about_mean", "earth_field", "main_field", "other_units", "placed", "positions",
-    "reference_field", "sphere_radius", "with_true_heading",
+    "reference_field", "require_date", "sphere_radius", "with_true_heading",
 ]  # fmt: skip
 
 MAIN_FIELD_RANGE_NT = 20_000.0, 70_000.0

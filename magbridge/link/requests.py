@@ -10,7 +10,7 @@ from magbridge.link.output import Announcer, Outbox, Timers
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAV_AUTOPILOT, MAV_CMD, MAV_RESULT, MAV_SEVERITY
 
-__all__ = ["AIRCRAFT", "StreamRequests", "needed_rates"]
+__all__ = ["AIRCRAFT", "MIN_RATE_FRACTION", "StreamRequests", "needed_rates"]
 
 AIRCRAFT: Final = frozenset((1, 2, 3, 4, 13, 14, 15, 19, 20, 21, 22, 23, 24, 25, 29, 35))
 """MAV_TYPE of vehicles that turn by tens of degrees a second: fixed and rotary wings."""
