@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from math import cos, degrees, hypot, inf, isfinite, radians, sin, tan
+from math import atan2, cos, degrees, hypot, inf, isfinite, nan, radians, sin, tan
 from typing import Final
 
 import numpy as np
 
 from magbridge.align import Sample
-from magbridge.arrays import FloatArray
 from magbridge.calibration.correct import vector_covariance
-from magbridge.calibration.heading import heading, model_declination_sigma, published_covariance
+from magbridge.calibration.heading import heading_of_sample, model_declination_sigma
 from magbridge.calibration.model import Boresight, Calibration
 from magbridge.config import HeadingOutput
 from magbridge.link.attitude import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
@@ -71,9 +70,12 @@ class LiveHeading:
         self._attitude_us = -(1 << 62)
         self._roll = self._pitch = 0.0
         self._rates = (0.0, 0.0, 0.0)
-        self._covariance: FloatArray | None = None
+        self._covariance: list[float] = []
+        self._turn: list[float] = []
         self._covariance_us = 0
         self._calibration: Calibration | None = None
+        self._main: tuple[Vector, float] | None = None
+        self._declination = self._declination_sigma = nan
 
     def receive(self, message: Message, time_us: int) -> None:
         """Process an ATTITUDE or HEARTBEAT of the autopilot, received at `time_us`."""
@@ -108,16 +110,16 @@ class LiveHeading:
         roll, pitch, tilt_sigma = self._tilt(since_us * 1e-6)
         if not abs(pitch) < MAX_PITCH_RAD:
             return NO_ATTITUDE
-        north, east, _ = main
-        declination = degrees(np.arctan2(east, north))
-        uncertain = model_declination_sigma(np.array([hypot(north, east)]), crustal)
-        covariance, turn = self._vector_covariance(sample, corrected, calibration, boresight)
-        found = heading(
-            np.array([corrected.field]), roll, pitch, declination, covariance=covariance,
-            boresight_covariance=turn, tilt_sigma_deg=degrees(tilt_sigma), declination_sigma_deg=uncertain,
+        self._decline(main, crustal)
+        self._update_covariance(sample, calibration, boresight)
+        x, y, z = corrected.field_sigma
+        published = x * x + y * y + z * z
+        magnetic, true, sigma = heading_of_sample(
+            corrected.field, roll, pitch, self._declination, self._covariance, self._turn,
+            published if published < inf else inf, tilt_sigma_deg=degrees(tilt_sigma),
+            declination_sigma_deg=self._declination_sigma,
         )  # fmt: skip
-        magnetic, true, sigma = (one.item() for one in (found.magnetic, found.true, found.sigma))
-        return Attitude(magnetic, true, sigma, declination, roll, pitch, self._rates, tilt_sigma)
+        return Attitude(magnetic, true, sigma, self._declination, roll, pitch, self._rates, tilt_sigma)
 
     def _tilt(self, elapsed: float) -> tuple[float, float, float]:
         """Return roll, pitch and their standard deviation (rad), `elapsed` s after the last ATTITUDE.
@@ -134,21 +136,28 @@ class LiveHeading:
         sigma = hypot(self._tilt_sigma, 0.5 * max(abs(roll_change), abs(pitch_change)))
         return roll + roll_change, pitch + pitch_change, sigma
 
-    def _vector_covariance(
-        self, sample: Sample, corrected: Corrected, calibration: Calibration, boresight: Boresight
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the covariances of the vector, (1, 3, 3) nT^2, and of the boresight, (3, 3) rad^2."""
+    def _decline(self, main: Vector, crustal: float) -> None:
+        """Compute the declination (deg) and its standard deviation when the main field has changed."""
+        if self._main == (main, crustal):
+            return
+        north, east, _ = main
+        self._main = main, crustal
+        self._declination = degrees(atan2(east, north))
+        sigma = model_declination_sigma(np.array([hypot(north, east)]), crustal)
+        self._declination_sigma = sigma.item()
+
+    def _update_covariance(self, sample: Sample, calibration: Calibration, boresight: Boresight) -> None:
+        """Compute the covariances of vector (nT^2) and boresight (rad^2) if the last ones are old."""
         is_old = abs(sample.time_us - self._covariance_us) >= COVARIANCE_INTERVAL_US
-        if self._covariance is None or is_old or calibration is not self._calibration:
-            channels = np.array([sample.values[: len(calibration.channels)]], float).reshape(1, -1)
-            times = np.array([sample.time_us * 1e-6])
-            # effects begin in a fresh state here: their part of the covariance is that of the steady state
-            self._covariance = vector_covariance(calibration, np.array([sample.field]), channels, times)
-            self._covariance_us, self._calibration = sample.time_us, calibration
-        turn = np.array(boresight.covariance)
-        variance = sum(one * one for one in corrected.field_sigma)
-        published = np.array([variance if variance < inf else inf])
-        return published_covariance(self._covariance, turn, np.array([corrected.field]), published), turn
+        if self._covariance and not is_old and calibration is self._calibration:
+            return
+        channels = np.array([sample.values[: len(calibration.channels)]], float).reshape(1, -1)
+        times = np.array([sample.time_us * 1e-6])
+        # effects begin in a fresh state here: their part of the covariance is that of the steady state
+        covariance = vector_covariance(calibration, np.array([sample.field]), channels, times)
+        self._covariance = covariance.ravel().tolist()
+        self._turn = np.array(boresight.covariance).ravel().tolist()
+        self._covariance_us, self._calibration = sample.time_us, calibration
 
     def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
         """Send the heading of a sample if it is due and accurate; `time_us` is the sample's time."""

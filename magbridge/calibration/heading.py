@@ -25,7 +25,9 @@ of the three components are correlated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import atan2, cos, degrees, hypot, inf, isnan, nan, radians, sin, sqrt
 
 import numpy as np
 
@@ -35,6 +37,7 @@ __all__ = [
     "DEFAULT_TILT_SIGMA_DEG",
     "Heading",
     "heading",
+    "heading_of_sample",
     "level_vector",
     "model_declination_sigma",
     "published_covariance",
@@ -47,8 +50,10 @@ MODEL_DECLINATION_SIGMA_DEG = 0.26
 World Magnetic Model 2020 (Chulliat et al. 2020, section 3.4): ``sqrt(0.26^2 + (5417 nT / H)^2)``."""
 MODEL_DECLINATION_SIGMA_NT_DEG = 5417.0
 """deg nT, the part of the same error model that falls with the horizontal field."""
-UNIFORM_SIGMA_DEG = 180.0 / np.sqrt(3.0)
+UNIFORM_SIGMA_DEG = 180.0 / sqrt(3.0)
 """deg, standard deviation of an angle of which nothing is known."""
+MAX_ADDED_VARIANCE = 1e12
+"""nT^2, largest variance that the published one adds to that of the calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +158,91 @@ def heading(
     return Heading(magnetic, (magnetic + declination) % 360.0, np.where(unknown, np.inf, sigma))
 
 
+def heading_of_sample(
+    vector: tuple[float, float, float],
+    roll: float,
+    pitch: float,
+    declination: float,
+    covariance: Sequence[float],
+    boresight_covariance: Sequence[float],
+    published_variance: float,
+    *,
+    tilt_sigma_deg: float,
+    declination_sigma_deg: float,
+) -> tuple[float, float, float]:
+    """Return :func:`heading` of one sample with :func:`published_covariance`, without arrays.
+
+    Parameters
+    ----------
+    vector : tuple of 3 float
+        nT, corrected field in body axes.
+    roll, pitch : float
+        rad.
+    declination : float
+        deg, east positive; NaN where unknown.
+    covariance : sequence of 9 float
+        nT^2, by the calibration alone, row by row.
+    boresight_covariance : sequence of 9 float
+        rad^2, of the boresight's rotation vector in body axes, row by row.
+    published_variance : float
+        nT^2, sum of the three components' published variances.
+    tilt_sigma_deg, declination_sigma_deg : float
+        deg, 1-sigma of roll and of pitch, and of the declination.
+
+    Returns
+    -------
+    magnetic, true, sigma : float
+        deg, as in :class:`Heading`.
+    """
+    x, y, z = vector
+    sin_roll, cos_roll, sin_pitch, cos_pitch = sin(roll), cos(roll), sin(pitch), cos(pitch)
+    # h = R_y R_x b
+    z_rolled = sin_roll * y + cos_roll * z
+    h_x, h_y = cos_pitch * x + sin_pitch * z_rolled, cos_roll * y - sin_roll * z
+    h_z = cos_pitch * z_rolled - sin_pitch * x
+    horizontal_squared = h_x * h_x + h_y * h_y
+    if isnan(horizontal_squared):
+        return nan, nan, inf
+    magnetic = degrees(atan2(-h_y, h_x)) % 360.0
+    true = (magnetic + declination) % 360.0
+    if horizontal_squared == 0.0:
+        return magnetic, true, UNIFORM_SIGMA_DEG
+    # g = L^T (h_y, -h_x, 0) / H^2
+    along, across = h_y / horizontal_squared, -h_x / horizontal_squared
+    g = (
+        cos_pitch * along,
+        sin_pitch * sin_roll * along + cos_roll * across,
+        sin_pitch * cos_roll * along - sin_roll * across,
+    )
+    w = (y * g[2] - z * g[1], z * g[0] - x * g[2], x * g[1] - y * g[0])  # w = b x g
+    # a third of the published variance beyond tr(V) + tr(Omega) |b|^2 - b^T Omega b goes to each axis
+    trace = boresight_covariance[0] + boresight_covariance[4] + boresight_covariance[8]
+    known = covariance[0] + covariance[4] + covariance[8] + trace * (x * x + y * y + z * z)
+    known -= _quadratic_form(boresight_covariance, vector)
+    more = min(max(published_variance - known, 0.0) / 3.0, MAX_ADDED_VARIANCE)
+    variance = _quadratic_form(covariance, g) + more * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+    variance += _quadratic_form(boresight_covariance, w)
+    # dpsi/dphi and dpsi/dtheta
+    by_roll, by_pitch = along * sin_pitch * h_y - across * z_rolled, along * h_z
+    tilt_sigma = radians(tilt_sigma_deg)
+    variance += (by_roll * by_roll + by_pitch * by_pitch) * tilt_sigma * tilt_sigma
+    if not variance >= 0.0:
+        return magnetic, true, UNIFORM_SIGMA_DEG
+    sigma = hypot(degrees(sqrt(variance)), 0.0 if isnan(declination_sigma_deg) else declination_sigma_deg)
+    return magnetic, true, min(sigma, UNIFORM_SIGMA_DEG)
+
+
+def _quadratic_form(matrix: Sequence[float], v: tuple[float, float, float]) -> float:
+    """Return ``v^T M v`` of a matrix (9 numbers, row by row)."""
+    a, b, c = v
+    m = matrix
+    return (
+        a * (m[0] * a + m[1] * b + m[2] * c)
+        + b * (m[3] * a + m[4] * b + m[5] * c)
+        + c * (m[6] * a + m[7] * b + m[8] * c)
+    )
+
+
 def published_covariance(
     stated: FloatArray, turn: FloatArray, vector: FloatArray, variance: FloatArray
 ) -> FloatArray:
@@ -176,7 +266,7 @@ def published_covariance(
     length = np.einsum("ni,ni->n", vector, vector)
     known = np.trace(stated, axis1=1, axis2=2)
     known = known + np.trace(turn) * length - np.einsum("ni,ij,nj->n", vector, turn, vector)
-    more = np.nan_to_num(np.maximum(variance - known, 0.0) / 3.0, posinf=1e12)
+    more = np.nan_to_num(np.maximum(variance - known, 0.0) / 3.0, posinf=MAX_ADDED_VARIANCE)
     return np.asarray(stated + more[:, None, None] * np.eye(3))
 
 

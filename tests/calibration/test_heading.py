@@ -10,7 +10,13 @@ import magbridge as mb
 from magbridge.arrays import FloatArray
 from magbridge.calibration.fitting.tilt_boresight import TiltBoresight, boresight_from_tilt
 from magbridge.calibration.fitting.validate import expected_heading_sigma
-from magbridge.calibration.heading import heading, level_vector, model_declination_sigma
+from magbridge.calibration.heading import (
+    heading,
+    heading_of_sample,
+    level_vector,
+    model_declination_sigma,
+    published_covariance,
+)
 from magbridge.errors import CalibrationError
 from sitl import load, simulate
 
@@ -78,6 +84,37 @@ def test_where_there_is_no_horizontal_field_the_heading_is_unknown() -> None:
     assert found.sigma[0] == pytest.approx(180.0 / np.sqrt(3.0))
     assert np.isnan(found.magnetic[1])
     assert np.isinf(found.sigma[1])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_sample_gives_the_heading_of_the_array_path(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 200
+    vector = rng.normal(0.0, 30_000.0, (n, 3))
+    vector[:3] = [[0.0, 0.0, 40_000.0], [np.nan, 1.0, 1.0], [1e-3, 0.0, 50_000.0]]
+    roll, pitch = rng.normal(0.0, 0.5, n), rng.uniform(-1.4, 1.4, n)
+    roll[0] = pitch[0] = 0.0
+    root = rng.normal(0.0, 3.0, (n, 3, 3))
+    stated = root @ root.transpose(0, 2, 1)
+    turn = np.diag(rng.uniform(1e-6, 1e-4, 3))
+    published = np.where(rng.random(n) < 0.1, np.inf, rng.uniform(0.0, 500.0, n))
+    declination, declination_sigma = rng.uniform(-30.0, 30.0, n), rng.uniform(0.2, 3.0, n)
+    declination[5] = declination_sigma[5] = np.nan
+    many = heading(
+        vector, roll, pitch, declination, covariance=published_covariance(stated, turn, vector, published),
+        boresight_covariance=turn, tilt_sigma_deg=0.4, declination_sigma_deg=declination_sigma,
+    )  # fmt: skip
+    one = np.array([
+        heading_of_sample(
+            tuple(vector[k].tolist()), float(roll[k]), float(pitch[k]), float(declination[k]),
+            stated[k].ravel().tolist(), turn.ravel().tolist(), float(published[k]),
+            tilt_sigma_deg=0.4, declination_sigma_deg=float(declination_sigma[k]),
+        )
+        for k in range(n)
+    ])  # fmt: skip
+    np.testing.assert_allclose(
+        one, np.stack([many.magnetic, many.true, many.sigma], axis=1), rtol=1e-9, atol=1e-9
+    )
 
 
 def test_the_declinations_sigma_grows_towards_the_pole_and_with_the_crust() -> None:
