@@ -33,7 +33,7 @@ def found() -> tuple[mb.Calibration, Observations]:
 
 
 def test_a_notebook_shows_a_fit_with_its_warnings() -> None:
-    fit = mb.fit(mb.observations(log, ("battpos", "ballast")), method="nominal")
+    fit = mb.fit(mb.observations(log, ("battpos", "ballast")))
     shown = fit._repr_html_()
     assert "&lt;Fit: " in shown
     assert fit.warnings

@@ -256,7 +256,7 @@ def test_bad_data_is_one_clear_line(glider: Gliders) -> None:
         parameters=np.where(turns, runs.parameters, np.nan),
         field=np.where(turns, np.nan, runs.field),
     )
-    refused("not known", "magic")
+    refused("expected one of auto, survey, nominal", "magic")
     refused("expected positive", reference=np.zeros(k))
     with pytest.raises(CalibrationError, match="only 5 of 5"):
         runs.part(np.arange(k) < 5)

@@ -134,7 +134,7 @@ def _rows(result: DiagnosisResult) -> list[dict[str, Any]]:
         sure = [abs(one["value"]) > 2.0 * one["sigma"] for one in numbers.values() if one["sigma"]]
         rows.append(
             {
-                "finding": finding, "notes": notes, "numbers": numbers, "clear": sum(sure),
+                "finding": finding, "notes": notes, "numbers": numbers, "significant": sum(sure),
                 "seen": finding.follows(diagnosis.problem, diagnosis.fit),
                 "rms": rms(finding.field(diagnosis.problem)),
                 "physics": marked_up(diagnosis.causes[finding.candidate.cause].physics),
