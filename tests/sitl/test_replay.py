@@ -209,7 +209,7 @@ def test_a_bridge_s_own_log_needs_its_configuration(
             WrongUse, match=r"survey\.nc: cannot be replayed together with .*\.tlog, a bridge"
         ):
             replay(files, path)
-    with pytest.raises(WrongUse, match=r"^\S*none\.toml: No such file"):
+    with pytest.raises(WrongUse, match=r"^\S*none\.toml: expected a file, there is none"):
         replay([log], tmp_path / "none.toml")
 
 
@@ -245,7 +245,7 @@ def test_a_bridge_that_cannot_start_says_why(survey: Path, tmp_path: Path) -> No
 
 def test_a_bridge_that_ends_before_it_connects_says_why_at_once(tmp_path: Path) -> None:
     begun = time.monotonic()
-    with pytest.raises(WrongUse, match=r"none\.toml: No such file"):
+    with pytest.raises(WrongUse, match=r"none\.toml: expected a file, there is none"):
         Stage(tmp_path / "none.toml", bytearray().extend)
     assert time.monotonic() - begun < 15.0  # it waits for a connection for 30 s
 

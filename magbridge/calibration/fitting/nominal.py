@@ -195,8 +195,9 @@ def _weighted(
     """Return the noise of a sample, and the noise with which each is weighed in the next fit.
 
     The error of the model is in the residuals: it lasts, and is not whitened, but fewer samples are counted
-    (Newey & West 1987, Econometrica 55:703, with one factor for all coefficients). The autocorrelation is
-    that of an AR(1) process with as many independent samples.
+    (Newey & West 1987, Econometrica 55:703, with one factor for all coefficients). The noise of a sample is
+    the sum of white noise and of an AR(1) process: together they have as many independent samples, and the
+    autocorrelation of neighbours that the residuals show.
     """
     e, g = residuals(samples, prior.coefficients(found.z))
     noise = estimate_noise(e, samples.steps, len(found.z), shape=(0.0, 0.0))
@@ -205,7 +206,21 @@ def _weighted(
     pulls = np.clip(e, -limit, limit)[:, None] * (g @ (prior.E @ root))
     repeats = samples_per_independent(pulls, samples.steps)
     weighted = replace(noise, sigma=noise.sigma * np.sqrt(repeats))
-    return replace(noise, autocorrelation=(repeats - 1.0) / (repeats + 1.0)), weighted
+    neighbours = estimate_noise(e, samples.steps, len(found.z)).autocorrelation
+    rho, white = _slow_and_white(0.5 * (repeats - 1.0), neighbours)
+    return replace(noise, autocorrelation=rho, white=white), weighted
+
+
+def _slow_and_white(lasting: float, neighbours: float) -> tuple[float, float]:
+    """Return autocorrelation rho and white fraction w of white noise and an AR(1) process.
+
+    `lasting` is the sum of the autocorrelations at all lags, ``(1 - w) rho / (1 - rho)``, and `neighbours` is
+    the autocorrelation of neighbours, ``(1 - w) rho``.
+    """
+    if not 0.0 < neighbours < lasting:  # no slow part, or none that lasts beyond the next sample
+        return max(lasting / (1.0 + lasting), 0.0), 0.0
+    rho = 1.0 - neighbours / lasting
+    return (rho, 1.0 - neighbours / rho) if neighbours < rho else (lasting / (1.0 + lasting), 0.0)
 
 
 def _precision(E: FloatArray, scale_sigma: float, gain_sigma: float) -> FloatArray:
