@@ -20,7 +20,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 110) -> None:
 
 
 def literal(figure: Figure) -> None:
-    r"""Let a figure's words be drawn letter by letter: matplotlib would set ``$\frac{$`` and fail.
+    r"""Draw the words of a figure letter by letter: matplotlib would set ``$\frac{$`` and fail.
 
     Numbers at the ticks are its own, and stay as they are.
     """

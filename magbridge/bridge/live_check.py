@@ -158,7 +158,7 @@ class LiveCheck:
         return self._counts[key] / (late_s * RATE_INTERVALS)
 
     def _compare(self, pipeline: Pipeline) -> None:
-        """List what arrived, and report what is missing."""
+        """List the messages that arrived, and report the missing ones."""
         streams, system = pipeline.component.streams, self._link.system
         needed = {
             (system, self._link.autopilot, number): streams.rate_of(number) for number in streams.needed

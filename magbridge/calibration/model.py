@@ -298,7 +298,7 @@ class Calibration:
     """How the first coefficients move together where the level of the reference is off by 1-sigma (nT); empty
     where that was known."""
     sensors: tuple[ScalarSensor, ...] = ()
-    """Scalar magnetometers beside the vector sensor."""
+    """Scalar magnetometers in addition to the vector sensor."""
     conditions: tuple[CalibratedRange, ...] = ()
     """Ranges of depth and temperature in the data that it was fitted to."""
 

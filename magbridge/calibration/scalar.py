@@ -101,7 +101,7 @@ class ScalarNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     time_constants: tuple[float, ...] = ()
     """s, of the Ornstein-Uhlenbeck processes."""
     process_sigma: tuple[float, ...] = ()
-    """nT, 1-sigma of each process."""
+    """1-sigma of each process, nT."""
 
 
 class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -120,7 +120,7 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """Permanent (nT), induced xx yy zz xy xz yz (nT), eddy (nT s, row by row), lag (s), three for each
     channel (nT a swing), then one level for each power cycle (nT)."""
     covariance: tuple[tuple[float, ...], ...]
-    """Of the coefficients."""
+    """Covariance of the coefficients."""
     prior_sigma: tuple[float, ...]
     """1-sigma of each coefficient's prior."""
     noise: ScalarNoise
@@ -137,7 +137,7 @@ class ScalarSensor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
 
 class ScalarSeries(NamedTuple):
-    """Samples of a scalar magnetometer beside a vector sensor."""
+    """Samples of a scalar magnetometer and a vector sensor."""
 
     time: FloatArray
     """(n,), s since 1970 UTC, ascending."""

@@ -135,7 +135,7 @@ def _check(config: Path, *, live: bool) -> None:
 
 
 def _listen(config: Path) -> list[ConfigFault]:
-    """Print what arrives on the ports; return what is missing."""
+    """Print the messages that arrive on the ports; return the faults."""
     from magbridge.bridge.live_check import LISTEN_TIME_S, LiveCheck
     from magbridge.config import load
 

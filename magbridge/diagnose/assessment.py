@@ -318,7 +318,7 @@ class Assessment:
 
 
 class DiagnosisResult(NamedTuple):
-    """The result of a diagnosis: what was found, and whether to use it."""
+    """The result of a diagnosis: the findings, and their assessment."""
 
     diagnosis: Diagnosis
     assessment: Assessment

@@ -229,7 +229,7 @@ def _joined(first: Records, second: Records) -> Records:
 
 
 def number_of(text: str) -> float:
-    """Return the number of a text; NaN if it is no number."""
+    """Return the number of a text; NaN for another text."""
     try:
         return float(text)
     except ValueError:

@@ -237,7 +237,7 @@ class TextTable:
         return frame
 
     def _times(self, frame: pd.DataFrame, numbers: Sequence[int]) -> tuple[FloatArray, BoolArray]:
-        """Return the times, and the rows in which the cell is no time."""
+        """Return the times, and the rows with another cell than a time."""
         if self._layout.rate:  # a row that was left out keeps its time
             lines = np.asarray(numbers, np.float64) - 1.0 - self._layout.first
             return lines / self._layout.rate, np.zeros(len(lines), bool)

@@ -98,7 +98,7 @@ def leave_out(
         With which the samples were weighed, where that is not `noise`.
     """
     weighted = noise if weighted is None else weighted
-    # positions that come late in the log are no test of the fit to its beginning
+    # positions that come late in the log do not test the fit to its beginning
     forward = samples.phi.shape[1] == 1
     found = _left_out(samples, prior, z, noise, _parts(runs), weighted, forward)
     if attitudes and noise.autocorrelation < MAX_GROUP_AUTOCORRELATION:

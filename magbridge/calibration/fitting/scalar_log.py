@@ -1,4 +1,4 @@
-"""Read a scalar magnetometer beside a vector sensor from a log, fit it, and compensate a log with it."""
+"""Read a scalar magnetometer and a vector sensor from a log, fit it, and compensate a log with it."""
 
 from __future__ import annotations
 

@@ -182,7 +182,7 @@ class FilterLag(_Delay):
     sign, width_s = -1.0, 2.0
 
     def candidates(self, problem: Problem) -> list[Candidate]:
-        """Return the delay and, beside the calibration's own runs, the attenuation."""
+        """Return the delay and, in addition to the calibration's own runs, the attenuation."""
         delayed = super().candidates(problem)
         return [*delayed, _shortened(problem)] if problem.survey.fitted.any() else delayed
 

@@ -127,7 +127,7 @@ def _adds_up(candidate: Candidate) -> bool:
 
 
 def _unexplained(diagnosis: Diagnosis, assessment: Assessment) -> dict[str, Any] | None:
-    """Return what is left without a name."""
+    """Return the unnamed part of the residual."""
     rest = diagnosis.unexplained
     return rest and {
         "kind": rest.kind,
