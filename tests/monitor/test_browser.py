@@ -30,15 +30,18 @@ PATIENCE = 20_000
 """ms that a loaded computer may take to show something."""
 
 
+SPIKES = 150, 200, 250
+
+
 def feed(link: tuple[str, int], stop: threading.Event) -> None:
-    """Send what two vehicles send, with one spike and a mass that moves."""
+    """Send what two vehicles send, with three spikes, because UDP may lose one, and a mass that moves."""
     bridges, autopilot = (Codec(1, 191), Codec(2, 191)), Codec(1, 1)
     begin = time.time() - 300.0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for k in range(100_000):
             us = round((begin + k if k < 300 else time.time()) * 1e6)
             place = {"lat": 495_000_000 + 200 * k, "lon": -579_000_000 + 300 * k}
-            total = 52_000.0 + 5.0 * math.sin(k / 20.0) + (9_000.0 if k == 150 else 0.0)
+            total = 52_000.0 + 5.0 * math.sin(k / 20.0) + (9_000.0 if k in SPIKES else 0.0)
             field = {"time_usec": us, "total_field": total, "total_field_sigma": 1.0}
             frames = [
                 bridges[0].pack("MAG_FIELD", flags=FLAGS, **field),
@@ -139,7 +142,7 @@ def test_a_spike_is_marked_and_does_not_flatten_the_axis(browser: Any, url: str)
     axis = page.evaluate(f"{CHART}.getOption().yAxis[0]")
     assert axis["max"] - axis["min"] < 100.0
     marks = page.evaluate(f"{CHART}.getOption().series[3].data")
-    assert [round(mark["value"][2], -3) for mark in marks] == [61_000]
+    assert {round(mark["value"][2], -3) for mark in marks} == {61_000}
     page.context.close()
 
 
