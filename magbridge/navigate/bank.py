@@ -24,25 +24,25 @@ __all__ = ["Bank", "Innovation", "Tracker", "widest"]
 
 MAX_HYPOTHESES = 6_000
 """Hypotheses, at most."""
-AT_FIRST = 20_000
+MAX_INITIAL_HYPOTHESES = 20_000
 """Hypotheses, at most, until the first measurement has thinned them out."""
 MERGE_FRACTION = 0.8
-"""Share of the resolution, within which two hypotheses are one."""
-SPACING = 1.2
+"""Fraction of the resolution, within which two hypotheses are one."""
+LATTICE_SPACING_SIGMA = 1.2
 """Distance of two neighbours, in their own sigma: their sum is flat to 1 %."""
-EDGE = 3.5
+LATTICE_EXTENT_SIGMA = 3.5
 """Sigmas: how far the hypotheses cover the Gaussian to begin with."""
 MIN_WEIGHT_FRACTION = 1e-7
-"""Share of the largest weight: a hypothesis with less is dropped."""
-COARSER = 1.25
+"""Fraction of the largest weight: a hypothesis with less is dropped."""
+COARSENING_FACTOR = 1.25
 """Factor by which the resolution changes at a time."""
-MERGE_EVERY = 4
+MERGE_INTERVAL = 4
 """Updates from one merging of hypotheses to the next."""
 # One Gaussian as three narrower ones (DeMars et al. 2013, table 1), their variance such that the sum
 # keeps its own.
-THREE = np.array([-1.0575154615, 0.0, 1.0575154615])
-THREE_WEIGHT = np.array([0.2252246249, 0.5495507502, 0.2252246249])
-THREE_VARIANCE = 1.0 - float(THREE_WEIGHT @ THREE**2)
+SPLIT_MEANS = np.array([-1.0575154615, 0.0, 1.0575154615])
+SPLIT_WEIGHTS = np.array([0.2252246249, 0.5495507502, 0.2252246249])
+SPLIT_VARIANCE = 1.0 - float(SPLIT_WEIGHTS @ SPLIT_MEANS**2)
 
 
 class Bank:
@@ -75,23 +75,23 @@ class Bank:
         level: float = 0.0,
     ) -> None:
         self._grid, self._gate = grid, gate
-        self._elsewhere = float(np.nanmean(grid.anomaly)), float(np.nanvar(grid.anomaly))
+        self._off_map = float(np.nanmean(grid.anomaly)), float(np.nanvar(grid.anomaly))
         self._updates = 0
         self.resolution = self.finest = resolution
         self.curvature_variance = 0.0
         """nT², variance that the map's curvature within the hypotheses added to the last measurement's."""
-        self.w, self.x, self.P = self._cut(x, P)
+        self.w, self.x, self.P = self._lattice(x, P)
         if level**2 > P[4, 4]:
             free = P.copy()
             free[4], free[:, 4], free[4, 4] = 0.0, 0.0, level**2
-            both = zip((self.w, self.x, self.P), self._cut(x, free), strict=True)
+            both = zip((self.w, self.x, self.P), self._lattice(x, free), strict=True)
             self.w, self.x, self.P = (np.concatenate(pair, axis=-1) for pair in both)
             self.w /= 2.0
 
     def __len__(self) -> int:
         return self.w.size
 
-    def _cut(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _lattice(self, x: FloatArray, P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Cut one Gaussian into a lattice of Gaussians of the bank's resolution along its position's axes.
 
         Notes
@@ -100,27 +100,39 @@ class Bank:
         the position, with σ² its variance and ``g = P e / σ²``: states that are correlated with the
         position shift with it.
         """
+        # Principal axes of the position. Limit the number of lattice points, by area, before they are made.
         values, axes = np.linalg.eigh(P[:2, :2])
         spread = np.sqrt(np.prod(np.maximum(values, self.resolution**2)))
-        area = (2.0 * EDGE / SPACING) ** 2 * np.pi / 4.0 * spread
-        self.resolution = max(self.resolution, float(np.sqrt(area / AT_FIRST)))
+        area = (2.0 * LATTICE_EXTENT_SIGMA / LATTICE_SPACING_SIGMA) ** 2 * np.pi / 4.0 * spread
+        self.resolution = max(self.resolution, float(np.sqrt(area / MAX_INITIAL_HYPOTHESES)))
         part, w, shifts = P.copy(), np.ones(1), np.zeros((x.size, 1))
         for value, axis in zip(values, axes.T, strict=True):
+            # Along this axis the variance is that of the lattice (`left`) plus that of each hypothesis.
             left = value - self.resolution**2
             if left <= 0.0:
                 continue
-            n = max(3, int(np.ceil(2.0 * EDGE * np.sqrt(left) / (SPACING * self.resolution))))
-            s = np.linspace(-EDGE, EDGE, n)
+            n = max(
+                3,
+                int(
+                    np.ceil(
+                        2.0 * LATTICE_EXTENT_SIGMA * np.sqrt(left) / (LATTICE_SPACING_SIGMA * self.resolution)
+                    )
+                ),
+            )
+            s = np.linspace(-LATTICE_EXTENT_SIGMA, LATTICE_EXTENT_SIGMA, n)
+            # States that are correlated with the position shift by g for each metre along the axis.
             g = P[:, :2] @ axis / value
             w = np.outer(w, np.exp(-0.5 * s * s)).ravel()
             shifts = (shifts[:, :, None] + np.outer(g, s * np.sqrt(left))[:, None, :]).reshape(x.size, -1)
             part -= np.outer(g, g) * left
-        keep = w > np.exp(-0.5 * EDGE**2)
+        # The corners of the lattice lie beyond its extent in sigmas.
+        keep = w > np.exp(-0.5 * LATTICE_EXTENT_SIGMA**2)
         w, shifts = w[keep], shifts[:, keep]
         return w / w.sum(), x[:, None] + shifts, np.repeat(part[:, :, None], w.size, axis=2)
 
     def predict(self, F: FloatArray, Q: FloatArray) -> None:
         """Propagate every hypothesis by one transition: F and the noise's covariance Q, (6, 6)."""
+        # x' = F x and P' = F P F' + Q for all hypotheses: F P first, with (6, 6 n) as one matrix product.
         self.x = F @ self.x
         half = (F @ self.P.reshape(N_STATES, -1)).reshape(self.P.shape)
         self.P = F @ half + Q[:, :, None]
@@ -130,6 +142,7 @@ class Bank:
 
         A hypothesis off the map predicts the map's mean, with the map's variance, and is not updated.
         """
+        # 1. Map and its slopes at each hypothesis; where there is no map, zeros stand in for NaN.
         north, east = self.x[:2]
         per_latitude, per_longitude = metres_per_degree(block.latitude)
         local = self._grid.evaluate(
@@ -137,6 +150,8 @@ class Bank:
         )
         off = np.isnan(local.anomaly)
         local = Local(*np.where(off, 0.0, local))
+        # 2. Second-order filter: the curvature within a hypothesis shifts the expected value by `bent` and
+        # adds the variance `spread`.
         bent, spread = curvature(local, self.P[0, 0], self.P[0, 1], self.P[1, 1])
         self.curvature_variance = float(self.w @ spread)
         anomaly = local.anomaly + (block.slope_north * north + block.slope_east * east + bent)
@@ -145,7 +160,8 @@ class Bank:
         slopes = np.where(off, 0.0, (local.north + block.slope_north, local.east + block.slope_east))
         gain = slopes[0] * self.P[0] + slopes[1] * self.P[1] + self.P[4] + errors * self.P[5]
         s = slopes[0] * gain[0] + slopes[1] * gain[1] + gain[4] + errors * gain[5]
-        anomaly[off], v[off] = self._elsewhere[0], block.variance + self._elsewhere[1]
+        # 4. Off the map the field is that of the whole map: its mean, with its variance.
+        anomaly[off], v[off] = self._off_map[0], block.variance + self._off_map[1]
         return self._observe(block.anomaly - anomaly - self.x[4] - errors * self.x[5], gain, s + v, off)
 
     def update_position(self, north: float, east: float, sigma: float) -> None:
@@ -160,41 +176,48 @@ class Bank:
         self, y: FloatArray, gain: FloatArray, s: FloatArray, rejected: BoolArray
     ) -> tuple[float, float, float]:
         """Update with innovations (n,) of variances (n,) and ``P H'`` (6, n); return as :meth:`update`."""
+        # Log-likelihood of each innovation. The gate limits it, so that one outlier cannot decide.
         z2 = y * y / s
         likelihood = -0.5 * (np.minimum(z2, self._gate) + np.log(s) + log(2.0 * pi))
+        # Mean and variance of the mixture's innovation.
         mean = float(self.w @ y)
         spread = float(self.w @ (s + (y - mean) ** 2))
+        # Kalman update, K = P H' / s; a rejected measurement has the gain zero.
         gain = np.where((z2 <= self._gate) & ~rejected, gain, 0.0)
         scaled = gain / s
         self.x = self.x + scaled * y
         self.P = self.P - gain[:, None] * scaled
+        # Bayes: weights times likelihoods, scaled by the largest one against underflow.
         top = float(likelihood.max())
         w = self.w * np.exp(likelihood - top)
         total = float(w.sum())
         self.w = w / total
         self._updates += 1
-        self._tidy()
+        self._limit_hypotheses()
         return mean, spread, top + log(total)
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Return mean (6,) and covariance (6, 6) of the whole mixture."""
+        # Law of total variance: mean of the covariances plus covariance of the means.
         mean: FloatArray = self.x @ self.w / self.w.sum()
         d = self.x - mean[:, None]
         covariance: FloatArray = (self.P @ self.w + (self.w * d) @ d.T) / self.w.sum()
         return mean, covariance
 
-    def _tidy(self) -> None:
+    def _limit_hypotheses(self) -> None:
         """Drop hypotheses of negligible weight, split wide ones, now and then merge those at one place."""
         keep = self.w > MIN_WEIGHT_FRACTION * self.w.max()
         if not keep.all():
             self._select(keep)
         while len(self) > MAX_HYPOTHESES:  # coarsen the resolution; dropping any could lose the true place
-            self.resolution *= COARSER
+            self.resolution *= COARSENING_FACTOR
             self._merge()
+        # With few hypotheses the resolution becomes finer again, in the same steps.
         if self.resolution > self.finest and len(self) < MAX_HYPOTHESES / 4:
-            self.resolution = max(self.finest, self.resolution / COARSER)
-        if self._updates % MERGE_EVERY == 0 and len(self) > 1:
+            self.resolution = max(self.finest, self.resolution / COARSENING_FACTOR)
+        if self._updates % MERGE_INTERVAL == 0 and len(self) > 1:
             self._merge()
+        # A hypothesis that grew too wide for the map to be linear in it is split; one without weight is not.
         width = worse_axis(self.P[0, 0], self.P[0, 1], self.P[1, 1])
         wide = (width > 1.5 * self.resolution) & (self.w > 1e-4)
         if wide.any() and len(self) + 2 * int(wide.sum()) <= 2 * MAX_HYPOTHESES:
@@ -210,13 +233,15 @@ class Bank:
         values, axes = np.linalg.eigh(np.moveaxis(P[:2, :2], 2, 0))
         axis = axes[:, :, 1].T
         g = (P[:, 0] * axis[0] + P[:, 1] * axis[1]) / np.sqrt(values[:, 1])
-        narrow = P - (1.0 - THREE_VARIANCE) * g[:, None] * g
-        self.w = np.concatenate([self.w[~wide]] + [w * share for share in THREE_WEIGHT])
-        self.x = np.concatenate([self.x[:, ~wide]] + [x + shift * g for shift in THREE], axis=1)
+        # Three components along the longest axis; their means and variances sum to the original's.
+        narrow = P - (1.0 - SPLIT_VARIANCE) * g[:, None] * g
+        self.w = np.concatenate([self.w[~wide]] + [w * share for share in SPLIT_WEIGHTS])
+        self.x = np.concatenate([self.x[:, ~wide]] + [x + shift * g for shift in SPLIT_MEANS], axis=1)
         self.P = np.concatenate([self.P[:, :, ~wide]] + [narrow] * 3, axis=2)
 
     def _merge(self) -> None:
         """Merge hypotheses whose positions lie in the same cell, keeping mean and covariance."""
+        # Sort by cell, then sum over runs of equal cells: moments of each cell's mixture.
         cell = np.floor(self.x[:2] / (MERGE_FRACTION * self.resolution)).astype(np.int64)
         order = np.lexsort(cell)
         cell = cell[:, order]
@@ -298,6 +323,8 @@ class Tracker:
         )
         if isnan(local.anomaly):
             return Innovation(nan, nan, 0.0, accepted=False)
+        # Second-order extended Kalman filter: the map's curvature within P biases the expected value
+        # and adds to the variance of the measurement.
         (pnn, pne), (_, pee) = self.P[:2, :2].tolist()
         bent, self.curvature_variance = curvature(local, pnn, pne, pee)
         expected = local.anomaly + block.slope_north * north + block.slope_east * east + bent
@@ -318,6 +345,7 @@ class Tracker:
     def _observe(
         self, value: float, expected: float, row: FloatArray, variance: float, *, gated: bool = True
     ) -> Innovation:
+        # Innovation y and its variance s = H P H' + R; the gate tests y^2 / s, a chi-square with one degree.
         y = value - expected
         s = float((row @ self.P @ row.T)[0, 0]) + variance
         accepted = not gated or y * y <= self._gate * s

@@ -60,7 +60,7 @@ def navigate(
         one of :data:`MOTIONS`.
     grid : AnomalyGrid
         The anomaly map, at the altitude where the vehicle is (:func:`~.depth.at_depth`).
-    options : Options, optional
+    options : NavigationOptions, optional
         How well start, current, calibration and map are known.
     start : (latitude, longitude), optional
         deg; default the log's first position. Later ones are the reference track.
@@ -95,6 +95,7 @@ def navigate(
             now = navigator.estimate
             states.append((now.x, now.P, *now.moved, len(now.jumps)))
 
+    # Forward pass: the navigator of the bridge over all rows, its states kept for the smoother.
     time_us = np.round(time * 1e6).astype(np.int64)
     navigator.fix(int(time_us[0]) - 1, latitude, longitude)
     rows = {name: values.tolist() for name, values in moves.items()}
@@ -141,6 +142,7 @@ def motion_of(deployment: xr.Dataset, source: str) -> str:
 
 def _glides(deployment: xr.Dataset) -> bool:
     """Return True if the vehicle sinks nose down and rises nose up, as a glider does."""
+    # A glider sinks with its nose down: depth rate and pitch have opposite signs.
     known = deployment[["depth", "pitch"]].dropna("time", how="any")
     rate = np.gradient(known["depth"].to_numpy().astype(float)) if known.sizes["time"] > 2 else np.zeros(0)
     steep = np.abs(known["pitch"].to_numpy()[: rate.size]) > GLIDE
@@ -174,6 +176,7 @@ def _smooth(
     x, P, F, Q = (np.stack([state[k] for state in states]) for k in range(4))
     jumps = np.array([state[4] for state in states])
     for piece in np.split(np.arange(jumps.size), np.flatnonzero(np.diff(jumps)) + 1):
+        # Rauch-Tung-Striebel pass; it must not cross a restart, where the state is not continuous.
         ahead = piece[1:].tolist() + piece[-1:].tolist()  # filterpy's F[k] leads from k to k + 1
         x[piece], P[piece], _, _ = rts_smoother(x[piece], P[piece], F[ahead], Q[ahead] + 1e-12 * np.eye(6))
     return x, P
@@ -185,6 +188,7 @@ def _dataset(records: list[Record], smoothed: tuple[FloatArray, FloatArray]) -> 
         for name in Record.__struct_fields__
         if name not in ("time_us", "gate")
     }
+    # The smoothed state is an offset from dead reckoning: move each position by the difference.
     x, P = smoothed
     moved = x[:, :2] - np.stack([columns["north"], columns["east"]], axis=1)
     places = [

@@ -61,7 +61,7 @@ def position_bound(
         s since 1970 UTC, increasing: the planned track's corners are enough.
     latitude, longitude : array_like, (n,)
         deg.
-    options : Options, optional
+    options : NavigationOptions, optional
         How well start, current, calibration and map are known.
     sigma : float, optional
         nT, of one sample.
@@ -86,12 +86,15 @@ def position_bound(
     it is the covariance of a Kalman filter that knows where to linearise,
     ``J_k+1 = (Q + F J_k^-1 F')^-1 + H' R^-1 H``. Off the map, measurements are missing.
     """
+    # The bound is the covariance of a Kalman filter that linearises at the truth: only the slopes of the
+    # field along the track are needed, no measurement.
     grid, o = lasting_errors(grid, options or NavigationOptions())
     corners = np.asarray(time, float)
     lat, lon = np.asarray(latitude, float), np.unwrap(np.asarray(longitude, float), period=360.0)
     along = _along(corners, lat, lon)
     speed = along[-1] / (corners[-1] - corners[0])
     lasts = min(o.interval, block_length(grid) / max(speed, 1e-9))
+    # The same blocks as the filter's, so that bound and filter use as many samples.
     interval = every * (int(lasts / every + 1e-9) + 1)  # a block of as many samples as the filter's
     at = np.arange(corners[0] + 0.5 * interval, corners[-1], interval)
     if not at.size:
@@ -103,6 +106,7 @@ def position_bound(
     local = grid.evaluate(lon, lat)
     main = total_field(lon, lat, depth, at)
     per_latitude, per_longitude = metres_per_degree(lat)
+    # Slopes of the main field by differences; the map's come from its interpolation.
     slope_north = (total_field(lon, lat + SLOPE_STEP_DEG, depth, at) - main) / (SLOPE_STEP_DEG * per_latitude)
     slope_east = (total_field(lon + SLOPE_STEP_DEG, lat, depth, at) - main) / (SLOPE_STEP_DEG * per_longitude)
 
@@ -113,6 +117,7 @@ def position_bound(
     unaided = np.empty(at.size)
     previous = corners[0]
     for i, now in enumerate(at):
+        # P' = F P F' + Q, then P = P' - P' H' (H P' H' + R)^-1 H P' where there is a map.
         F, Q = transition(o, now - previous, float(metres[i]))
         P, alone, previous = F @ P @ F.T + Q, F @ alone @ F.T + Q, now
         if np.isfinite(local.anomaly[i]):

@@ -101,6 +101,7 @@ class DeadReckoning:
     def advance(self, time: float) -> None:
         """Move along the last known velocity up to `time` (s)."""
         elapsed = time - self.time
+        # Event time never goes back.
         if elapsed <= 0.0:
             return
         if isfinite(elapsed) and elapsed < MAX_TELEMETRY_GAP_S:
@@ -136,6 +137,7 @@ class DeadReckoning:
         self._heading = values.get("heading", self._heading)
         self._pitch = values.get("pitch", self._pitch)
         self._speed = values.get("speed", self._speed)
+        # Sources of motion, the best first: local position, dead-reckoned position, velocity, speed.
         if "north" in values and "east" in values:
             here = values["north"], values["east"]
             if self._local is not None:
@@ -165,6 +167,7 @@ class DeadReckoning:
         (v₁ - v₀)(v₁ - v₀)ᵀ Δt²/12. An error of heading or speed turns with the vehicle, so that a turn
         changes the error of the velocity in proportion to v₁ - v₀.
         """
+        # Change of the velocity since the previous report.
         north, east = velocity[0] - self._velocity[0], velocity[1] - self._velocity[1]
         elapsed = min(time - self._reported, MAX_REPORT_INTERVAL_S)
         nn, ne, ee, turns = self.noise

@@ -14,8 +14,8 @@ from magbridge.navigate.options import NavigationOptions, with_level
 
 __all__ = ["at_depth", "lasting_errors"]
 
-NEGLIGIBLE = 0.1
-"""Share of the map error below which what lies between the nodes changes it by less than 1 %."""
+NEGLIGIBLE_FRACTION = 0.1
+"""Fraction of the map error below which what lies between the nodes changes it by less than 1 %."""
 
 
 def at_depth(
@@ -27,7 +27,7 @@ def at_depth(
     ----------
     grid : AnomalyGrid
         One of unknown altitude is returned as it is.
-    options : Options
+    options : NavigationOptions
         Its map error is that of the map as it is.
     depth : array_like, (n,)
         m, the vehicle's; NaN is ignored, and without any depth the map is continued to the surface.
@@ -39,9 +39,10 @@ def at_depth(
     """
     known = np.asarray(depth, float)
     known = known[np.isfinite(known)]
+    # Errors of the continued map add to the map's own error as independent ones.
     there = continued(grid, known if known.size else 0.0)
     errors = [(there.sigma, there.length)] if there.sigma else []
-    if grid.interpolation_sigma > NEGLIGIBLE * options.map_sigma:
+    if grid.interpolation_sigma > NEGLIGIBLE_FRACTION * options.map_sigma:
         errors.append((grid.interpolation_sigma, 0.5 * grid.spacing))
     return lasting_errors(there.grid, _added(options, errors) if errors else options)
 
@@ -69,5 +70,6 @@ def _added(options: NavigationOptions, errors: list[tuple[float, float]]) -> Nav
     """Return options whose map error includes others, of a sigma, nT, and a length, m."""
     whole = [*errors, (options.map_sigma, options.map_length)]
     sigma = hypot(*(sigma for sigma, _ in whole))
+    # sigma^2 = sum s_i^2 and (sigma / L)^2 = sum (s_i / L_i)^2.
     steepness = hypot(*(sigma / length for sigma, length in whole))
     return replace(options, map_sigma=sigma, map_length=sigma / steepness)

@@ -18,21 +18,21 @@ from magbridge.navigate.record import Jump, NavigationState
 
 __all__ = ["Estimate"]
 
-CONTRADICTION = 25.0
+MAX_FIX_DISTANCE_SQUARED = 25.0
 """Squared distance of a fix in sigmas, two degrees of freedom: by chance in 4e-6."""
-UNINFORMED = 0.8
-"""Share of the sigma of dead reckoning alone, above which the field has added no information."""
-LED_TIME_S = 60.0
+MAX_INFORMED_RATIO = 0.8
+"""Fraction of the sigma of dead reckoning alone, above which the field has added no information."""
+MIN_CARRY_OFF_TIME_S = 60.0
 """s, shortest time in which fixes lead the position away without being noticed."""
 MIN_SEARCH_RADIUS_M = 300.0
 """m, smallest radius in which the integrity monitor searches."""
-JOIN, SPLIT = 1.2, 1.5
+JOIN_SPREAD, SPLIT_SPREAD = 1.2, 1.5
 """Position spread over the resolution: below the first, one hypothesis; above the second, several."""
-FINER = 0.8
-"""Share of the resolution: it changes only if a measurement asks for one finer than this."""
-DOUBTFUL_LOG_ODDS = 1.0
-"""Log odds: another place explains the field better, but not yet at the odds of ``options.doubt``."""
-SPREADS = (2.0, 4.0, 2.0, 8.0)
+MIN_REFINEMENT = 0.8
+"""Fraction of the resolution: it changes only if a measurement asks for one finer than this."""
+SUSPECT_LOG_ODDS = 1.0
+"""Log odds: another place explains the field better, but not yet at the odds of ``options.alarm_odds``."""
+SEARCH_SPREADS = (2.0, 4.0, 2.0, 8.0)
 """1-sigma of successive searches, over the reach."""
 
 
@@ -41,15 +41,15 @@ class Estimate:
 
     Attributes
     ----------
-    options : Options
+    options : NavigationOptions
         As given, but with a wider constant error of the field once the filter was lost.
-    state : State
+    state : NavigationState
     time_us : int
         µs, of the last start, fix or measurement.
     x, P : ndarray, (6,), (6, 6)
         Estimate and covariance, of :mod:`~magbridge.navigate.model`'s states.
     valid : bool
-        The position can be used: the map has described the field at odds of ``options.doubt``; the
+        The position can be used: the map has described the field at odds of ``options.alarm_odds``; the
         filter began as wide as competing filters do, or they have since come to the same place; and no test
         rejects it now.
     moved : tuple of ndarray
@@ -79,14 +79,14 @@ class Estimate:
         self._filter: Tracker | Bank | None = None
         self._monitor: IntegrityMonitor | None = None
         self._unmapped = Unmapped(grid, options)
-        self._nowhere = 0.0
+        self._log_odds_unmapped = 0.0
         self._resolution = inf
         self.alone = self.P[:4, :4].copy()  # covariance of dead reckoning alone
         self._level: tuple[float, int] | None = None  # nT², the bias's variance at a known place; µs, then
         self._lost = False
         self._searches = 0
-        self._confirmed = False  # competing filters that began wider have come to the same place
-        self._described = False  # the map has described the field
+        self._unique = False  # competing filters that began wider have come to the same place
+        self._map_confirmed = False  # the map has described the field
         self._fixed = False  # the place is that of a fix
 
     @property
@@ -110,14 +110,14 @@ class Estimate:
         self._measured = time_us, self.travelled, self.motion
         self.x, self.P = prior(self.options, sigma)
         self.alone = self.P[:4, :4].copy()
-        self._confirmed = sigma >= self._reach()
+        self._unique = sigma >= self._reach()
         self.state = NavigationState.SEARCHING
 
     def correct(self, fix: FloatArray, sigma: float, fused_sigma: float | None = None) -> None:
         """Update with a fix that holds at the time of the last prediction.
 
-        The fix confirms the place, but does not end :attr:`State.LOST`: the map must describe the field
-        there first.
+        The fix confirms the place. It does not end :attr:`NavigationState.LOST`: the map must first describe
+        the field there.
 
         Parameters
         ----------
@@ -129,33 +129,41 @@ class Estimate:
             m, with which it is fused: larger than `sigma` if its error is that of the previous fix.
         """
         assert self._filter is not None
-        self._read()
-        if squared_mahalanobis(fix - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2)) > CONTRADICTION:
+        self._refresh()
+        # Chi-square test of the fix with two degrees of freedom. A fix that fails replaces the position;
+        # current, bias and map error keep their estimates, with their prior variance added.
+        if (
+            squared_mahalanobis(fix - self.x[:2], self.P[:2, :2] + sigma**2 * np.eye(2))
+            > MAX_FIX_DISTANCE_SQUARED
+        ):
             _, start = prior(self.options, sigma)
             start[2:, 2:] += self.P[2:, 2:]
             self._begin(np.concatenate([fix, self.x[2:]]), start, "a fix contradicts the filter")
-            self._nowhere = 0.0
+            self._log_odds_unmapped = 0.0
         else:
             self._filter.update_position(float(fix[0]), float(fix[1]), fused_sigma or sigma)
-            self._read()
+            self._refresh()
+        # The filter was lost: the map has to describe the field again at the fix.
         if self._lost and not self._fixed:
-            self._described, self._nowhere = False, 0.0
-        self._monitor, self._confirmed, self._fixed = None, True, True
+            self._map_confirmed, self._log_odds_unmapped = False, 0.0
+        self._monitor, self._unique, self._fixed = None, True, True
         self.alone = np.diag([sigma**2, sigma**2, *np.diag(self.P)[2:4]])
 
     def widen(self, metres: float) -> None:
         """Add an error of `metres` (1-sigma, each axis) to the position: fixes that were fused were wrong.
 
-        They also moved the current, by that error over :data:`LED_TIME_S` and by its prior sigma at most.
+        They also moved the current: by that error over :data:`MIN_CARRY_OFF_TIME_S`, and by its prior
+        sigma at most.
         """
         if self._filter is None:
             return
         Q = np.zeros_like(self.P)
+        # Wrong fixes moved the position by `metres`, and the current by that over the time they took.
         Q[0, 0] = Q[1, 1] = metres**2
-        Q[2, 2] = Q[3, 3] = min(metres / LED_TIME_S, self.options.current_sigma) ** 2
+        Q[2, 2] = Q[3, 3] = min(metres / MIN_CARRY_OFF_TIME_S, self.options.current_sigma) ** 2
         self._filter.predict(np.eye(len(Q)), Q)
         self.alone += Q[:4, :4]
-        self._read()
+        self._refresh()
 
     def update(self, block: Block, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> Innovation:
         """Update with a measurement and return its innovation, NaN off the map.
@@ -170,15 +178,18 @@ class Estimate:
             Uncertainty of the dead-reckoned motion since the start.
         """
         self.predict(block.time_us, travelled, motion)
+        # 1. The resolution follows the most precise measurement so far.
         finer = resolution(self.grid, self.options, block.variance)
-        if finer < FINER * self._resolution:  # never coarser: a first block may have been a poor one
+        if finer < MIN_REFINEMENT * self._resolution:  # never coarser: a first block may have been a poor one
             self._resolution = finer
             if isinstance(self._filter, Bank):
                 self._filter.finest = finer
         if self._filter is None:
             self._filter = self._estimator(self.x, self.P)
-        seen = self._take_in(block)
-        self._read()
+        # 2. Kalman update of the one filter, or of each hypothesis.
+        seen = self._measure(block)
+        self._refresh()
+        # 3. On the map: compare the filter with other explanations of the same measurement.
         on_the_map = isfinite(seen.anomaly)
         if on_the_map:
             if widest(self.alone) < self._resolution:
@@ -188,12 +199,15 @@ class Estimate:
             self.step = Step(seconds, travelled - before, motion.growth_since(earlier))
             self._measured = block.time_us, travelled, motion
             self._judge(block, seen)
-        self._choose(on_the_map)
-        proven = self._confirmed and self._described
-        doubted = (
-            self.odds > DOUBTFUL_LOG_ODDS or self._nowhere > 0.0 or widest(self.P) > self.options.sigma_limit
+        # 4. One filter or a bank, the state, and whether the position may be used.
+        self._set_state(on_the_map)
+        proven = self._unique and self._map_confirmed
+        suspect = (
+            self.odds > SUSPECT_LOG_ODDS
+            or self._log_odds_unmapped > 0.0
+            or widest(self.P) > self.options.sigma_limit
         )
-        self.valid = self.state is NavigationState.TRACKING and proven and not doubted
+        self.valid = self.state is NavigationState.TRACKING and proven and not suspect
         return seen
 
     def predict(self, time_us: int, travelled: float, motion: MotionNoise = NO_MOTION_NOISE) -> None:
@@ -204,6 +218,7 @@ class Estimate:
         """
         time_us = max(time_us, self.time_us)
         seconds, metres = (time_us - self.time_us) * 1e-6, travelled - self.travelled
+        # x' = F x, P' = F P F' + Q. Dead reckoning alone follows the same model without measurements.
         F, Q = transition(self.options, seconds, metres, motion.growth_since(self.motion))
         self.time_us, self.travelled, self.motion = time_us, travelled, motion
         self.alone = F[:4, :4] @ self.alone @ F[:4, :4].T + Q[:4, :4]
@@ -223,12 +238,13 @@ class Estimate:
         for one in (self._filter, *banks):
             one.predict(np.eye(len(Q)), Q)
         self.alone += Q[:4, :4]
-        self._read()
+        self._refresh()
 
-    def _take_in(self, block: Block) -> Innovation:
+    def _measure(self, block: Block) -> Innovation:
         if isinstance(self._filter, Tracker):
             return self._filter.update(block)
         assert self._filter is not None
+        # A bank reports the innovation of the mixture; the map's value is that of the likeliest hypothesis.
         innovation, variance, likelihood = self._filter.update(block)
         best = self._filter.x[:, int(self._filter.w.argmax())]
         latitude, longitude = offset(block.latitude, block.longitude, float(best[0]), float(best[1]))
@@ -236,7 +252,7 @@ class Estimate:
         accepted = innovation**2 <= self.options.gate * variance
         return Innovation(innovation, variance, likelihood, accepted, anomaly)
 
-    def _read(self) -> None:
+    def _refresh(self) -> None:
         if isinstance(self._filter, Bank):
             self.x, self.P = self._filter.moments()
         elif self._filter is not None:
@@ -246,7 +262,7 @@ class Estimate:
 
     def _estimator(self, x: FloatArray, P: FloatArray) -> Tracker | Bank:
         """Return one tracker if the position is narrow enough for it, else a bank."""
-        if widest(P) < SPLIT * self._resolution:
+        if widest(P) < SPLIT_SPREAD * self._resolution:
             return Tracker(self.grid, x, P, self.options.gate)
         return Bank(self.grid, x, P, self._resolution, self.options.gate)
 
@@ -258,24 +274,27 @@ class Estimate:
     def _jump(self, x: FloatArray, cause: str) -> None:
         north, east = (x[:2] - self.x[:2]).tolist()
         self.jumps.append(Jump(self.time_us, north, east, widest(self.alone), cause))
-        self._monitor, self._confirmed, self._fixed = None, False, False
+        self._monitor, self._unique, self._fixed = None, False, False
 
     def _judge(self, block: Block, seen: Innovation) -> None:
         """Compare the filter with competing ones, and replace it if one of them has won."""
         assert self._filter is not None
+        # Log odds of 'the map is unrelated to the field' against the filter, as a cumulative sum that starts
+        # again at its lower limit (Page 1954).
         unmapped = self._unmapped.update(block, self.step, self._filter.curvature_variance)
         against = unmapped - seen.log_likelihood
         if (
             not seen.accepted
         ):  # the likelihood is limited by the gate: a rejected sample never supports the map
             against = max(against, 0.0)
-        self._nowhere = max(self._nowhere + against, -log(self.options.doubt))
-        if self._nowhere > log(self.options.doubt):
-            self._search_anew()
+        self._log_odds_unmapped = max(self._log_odds_unmapped + against, -log(self.options.alarm_odds))
+        if self._log_odds_unmapped > log(self.options.alarm_odds):
+            self._restart_search()
             return
-        self._described |= self._nowhere <= -log(self.options.doubt)
-        if self._described and self._fixed and self._confirmed:
+        self._map_confirmed |= self._log_odds_unmapped <= -log(self.options.alarm_odds)
+        if self._map_confirmed and self._fixed and self._unique:
             self._lost, self._searches = False, 0
+        # A position that is still spread over several places has nothing to be compared with.
         if not self._compact(widest(self.P)):
             return
         if self._monitor is None:
@@ -295,10 +314,10 @@ class Estimate:
         if verdict is Verdict.ELSEWHERE:
             self._filter, self._lost = self._monitor.surrender(block.time_us), True
             self._jump(self._filter.moments()[0], verdict.value)
-            self._read()
+            self._refresh()
         elif verdict is Verdict.HOLDS:
-            self._monitor, self._confirmed = None, True
-            if self._described:
+            self._monitor, self._unique = None, True
+            if self._map_confirmed:
                 self._lost, self._searches = False, 0
 
     def _levels(self) -> tuple[float, float]:
@@ -311,18 +330,20 @@ class Estimate:
         level = o.bias_sigma
         if self._level is not None:
             variance, then = self._level
+            # A Gauss-Markov bias gains the variance s^2 (1 - exp(-2 t / tau)) in the time t.
             changed = -expm1(-2.0 * (self.time_us - then) * 1e-6 / o.bias_time)
             level = min(level, sqrt(variance + level**2 * changed))
         return level, self.options.bias_sigma if self.options is not o else 0.0
 
-    def _search_anew(self) -> None:
-        """Search around dead reckoning, by the next of SPREADS, at any bias: the level may be wrong."""
-        self._nowhere, self._described, self._lost = 0.0, False, True
+    def _restart_search(self) -> None:
+        """Search around dead reckoning, within the next of SEARCH_SPREADS and at any bias (level)."""
+        self._log_odds_unmapped, self._map_confirmed, self._lost = 0.0, False, True
         self.options = any_level(self.options, self.grid)
         self._unmapped = Unmapped(self.grid, self.options)
         x, P = prior(self._claimed)
         P[:4, :4] = self.alone
-        P[:2, :2] += (self._reach() * SPREADS[self._searches % len(SPREADS)]) ** 2 * np.eye(2)
+        # Dead reckoning's own covariance, widened by the radius of this search.
+        P[:2, :2] += (self._reach() * SEARCH_SPREADS[self._searches % len(SEARCH_SPREADS)]) ** 2 * np.eye(2)
         self._searches += 1
         self._jump(x, Verdict.NOWHERE.value)
         level = self.options.bias_sigma
@@ -331,36 +352,37 @@ class Estimate:
 
     def _compact(self, width: float) -> bool:
         """Return whether a position of this 1-sigma (m) counts as one place on the scale of the map."""
-        return width <= max(SPLIT * self._resolution, 0.25 * self.grid.correlation_length)
+        return width <= max(SPLIT_SPREAD * self._resolution, 0.25 * self.grid.correlation_length)
 
     def _reach(self) -> float:
         """Return the 1-sigma (m) of the places around the filter that competing filters start from."""
-        length = self.grid.correlation_length * (0.5 if self._confirmed else 1.0)
+        length = self.grid.correlation_length * (0.5 if self._unique else 1.0)
         return max(MIN_SEARCH_RADIUS_M, widest(self.alone), min(length, 5.0 * MIN_SEARCH_RADIUS_M))
 
     @property
     def informed(self) -> bool:
         """Return True if the field has improved the position of dead reckoning alone."""
-        return widest(self.P) <= UNINFORMED * widest(self.alone)
+        return widest(self.P) <= MAX_INFORMED_RATIO * widest(self.alone)
 
-    def _near_fix(self) -> bool:
+    def _tracks_from_fix(self) -> bool:
         """Return True if a fix, and dead reckoning since, give the place as well as the map could."""
         limit = min(0.25 * self.grid.correlation_length, self.options.sigma_limit)
-        return self._fixed and self._described and widest(self.alone) <= limit
+        return self._fixed and self._map_confirmed and widest(self.alone) <= limit
 
-    def _choose(self, on_the_map: bool) -> None:
+    def _set_state(self, on_the_map: bool) -> None:
         """Change between a bank and one tracker if the width demands it; set the state."""
         width = widest(self.P)
-        if isinstance(self._filter, Bank) and width < JOIN * self._resolution:
+        # Hysteresis between JOIN_SPREAD and SPLIT_SPREAD: the kind of filter does not alternate.
+        if isinstance(self._filter, Bank) and width < JOIN_SPREAD * self._resolution:
             self._filter = Tracker(self.grid, self.x, self.P, self.options.gate)
-        elif isinstance(self._filter, Tracker) and width > SPLIT * self._resolution:
+        elif isinstance(self._filter, Tracker) and width > SPLIT_SPREAD * self._resolution:
             self._filter = Bank(self.grid, self.x, self.P, self._resolution, self.options.gate)
             self._monitor = None
         if self._lost:
             self.state = NavigationState.LOST
         elif not self._compact(width):
             self.state = NavigationState.SEARCHING
-        elif self._near_fix():
+        elif self._tracks_from_fix():
             self.state = NavigationState.TRACKING
         elif not on_the_map or not self.informed:
             self.state = NavigationState.DEAD_RECKONING

@@ -29,7 +29,7 @@ MIN_RELIEF_SIGMA = 3.0
 DOUBLE = 2.0
 """Scatter over the sigma of bias and map error, above which it is that of another field."""
 MAX_SHIFTED_SCATTER_FRACTION = 0.6
-"""Share of the scatter at the map's own place: a shift must do at least as well to be believed."""
+"""Fraction of the scatter at the map's own place: a shift must do at least as well to be believed."""
 MAX_BIAS_SIGMA = 4.0
 """Sigmas of the calibration's bias: a larger difference in level has another reason."""
 LISTED = 3
@@ -37,7 +37,7 @@ LISTED = 3
 MAX_MEDIAN_SIGMA_RATIO = 3.0
 """Sigma of a sample over the median one, above which it says nothing about the map."""
 EXPLAINED = 0.5
-"""Share of the field's variance along the track, below which the map does not describe it."""
+"""Fraction of the field's variance along the track, below which the map does not describe it."""
 
 
 def findings_of(
@@ -156,6 +156,7 @@ def _best_shift(
     anomaly : array, (n,)
         nT; a constant is subtracted.
     """
+    # Exhaustive search over a lattice of shifts: the scatter has many minima.
     shifts = np.linspace(-SEARCH, SEARCH, LATTICE)
     per_latitude, per_longitude = metres_per_degree(float(np.mean(latitude)))
     best = (0.0, 0.0, np.inf)
@@ -186,6 +187,7 @@ def _positions(grid: AnomalyGrid, reference_track: xr.Dataset, options: Navigati
         known &= sigma <= MAX_MEDIAN_SIGMA_RATIO * np.nanmedian(sigma)
     if known.sum() < MIN_MAP_POSITIONS:
         return []
+    # 400 positions suffice for the scatter of a map.
     thin = np.flatnonzero(known)[:: max(1, int(known.sum()) // 400)]
     measured, latitude, longitude, depth = measured[thin], latitude[thin], longitude[thin], depth[thin]
     north, east, there, here = _best_shift(grid, latitude, longitude, depth, measured)

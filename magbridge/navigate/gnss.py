@@ -146,7 +146,7 @@ class GnssMonitor:
     Parameters
     ----------
     grid : AnomalyGrid
-    options : Options
+    options : NavigationOptions
         Of the navigator.
 
     Attributes
@@ -227,8 +227,11 @@ class GnssMonitor:
             Of the navigator, at this time.
         """
         sigma = max(sigma, MIN_SIGMA_M)
+        # A jammed receiver's claimed error varies: the smallest recent one limits what it may claim.
         smallest = min((row.sigma for row in self._history), default=sigma)
         sigma = min(sigma, MAX_SIGMA_RATIO * smallest)
+        # Every test runs on every position, because each has a history. The state then follows from the first
+        # that fails: the receiver's report, a frozen position, a jump, the deviation, the field.
         jumped = self._jumps(time_us, offset_m, sigma, prediction)
         frozen = self._frozen(place, sigma, prediction.travelled)
         self._field.move(time_us, offset_m, sigma, restart=jumped)
@@ -282,6 +285,8 @@ class GnssMonitor:
         (σ_c² + 2 σ² Δ/τ) Δ² of a Gauss-Markov current (σ, τ), and by its own random walk.
         """
         history, o = self._history, self._options
+        # Three comparisons, with the latest, a middle and the oldest position: a jump shows in the first, a
+        # slow carry-off in the last.
         while len(history) > 1 and time_us - history[0].time_us > WINDOW_US:
             history.popleft()
         jumped = False
@@ -289,12 +294,14 @@ class GnssMonitor:
             seconds = max((time_us - then.time_us) * 1e-6, 0.0)
             # the estimate of the current from before the positions were wrong
             known = then if self._trusted is None else self._trusted
+            # Velocity error of dead reckoning: the current's estimate, its change since, and turns.
             age = max((time_us - known.time_us) * 1e-6, 0.0)
             changed = o.current_sigma * sqrt(min(2.0 * age / o.current_time, 1.0))
             turned = o.motion_error * sqrt(prediction.turns - known.turns)
             velocity_error = hypot(known.current_sigma, changed, turned)
             if seconds * 1e6 > OUTAGE_US:
                 velocity_error = max(velocity_error, OUTAGE_SPEED_FRACTION * prediction.speed)
+            # Two receiver errors, the velocity error over the time, and the random walk add in quadrature.
             error = hypot(sqrt(2.0) * sigma, velocity_error * seconds, o.drift * sqrt(seconds))
             distance = hypot(
                 offset_m[0] - then.north - known.current_north * seconds,
@@ -325,11 +332,13 @@ class GnssMonitor:
     def _drifts(self, time_us: int, away: FloatArray, sigma: float, prediction: Prediction) -> bool:
         """Return True if the mean deviation from the navigator is larger than the errors allow."""
         seconds = (time_us - self._history[-2].time_us) * 1e-6 if len(self._history) > 1 else inf
+        # Exponential mean of the deviation, with the time constant MEAN_TIME_S.
         kept = exp(-seconds / MEAN_TIME_S)
         if self.state is not GnssState.GOOD or seconds > MEAN_TIME_S:
             self._mean, kept = np.zeros(2), 1.0  # starts again after a pause
         self._mean = kept * self._mean + (1.0 - kept) * away
         self.drift = hypot(*self._mean.tolist())
+        # The mean keeps the navigator's error whole, and half of the receiver's: that part changes slowly.
         P = prediction.covariance + (LASTING_FRACTION * sigma) ** 2 * np.eye(2)
         return squared_mahalanobis(self._mean, P) > MAX_DEVIATION_SIGMA**2
 
@@ -355,9 +364,11 @@ class GnssMonitor:
     def _returns(self, time_us: int, agrees: bool, prediction: Prediction) -> bool:
         """Return True if positions that were not used are right again."""
         held_us = time_us - self._since_us
+        # Positions return only after they have agreed with each other for a while.
         if held_us < HOLD_US or self._count < MIN_POSITIONS:
             return False
         field = self._field
+        # The field decides first; where it cannot, agreement with the navigator; else time alone.
         if field.confirms or (field.favours and not prediction.lost):
             return True
         if field.contradicts or self.reason is GnssReason.FIELD:
@@ -371,7 +382,7 @@ class GnssMonitor:
 class _FieldTest:
     """Compares the field with the map at the GNSS position, with an unrelated field, and with the navigator.
 
-    Each difference of log-likelihoods is summed, within ± the logarithm of ``options.doubt``.
+    Each difference of log-likelihoods is summed, within ± the logarithm of ``options.alarm_odds``.
 
     Attributes
     ----------
@@ -384,7 +395,7 @@ class _FieldTest:
     """
 
     def __init__(self, grid: AnomalyGrid, options: NavigationOptions) -> None:
-        self.limit = log(options.doubt)
+        self.limit = log(options.alarm_odds)
         self.log_odds_of_map = self.log_odds_of_position = 0.0
         self._against = 0.0  # cumulative sum of the odds against the map, never negative (Page 1954)
         self._grid, self._options = grid, any_level(options, grid)
@@ -422,6 +433,7 @@ class _FieldTest:
         far = self._step.metres >= FIELD_STEP * self._grid.correlation_length
         if abs(block.time_us - self._time_us) > MAX_GNSS_AGE_US or not far:
             return
+        # One filter runs at the receiver's position; only its bias and map error are free.
         whole, self._step = self._step, Step()
         if self._tracker is None:
             self._tracker = Tracker(self._grid, *prior(self._options, self._sigma), self._options.gate)
@@ -438,6 +450,7 @@ class _FieldTest:
             return
         if not seen.accepted:  # as the filter does: a rejected measurement is never evidence for the map
             unmapped = max(unmapped, seen.log_likelihood)
+        # Cumulative sums of log-likelihood ratios, limited so that a change of truth shows soon.
         self._against = min(max(self._against - seen.log_likelihood + unmapped, 0.0), self.limit)
         for name, other in (("log_odds_of_map", unmapped), ("log_odds_of_position", filter_likelihood)):
             total = getattr(self, name) + seen.log_likelihood - other

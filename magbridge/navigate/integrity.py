@@ -27,13 +27,13 @@ from magbridge.navigate.options import NavigationOptions
 
 __all__ = ["IntegrityMonitor", "Unmapped", "Verdict", "squared_mahalanobis"]
 
-AGREES = 9.0
+MAX_AGREEING_DISTANCE = 9.0
 """Squared distance in sigmas within which two estimates are the same place."""
 ELSEWHERE = 16.0
 """Squared distance in sigmas beyond which they are not."""
-PATIENCE_US = 45_000_000
+MAX_WAIT_US = 45_000_000
 """µs over which blocks are averaged to one measurement of the competing filters."""
-STRIDES = 3.0
+MAX_WAIT_BLOCKS = 3.0
 """Distance over that which a block covers: they are averaged after it, if that comes sooner."""
 
 
@@ -77,12 +77,14 @@ class Unmapped:
         """
         o, rate = self._options, self._rate
         seconds, metres, _ = step
+        # Prediction over the distance d: F = [[a, b], [c, d]] of the Matern process (see Notes).
         kept = exp(-rate * metres)
         a, b = kept * (1.0 + rate * metres), kept * metres
         c, d = -kept * rate * rate * metres, kept * (1.0 - rate * metres)
         value, slope = a * self._x[0] + b * self._x[1], c * self._x[0] + d * self._x[1]
         p, q, r = self._p
         v, w = self._value, self._slope
+        # What bias and map error may have changed since the previous measurement.
         wander = o.map_sigma**2 * -expm1(-2.0 * metres / o.map_length)
         wander += o.bias_sigma**2 * -expm1(-2.0 * seconds / o.bias_time)
         p, q, r = (
@@ -90,6 +92,7 @@ class Unmapped:
             a * c * (p - v) + (a * d + b * c) * q + b * d * (r - w),
             c * c * (p - v) + 2.0 * c * d * q + d * d * (r - w) + w,
         )
+        # Kalman update of the two states with H = [1, 0], and the log-likelihood of the innovation.
         y, s = block.anomaly - self._mean - value, p + block.variance + curvature_variance
         self._x = value + p / s * y, slope + q / s * y
         self._p = p - p * p / s, q - p * q / s, r - q * q / s
@@ -131,14 +134,15 @@ class IntegrityMonitor:
         levels: tuple[float, float],
     ) -> None:
         level, doubted = levels
+        # *elsewhere* begins with the filter's covariance, widened in position, current and bias.
         wide = P.copy()
         wide[:2, :2] += reach**2 * np.eye(2)
         for state, sigma in ((2, options.current_sigma), (3, options.current_sigma), (4, level)):
             wide[state, state] = max(wide[state, state], sigma**2)
         self._options, self._time_us = options, time_us
-        self._threshold = log(options.doubt)
+        self._threshold = log(options.alarm_odds)
         self._waiting: list[Block] = []
-        self._since, self._step = Step(), STRIDES * block_length(grid)
+        self._since, self._step = Step(), MAX_WAIT_BLOCKS * block_length(grid)
         self.here = Bank(grid, x, P, resolution, options.gate)
         self.elsewhere = Bank(grid, x, wide, resolution, options.gate, doubted)
         self.odds = 0.0
@@ -150,10 +154,11 @@ class IntegrityMonitor:
         They are compared with the filter's estimate after that block: `x` (6,) and its covariance `P`
         (6, 6).
         """
+        # Collect blocks until the competing filters are worth an update.
         self._waiting.append(block)
         self._since = self._since.joined(step)
         first = self._waiting[0]
-        if block.time_us - first.time_us < PATIENCE_US and self._since.metres < self._step:
+        if block.time_us - first.time_us < MAX_WAIT_US and self._since.metres < self._step:
             return Verdict.OPEN
         together = average(self._waiting)
         seconds = (together.time_us - self._time_us) * 1e-6
@@ -162,6 +167,7 @@ class IntegrityMonitor:
         self._waiting.clear()
         self.here.predict(F, Q)
         self.elsewhere.predict(F, Q)
+        # Both predict the same measurement: the difference of log-likelihoods is the change of the log odds.
         self.odds += self.elsewhere.update(together)[2] - self.here.update(together)[2]
         return self._compare(x, P)
 
@@ -172,15 +178,20 @@ class IntegrityMonitor:
 
     def _compare(self, x: FloatArray, P: FloatArray) -> Verdict:
         there, spread = self.elsewhere.moments()
+        # Another place has won if its odds pass the threshold and it is another place indeed.
         if self.odds > self._threshold and squared_mahalanobis(there - x, P) > ELSEWHERE:
             return Verdict.ELSEWHERE
+        # As long as *elsewhere* covers several places, nothing is decided.
         if widest(spread) > 1.5 * max(self.elsewhere.resolution, widest(P)):
             return Verdict.OPEN
-        if squared_mahalanobis(there - x, spread + P) < AGREES:
+        # Spread out and started wide, it came back to the filter's place: the filter holds.
+        if squared_mahalanobis(there - x, spread + P) < MAX_AGREEING_DISTANCE:
             return Verdict.HOLDS
         here, narrow = self.here.moments()  # where the filter would be without its single linearisation
         return (
-            Verdict.ELSEWHERE if squared_mahalanobis(there - here, spread + narrow) < AGREES else Verdict.OPEN
+            Verdict.ELSEWHERE
+            if squared_mahalanobis(there - here, spread + narrow) < MAX_AGREEING_DISTANCE
+            else Verdict.OPEN
         )
 
 

@@ -78,6 +78,7 @@ def average(blocks: Sequence[Block] | FloatArray) -> Block:
     """
     rows = np.array(blocks)
     start, _, longitude, *_ = rows[0].tolist()
+    # Time and longitude relative to the first row: no precision is lost, and no wrap at 180 degrees.
     precision = 1.0 / rows[:, 4]
     rows[:, 0] -= start
     rows[:, 2] = wrap(rows[:, 2] - longitude)
@@ -101,7 +102,7 @@ def transition(
 
     Parameters
     ----------
-    options : Options
+    options : NavigationOptions
         Of the navigator.
     seconds, metres : float
         Time, and distance through the water.
@@ -115,6 +116,8 @@ def transition(
     """
     o = options
     f, q = np.eye(N_STATES), np.zeros((N_STATES, N_STATES))
+    # Gauss-Markov current over the time t: c' = a c + w, var w = s^2 (1 - a^2). Its integral is the drift
+    # of the position; trapezoid for the mean, t^2/3 and t/2 for the covariances of an integrated random walk.
     kept = exp(-seconds / o.current_time)
     gained = o.current_sigma**2 * (1.0 - kept * kept)
     for p, c in ((0, 2), (1, 3)):
@@ -122,6 +125,7 @@ def transition(
         q[p, p] = o.drift**2 * seconds + gained * seconds * seconds / 3.0
         q[p, c] = q[c, p] = gained * seconds / 2.0
         q[c, c] = gained + 0.5 * o.motion_error**2 * motion.turns
+    # Position error of the motion between reports, then the two errors of the measurement.
     q[:2, :2] += [[motion.nn, motion.ne], [motion.ne, motion.ee]]
     slow = (4, o.bias_sigma, seconds / o.bias_time), (5, o.map_sigma, metres / o.map_length)
     for i, sigma, decay in slow:
@@ -147,7 +151,7 @@ def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -
     ----------
     grid : AnomalyGrid
         Its scatter σ and its correlation length L.
-    options : Options
+    options : NavigationOptions
         Bias and map error.
     variance : float
         nT², of a measurement. A sixteenth of what bias and map error gain until the next is added (as for
@@ -163,6 +167,7 @@ def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -
     if not np.isfinite(length) or grid.rms == 0.0:
         return float("inf")
     _, Q = transition(options, options.interval, block_length(grid))
+    # s^2 < sqrt(2 noise) / k: the curvature's error stays below the noise of one measurement.
     noise = variance + (Q[4, 4] + Q[5, 5]) * 0.5**4
     curvature = 3.0**0.5 * grid.rms / length**2
     return float(min(0.25 * length, MAX_SPREAD_FRACTION * (2.0 * noise) ** 0.25 / curvature**0.5))
@@ -179,7 +184,7 @@ class Collector:
 
     Parameters
     ----------
-    options : Options
+    options : NavigationOptions
     step : float
         m, that a block covers at most.
 
@@ -213,6 +218,7 @@ class Collector:
         total_field, sigma : float
             Total field and its 1-sigma, nT.
         """
+        # Anomaly = total field - main field at the dead-reckoned position and date.
         main, slope_north, slope_east = self._main_field.field_and_slopes(
             reckoning.latitude, reckoning.longitude, reckoning.depth, (time_us + utc_offset_us) * 1e-6
         )
@@ -229,6 +235,7 @@ class Collector:
         anomaly, variance = total_field - main, max(sigma, MIN_SIGMA_NT) ** 2
         place = reckoning.latitude, reckoning.longitude
         self._rows.extend((time_us, *place, anomaly, variance, slope_north, slope_east, reckoning.depth))
+        # Full if the next sample, as far on as this one from its predecessor, would not fit.
         full = (
             time_us - self._start_us + wait > self._interval_us
             or reckoning.travelled - self._begun + step > self._step
@@ -239,6 +246,8 @@ class Collector:
         """Return the block of the samples collected so far; None if there are none."""
         if not self._rows:
             return None
+        # Precision-weighted mean. Its variance has three parts: white noise, which averages out; noise with a
+        # correlation time, by the number of independent samples; and what does not average out (`slow`).
         rows, self._rows = np.frombuffer(self._rows).reshape(-1, len(Block._fields)), array("d")
         variance = rows[:, Block._fields.index("variance")]
         w, white = 1.0 / variance, np.minimum(self._white, variance)

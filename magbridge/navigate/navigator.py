@@ -2,7 +2,7 @@
 
 Pure in event time, with nothing random in it: a replay gives the same bits. ::
 
-    nav = Navigator(read_grid("grid.nc"), Options(start_sigma=100.0))
+    nav = Navigator(read_grid("grid.nc"), NavigationOptions(start_sigma=100.0))
     nav.fix(t_us, latitude, longitude)
     nav.telemetry(t_us, heading=90.0, speed=0.35, depth=40.0)
     record = nav.sample(t_us, corrected)        # None until enough samples make a measurement
@@ -32,7 +32,7 @@ __all__ = ["NO_POSITION_FLAGS", "Navigator"]
 NO_POSITION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED)
 MAX_SAMPLE_AGE_S = 10.0
 """s by which a sample may be older than the dead-reckoned position, which does not go back to its place."""
-FRESH = 3.0
+MAX_UPDATE_AGE_INTERVALS = 3.0
 """Intervals: no position is dead-reckoned from an update older than that."""
 
 
@@ -100,6 +100,7 @@ class Navigator:
             away = separation(where.latitude, where.longitude, latitude, longitude)
             was_good = monitor.state is GnssState.GOOD
             state = monitor.check(time_us, place, away, known, self._prediction(time_us))
+            # Positions that were fused before the fault was found may have been wrong: widen by their effect.
             if was_good and state is not GnssState.GOOD:
                 estimate.widen(monitor.possible_error)
         if state is not GnssState.GOOD:
@@ -109,6 +110,7 @@ class Navigator:
     def _prediction(self, time_us: int) -> Prediction:
         """Return the predicted position at a time from the last update on."""
         now, where = self.estimate, self._reckoning
+        # Prediction of the state; the receiver's own deviation is measured relative to dead reckoning.
         F, Q = transition(now.options, max((time_us - now.time_us) * 1e-6, 0.0), 0.0)
         x, P = F @ now.x, F @ now.P @ F.T + Q
         current_sigma = worse_axis(P[2, 2], P[2, 3], P[3, 3])
@@ -134,6 +136,7 @@ class Navigator:
             return None
         record = self.finish()
         self.estimate.predict(time_us, where.travelled, where.noise)
+        # The filter's state is the offset from dead reckoning, so a fix enters as such an offset.
         there = np.array(separation(where.latitude, where.longitude, *place))
         self.estimate.correct(there, sigma, fused_sigma)
         return record
@@ -183,10 +186,11 @@ class Navigator:
         """
         last = self.estimate
         elapsed = (time_us - last.time_us) * 1e-6
-        if not last.valid or elapsed > FRESH * last.options.interval:
+        if not last.valid or elapsed > MAX_UPDATE_AGE_INTERVALS * last.options.interval:
             return None
         F, Q = transition(last.options, max(elapsed, 0.0), 0.0)
         x, P = F @ last.x, F @ last.P @ F.T + Q
+        # A position that is too uncertain is not sent, however valid it was.
         if widest(P) > last.options.sigma_limit:
             return None
         place = offset(*self.reckoned(time_us), float(x[0]), float(x[1]))
@@ -199,6 +203,7 @@ class Navigator:
 
     def _update(self, block: Block) -> Record:
         now, where = self.estimate, self._reckoning
+        # Estimate first; then the receiver's test uses the same measurement and its likelihood.
         seen = now.update(block, where.travelled, where.noise)
         if isfinite(seen.anomaly):
             self.gnss.observe(block, now.step, seen.log_likelihood)

@@ -15,7 +15,7 @@ __all__ = ["NavigationOptions", "any_level", "informed", "with_level"]
 
 MAX_NOISE_INTERVALS = 3.0
 """Intervals: noise with a longer correlation time becomes a bias."""
-LEG = 1_800.0
+LEG_TIME_S = 1_800.0
 """s, between turns or from dive to climb."""
 
 
@@ -52,7 +52,7 @@ class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     correlation length."""
     sigma_limit: Positive = 500.0
     """m, the largest 1-sigma of a valid position."""
-    doubt: Positive = 2_000.0
+    alarm_odds: Positive = 2_000.0
     """Odds at which another explanation of the field replaces the filter's."""
 
 
@@ -61,7 +61,7 @@ def informed(options: NavigationOptions, calibration: Calibration, sigma: float)
 
     Parameters
     ----------
-    options : Options
+    options : NavigationOptions
         Their bias is that of all other sources: the map's level, the field's variation in time.
     calibration : Calibration
         Of the total field that will be used.
@@ -75,14 +75,17 @@ def informed(options: NavigationOptions, calibration: Calibration, sigma: float)
     is what drives it, ``σ √(1 - ρ²)`` with ρ the correlation from sample to sample. A calibration's other
     errors depend on attitude and masses, and last for a leg; its level is that of all samples.
     """
+    # AR(1) noise with the correlation rho from sample to sample: correlation time -dt / log(rho).
     noise = calibration.noise
     white = noise.sensor
     rho = noise.autocorrelation
     noise_time = -noise.interval / log(rho) if 0.0 < rho < 1.0 else 0.0
-    lasts = LEG
+    lasts = LEG_TIME_S
+    # Correlated for longer than a few updates: it is a bias; only its driving noise averages out.
     if noise_time > MAX_NOISE_INTERVALS * options.interval:
         white *= sqrt(noise.white + (1.0 - noise.white) * (1.0 - rho**2))
         lasts, noise_time = noise_time, 0.0
+    # The rest of sigma^2, beyond level and white noise, lasts for a leg.
     level = calibration.reference.level_sigma
     slow = sqrt(max(0.0, sigma**2 - level**2 - white**2))
     known = replace(

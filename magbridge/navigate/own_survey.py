@@ -46,23 +46,23 @@ from magbridge.navigate.reference_track import reference_track, with_errors
 
 __all__ = ["COVARIANCE_KINDS", "OwnField", "drift_functions", "localise", "own_bound"]
 
-STEP, LASTS, BLOCKS = 60.0, 100.0, 400
-"""m that a block of samples covers at most, the share of the log that it lasts at most is one in so many, and
-the number of blocks at most: of more, every second or third is used."""
+BLOCK_LENGTH_M, MIN_BLOCKS_PER_LOG, MAX_BLOCKS = 60.0, 100.0, 400
+"""Limits of a block: its length, m, and the number of blocks that a log has at least. Of more than the last
+number, every second or third block is used."""
 MIN_TRACK_BLOCKS = 12
 """Blocks."""
-STAGES, PARTICLES = 10, 80
+STAGE_COUNT, PARTICLE_COUNT = 10, 80
 """Parts in which the track is processed, and number of tracks (particles)."""
 MIN_LOST_FRACTION = 0.49
-"""Share of the blocks from which on a track can be lost."""
-CONTRADICTED = 1.5
+"""Fraction of the blocks from which on a track can be lost."""
+MAX_NOISE_RATIO = 1.5
 """Noise over the calibration's from which on field and track contradict each other."""
-GAINED = 0.85
+MAX_IMPROVED_RATIO = 0.85
 """Of dead reckoning's sigma: less is worth saying."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _PosteriorTracks:
     """The tracks that agree with the field: their errors (k, n, 2), m, and the likeliest kind of field.
 
     `typical` (q,) is the track of that kind nearest to the mean; `scales` (3,) are the median amplitude,
@@ -78,7 +78,7 @@ class _Found:
     lost: bool
 
     @classmethod
-    def from_particles(cls, field: OwnField, particles: Particles) -> _Found:
+    def from_particles(cls, field: OwnField, particles: Particles) -> _PosteriorTracks:
         moved = field.moved(particles.u)
         kind = int(np.bincount(particles.kind, minlength=len(COVARIANCE_KINDS)).argmax())
         off = ((moved - moved.mean(axis=0)) ** 2).sum(axis=(1, 2))
@@ -95,6 +95,7 @@ def _lost(field: OwnField, u: FloatArray, count: int | None = None) -> bool:
     """
     if count is not None and count < MIN_LOST_FRACTION * len(field.time):
         return False
+    # Spread of the tracks, RMS over the particles, against the median length of the field.
     apart = np.sqrt(field.moved(u)[:, :count].var(axis=0).sum(axis=1))
     return bool(np.median(apart) > np.median(field.scales(u), axis=0)[1])
 
@@ -111,7 +112,7 @@ def localise(
     ----------
     deployment : Dataset
         As for :func:`~.batch.navigate`.
-    options : Options, optional
+    options : NavigationOptions, optional
         How well start, current and calibration are known.
     start : (latitude, longitude), optional
         deg; default the log's first position.
@@ -121,7 +122,7 @@ def localise(
     Dataset
         On ``time`` of the blocks: position with covariance, ``north east`` from the dead-reckoned one,
         ``unaided_sigma`` of dead reckoning alone, anomaly and that of the field found; where the log has a
-        better position, ``error_*`` and ``bound_sigma``, the smallest (:func:`~.own_bound.own_bound`).
+        better position, ``error_*`` and ``bound_sigma``, the smallest (:func:`own_bound`).
         Attributes: ``findings``, ``motion``, ``reference_track``.
 
     Raises
@@ -133,15 +134,23 @@ def localise(
     options = options or NavigationOptions()
     motion = motion_of(deployment, source)
     origin = start if start is not None else first_position(deployment, source)
+    # 1. Average the samples to blocks along the dead-reckoned track.
+    # 2. Sample the posterior of drift and field (particles).
+    # 3. Mean and covariance over the particles; bound and errors where the truth is known.
     blocks, step = _blocks(deployment, options, motion, origin, source)
     rows = np.array(blocks)
     field = OwnField(blocks, np.stack(separation(*origin, rows[:, 1], rows[:, 2]), axis=1), options)
-    counts = [len(blocks) * stage // STAGES for stage in range(1, STAGES + 1)]
+    counts = [len(blocks) * stage // STAGE_COUNT for stage in range(1, STAGE_COUNT + 1)]
     with threadpool_limits(1, "blas"):
         particles = sample(
-            field.log_likelihood, field.q, len(COVARIANCE_KINDS), counts, PARTICLES, partial(_lost, field)
+            field.log_likelihood,
+            field.q,
+            len(COVARIANCE_KINDS),
+            counts,
+            PARTICLE_COUNT,
+            partial(_lost, field),
         )
-        found = _Found.from_particles(field, particles)
+        found = _PosteriorTracks.from_particles(field, particles)
         known = reference_track(deployment, frozenset(MOTIONS[motion]))
         result = with_errors(_dataset(field, found, options, origin, rows[:, 7]), known)
         if known is not None:
@@ -163,8 +172,8 @@ def _blocks(
     """Return the blocks, and of how many each is one."""
     time, field, sigma = samples_of(deployment, source)
     moves = columns_of(deployment, MOTIONS[motion] | {"depth": "depth"})
-    interval = max(options.interval, float(time[-1] - time[0]) / LASTS)
-    collector = Collector(structs.replace(options, interval=interval), STEP)
+    interval = max(options.interval, float(time[-1] - time[0]) / MIN_BLOCKS_PER_LOG)
+    collector = Collector(structs.replace(options, interval=interval), BLOCK_LENGTH_M)
     reckoning, found = DeadReckoning(), []
     reckoning.place(*start)
     for i, t in enumerate(time.tolist()):
@@ -174,25 +183,31 @@ def _blocks(
     whole = [one for one in (*found, collector.flush()) if one is not None]
     if len(whole) < MIN_TRACK_BLOCKS:
         raise FormatError(source, "expected samples of the total field at known times: too few are usable")
-    step = ceil(len(whole) / BLOCKS)
+    step = ceil(len(whole) / MAX_BLOCKS)
     return whole[::step], step
 
 
 def _dataset(
-    field: OwnField, found: _Found, options: NavigationOptions, origin: tuple[float, float], depth: FloatArray
+    field: OwnField,
+    found: _PosteriorTracks,
+    options: NavigationOptions,
+    origin: tuple[float, float],
+    depth: FloatArray,
 ) -> xr.Dataset:
     """Return mean and covariance over the tracks, and the field that a typical one finds."""
     moved = found.moved.mean(axis=0)
+    # Sample covariance over the particles for each block.
     off = found.moved - moved
     C = np.einsum("kni,knj->nij", off, off) / (len(off) - 1)
     place = field.place + moved
     latitude, longitude = offset(*origin, place[:, 0], place[:, 1])
     there = field.moved(found.typical)
+    # Posterior mean of the field, y - R K^-1 y: what remains after the noise is taken off.
     K, R = field.covariance(field.place + there, found.typical, found.kind)
     y = field.anomaly - field.mean - (field.slope * there).sum(axis=1)
     alone = np.sqrt(2.0 * (field.drift**2).sum(axis=1))
     sigma = np.sqrt(C[:, 0, 0] + C[:, 1, 1])
-    good = (found.scales[2] < CONTRADICTED) & (sigma < options.sigma_limit)
+    good = (found.scales[2] < MAX_NOISE_RATIO) & (sigma < options.sigma_limit)
     columns = {
         "latitude": latitude, "longitude": longitude, "smoothed_latitude": latitude,
         "smoothed_longitude": longitude, "depth": depth, "covariance_nn": C[:, 0, 0],
@@ -205,7 +220,7 @@ def _dataset(
     return made("track", field.time, columns, COLUMN_UNITS | {"unaided_sigma": "m"})
 
 
-def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> Iterator[str]:
+def _findings(result: xr.Dataset, field: OwnField, found: _PosteriorTracks, step: int) -> Iterator[str]:
     """Yield sentences on how much the field improved the track."""
     sigma = np.sqrt((result["covariance_nn"] + result["covariance_ee"]).to_numpy())
     alone = result["unaided_sigma"].to_numpy()
@@ -218,7 +233,7 @@ def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> 
     if "bound_sigma" in result:
         best = float((result["bound_sigma"] ** 2).mean()) ** 0.5
         yield f"no estimator could be better than {best:.0f} m RMS here, with this track and this field"
-    if noise >= CONTRADICTED:
+    if noise >= MAX_NOISE_RATIO:
         yield (
             f"field and track contradict each other (noise of {noise:.1f} times what the calibration "
             "claims): the calibration or the options for dead reckoning are not good; do not use it"
@@ -240,7 +255,7 @@ def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> 
             "dead reckoning may be off by more than the field's length: the track may be at another "
             "repetition of the field, which its sigma does not count; check it against a fix"
         )
-    elif np.median(sigma) > GAINED * np.median(alone):
+    elif np.median(sigma) > MAX_IMPROVED_RATIO * np.median(alone):
         yield (
             "the field adds little to dead reckoning: the track has to come back to places it has met, "
             "before it has drifted by more than the field's length"
@@ -249,17 +264,17 @@ def _findings(result: xr.Dataset, field: OwnField, found: _Found, step: int) -> 
 
 COVARIANCE_KINDS = ("exponential, once smooth", "exponential, twice smooth", "Gaussian")
 """Matern's covariances of smoothness 3/2 and 5/2, and the limit of both (Rasmussen & Williams, eq. 4.17)."""
-SIZE, SIZE_SPREAD = 50.0, np.log(4.0)
+FIELD_AMPLITUDE_NT, AMPLITUDE_SPREAD = 50.0, np.log(4.0)
 """nT of the crustal field, and the 1-sigma of its logarithm: sea floor and land by airborne surveys."""
 LENGTH_SPREAD, NOISE_SPREAD = np.log(6.0), np.log(1.3)
 """1-sigma of the logarithm of the length, and of the noise over what the calibration claims."""
-STEPS, SHARE = 4.0, 2.5
+MIN_LENGTH_SPACINGS, MIN_EXTENT_LENGTHS = 4.0, 2.5
 """The shortest length expected, over the distance of neighbours; the longest, over the track's extent."""
 LEVEL_SCATTERS = 10.0
 """The level's 1-sigma, over the scatter of the measured field: it is not known."""
-KNOTS, WAVES, LEFT_OUT = 240, 48, 1e-4
+COVARIANCE_TIMES, MAX_FUNCTIONS, NEGLIGIBLE_VARIANCE_FRACTION = 240, 48, 1e-4
 """Times at which a drift's covariance is taken, its functions at most, and the share they may leave out."""
-FARTHEST = 8.0
+MAX_PRIOR_SIGMAS = 8.0
 """Sigmas of its prior beyond which no size, length or noise is tried."""
 IMPOSSIBLE_LOG_LIKELIHOOD = -1e300
 """Log likelihood of an impossible track."""
@@ -271,7 +286,9 @@ def drift_functions(time: FloatArray, options: NavigationOptions) -> FloatArray:
     `time` (n,) is in s. They are Karhunen-Loeve's: eigenvectors of the covariance that the state of
     :mod:`.model` has, scaled by the root of their eigenvalues.
     """
-    knots = np.linspace(time[0], max(time[-1], time[0] + 1.0), min(KNOTS, max(len(time), 2)))
+    # Covariance C(t_j, t_k) of the position error on a coarse grid of times, from the transition of position
+    # and current: P(t_k) propagated forward to t_j.
+    knots = np.linspace(time[0], max(time[-1], time[0] + 1.0), min(COVARIANCE_TIMES, max(len(time), 2)))
     F, Q = (one[np.ix_((0, 2), (0, 2))] for one in transition(options, knots[1] - knots[0], 0.0))
     P = np.diag([options.start_sigma, options.current_sigma]) ** 2
     C = np.zeros((len(knots), len(knots)))
@@ -281,9 +298,10 @@ def drift_functions(time: FloatArray, options: NavigationOptions) -> FloatArray:
             C[j, k] = C[k, j] = later[0, 0]
             later = F @ later
         P = F @ P @ F.T + Q
+    # Karhunen-Loeve: leading eigenvectors, scaled by the root of their eigenvalues.
     values, vectors = np.linalg.eigh(C)
-    order = np.argsort(values)[::-1][:WAVES]
-    kept = order[values[order] > LEFT_OUT * values.max()]
+    order = np.argsort(values)[::-1][:MAX_FUNCTIONS]
+    kept = order[values[order] > NEGLIGIBLE_VARIANCE_FRACTION * values.max()]
     functions = vectors[:, kept] * np.sqrt(values[kept])
     return np.stack([np.interp(time, knots, one) for one in functions.T], axis=1)
 
@@ -299,7 +317,7 @@ class OwnField:
     blocks : list of Block
     place : (n, 2) array
         m, north and east, where dead reckoning has them.
-    options : Options
+    options : NavigationOptions
         How well start, current and calibration are known.
 
     Attributes
@@ -322,8 +340,9 @@ class OwnField:
         self.mean = float(np.median(self.anomaly))
         step = float(np.median(np.linalg.norm(np.diff(place, axis=0), axis=1)))
         extent = float(np.hypot(*np.ptp(place, axis=0)))
-        self.shortest = STEPS * max(step, 1.0)
-        self._middle = float(np.sqrt(self.shortest * max(extent / SHARE, 1.5 * self.shortest)))
+        self.shortest = MIN_LENGTH_SPACINGS * max(step, 1.0)
+        self._middle = float(np.sqrt(self.shortest * max(extent / MIN_EXTENT_LENGTHS, 1.5 * self.shortest)))
+        # The calibration's error (exponential in time) and an unknown level.
         apart = np.abs(self.time[:, None] - self.time) / options.bias_time
         self._other = (
             options.bias_sigma**2 * np.exp(-apart) + (LEVEL_SCATTERS * float(self.anomaly.std())) ** 2
@@ -336,31 +355,34 @@ class OwnField:
 
     def scales(self, u: FloatArray) -> FloatArray:
         """Return the field's size, nT, its length, m, and the noise over the claimed one: (3,) or (k, 3)."""
-        at_zero = np.array([SIZE, self._middle, 1.0])
-        return np.asarray(at_zero * np.exp(u[..., -3:] * (SIZE_SPREAD, LENGTH_SPREAD, NOISE_SPREAD)))
+        at_zero = np.array([FIELD_AMPLITUDE_NT, self._middle, 1.0])
+        return np.asarray(at_zero * np.exp(u[..., -3:] * (AMPLITUDE_SPREAD, LENGTH_SPREAD, NOISE_SPREAD)))
 
     def log_likelihood(self, u: FloatArray, kind: int, count: int) -> tuple[float, FloatArray]:
         """Return log p of the first `count` blocks, up to a constant, and its gradient by u (q,)."""
         gradient = np.zeros(self.q)
-        if np.abs(u[-3:]).max() > FARTHEST:
+        if np.abs(u[-3:]).max() > MAX_PRIOR_SIGMAS:
             return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
         n = slice(0, count)
         size, length, noise = self.scales(u)
         d, W = self.moved(u)[n], self.drift[n]
         x, y = self.place[n] + d, self.anomaly[n] - self.mean - (self.slope[n] * d).sum(axis=1)
         squared, k, h, K, R = self._covariance(x, kind, size, length, noise)
+        # log p = -y' K^-1 y / 2 - log |L| with K = L L'.
         L, info = dpotrf(K.T, lower=1)
         if info:
             return IMPOSSIBLE_LOG_LIKELIHOOD, gradient
+        # alpha = K^-1 y; d log p / dK = (alpha alpha' - K^-1) / 2 (Rasmussen & Williams 2006, eq. 5.9).
         alpha = dpotrs(L, y, lower=1)[0]
         value = -0.5 * float(y @ alpha) - float(np.log(L.diagonal()).sum())
         inverse = np.tril(dpotri(L, lower=1)[0])
         G = np.outer(alpha, alpha) - inverse - np.tril(inverse, -1).T  # twice the slope by K
+        # Chain rule: dK/dx through the distance, dK/d(log amplitude), dK/d(log length), dK/d(log noise).
         Gh = G * h
         steep = (size / length) ** 2
         by_place = steep * (Gh.sum(axis=1)[:, None] * x - Gh @ x) + self.slope[n] * alpha[:, None]
         gradient[: 2 * self.r] = (W.T @ by_place).T.ravel()
-        gradient[-3] = size * size * float((G * k).sum()) * SIZE_SPREAD
+        gradient[-3] = size * size * float((G * k).sum()) * AMPLITUDE_SPREAD
         gradient[-2] = -0.5 * steep * float((Gh * squared).sum()) * LENGTH_SPREAD
         gradient[-1] = float(G.diagonal() @ R) * NOISE_SPREAD
         return value, gradient
@@ -400,6 +422,7 @@ def _kind(a: FloatArray, kind: int) -> tuple[FloatArray, FloatArray]:
     if kind == 2:
         k = np.exp(-0.5 * a * a)
         return k, -k
+    # Matern 3/2 and 5/2 (eq. 4.17), in the scaled distance a = sqrt(2 nu) r / l.
     a = np.sqrt(2.0 * kind + 3.0) * a
     falling = np.exp(-a)
     if kind == 0:
@@ -432,6 +455,7 @@ def own_bound(
     """
     whole = np.asarray(np.isfinite(np.hstack([place, slopes])).all(axis=1))
     K = field.covariance(np.where(whole[:, None], place, 0.0), typical, kind)[0][np.ix_(whole, whole)]
+    # G: change of the measured anomaly by each weight of the drift's functions.
     felt = slopes[whole] + field.slope[whole]
     W = field.drift
     G = np.hstack([felt[:, :1] * W[whole], felt[:, 1:] * W[whole]])

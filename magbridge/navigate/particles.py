@@ -20,16 +20,16 @@ __all__ = ["Likelihood", "Particles", "sample"]
 Likelihood = Callable[[FloatArray, int, int], tuple[float, FloatArray]]
 """``f(u, kind, count)``: log likelihood of the first `count` data, and its gradient by u (q,)."""
 
-EFFECTIVE = 0.5
-"""Share of the particles that stays effective in a step."""
-MOVES, LEAPS = 2, 6
+MIN_EFFECTIVE_FRACTION = 0.5
+"""Fraction of the particles that stays effective in a step."""
+MOVES_PER_STEP, LEAPFROG_STEPS = 2, 6
 """Moves after a step, and leaps in a move."""
-ACCEPTED, LONGEST = 0.7, 1.0
-"""Share of moves to be accepted, and the longest leap, in the metric's unit."""
-DIVERGED = 1e3
+TARGET_ACCEPTANCE, MAX_STEP_SIZE = 0.7, 1.0
+"""Fraction of moves to be accepted, and the longest step_size, in the metric's unit."""
+MAX_ENERGY_ERROR = 1e3
 """Loss of log posterior after which a move is given up."""
-ALONE = 0.1
-"""Share of the metric that takes the unknowns as independent: few particles do not tell."""
+DIAGONAL_FRACTION = 0.1
+"""Fraction of the metric that takes the unknowns as independent: few particles do not tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +41,16 @@ class Particles:
 
 
 @dataclass(eq=False)
-class _Seen:
+class _Tempered:
     """Log likelihood and gradient with the data of the last stage, and with those of this one."""
 
     before: tuple[float, FloatArray]
     now: tuple[float, FloatArray]
 
-    def log_posterior(self, share: float, u: FloatArray) -> tuple[float, FloatArray]:
+    def log_posterior(self, power: float, u: FloatArray) -> tuple[float, FloatArray]:
         """Return log posterior and gradient, the prior being N(0, 1)."""
         (a, da), (b, db) = self.before, self.now
-        return (1.0 - share) * a + share * b - 0.5 * float(u @ u), (1.0 - share) * da + share * db - u
+        return (1.0 - power) * a + power * b - 0.5 * float(u @ u), (1.0 - power) * da + power * db - u
 
 
 def sample(
@@ -59,11 +59,11 @@ def sample(
     kinds: int,
     counts: Sequence[int],
     number: int,
-    hopeless: Callable[[FloatArray, int], bool] = lambda _u, _count: False,
+    stop: Callable[[FloatArray, int], bool] = lambda _u, _count: False,
 ) -> Particles:
     """Return `number` particles of the posterior of u (q,), N(0, 1) beforehand, and of one of `kinds` models.
 
-    `counts` says how many data each stage has; after one that is `hopeless`, by its u (k, q) and its count,
+    `counts` says how many data each stage has; after one that is `stop`, by its u (k, q) and its count,
     no more are used.
     """
     rng = np.random.default_rng(0)
@@ -72,34 +72,37 @@ def sample(
     last = [nothing] * number
     mover = _Mover(likelihood, kinds, rng)
     for before, count in zip((0, *counts), counts, strict=False):
-        seen = [_Seen(last[i], likelihood(u[i], int(kind[i]), count)) for i in range(number)]
-        mover.before, mover.count, share = before, count, 0.0
-        while share < 1.0:
+        seen = [_Tempered(last[i], likelihood(u[i], int(kind[i]), count)) for i in range(number)]
+        mover.before, mover.count, power = before, count, 0.0
+        # Tempering: raise the power of the new likelihood in steps, resample, and move the particles.
+        while power < 1.0:
             gained = np.array([one.now[0] - one.before[0] for one in seen])
-            share, weights = _step(gained, share)
+            power, weights = _step(gained, power)
             metric = _metric(u, weights)
+            # Systematic resampling: one uniform number for all particles.
             chosen = np.searchsorted(np.cumsum(weights), (np.arange(number) + rng.uniform()) / number)
             chosen = np.minimum(chosen, number - 1)
             u, kind, seen = u[chosen], kind[chosen], [seen[i] for i in chosen.tolist()]
-            mover.share, mover.root = share, metric
+            mover.power, mover.root = power, metric
             mover.move(u, kind, seen)
-        if hopeless(u, count):
+        if stop(u, count):
             break
         last = [one.now for one in seen]
     return Particles(u, kind)
 
 
-def _step(gained: FloatArray, share: float) -> tuple[float, FloatArray]:
-    """Return the next share of the new likelihood, and the particles' weights (k,) by their gain."""
+def _step(gained: FloatArray, power: float) -> tuple[float, FloatArray]:
+    """Return the next fraction of the new likelihood, and the particles' weights (k,) by their gain."""
 
     def weighed(to: float) -> FloatArray:
-        w = np.exp((to - share) * (gained - gained.max()))
+        w = np.exp((to - power) * (gained - gained.max()))
         return np.asarray(w / w.sum())
 
     def effective(to: float) -> bool:
-        return float(1.0 / (weighed(to) ** 2).sum()) >= EFFECTIVE * len(gained)
+        return float(1.0 / (weighed(to) ** 2).sum()) >= MIN_EFFECTIVE_FRACTION * len(gained)
 
-    low, high = share, 1.0
+    # Bisection for the power at which MIN_EFFECTIVE_FRACTION of the particles remains effective.
+    low, high = power, 1.0
     if not effective(high):
         for _ in range(40):
             middle = 0.5 * (low + high)
@@ -111,7 +114,8 @@ def _metric(u: FloatArray, weights: FloatArray) -> FloatArray:
     """Return a root of the particles' covariance (q, q)."""
     off = u - weights @ u
     C = off.T @ (off * weights[:, None])
-    C = (1.0 - ALONE) * C + ALONE * np.diag(np.diag(C)) + 1e-8 * np.eye(len(C))
+    # Shrink towards the diagonal: few particles do not determine a full covariance.
+    C = (1.0 - DIAGONAL_FRACTION) * C + DIAGONAL_FRACTION * np.diag(np.diag(C)) + 1e-8 * np.eye(len(C))
     return np.asarray(np.linalg.cholesky(C))
 
 
@@ -121,47 +125,51 @@ class _Mover:
     def __init__(self, likelihood: Likelihood, kinds: int, rng: np.random.Generator) -> None:
         self.likelihood, self.kinds, self.rng = likelihood, kinds, rng
         self.before = self.count = 0
-        self.share, self.root, self.leap = 0.0, np.eye(1), 0.5 * LONGEST
+        self.power, self.root, self.step_size = 0.0, np.eye(1), 0.5 * MAX_STEP_SIZE
 
-    def move(self, u: FloatArray, kind: IntArray, seen: list[_Seen]) -> None:
+    def move(self, u: FloatArray, kind: IntArray, seen: list[_Tempered]) -> None:
         """Move particles u (k, q) of `kind` (k,) in place."""
-        for _ in range(MOVES):
+        for _ in range(MOVES_PER_STEP):
             accepted = 0
             for i in range(len(u)):
+                # Metropolis move between kinds of field, then a Hamiltonian move of the unknowns.
                 other = int(kind[i] + self.rng.integers(1, self.kinds)) % self.kinds
-                there = self._seen(u[i], other)
-                if self._better(
-                    there.log_posterior(self.share, u[i])[0] - seen[i].log_posterior(self.share, u[i])[0]
+                there = self._evaluate(u[i], other)
+                if self._accept(
+                    there.log_posterior(self.power, u[i])[0] - seen[i].log_posterior(self.power, u[i])[0]
                 ):
                     kind[i], seen[i] = other, there
-                accepted += self._leaped(u, int(kind[i]), seen, i)
-            self.leap = min(self.leap * float(np.exp(0.5 * (accepted / len(u) - ACCEPTED))), LONGEST)
+                accepted += self._hamiltonian_move(u, int(kind[i]), seen, i)
+            self.step_size = min(
+                self.step_size * float(np.exp(0.5 * (accepted / len(u) - TARGET_ACCEPTANCE))), MAX_STEP_SIZE
+            )
 
-    def _leaped(self, u: FloatArray, kind: int, seen: list[_Seen], i: int) -> bool:
+    def _hamiltonian_move(self, u: FloatArray, kind: int, seen: list[_Tempered], i: int) -> bool:
         """Move one particle along its posterior's slope (Neal 2011, fig. 2); return whether it moved."""
-        leap = self.leap * float(self.rng.uniform(0.7, 1.3))
+        step_size = self.step_size * float(self.rng.uniform(0.7, 1.3))
         x, here = u[i], seen[i]
+        # Leapfrog integration of H = -log posterior + p'p / 2, in the metric root root'.
         p = np.asarray(self.rng.normal(size=u.shape[1]))
-        value, slope = here.log_posterior(self.share, x)
+        value, slope = here.log_posterior(self.power, x)
         begun = value - 0.5 * float(p @ p)
-        for _ in range(LEAPS):
-            p = p + 0.5 * leap * (self.root.T @ slope)
-            x = x + leap * (self.root @ p)
-            here = self._seen(x, kind)
-            value, slope = here.log_posterior(self.share, x)
-            if not value - begun > -DIVERGED:
+        for _ in range(LEAPFROG_STEPS):
+            p = p + 0.5 * step_size * (self.root.T @ slope)
+            x = x + step_size * (self.root @ p)
+            here = self._evaluate(x, kind)
+            value, slope = here.log_posterior(self.power, x)
+            if not value - begun > -MAX_ENERGY_ERROR:
                 return False
-            p = p + 0.5 * leap * (self.root.T @ slope)
-        if not self._better(value - 0.5 * float(p @ p) - begun):
+            p = p + 0.5 * step_size * (self.root.T @ slope)
+        if not self._accept(value - 0.5 * float(p @ p) - begun):
             return False
         u[i], seen[i] = x, here
         return True
 
-    def _seen(self, u: FloatArray, kind: int) -> _Seen:
+    def _evaluate(self, u: FloatArray, kind: int) -> _Tempered:
         now = self.likelihood(u, kind, self.count)
-        if self.share == 1.0 or not self.before:
-            return _Seen((0.0, np.zeros(len(u))), now)
-        return _Seen(self.likelihood(u, kind, self.before), now)
+        if self.power == 1.0 or not self.before:
+            return _Tempered((0.0, np.zeros(len(u))), now)
+        return _Tempered(self.likelihood(u, kind, self.before), now)
 
-    def _better(self, gained: float) -> bool:
+    def _accept(self, gained: float) -> bool:
         return bool(np.log(self.rng.uniform()) < gained)

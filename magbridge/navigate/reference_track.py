@@ -37,6 +37,7 @@ def with_errors(result: xr.Dataset, truth: xr.Dataset | None) -> xr.Dataset:
     time = result["time"].to_numpy()
     known = truth["time"].to_numpy()
     spacing = max(60.0, 2.0 * float(np.median(np.diff(known)))) if known.size > 1 else 60.0
+    # Interpolate the reference track; a row without a reference position near in time has no error.
     nearest = np.abs(known[np.clip(np.searchsorted(known, time), 0, known.size - 1)] - time)
     before = np.abs(known[np.clip(np.searchsorted(known, time) - 1, 0, known.size - 1)] - time)
     near = np.minimum(nearest, before) <= spacing

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from voyages import Map, blocks, synthetic, track_over
 
 from magbridge.field.grid import AnomalyGrid
-from magbridge.navigate.estimate import SPREADS, Estimate
+from magbridge.navigate.estimate import SEARCH_SPREADS, Estimate
 from magbridge.navigate.integrity import Verdict
 from magbridge.navigate.model import Block
 from magbridge.navigate.options import NavigationOptions, with_level
@@ -102,11 +102,11 @@ def test_each_search_that_finds_nothing_is_followed_by_one_of_another_width(
             assert estimate.jumps[-1].cause == Verdict.NOWHERE.value
             assert estimate.state is NavigationState.LOST
             widths.append((float(estimate.P[0, 0]) ** 0.5, estimate.jumps[-1].allowed))
-        if len(widths) == len(SPREADS):
+        if len(widths) == len(SEARCH_SPREADS):
             break
     expected = [
         hypot(spread * grid.correlation_length, allowed)
-        for spread, (_, allowed) in zip(SPREADS, widths, strict=True)
+        for spread, (_, allowed) in zip(SEARCH_SPREADS, widths, strict=True)
     ]
     assert [width for width, _ in widths] == pytest.approx(expected, rel=1e-6)
     assert max(widths)[0] > 3.5 * min(widths)[0]

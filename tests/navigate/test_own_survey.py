@@ -85,7 +85,7 @@ def test_a_drift_that_may_be_many_lengths_of_the_field_is_left_to_dead_reckoning
 
 def test_a_drift_that_may_be_longer_than_the_field_is_to_be_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     """There a track may converge to another repetition of the field, which its spread does not include."""
-    monkeypatch.setattr(own_survey, "PARTICLES", 24)
+    monkeypatch.setattr(own_survey, "PARTICLE_COUNT", 24)
     track = localise(flown(straight=False), structs.replace(OPTIONS, current_sigma=0.3), start=START)
     assert "check it against a fix" in track.attrs["findings"]
 
