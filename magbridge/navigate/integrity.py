@@ -31,9 +31,9 @@ MAX_AGREEING_DISTANCE = 9.0
 """Squared distance in sigmas within which two estimates are the same place."""
 ELSEWHERE = 16.0
 """Squared distance in sigmas beyond which they are not."""
-MAX_WAIT_US = 45_000_000
+MAX_AVERAGING_US = 45_000_000
 """µs over which blocks are averaged to one measurement of the competing filters."""
-MAX_WAIT_BLOCKS = 3.0
+MAX_AVERAGING_BLOCKS = 3.0
 """Distance over that which a block covers: they are averaged after it, if that comes sooner."""
 
 
@@ -142,7 +142,7 @@ class IntegrityMonitor:
         self._options, self._time_us = options, time_us
         self._threshold = log(options.alarm_odds)
         self._waiting: list[Block] = []
-        self._since, self._step = Step(), MAX_WAIT_BLOCKS * block_length(grid)
+        self._since, self._step = Step(), MAX_AVERAGING_BLOCKS * block_length(grid)
         self.here = Bank(grid, x, P, resolution, options.gate)
         self.elsewhere = Bank(grid, x, wide, resolution, options.gate, doubted)
         self.odds = 0.0
@@ -158,7 +158,7 @@ class IntegrityMonitor:
         self._waiting.append(block)
         self._since = self._since.joined(step)
         first = self._waiting[0]
-        if block.time_us - first.time_us < MAX_WAIT_US and self._since.metres < self._step:
+        if block.time_us - first.time_us < MAX_AVERAGING_US and self._since.metres < self._step:
             return Verdict.OPEN
         together = average(self._waiting)
         seconds = (together.time_us - self._time_us) * 1e-6

@@ -46,7 +46,7 @@ from magbridge.navigate.reference_track import reference_track, with_errors
 
 __all__ = ["COVARIANCE_KINDS", "OwnField", "drift_functions", "localise", "own_bound"]
 
-BLOCK_LENGTH_M, MIN_BLOCKS_PER_LOG, MAX_BLOCKS = 60.0, 100.0, 400
+BLOCK_LENGTH_M, MIN_BLOCKS_PER_LOG, MAX_TRACK_BLOCKS = 60.0, 100.0, 400
 """Limits of a block: its length, m, and the number of blocks that a log has at least. Of more than the last
 number, every second or third block is used."""
 MIN_TRACK_BLOCKS = 12
@@ -183,7 +183,7 @@ def _blocks(
     whole = [one for one in (*found, collector.flush()) if one is not None]
     if len(whole) < MIN_TRACK_BLOCKS:
         raise FormatError(source, "expected samples of the total field at known times: too few are usable")
-    step = ceil(len(whole) / MAX_BLOCKS)
+    step = ceil(len(whole) / MAX_TRACK_BLOCKS)
     return whole[::step], step
 
 
