@@ -41,6 +41,9 @@ sensor's ``filter_cutoff``: each is written only where there is any."""
 MAX_STATED_SIGMA = 1e15
 """The largest noise (nT) or standard deviation of a coefficient that is accepted: its square is a float32."""
 
+MAX_POSITION = 1e12
+"""Largest position of a mass, or value of another parameter, in the parameter's own unit."""
+
 MAX_FILTER_CUTOFF_HZ = 1e6
 """Largest cutoff frequency of an anti-alias filter, Hz."""
 
@@ -201,6 +204,8 @@ def _checked(content: _File, terms: tuple[Term, ...], effects: tuple[Term, ...])
     _check_covariance(covariance)
     if content.boresight:
         _check_covariance(np.array(content.boresight.covariance), "boresight: ")
+        if np.abs(content.boresight.rotation).max() > 2.0 * np.pi:
+            raise CalibrationError("boresight: rotation: expected a rotation vector, rad, up to a full turn")
     _check_settings(content)
     positions = tuple(term for term in terms if isinstance(term, PositionTerm))
     others = tuple(effect for effect in effects if isinstance(effect, Effect))
@@ -226,6 +231,11 @@ def _check_settings(content: _File) -> None:
     for parameter in content.parameters:
         if not (parameter.scale > 0.0 and parameter.low <= parameter.high):
             raise CalibrationError(f"parameter {parameter.name!r}: expected scale > 0 and low <= high")
+        if (
+            max(abs(parameter.low), abs(parameter.high), abs(parameter.centre), parameter.scale)
+            > MAX_POSITION
+        ):
+            raise CalibrationError(f"parameter {parameter.name!r}: expected positions up to {MAX_POSITION:g}")
     for condition in content.conditions:
         if condition.name not in MIN_HALF_RANGE or not condition.low <= condition.high:
             raise CalibrationError(

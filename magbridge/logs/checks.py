@@ -130,6 +130,7 @@ class _Checks:
     def _times(self, time: FloatArray, rows: Sequence[int], next_times: FloatArray) -> tuple[IndexArray, int]:
         """Return the indices of the rows to keep, and how many of these have the time of the one before."""
         self._faults.count("time", len(time))
+        time = np.where(np.isfinite(time), time, np.nan)  # an infinite time has no difference from another
         whole = np.concatenate([time, next_times[:LOOKAHEAD_ROWS]])
         if not len(_wrong(whole, self._last)) and not (np.diff(whole) > MAX_ISOLATION_S).any():
             return np.arange(len(time)), 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from math import hypot
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -372,7 +373,7 @@ def _length(found: Layout, rows: Sequence[Sequence[str]], places: Sequence[int])
     for row in rows:
         try:
             texts = (row[k].replace(",", ".") if found.decimal == "," else row[k] for k in places)
-            lengths.append(float(np.linalg.norm([float(text) for text in texts])))
+            lengths.append(hypot(*map(float, texts)))
         except (ValueError, IndexError):
             continue
     return float(np.median(lengths)) if lengths else 0.0

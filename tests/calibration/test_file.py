@@ -169,6 +169,11 @@ EDITS: dict[str, tuple[Callable[[dict[str, Any]], Any], type[Exception], str]] =
     "a boresight's negative variance": (
         lambda c: c.update(boresight={"rotation": [0.0] * 3, "covariance": np.diag([1, 1, -1.0]).tolist()}),
         CalibrationError, "boresight: covariance: a variance is negative"),
+    "a boresight beyond a full turn": (
+        lambda c: c.update(boresight={"rotation": [0.0, 0.0, 1e308], "covariance": np.eye(3).tolist()}),
+        CalibrationError, "boresight: rotation: expected a rotation vector"),
+    "a position of 1e150": (
+        lambda c: c["parameters"][0].update(high=1e150), CalibrationError, "expected positions up to"),
     "an effect among terms": (
         lambda c: c["terms"].append(c["effects"].pop()), CalibrationError, "terms and effects"),
 }  # fmt: skip
