@@ -113,3 +113,27 @@ def test_what_a_constant_means_stands_below_it() -> None:
         if "TYPE_CHECKING" not in match[0]
     ]
     assert not found
+
+
+def test_a_name_in_a_docstring_exists() -> None:
+    """A reference, or the type of a parameter, must not keep the name of something that was renamed."""
+    nodes = [n for tree in trees().values() for n in ast.walk(tree)]
+    defined = {path.stem for path in trees()} | {room.name for path in trees() for room in path.parents}
+    defined |= {n.name for n in nodes if isinstance(n, ast.ClassDef | ast.FunctionDef)}
+    defined |= {n.id for n in nodes if isinstance(n, ast.Name)} | {
+        n.arg for n in nodes if isinstance(n, ast.arg)
+    }
+    defined |= {n.attr for n in nodes if isinstance(n, ast.Attribute)}
+    defined |= {(n.asname or n.name).rpartition(".")[2] for n in nodes if isinstance(n, ast.alias)}
+    reference = re.compile(r":(?:class|func|meth|attr|data|mod|exc):`~?([\w.]+)`")
+    parameter = re.compile(r"^ *[\w, *]+ : ([A-Z]\w+)(?:,|$)", re.MULTILINE)
+    missing = [
+        f"{path}: {name}"
+        for path, tree in trees().items()
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Module | ast.ClassDef | ast.FunctionDef)
+        for name in reference.findall(ast.get_docstring(n) or "")
+        + parameter.findall(ast.get_docstring(n) or "")
+        if path.stem != "dialect" and name.rpartition(".")[2] not in defined
+    ]
+    assert not missing, missing

@@ -67,7 +67,7 @@ class Pipeline:
     ----------
     config : Config
     calibration : Calibration or None
-    start : Start
+    start : StartEvent
     key : bytes or None
         The signing key.
     navigate : callable or None

@@ -66,7 +66,7 @@ class Position:
 
     @property
     def depth(self) -> float:
-        """Depth of the last position, m; NaN where :attr:`where` is None."""
+        """Depth of the last position, m; NaN where :attr:`last_position` is None."""
         return nan if self.last_position is None else self._depth
 
     def update(self, message: Message, time_us: int) -> None:

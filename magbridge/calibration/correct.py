@@ -46,7 +46,7 @@ class CorrectedArrays(NamedTuple):
 def correct(
     calibration: Calibration, field: FloatArray, channels: FloatArray, time: FloatArray
 ) -> CorrectedArrays:
-    """Correct many samples; within 1e-12 of the field what :class:`Corrector` gives one by one.
+    """Correct many samples; within 1e-12 of the field what :class:`~.corrector.Corrector` gives one by one.
 
     Parameters
     ----------

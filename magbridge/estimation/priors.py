@@ -11,7 +11,7 @@ So each parameter has three widths, all logarithmic: the first power in T, the f
 first order masses do not affect each other: cross terms have widths of their own, expected to be far
 smaller. The constant terms have three: the gain common to all axes, soft iron, hard iron. Every width is
 ``log w = constant + design . eta``. eta has a broad Gaussian prior about sizes found on vehicles and is
-chosen to maximise the evidence (:mod:`.evidence`), so the data can overrule those sizes.
+chosen to maximise the evidence (:mod:`.hyperparameters`), so the data can overrule those sizes.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class HeldField:
 
 
 class NearbyField:
-    """Intensity of the main field around a moving vehicle; :meth:`at` refits it on the way."""
+    """Intensity of the main field around a moving vehicle; :meth:`field_and_slopes` refits it on the way."""
 
     def __init__(self) -> None:
         self._middle = (np.nan, np.nan, np.nan)  # latitude, longitude, time

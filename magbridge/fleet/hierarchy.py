@@ -29,7 +29,7 @@ and back, :math:`x | p \sim N(L^{-1}(h + S^{-1} p), L^{-1})`. A difference d spl
 parts, with the covariance Q and the shape B (V and I, or U and D), contributes:
 :math:`b | d \sim N(Q B^T S^{-1} d,\ Q - Q B^T S^{-1} B Q)`. The variances maximise the likelihood by
 expectation-maximisation (Laird & Ware 1982, Biometrics 38:963), each with a scaled inverse chi-squared prior
-worth :data:`.WORTH` differences, so that a level with few members keeps a plausible size.
+worth :data:`.PRIOR_DIFFERENCES` differences, so that a level with few members keeps a plausible size.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Population:
     """A fleet's variances, and what all but each vehicle say of the fleet's mean."""
 
     variances: Variances
-    """Variances of the differences at each of :data:`.LEVELS`."""
+    """Variances of the differences at each of :data:`.FLEET_LEVELS`."""
     shapes: Shapes
     """How refits move the coefficients of each vehicle."""
     total: GaussianInformation

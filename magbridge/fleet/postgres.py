@@ -1,6 +1,6 @@
 """A catalogue in a PostgreSQL database, for those who share one.
 
-The tables are those of :data:`.TABLES`, in a schema of their own, each with the rows' keys as its primary
+The tables are those of :data:`.CATALOGUE_TABLES`, in a schema of their own, each with the rows' keys as its primary
 key: rows that two people add at once are there once.
 """
 

@@ -68,7 +68,7 @@ def gained(found: Fit, single: Fit | None, began: FleetPrediction) -> tuple[dict
     ----------
     found, single : Fit
         With the fleet, and by its own data; None where those allow no fit.
-    began : Start
+    began : FleetPrediction
         Where the first began.
     """
     with_it, without = (

@@ -29,7 +29,7 @@ __all__ = [
 FLEET_LEVELS = ("vehicle", "refit", "power-up")
 """What coefficients vary with, from the root down."""
 VARIATION_FRACTIONS = (1.0, 0.1, 0.02)
-"""Shares of the physical widths by which they are expected to vary with each, before any fleet is seen."""
+"""Fractions of the physical widths by which they are expected to vary with each, before any fleet is seen."""
 PRIOR_DIFFERENCES = 2.0
 """Differences that this expectation is worth."""
 
@@ -43,10 +43,10 @@ class Shapes:
     groups: IndexArray
     """(s,): Number of the group that each column shares its variance with."""
     rest: FloatArray | float = VARIATION_FRACTIONS[1]
-    """(K,): Share of the physical widths by which coefficients are expected to vary besides."""
+    """(K,): Fraction of the physical widths by which coefficients are expected to vary besides."""
 
     def expected(self, K: int) -> FloatArray:
-        """Return the shares (3, K) by which coefficients are expected to vary, before any fleet is seen."""
+        """Return the fractions (3, K) by which coefficients are expected to vary, before any fleet is seen."""
         return np.stack(
             [np.broadcast_to(size, K) for size in (VARIATION_FRACTIONS[0], self.rest, VARIATION_FRACTIONS[2])]
         )

@@ -26,7 +26,7 @@ def bundle(state: BridgeState, now_s: float, link: str) -> bytes:
 
     Parameters
     ----------
-    state : State
+    state : BridgeState
         Of the bridge that it is about.
     now_s : float
         s, of the receiver's clock.

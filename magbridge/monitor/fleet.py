@@ -25,7 +25,7 @@ class ReceivedBridges:
 
     Attributes
     ----------
-    states : dict of tuple of 2 int to State
+    states : dict of tuple of 2 int to BridgeState
         By system and component, in the order in which they were first heard.
     """
 

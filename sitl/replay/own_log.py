@@ -50,7 +50,7 @@ class Recorded:
 
     Attributes
     ----------
-    start : Start
+    start : StartEvent
         What the run started from.
     late : float
         s of the run before the log begins; above 0 if the log was restarted after a loss. The bridge's
