@@ -190,7 +190,8 @@ class Navigation(Table, frozen=True):
     depth: NotNegative = 0.0
     """m, of the deepest dives; a map whose altitude is known is continued to half this depth."""
     options: dict[str, Any] = msgspec.field(default_factory=dict)
-    """Prior uncertainties and settings of the position filter: :class:`magbridge.navigate.NavigationOptions`."""
+    """Prior uncertainties and settings of the position filter: the fields of
+    :class:`magbridge.navigate.NavigationOptions`."""
 
 
 class HeadingOutput(Table, frozen=True):

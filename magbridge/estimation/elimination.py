@@ -7,8 +7,8 @@ changes with time), B sparse (splines in place). With AR(1) noise of size :math:
 .. math:: N = B^T R^{-1} B + Q / r^2, \quad H = D^T R^{-1} D - D^T R^{-1} B\, N^{-1} B^T R^{-1} D
 
 is what remains for z when w is eliminated (Schur's complement): a quadratic as any other fit has it
-(:class:`.GaussianInformation`), whose evidence gains :math:`\tfrac12 \log|Q / r^2| - \tfrac12 \log|N|`. The noise's
-autocorrelation enters by two more sums over the samples, so that it costs nothing to try another.
+(:class:`.GaussianInformation`). Its evidence gains :math:`\tfrac12 \log|Q / r^2| - \tfrac12 \log|N|`. The
+noise's autocorrelation enters by two more sums over the samples, so that trying another costs nothing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A catalogue in a PostgreSQL database, for those who share one.
 
-The tables are those of :data:`.CATALOGUE_TABLES`, in a schema of their own, each with the rows' keys as its primary
-key: rows that two people add at once are there once.
+The tables are those of :data:`.CATALOGUE_TABLES`, in a schema of their own. The rows' keys are the primary
+key of each: a row that two people add at once is there once.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Shapes:
     """(K,): Fraction of the physical widths by which coefficients are expected to vary besides."""
 
     def expected(self, K: int) -> FloatArray:
-        """Return the fractions (3, K) by which coefficients are expected to vary, before any fleet is seen."""
+        """Return the expected variation of coefficients (3, K), as fractions, before any fleet is seen."""
         return np.stack(
             [np.broadcast_to(size, K) for size in (VARIATION_FRACTIONS[0], self.rest, VARIATION_FRACTIONS[2])]
         )

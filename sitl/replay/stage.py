@@ -122,7 +122,7 @@ class Stage:
 
         Parameters
         ----------
-        start : Start
+        start : StartEvent
             The bridge's own.
         events : iterable of Event
             Input from sensor and link, in order of time.
