@@ -31,7 +31,7 @@ MERGE_FRACTION = 0.8
 LATTICE_SPACING_SIGMA = 1.2
 """Distance of two neighbours, in their own sigma: their sum is flat to 1 %."""
 LATTICE_EXTENT_SIGMA = 3.5
-"""Sigmas: how far the hypotheses cover the Gaussian to begin with."""
+"""Extent of the first lattice of hypotheses, in sigmas of the Gaussian."""
 MIN_WEIGHT_FRACTION = 1e-7
 """Fraction of the largest weight: a hypothesis with less is dropped."""
 COARSENING_FACTOR = 1.25
@@ -79,7 +79,7 @@ class Bank:
         self._updates = 0
         self.resolution = self.finest = resolution
         self.curvature_variance = 0.0
-        """nT², variance that the map's curvature within the hypotheses added to the last measurement's."""
+        """Variance that the map's curvature within the hypotheses added to the last measurement's, nT²."""
         self.w, self.x, self.P = self._lattice(x, P)
         if level**2 > P[4, 4]:
             free = P.copy()
@@ -288,7 +288,7 @@ class Tracker:
         self._filter = ExtendedKalmanFilter(dim_x=N_STATES, dim_z=1)
         self._filter.x, self._filter.P = x.copy(), P.copy()
         self.curvature_variance = 0.0
-        """nT², variance that the map's curvature within the spread added to the last measurement's."""
+        """Variance that the map's curvature within the spread added to the last measurement's, nT²."""
 
     @property
     def x(self) -> FloatArray:

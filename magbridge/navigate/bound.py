@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["Bound", "as_dataset", "position_bound"]
 
 SLOPE_STEP_DEG = 0.005
-"""deg, over which the main field's slope is taken."""
+"""Difference of latitude or longitude over which the main field's slope is computed, deg."""
 
 
 class Bound(NamedTuple):

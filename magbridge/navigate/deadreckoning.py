@@ -10,11 +10,11 @@ from magbridge.field.geodesy import offset, separation
 __all__ = ["GLIDE", "DeadReckoning", "MotionNoise", "Step"]
 
 GLIDE = 8.0
-"""deg, of pitch; a glider flatter than that is turning between dive and climb."""
+"""Smallest pitch of a glide, deg; a flatter glider turns between dive and climb."""
 DEPTH_BASE = 10.0
-"""s, over which the depth's rate is taken."""
+"""Time over which the rate of depth is computed, s."""
 MAX_WATER_SPEED_M_S = 3.0
-"""m/s, through the water; a higher speed comes from a jump in the depth."""
+"""Largest speed through the water, m/s; a higher one comes from a jump in the depth."""
 MAX_TELEMETRY_GAP_S = 3600.0
 """s without telemetry, after which the motion is unknown."""
 MAX_REPORT_INTERVAL_S = 60.0

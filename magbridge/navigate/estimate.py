@@ -23,9 +23,9 @@ MAX_FIX_DISTANCE_SQUARED = 25.0
 MAX_INFORMED_RATIO = 0.8
 """Fraction of the sigma of dead reckoning alone, above which the field has added no information."""
 MIN_CARRY_OFF_TIME_S = 60.0
-"""s, shortest time in which fixes lead the position away without being noticed."""
+"""Shortest time in which fixes lead the position away without being noticed, s."""
 MIN_SEARCH_RADIUS_M = 300.0
-"""m, smallest radius in which the integrity monitor searches."""
+"""Smallest radius in which the integrity monitor searches, m."""
 JOIN_SPREAD, SPLIT_SPREAD = 1.2, 1.5
 """Position spread over the resolution: below the first, one hypothesis; above the second, several."""
 MIN_REFINEMENT = 0.8

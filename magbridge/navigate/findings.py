@@ -21,7 +21,7 @@ __all__ = ["findings_of"]
 MIN_MAP_POSITIONS = 40
 """Positions, below which a map's place cannot be judged."""
 SEARCH = 1_500.0
-"""m, the largest displacement of a map that is tried, on each axis."""
+"""Largest displacement of a map that is tried, on each axis, m."""
 LATTICE = 31
 """Shifts that are tried on each axis."""
 MIN_RELIEF_SIGMA = 3.0

@@ -39,11 +39,11 @@ __all__ = ["GnssMonitor", "GnssReason", "GnssState", "Prediction"]
 MAX_DEVIATION_SIGMA = 4.5
 """Deviation from a prediction on which a position is rejected: by chance in 4e-5, two degrees of freedom."""
 MIN_SIGMA_M = 1.5
-"""m: a smaller sigma of a receiver is not used, since its error changes slowly."""
+"""Smallest sigma of a receiver that is used, m: its error changes slowly."""
 WINDOW_US = 30_000_000
 """µs over which the motion by GNSS is compared with dead reckoning."""
 MEAN_TIME_S = 20.0
-"""s, time constant of the mean deviation from the navigator."""
+"""Time constant of the mean deviation from the navigator, s."""
 LASTING_FRACTION = 0.5
 """Part of the receiver's sigma that a mean over MEAN_TIME_S does not reduce."""
 HOLD_US, LONG_HOLD_US = 20_000_000, 45_000_000
@@ -58,7 +58,7 @@ OUTAGE_US = 60_000_000
 OUTAGE_SPEED_FRACTION = 0.1
 """1-sigma of the velocity error after an outage, as a fraction of the speed."""
 MIN_FROZEN_M = 10.0
-"""m, that the vehicle must have moved until a constant position is frozen."""
+"""Distance that the vehicle must have moved until a constant position is frozen, m."""
 FIELD_STEP = 0.1
 """Correlation lengths of the map between two measurements of the field that are compared: between closer ones
 an unrelated smooth field predicts as well as the map."""
@@ -178,7 +178,7 @@ class GnssMonitor:
 
     @property
     def possible_error(self) -> float:
-        """m, by which positions that were used may have been wrong when they ceased to be."""
+        """Error that positions may have had while they were still used, m."""
         unseen = FIELD_STEP * self._grid.correlation_length if self.reason is GnssReason.FIELD else 0.0
         return hypot(self.drift, unseen)
 

@@ -61,14 +61,14 @@ class Block(NamedTuple):
     longitude: float
     """`latitude`, `longitude`: deg, dead-reckoned, their mean."""
     anomaly: float
-    """nT, total field minus the main field at the dead-reckoned position."""
+    """Total field minus the main field at the dead-reckoned position, nT."""
     variance: float
-    """nT², of that mean."""
+    """Variance of that mean, nT²."""
     slope_north: float
     slope_east: float
     """`slope_north`, `slope_east`: nT/m, of the main field."""
     depth: float = nan
-    """m, their mean; NaN stands for the map's own height."""
+    """Mean depth, m; NaN stands for the map's own height."""
 
 
 def average(blocks: Sequence[Block] | FloatArray) -> Block:
@@ -174,7 +174,7 @@ def resolution(grid: AnomalyGrid, options: NavigationOptions, variance: float) -
 
 
 MIN_SIGMA_NT = 1e-3
-"""nT: a smaller sigma is not believed."""
+"""Smallest sigma of a sample that is believed, nT."""
 
 
 class Collector:

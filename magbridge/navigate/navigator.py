@@ -33,7 +33,7 @@ NO_POSITION_FLAGS = int(Quality.SATURATED | Quality.UNCALIBRATED)
 MAX_SAMPLE_AGE_S = 10.0
 """s by which a sample may be older than the dead-reckoned position, which does not go back to its place."""
 MAX_UPDATE_AGE_INTERVALS = 3.0
-"""Intervals: no position is dead-reckoned from an update older than that."""
+"""Age of an update, in intervals, from which on no position is dead-reckoned from it."""
 
 
 class Navigator:

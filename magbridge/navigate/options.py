@@ -14,16 +14,16 @@ from magbridge.field.grid import AnomalyGrid
 __all__ = ["NavigationOptions", "any_level", "informed", "with_level"]
 
 MAX_NOISE_INTERVALS = 3.0
-"""Intervals: noise with a longer correlation time becomes a bias."""
+"""Longest correlation time of noise, in intervals; noise with a longer one becomes a bias."""
 LEG_TIME_S = 1_800.0
-"""s, between turns or from dive to climb."""
+"""Duration of a leg between turns, or from dive to climb, s."""
 
 
 class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How well things are known beforehand; all 1-sigma."""
 
     start_sigma: Positive = 50.0
-    """m, of the first position, each axis."""
+    """Sigma of the first position on each axis, m."""
     current_sigma: NotNegative = 0.1
     current_time: Positive = 21_600.0
     """`current_sigma`, `current_time`: m/s and s: the current, and its correlation time."""
@@ -41,17 +41,17 @@ class NavigationOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     """`map_sigma`, `map_length`: nT and m: the map's error, and its correlation length. Independent errors of
     single nodes are the grid's own sigma."""
     noise: NotNegative | None = None
-    """nT, the part of a sample's sigma that is white; of the rest, what goes beyond ``bias_sigma`` does not
+    """White part of a sample's sigma, nT; of the rest, what goes beyond ``bias_sigma`` does not
     average out. None: all of it is white."""
     noise_time: NotNegative = 0.0
-    """s, correlation time of that noise; noise that lasts longer than a few intervals belongs to the bias."""
+    """Correlation time of that noise, s; noise that lasts longer than a few intervals belongs to the bias."""
     gate: Positive = 16.0
     """Largest innovation squared over its variance that is accepted."""
     interval: NotNegative = 20.0
-    """s, samples within are averaged to one update; sooner if the vehicle has moved 2 % of the map's
+    """Time over which samples are averaged to one update, s; less if the vehicle has moved 2 % of the map's
     correlation length."""
     sigma_limit: Positive = 500.0
-    """m, the largest 1-sigma of a valid position."""
+    """Largest 1-sigma of a valid position, m."""
     alarm_odds: Positive = 2_000.0
     """Odds at which another explanation of the field replaces the filter's."""
 

@@ -50,9 +50,9 @@ class Record(msgspec.Struct, frozen=True, gc=False):
     depth: float
     """Depth of the vehicle, m."""
     anomaly: float
-    """nT, measured: total field minus main field at the dead-reckoned position."""
+    """Measured anomaly: total field minus main field at the dead-reckoned position, nT."""
     map_anomaly: float
-    """nT, of the map at the position; NaN off the map."""
+    """Anomaly of the map at the position, nT; NaN off the map."""
     bias: float
     bias_sigma: float
     """`bias`, `bias_sigma`: nT, of the calibration."""
