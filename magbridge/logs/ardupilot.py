@@ -31,11 +31,12 @@ import xarray as xr
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError
-from magbridge.logs.autopilot import BootRun, Fields, Magnetometer, Series, pieces, values_of
+from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
 from magbridge.logs.checks import boots
 from magbridge.logs.compasses import LogCompass, rate
 from magbridge.logs.dataflash import OWN_SCALE, Flash, Records, read_binary, read_text
 from magbridge.logs.deployment import NOTES
+from magbridge.logs.fields import DEG_PER_RAD, FieldMap, by_record, fields_of
 from magbridge.logs.stamps import GPS_EPOCH, WEEK, leap_seconds
 
 if TYPE_CHECKING:
@@ -205,7 +206,7 @@ def _telemetry(fields: Fields, records: dict[str, Records]) -> Iterator[Series]:
             if record == "GPS" and "Status" in table:
                 fixed = table["Status"] >= MIN_GPS_STATUS
                 table |= {key: np.where(fixed, table[key], np.nan) for key in ("Lat", "Lng") if key in table}
-            for column, unit, values in values_of(fields, record, number, table):
+            for column, unit, values in fields_of(fields[record], table, number):
                 if np.any(values) or not column.startswith("servo"):  # an output that is 0 is not in use
                     yield time, column, unit, values
 
@@ -244,37 +245,45 @@ def _utc_offset(records: dict[str, Records]) -> float | None:
     return float((offset - leap_seconds(offset))[0])
 
 
-ARDUPILOT_FIELDS: Fields = {
-    "ATT": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
-    "AHR2": (("roll", "Roll", "deg", 1.0), ("pitch", "Pitch", "deg", 1.0), ("heading", "Yaw", "deg", 1.0)),
-    "POS": (
-        ("latitude", "Lat", "deg", 1.0),
-        ("longitude", "Lng", "deg", 1.0),
-        ("depth", "RelHomeAlt", "m", -1.0),
-    ),
-    "GPS": (("latitude", "Lat", "deg", 1.0), ("longitude", "Lng", "deg", 1.0)),
-    "CTUN": (("depth", "Alt", "m", -1.0), ("throttle", "ThO", "1", 1.0)),
-    "THR": (("throttle", "ThrOut", "%", 1.0),),
-    "MOTB": (("motor_throttle", "ThrOut", "1", 1.0),),
-    "BAT": (("battery#_current", "Curr", "A", 1.0), ("battery#_voltage", "Volt", "V", 1.0)),
-    "CURR": (("battery#_current", "Curr", "A", 1.0), ("battery#_voltage", "Volt", "V", 1.0)),
-    "BARO": (
-        ("pressure#", "Press", "hPa", 0.01),
-        ("pressure#_temperature", "Temp", "degC", 1.0),
-        ("depth", "Alt", "m", -1.0),
-    ),
-    "ESC": (
-        ("esc#_current", "Curr", "A", 1.0),
-        ("esc#_voltage", "Volt", "V", 1.0),
-        ("esc#_rpm", "RPM", "rpm", 1.0),
-        ("esc#_temperature", "Temp", "degC", 1.0),
-    ),
-    "RPM": (("rpm#", "RPM", "rpm", 1.0), ("rpm", "rpm1", "rpm", 1.0), ("rpm2", "rpm2", "rpm", 1.0)),
-    "IMU": (("imu#_temperature", "T", "degC", 1.0),),
-    "RCOU": tuple((f"servo{k}", f"C{k}", "us", 1.0) for k in range(1, 15)),
-    "RCO2": tuple((f"servo{k}", f"C{k}", "us", 1.0) for k in range(15, 19)),
-    "RCO3": tuple((f"servo{k}", f"C{k}", "us", 1.0) for k in range(19, 33)),
-}
+Fields = dict[str, list[FieldMap]]
+"""Kind of record to its fields."""
+ARDUPILOT_FIELDS: Fields = by_record(
+    (
+        FieldMap("ATT", "Roll", "roll", "deg"),
+        FieldMap("ATT", "Pitch", "pitch", "deg"),
+        FieldMap("ATT", "Yaw", "heading", "deg"),
+        FieldMap("AHR2", "Roll", "roll", "deg"),
+        FieldMap("AHR2", "Pitch", "pitch", "deg"),
+        FieldMap("AHR2", "Yaw", "heading", "deg"),
+        FieldMap("POS", "Lat", "latitude", "deg"),
+        FieldMap("POS", "Lng", "longitude", "deg"),
+        FieldMap("POS", "RelHomeAlt", "depth", "m", -1.0),
+        FieldMap("GPS", "Lat", "latitude", "deg"),
+        FieldMap("GPS", "Lng", "longitude", "deg"),
+        FieldMap("CTUN", "Alt", "depth", "m", -1.0),
+        FieldMap("CTUN", "ThO", "throttle", "1"),
+        FieldMap("THR", "ThrOut", "throttle", "%"),
+        FieldMap("MOTB", "ThrOut", "motor_throttle", "1"),
+        FieldMap("BAT", "Curr", "battery#_current", "A"),
+        FieldMap("BAT", "Volt", "battery#_voltage", "V"),
+        FieldMap("CURR", "Curr", "battery#_current", "A"),
+        FieldMap("CURR", "Volt", "battery#_voltage", "V"),
+        FieldMap("BARO", "Press", "pressure#", "hPa", 0.01),
+        FieldMap("BARO", "Temp", "pressure#_temperature", "degC"),
+        FieldMap("BARO", "Alt", "depth", "m", -1.0),
+        FieldMap("ESC", "Curr", "esc#_current", "A"),
+        FieldMap("ESC", "Volt", "esc#_voltage", "V"),
+        FieldMap("ESC", "RPM", "esc#_rpm", "rpm"),
+        FieldMap("ESC", "Temp", "esc#_temperature", "degC"),
+        FieldMap("RPM", "RPM", "rpm#", "rpm"),
+        FieldMap("RPM", "rpm1", "rpm", "rpm"),
+        FieldMap("RPM", "rpm2", "rpm2", "rpm"),
+        FieldMap("IMU", "T", "imu#_temperature", "degC"),
+        *(FieldMap("RCOU", f"C{k}", f"servo{k}", "us") for k in range(1, 15)),
+        *(FieldMap("RCO2", f"C{k}", f"servo{k}", "us") for k in range(15, 19)),
+        *(FieldMap("RCO3", f"C{k}", f"servo{k}", "us") for k in range(19, 33)),
+    )
+)
 """Of records with one column, the first that the log has is taken. Sub's and Copter's CTUN have height and
 throttle, Rover's throttle is in THR, that of all motors together in MOTB."""
 INSTANCE = ("I", "Instance", "Inst")
@@ -285,16 +294,15 @@ SURVEY, SURVEY_ID, SURVEY_AXES = "MAGH", ("Node", "Sensor", "Bus"), ("Mx", "My",
 POWER_MESSAGES = "CURR", "BAT"
 MAX_VOLTAGE_V = 100.0
 """Larger integers in a log that does not declare its units are in hundredths of V and A."""
-NUMBERED = 8
 MAG = {*(f"{what}{axis}" for what in ("Mag", "Ofs", "MO", "MOfs") for axis in "XYZ"), "Health", *INSTANCE}
 WANTED: dict[str, set[str]] = {
     **{
-        f"{name}{k}": {*TIME_FIELDS, *INSTANCE, *(field for _, field, _, _ in fields)}
+        f"{name}{k}": {*TIME_FIELDS, *INSTANCE, *fields}
         for name, fields in {
-            **ARDUPILOT_FIELDS,
-            "MAG": tuple(("", field, "", 1.0) for field in sorted(MAG)),
+            **{kind: {one.field for one in fields} for kind, fields in ARDUPILOT_FIELDS.items()},
+            "MAG": MAG,
         }.items()
-        for k in ("", *range(2, NUMBERED + 1))
+        for k in ("", *range(2, MAX_KIND_NUMBER + 1))
     },
     SURVEY: {*TIME_FIELDS, *SURVEY_ID, *SURVEY_AXES},
     "PARM": {"TimeUS", "Name", "Value"},
@@ -311,7 +319,7 @@ for _gps in ("GPS", "GPS2"):
 UNIT_FACTORS = {
     **{label: (label, 1.0) for label in ("deg", "m", "A", "V", "rpm", "%")},
     **dict.fromkeys(("degheading", "deglatitude", "deglongitude"), ("deg", 1.0)),
-    "rad": ("deg", 57.29577951308232),
+    "rad": ("deg", DEG_PER_RAD),
     "O": ("degC", 1.0),
     "degC": ("degC", 1.0),
     "Pa": ("hPa", 0.01),
@@ -326,8 +334,8 @@ def in_declared_units(flash: Flash) -> Fields:
     """Return :data:`ARDUPILOT_FIELDS` with the units and factors that the log itself declares."""
     declared = _declared(flash)
     return {
-        kind: tuple(_converted(row, declared.get((kind, row[1]))) for row in rows)
-        for kind, rows in ARDUPILOT_FIELDS.items()
+        kind: [_converted(one, declared.get((kind, one.field))) for one in fields]
+        for kind, fields in ARDUPILOT_FIELDS.items()
     }
 
 
@@ -344,26 +352,21 @@ def in_hundredths(flash: Flash, fields: Fields) -> tuple[Fields, list[str]]:
         is_whole = bool((volts == np.round(volts)).all())
         if (name, "Curr") in declared or not len(volts) or not is_whole or np.median(volts) < MAX_VOLTAGE_V:
             continue
-        found[name] = tuple(
-            (column, field, unit, 0.01 * factor) for column, field, unit, factor in found[name]
-        )
+        found[name] = [one._replace(factor=0.01 * one.factor) for one in found[name]]
         notes.append(
             f"{name}: current and voltage are read in hundredths of A and V: {np.median(volts):g} V else"
         )
     return found, notes
 
 
-def _converted(
-    row: tuple[str, str, str, float], declared: tuple[str, float] | None
-) -> tuple[str, str, str, float]:
-    """Return the row of a column with the declared unit, where that is one of its kind."""
-    column, field, unit, factor = row
+def _converted(one: FieldMap, declared: tuple[str, float] | None) -> FieldMap:
+    """Return a field with the declared unit, where that is one of its kind."""
     if declared is None or declared[0] not in UNIT_FACTORS:
-        return row
-    ours, scale = UNIT_FACTORS[declared[0]]
-    if unit not in (ours, "1"):
-        return row
-    return column, field, ours, float(np.copysign(scale * declared[1], factor))
+        return one
+    unit, scale = UNIT_FACTORS[declared[0]]
+    if one.unit not in (unit, "1"):
+        return one
+    return one._replace(unit=unit, factor=float(np.copysign(scale * declared[1], one.factor)))
 
 
 def _declared(flash: Flash) -> dict[tuple[str, str], tuple[str, float]]:

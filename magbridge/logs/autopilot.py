@@ -21,11 +21,9 @@ from magbridge.logs.compasses import LogCompass, choose, compass_notes, listed
 from magbridge.logs.deployment import NOTES, deployment, noted, same_columns, sliced, uncounted
 from magbridge.logs.resample import latest
 
-__all__ = ["BootRun", "Fields", "Magnetometer", "Series", "pieces", "values_of"]
+__all__ = ["BootRun", "Magnetometer", "Series", "pieces"]
 
 FieldTable = Mapping[str, FloatArray]
-Fields = dict[str, tuple[tuple[str, str, str, float], ...]]
-"""Record: (column, field, unit, factor); ``#`` is the number of the instance where it is not the first."""
 Series = tuple[FloatArray, str, str, FloatArray]
 """Times (m,), s; column, unit and values (m,)."""
 MIN_BOOT_INTERVAL_S = 60.0
@@ -51,15 +49,6 @@ class BootRun(NamedTuple):
     """The first of several with one name is taken."""
     offset: float | None
     """UTC minus the log's time, s; None where it is not known."""
-
-
-def values_of(
-    fields: Fields, record: str, number: int, table: FieldTable
-) -> Iterator[tuple[str, str, FloatArray]]:
-    """Yield column, unit and values (m,) of each of `fields` that an instance (from 0) of a record holds."""
-    for column, field, unit, factor in fields[record]:
-        if field in table:
-            yield column.replace("#", str(number + 1) if number else ""), unit, table[field] * factor
 
 
 def pieces(

@@ -28,8 +28,9 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.columns import NT_PER_UNIT
 from magbridge.errors import FormatError, MissingExtra
-from magbridge.logs.autopilot import BootRun, Fields, Magnetometer, Series, pieces, values_of
+from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
 from magbridge.logs.compasses import LogCompass, rate
+from magbridge.logs.fields import FieldMap, by_record, fields_of
 
 try:
     from pyulog import ULog
@@ -46,41 +47,39 @@ Table = dict[str, FloatArray]
 Topics = dict[str, dict[int, Table]]
 Parameters = Mapping[str, float]
 
-PX4_FIELDS: Fields = {
-    "vehicle_global_position": (
-        *(("latitude", "lat", "deg", 1.0), ("longitude", "lon", "deg", 1.0)),
-        ("depth", "alt", "m", -1.0),
-    ),
-    "sensor_gps": (
-        *(("latitude", "latitude_deg", "deg", 1.0), ("longitude", "longitude_deg", "deg", 1.0)),
-        *(("latitude", "lat", "deg", 1e-7), ("longitude", "lon", "deg", 1e-7)),
-        *(("depth", "altitude_msl_m", "m", -1.0), ("depth", "alt", "m", -1e-3)),
-    ),
-    "battery_status": (
-        ("battery#_current", "current_a", "A", 1.0),
-        ("battery#_voltage", "voltage_v", "V", 1.0),
-    ),
-    "vehicle_air_data": (("pressure", "baro_pressure_pa", "hPa", 0.01),),
-    "sensor_baro": (
-        ("pressure", "pressure", "hPa", 0.01),
-        ("pressure_temperature", "temperature", "degC", 1.0),
-    ),
-    "actuator_outputs": tuple((f"servo{k + 1}", f"output[{k}]", "us", 1.0) for k in range(16)),
-    "actuator_motors": tuple((f"motor{k + 1}", f"control[{k}]", "1", 1.0) for k in range(12)),
-    "esc_status": tuple(
-        (f"esc{k + 1}_{column}", f"esc[{k}].{field}", unit, 1.0)
-        for k in range(8)
-        for column, field, unit in (
-            ("current", "esc_current", "A"),
-            ("voltage", "esc_voltage", "V"),
-            ("rpm", "esc_rpm", "rpm"),
-        )
-    ),
-}
-"""Topic to columns; of topics with one column, the first that the log has is taken."""
+PX4_FIELDS = by_record(
+    (
+        FieldMap("vehicle_global_position", "lat", "latitude", "deg"),
+        FieldMap("vehicle_global_position", "lon", "longitude", "deg"),
+        FieldMap("vehicle_global_position", "alt", "depth", "m", -1.0),
+        FieldMap("sensor_gps", "latitude_deg", "latitude", "deg"),
+        FieldMap("sensor_gps", "longitude_deg", "longitude", "deg"),
+        FieldMap("sensor_gps", "lat", "latitude", "deg", 1e-7),
+        FieldMap("sensor_gps", "lon", "longitude", "deg", 1e-7),
+        FieldMap("sensor_gps", "altitude_msl_m", "depth", "m", -1.0),
+        FieldMap("sensor_gps", "alt", "depth", "m", -1e-3),
+        # -1 A: the current is not measured
+        FieldMap("battery_status", "current_a", "battery#_current", "A", missing=(-1.0,)),
+        FieldMap("battery_status", "voltage_v", "battery#_voltage", "V"),
+        FieldMap("vehicle_air_data", "baro_pressure_pa", "pressure", "hPa", 0.01),
+        FieldMap("sensor_baro", "pressure", "pressure", "hPa", 0.01),
+        FieldMap("sensor_baro", "temperature", "pressure_temperature", "degC"),
+        *(FieldMap("actuator_outputs", f"output[{k}]", f"servo{k + 1}", "us") for k in range(16)),
+        *(FieldMap("actuator_motors", f"control[{k}]", f"motor{k + 1}", "1") for k in range(12)),
+        *(
+            FieldMap("esc_status", f"esc[{k}].{field}", f"esc{k + 1}_{column}", unit)
+            for k in range(8)
+            for field, column, unit in (
+                ("esc_current", "current", "A"),
+                ("esc_voltage", "voltage", "V"),
+                ("esc_rpm", "rpm", "rpm"),
+            )
+        ),
+    )
+)
 PX4_FIELDS["vehicle_gps_position"] = PX4_FIELDS["sensor_gps"]
 # heights are above the sea; that of the local position is above the start, and the last choice
-PX4_FIELDS["vehicle_local_position"] = (("depth", "z", "m", 1.0),)
+PX4_FIELDS["vehicle_local_position"] = [FieldMap("vehicle_local_position", "z", "depth", "m")]
 GAUSS_AXES = tuple(f"magnetometer_ga[{k}]" for k in range(3))
 """The three axes in ``vehicle_magnetometer`` and ``sensor_combined``."""
 NEEDED_FIELDS = {
@@ -229,7 +228,7 @@ def _telemetry(topics: Topics) -> Iterator[Series]:
     for topic in PX4_FIELDS:
         for number, table in topics.get(topic, {}).items():
             fixed = table.get("fix_type", np.full(len(table["timestamp"]), MIN_FIX_TYPE)) >= MIN_FIX_TYPE
-            for column, unit, values in values_of(PX4_FIELDS, topic, number, _known(table)):
+            for column, unit, values in fields_of(PX4_FIELDS[topic], table, number):
                 if np.any(np.nan_to_num(values)) or not column.startswith(UNUSED):
                     yield _time(table), column, unit, np.where(fixed, values, np.nan)
     for table in topics.get("debug_key_value", {}).values():
@@ -239,13 +238,6 @@ def _telemetry(topics: Topics) -> Iterator[Series]:
         )
         for name in dict.fromkeys(names.tolist()):
             yield _time(table)[names == name], name, "1", table["value"][names == name]
-
-
-def _known(table: Table) -> Table:
-    """Return a table without the -1 A of ``battery_status``, which means that the current is not measured."""
-    if "current_a" not in table:
-        return table
-    return {**table, "current_a": np.where(table["current_a"] == -1.0, np.nan, table["current_a"])}
 
 
 def _angles(attitude: Table) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -51,10 +51,9 @@ def linear(
     time: FloatArray,
     values: FloatArray,
     max_gap: float,
-    period: float | None = None,
-    start: float = 0.0,
+    column: str,
 ) -> FloatArray:
-    """Return values interpolated linearly in time, for quantities that change smoothly.
+    """Return the values of a column interpolated linearly in time, along the shorter arc of a circle.
 
     Parameters
     ----------
@@ -65,10 +64,8 @@ def linear(
     max_gap : float
         s; the result is NaN between neighbours with a longer interval, except at the neighbours' own times,
         and farther beyond an end. Nearer to an end, the value there is held.
-    period : float, optional
-        Circumference of the circle that the values lie on: 360 for a heading in degrees.
-    start : float
-        Lowest value on that circle.
+    column : str
+        Its name; the values of :data:`CIRCLES` lie on a circle.
 
     Returns
     -------
@@ -78,14 +75,18 @@ def linear(
     time, values = time[known], values[known]
     if not len(time):
         return np.full(len(target), np.nan)
-    if period is not None:
-        values = np.unwrap(values, period=period)
+    circle = CIRCLES.get(column)
+    if circle is not None:
+        values = np.unwrap(values, period=circle[0])
     result = np.interp(target, time, values)
     right = np.searchsorted(time, target)
     before, after = time[np.maximum(right - 1, 0)], time[np.minimum(right, len(time) - 1)]
     in_gap = (after - before > max_gap) & (target != after) & (target != before)
     result[in_gap | (target - time[-1] > max_gap) | (time[0] - target > max_gap)] = np.nan
-    return result if period is None else result - period * np.floor((result - start) / period)
+    if circle is None:
+        return result
+    period, start = circle
+    return result - period * np.floor((result - start) / period)
 
 
 def degrees(written: ArrayLike) -> FloatArray:

@@ -28,9 +28,10 @@ import xarray as xr
 from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError
 from magbridge.logs.deployment import HISTORY_ATTRIBUTE, deployment, named_losses, sliced, with_losses
+from magbridge.logs.fields import FieldMap
 from magbridge.logs.headings import aliases
 from magbridge.logs.registry import opened
-from magbridge.logs.resample import CIRCLES, degrees, linear
+from magbridge.logs.resample import degrees, linear
 from magbridge.logs.stamps import epoch
 
 __all__ = ["chunks"]
@@ -41,31 +42,30 @@ MAX_NAVIGATION_GAP_S = 120.0
 """s between two samples of the navigation, between which it is interpolated: it writes each 10 to 30 s."""
 CLOCK_COLUMNS = "Timestamp", "PLD_REALTIMECLOCK"
 DATE = "%d/%m/%Y %H:%M:%S"
-UNKNOWN_CODE = 9999.0
-"""A code for "not known"."""
+UNKNOWN_CODES = 9999.0, -9999.0
+"""Codes for "not known"."""
 DEGREE_MINUTE_COLUMNS = "Lat", "Lon", "NAV_LATITUDE", "NAV_LONGITUDE"
-SEAEXPLORER_COLUMNS = {
-    # theirs: (ours, unit, factor)
-    "Lat": ("latitude", "deg", 1.0),
-    "Lon": ("longitude", "deg", 1.0),
-    "NAV_LATITUDE": ("latitude", "deg", 1.0),
-    "NAV_LONGITUDE": ("longitude", "deg", 1.0),
-    "NAV_DEPTH": ("depth", "m", 1.0),
-    "Depth": ("depth", "m", 1.0),
-    "Heading": ("heading", "deg", 1.0),
-    "Pitch": ("pitch", "deg", 1.0),
-    "Roll": ("roll", "deg", 1.0),
-    "Temperature": ("vehicle_temperature", "degC", 1.0),
-    "Pa": ("vehicle_pressure", "Pa", 1.0),
-    "BallastPos": ("ballast", "cc", 1.0),
-    "LinPos": ("battpos", "mm", 1.0),
-    "AngPos": ("battery_roll", "deg", 1.0),
-    "Voltage": ("battery_voltage", "V", 1.0),
-    "GPCTD_TEMPERATURE": ("water_temperature", "degC", 1.0),
-    "GPCTD_PRESSURE": ("water_pressure", "dbar", 1.0),
-    "LEGATO_TEMPERATURE": ("water_temperature", "degC", 1.0),
-    "LEGATO_PRESSURE": ("water_pressure", "dbar", 1.0),
-}
+SEAEXPLORER_FIELDS = (
+    FieldMap("", "Lat", "latitude", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "Lon", "longitude", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "NAV_LATITUDE", "latitude", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "NAV_LONGITUDE", "longitude", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "NAV_DEPTH", "depth", "m", missing=UNKNOWN_CODES),
+    FieldMap("", "Depth", "depth", "m", missing=UNKNOWN_CODES),
+    FieldMap("", "Heading", "heading", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "Pitch", "pitch", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "Roll", "roll", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "Temperature", "vehicle_temperature", "degC", missing=UNKNOWN_CODES),
+    FieldMap("", "Pa", "vehicle_pressure", "Pa", missing=UNKNOWN_CODES),
+    FieldMap("", "BallastPos", "ballast", "cc", missing=UNKNOWN_CODES),
+    FieldMap("", "LinPos", "battpos", "mm", missing=UNKNOWN_CODES),
+    FieldMap("", "AngPos", "battery_roll", "deg", missing=UNKNOWN_CODES),
+    FieldMap("", "Voltage", "battery_voltage", "V", missing=UNKNOWN_CODES),
+    FieldMap("", "GPCTD_TEMPERATURE", "water_temperature", "degC", missing=UNKNOWN_CODES),
+    FieldMap("", "GPCTD_PRESSURE", "water_pressure", "dbar", missing=UNKNOWN_CODES),
+    FieldMap("", "LEGATO_TEMPERATURE", "water_temperature", "degC", missing=UNKNOWN_CODES),
+    FieldMap("", "LEGATO_PRESSURE", "water_pressure", "dbar", missing=UNKNOWN_CODES),
+)
 NAV_ONLY = {
     *("Altitude", "DesiredH", "BallastCmd", "LinCmd", "AngCmd", "NavState", "SecurityLevel", "Declination")
 }
@@ -101,8 +101,7 @@ def _with_navigation(payload: xr.Dataset, navigation: xr.Dataset, path: Path) ->
     taken = {}
     for name, column in navigation.data_vars.items():
         if name not in payload:
-            circle = CIRCLES.get(str(name), ())
-            values = linear(at, time, column.to_numpy()[order], MAX_NAVIGATION_GAP_S, *circle)
+            values = linear(at, time, column.to_numpy()[order], MAX_NAVIGATION_GAP_S, str(name))
             taken[str(name)] = ("time", values, column.attrs)
     note = f"{' '.join(taken)} between the samples of {path.name}"
     remarks = [line for line in named_losses(navigation.attrs) if "heading" in line]
@@ -120,14 +119,15 @@ def _read(path: Path) -> xr.Dataset:
     columns: dict[str, FloatArray] = {}
     units: dict[str, str] = {}
     known = aliases([str(name) for name in numbers])
-    for k, theirs in enumerate(numbers):
+    fields = {one.field: one for one in SEAEXPLORER_FIELDS}
+    for k, theirs in enumerate(map(str, numbers)):
         if theirs in NAV_ONLY:
             continue
-        name, unit, scale = SEAEXPLORER_COLUMNS.get(str(theirs), (known.get(k, str(theirs).lower()), "", 1.0))
-        values = numbers[theirs].to_numpy(float)
-        values = np.where(np.abs(values) == UNKNOWN_CODE, np.nan, values)
-        columns.setdefault(name, degrees(values) if theirs in DEGREE_MINUTE_COLUMNS else values * scale)
-        units[name] = unit
+        own = FieldMap("", theirs, known.get(k, theirs.lower()), "", missing=UNKNOWN_CODES)
+        one = fields.get(theirs, own)
+        values = one.values(numbers[theirs].to_numpy(float))
+        columns.setdefault(one.column, degrees(values) if theirs in DEGREE_MINUTE_COLUMNS else values)
+        units[one.column] = one.unit
     whole = deployment(path, time, columns, units)
     remarks = (
         [f"{path}: headings are taken as true, which the file does not say"] if "heading" in columns else []

@@ -40,7 +40,8 @@ from magbridge.field.igrf import total_field
 from magbridge.field.reference import sphere_radius
 from magbridge.logs.cf import floats
 from magbridge.logs.deployment import deployment, sliced, with_losses
-from magbridge.logs.resample import CIRCLES, degrees, linear
+from magbridge.logs.fields import FieldMap, Track, fields_of, interpolated
+from magbridge.logs.resample import degrees, linear
 
 __all__ = ["DIMENSION", "chunks", "dive", "read_netcdf"]
 
@@ -50,25 +51,26 @@ COMPASS_NT_PER_COUNT = {1: 100.0, 2: 100.0, 4: 56.0, 6: 100.0}
 SECOND_COMPASS_BIT = 2048
 """Bit of ``COMPASS_USE``: the second compass is in use."""
 MAX_CTD_GAP_S = 120.0
-"""s between CTD_COLUMNS samples across which nothing is interpolated."""
-SAMPLED = {
-    # ours: (theirs, unit); the channels are in counts
-    "mag_x": ("mag_x", "nT"),
-    "mag_y": ("mag_y", "nT"),
-    "mag_z": ("mag_z", "nT"),
-    "roll": ("rollAng", "deg"),
-    "pitch": ("pitchAng", "deg"),
-    "heading": ("head", "deg"),
-    "pitchCtl": ("pitchCtl", "cm"),
-    "rollCtl": ("rollCtl", "deg"),
-    "vbdCC": ("vbdCC", "cc"),
-}
-CTD_COLUMNS = {
-    "latitude": ("latitude", "deg"),
-    "longitude": ("longitude", "deg"),
-    "water_temperature": ("temperature", "degC"),
-    "water_pressure": ("ctd_pressure", "dbar"),
-}
+"""s between samples of the CTD across which nothing is interpolated."""
+SAMPLED = (
+    # the channels are in counts, before they are multiplied by what a count is worth
+    FieldMap("eng", "mag_x", "mag_x", "nT"),
+    FieldMap("eng", "mag_y", "mag_y", "nT"),
+    FieldMap("eng", "mag_z", "mag_z", "nT"),
+    FieldMap("eng", "rollAng", "roll", "deg"),
+    FieldMap("eng", "pitchAng", "pitch", "deg"),
+    FieldMap("eng", "head", "heading", "deg"),
+    FieldMap("eng", "pitchCtl", "pitchCtl", "cm"),
+    FieldMap("eng", "rollCtl", "rollCtl", "deg"),
+    FieldMap("eng", "vbdCC", "vbdCC", "cc"),
+    FieldMap("eng", "depth", "depth", "m"),
+)
+CTD_FIELDS = (
+    FieldMap("ctd", "latitude", "latitude", "deg"),
+    FieldMap("ctd", "longitude", "longitude", "deg"),
+    FieldMap("ctd", "temperature", "water_temperature", "degC"),
+    FieldMap("ctd", "ctd_pressure", "water_pressure", "dbar"),
+)
 PLACE = "longitude", "latitude"
 MASSES = {"pitchCtl": ("pitch", "C_PITCH"), "rollCtl": ("roll", "C_ROLL_DIVE"), "vbdCC": ("vbd", "C_VBD")}
 """Column to the name of its motor, and of the parameter that holds its centre in AD counts."""
@@ -87,8 +89,8 @@ class Dive:
     manoeuvres: dict[str, FloatArray] = field(default_factory=dict)
     """(m,) each: ``st_secs`` and ``end_secs``, s since 1970, and the values logged of each, as ``pitch_ctl``.
     """
-    elsewhere: dict[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    """(k,) each: Times, s, and values of variables with their own times: positions, CTD_COLUMNS."""
+    elsewhere: dict[str, Track] = field(default_factory=dict)
+    """(k,) each: Times, s, and values of variables with their own times: positions, those of the CTD."""
     max_gap: float = MAX_CTD_GAP_S
     """s between two of those times across which nothing is interpolated."""
 
@@ -104,18 +106,9 @@ def dive(path: Path, known: Dive) -> xr.Dataset:
             raise FormatError(
                 path, "expected this variable, as of a Seaglider with a raw compass", column=f"eng_mag_{axis}"
             )
-    columns = {
-        ours: known.sampled[theirs] for ours, (theirs, _) in SAMPLED.items() if theirs in known.sampled
-    }
-    units = {ours: unit for ours, (_, unit) in SAMPLED.items()}
-    if "depth" in known.sampled:
-        columns["depth"], units["depth"] = known.sampled["depth"], "m"
-    for ours, (theirs, unit) in CTD_COLUMNS.items():
-        if theirs in known.elsewhere:
-            columns[ours] = linear(
-                known.time, *known.elsewhere[theirs], known.max_gap, *CIRCLES.get(ours, ())
-            )
-            units[ours] = unit
+    columns = {column: values for column, _, values in fields_of(SAMPLED, known.sampled)}
+    units = {one.column: one.unit for one in (*SAMPLED, *CTD_FIELDS)}
+    columns |= interpolated(CTD_FIELDS, known.elsewhere, known.time, known.max_gap)[0]
     for column in MASSES:
         if column not in columns and (moved := _position(known, column)) is not None:
             columns[column] = moved
@@ -183,7 +176,7 @@ def _position(known: Dive, column: str) -> FloatArray | None:
     where = np.column_stack([before, after]).ravel()
     order = np.argsort(when, kind="stable")
     sure = order[np.isfinite(when[order]) & np.isfinite(where[order])]
-    where_it_was = linear(known.time, when[sure], where[sure], np.inf)
+    where_it_was = linear(known.time, when[sure], where[sure], np.inf, column)
     return np.where(known.time < when[sure][:1].min(initial=np.inf), np.nan, where_it_was)
 
 
@@ -229,9 +222,9 @@ def read_netcdf(path: Path, file: Any) -> Dive:
     if "ctd_time" in file.variables:
         ctd_time = floats(file["ctd_time"])
         elsewhere = {
-            theirs: (ctd_time, values)
-            for theirs, _ in CTD_COLUMNS.values()
-            if (values := _numbers(file, theirs, ctd_time.size)) is not None
+            one.field: (ctd_time, values)
+            for one in CTD_FIELDS
+            if (values := _numbers(file, one.field, ctd_time.size)) is not None
         }
     return Dive(time, sampled, settings, manoeuvres, elsewhere)
 

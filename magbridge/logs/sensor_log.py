@@ -246,7 +246,7 @@ def _interpolated(target: FloatArray, time: FloatArray, name: str, values: Float
     max_gap_s = _max_gap(time)
     if name not in CIRCLES and _is_state(values):
         return latest(target, time, values, max_gap_s)
-    return linear(target, time, values, max_gap_s, *CIRCLES.get(name, ()))
+    return linear(target, time, values, max_gap_s, name)
 
 
 def _is_state(values: FloatArray) -> bool:

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magbridge.arrays import FloatArray
 from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.deployment import deployment, sliced
+from magbridge.logs.fields import DEG_PER_RAD, FieldMap, Track, interpolated
 from magbridge.logs.registry import FLIGHT
-from magbridge.logs.resample import CIRCLES, degrees, linear
+from magbridge.logs.resample import degrees
 
 __all__ = ["check_header", "chunks"]
 
@@ -44,8 +44,8 @@ CACHES = ".", "cac", "cache", "../cac", "../cache"
 """Folders, seen from a file's, in which its list of sensors may be."""
 MAX_SENSOR_GAP_S = 300.0
 """s between two updates of a sensor across which nothing is interpolated."""
-Tracks = dict[str, tuple[FloatArray, FloatArray]]
-"""By sensor: times (m,), s, and values (m,)."""
+Tracks = dict[str, Track]
+"""By sensor: its times and values."""
 CTD_SENSORS = "sci_water_temp", "sci_water_pressure"
 ASCII_HEADER = re.compile(rb"\w+:.*")
 """A line of the header of what ``dbd2asc`` wrote; below it are names, units, sizes, and a cycle a line."""
@@ -53,26 +53,26 @@ CLOCK_SENSORS = b"m_present_time", b"sci_m_present_time"
 FILL = 69_696_969.0
 """deg and min, of a position that was never known."""
 SCIENCE = {flight: science for science, flight in FLIGHT.items()}
-SENSORS = {
-    # theirs: (ours, unit, factor)
-    "m_roll": ("roll", "deg", 180.0 / np.pi),
-    "m_pitch": ("pitch", "deg", 180.0 / np.pi),
-    "m_heading": ("heading", "deg", 180.0 / np.pi),
-    "m_lat": ("latitude", "deg", 1.0),
-    "m_lon": ("longitude", "deg", 1.0),
-    "m_depth": ("depth", "m", 1.0),
-    "m_battpos": ("battpos", "in", 1.0),
-    "m_ballast_pumped": ("ballast", "cc", 1.0),
-    "m_de_oil_vol": ("oil_volume", "cc", 1.0),
-    "m_fin": ("fin", "deg", 180.0 / np.pi),
-    "m_coulomb_current": ("coulomb_current", "A", 1.0),
-    "m_battery": ("battery_voltage", "V", 1.0),
-    "m_veh_temp": ("vehicle_temperature", "degC", 1.0),
-    "m_vacuum": ("vacuum", "inHg", 1.0),
-    "m_pressure": ("flight_pressure", "bar", 1.0),
-    "sci_water_temp": ("water_temperature", "degC", 1.0),
-    "sci_water_pressure": ("water_pressure", "bar", 1.0),
-}
+SLOCUM_FIELDS = (
+    FieldMap("", "m_roll", "roll", "deg", DEG_PER_RAD),
+    FieldMap("", "m_pitch", "pitch", "deg", DEG_PER_RAD),
+    FieldMap("", "m_heading", "heading", "deg", DEG_PER_RAD),
+    FieldMap("", "m_lat", "latitude", "deg"),
+    FieldMap("", "m_lon", "longitude", "deg"),
+    FieldMap("", "m_depth", "depth", "m"),
+    FieldMap("", "m_battpos", "battpos", "in"),
+    FieldMap("", "m_ballast_pumped", "ballast", "cc"),
+    FieldMap("", "m_de_oil_vol", "oil_volume", "cc"),
+    FieldMap("", "m_fin", "fin", "deg", DEG_PER_RAD),
+    FieldMap("", "m_coulomb_current", "coulomb_current", "A"),
+    FieldMap("", "m_battery", "battery_voltage", "V"),
+    FieldMap("", "m_veh_temp", "vehicle_temperature", "degC"),
+    FieldMap("", "m_vacuum", "vacuum", "inHg"),
+    FieldMap("", "m_pressure", "flight_pressure", "bar"),
+    FieldMap("", "sci_water_temp", "water_temperature", "degC"),
+    FieldMap("", "sci_water_pressure", "water_pressure", "bar"),
+)
+SENSORS = [one.field for one in SLOCUM_FIELDS]
 
 
 def _import() -> Any:
@@ -108,12 +108,7 @@ def chunks(path: Path, rows: int) -> Iterator[xr.Dataset]:
     time = tracks[base][0]
     if len(time) > 1 and time[0] == time[1]:  # some files hold their first cycle twice
         time = time[1:]
-    columns, units = {}, {}
-    for theirs, (ours, unit, factor) in SENSORS.items():
-        if theirs in tracks and len(tracks[theirs][0]):
-            when, what = tracks[theirs]
-            columns[ours] = linear(time, when, what * factor, MAX_SENSOR_GAP_S, *CIRCLES.get(ours, ()))
-            units[ours] = unit
+    columns, units = interpolated(SLOCUM_FIELDS, tracks, time, MAX_SENSOR_GAP_S)
     dataset = deployment(path, time, columns, units, {"heading_reference": "magnetic"})
     yield from sliced(dataset, rows)
 
@@ -146,7 +141,7 @@ def _measured(tracks: Tracks) -> Tracks:
 
 
 def _read(path: Path | None) -> Tracks:
-    """Return time and values of each of :data:`SENSORS` in the file, at its updates."""
+    """Return time and values of each of :data:`SLOCUM_FIELDS` in the file, at its updates."""
     if path is None:
         return {}
     with path.open("rb") as file:
