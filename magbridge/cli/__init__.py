@@ -16,7 +16,7 @@ from pathlib import Path
 
 from cyclopts import CycloptsError, MissingArgumentError, UnusedCliTokensError
 
-from magbridge.cli.common import app, complain
+from magbridge.cli.common import FailedResult, app, complain, print_error
 from magbridge.errors import MagbridgeError, MissingExtra
 
 __all__ = ["app", "main"]
@@ -54,6 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
         sys.stderr.close()
     except (CycloptsError, MagbridgeError, ImportError, UnicodeEncodeError, OSError, MemoryError) as error:
         sentence, code = _explained(error)
+        as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
+        if as_json and not isinstance(error, FailedResult):
+            print_error(sentence, code)
         return complain(sentence, code)
     except _Terminated as end:
         signal.signal(end.number, signal.SIG_DFL)

@@ -29,6 +29,7 @@ def init(
     parameter: tuple[str, ...] = (),
     option: tuple[str, ...] = (),
     calibration: Path | None = None,
+    json: Json = False,
 ) -> None:
     """Write a commented bridge.toml, from five questions or from options.
 
@@ -63,7 +64,7 @@ def init(
     from magbridge.files import atomic_path
 
     known = _loaded(calibration)
-    asks = sys.stdin.isatty() and sys.stdout.isatty()
+    asks = not json and sys.stdin.isatty() and sys.stdout.isatty()
     driver = driver or _ask("1. Which sensor?", _drivers_help(), "digitizer", asks, "--driver")
     port = port or _ask("2. On which port?", _ports_listed(), "/dev/ttyUSB*", asks, "--port")
     default = "udpout:127.0.0.1:14550"
@@ -79,9 +80,11 @@ def init(
     text = bridge_toml(answers, known)
     with atomic_path(output) as path:
         path.write_text(text, encoding="utf-8")
-    for one in findings(output):
-        complain(one.text)
-    print(f"{output}: written; next: magbridge run --check --config {output}")
+    found = [one.text for one in findings(output)]
+    for text in found:
+        complain(text)
+    sentence = f"{output}: written; next: magbridge run --check --config {output}"
+    print_result({"file": str(output), "findings": found}, sentence, json)
 
 
 def _loaded(calibration: Path | None) -> Calibration | None:
@@ -178,10 +181,7 @@ def ports(
             speed = f" at {at} bit/s" if at and recognised.who else ""
             about = f" ({port.description})" if port.description else ""
             print(f"{port.device}{about}: {recognised.text}{speed}")
-    if not asked and not json:
-        print("no serial port is there")
-    if json:
-        print_result({"ports": found}, "", as_json=True)
+    print_result({"ports": found}, "" if asked else "no serial port is there", json)
 
 
 @command("drivers [NAME] [OPTIONS]")

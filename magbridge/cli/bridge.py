@@ -6,12 +6,13 @@ import sys
 from contextlib import nullcontext
 from math import inf, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
     AS_THEY_SAY,
+    FailedResult,
     Folder,
     Json,
     ReadingOptions,
@@ -22,7 +23,7 @@ from magbridge.cli.common import (
     logs_to_read,
     print_result,
 )
-from magbridge.errors import DataError, WrongUse
+from magbridge.errors import WrongUse
 from magbridge.files import new_folder
 from magbridge.wording import counted
 
@@ -64,6 +65,8 @@ def demo(
         With --live, open the page in a browser.
     """
     if live:
+        if json:
+            raise WrongUse("--json: demo --live runs until Ctrl-C and has no result; leave one of them out")
         _live(out, seed, port, show=show)
         return
     from sitl import demo as demonstration
@@ -87,8 +90,8 @@ def _live(folder: Path, seed: int, port: int, *, show: bool) -> None:
             serve(link, 0, "127.0.0.1", port, grid=folder / MAP, show=show)
 
 
-@command("run --config bridge.toml [--check [--live]]")
-def run(*, config: Path, check: bool = False, live: bool = False) -> None:
+@command("run --config bridge.toml [--check [--live] [--json]]")
+def run(*, config: Path, check: bool = False, live: bool = False, json: Json = False) -> None:
     """Attach to the sensor and the autopilot link, and publish the corrected field until stopped.
 
     magbridge init writes a configuration, magbridge ports shows which device sends on which serial port, and
@@ -104,10 +107,10 @@ def run(*, config: Path, check: bool = False, live: bool = False) -> None:
         With --check, open the ports for 20 s and list which messages arrive at which rate.
     """
     if check:
-        _check(config, live=live)
+        _check(config, live=live, json=json)
         return
-    if live:
-        raise WrongUse("run: --live needs --check")
+    if live or json:
+        raise WrongUse("run: --live and --json go with --check")
 
     from magbridge.bridge.run import run as attach
 
@@ -116,40 +119,49 @@ def run(*, config: Path, check: bool = False, live: bool = False) -> None:
     attach(config)
 
 
-def _check(config: Path, *, live: bool) -> None:
+def _check(config: Path, *, live: bool, json: bool) -> None:
     """Print all that would go wrong, and with `live` what arrives; WrongUse: the bridge would not start."""
     from magbridge.bridge.check import findings
     from magbridge.toml import load_toml
 
     load_toml(config)  # a file that cannot be read is an error of its own
-    found = findings(config)
+    found, arriving = findings(config), dict[str, Any]()
     errors = sum(one.fatal for one in found)
     if live and not errors:
-        found += _listen(config)
-    for one in found:
-        complain(f"{'error' if one.fatal else 'warning'}: {one.text}")
+        faults, arriving = _listen(config, quiet=json)
+        found += faults
+    faults_of = [{"severity": "error" if one.fatal else "warning", "text": one.text} for one in found]
+    for fault in faults_of:
+        complain(f"{fault['severity']}: {fault['text']}")
     warnings = counted(len(found) - errors, "warning")
+    facts = {"file": str(config), "would_start": not errors, "findings": faults_of, **arriving}
+    print_result(facts, "" if errors else f"{config}: the bridge would start, {warnings}", json)
     if errors:
-        raise WrongUse(f"{config}: the bridge would not start: {counted(errors, 'error')}, {warnings}")
-    print(f"{config}: the bridge would start, {warnings}")
+        raise FailedResult(
+            f"{config}: the bridge would not start: {counted(errors, 'error')}, {warnings}",
+            WrongUse.exit_code,
+        )
 
 
-def _listen(config: Path) -> list[ConfigFault]:
-    """Print the messages that arrive on the ports; return the faults."""
+def _listen(config: Path, *, quiet: bool) -> tuple[list[ConfigFault], dict[str, Any]]:
+    """Listen on the ports; return the faults, and what arrived for JSON; print that unless `quiet`."""
     from magbridge.bridge.live_check import LISTEN_TIME_S, LiveCheck
     from magbridge.config import load
 
     loaded = load(config)
-    print(f"{config}: {LISTEN_TIME_S:.0f} s on {loaded.link.url} and {loaded.sensor.port}", flush=True)
+    where = f"{config}: {LISTEN_TIME_S:.0f} s on {loaded.link.url} and {loaded.sensor.port}"
+    print(where, file=sys.stderr if quiet else sys.stdout, flush=True)
     check = LiveCheck(loaded, LISTEN_TIME_S)
     check.listen()
-    for name, rate_hz in check.readings_hz.items():
-        print(f"sensor {name}: {rate_hz:.4g} readings/s")
-    print(f"{'message':30} {'from':>8} {'Hz':>8} {'needed':>8}")
-    for one in check.arrived:
-        needed = f"{one.needed_hz:g}" if one.needed_hz else "-"
-        print(f"{one.name:30} {one.sender:>8} {one.rate_hz:8.3g} {needed:>8}")
-    return check.faults
+    if not quiet:
+        for name, rate_hz in check.readings_hz.items():
+            print(f"sensor {name}: {rate_hz:.4g} readings/s")
+        print(f"{'message':30} {'from':>8} {'Hz':>8} {'needed':>8}")
+        for one in check.arrived:
+            needed = f"{one.needed_hz:g}" if one.needed_hz else "-"
+            print(f"{one.name:30} {one.sender:>8} {one.rate_hz:8.3g} {needed:>8}")
+    arrived = [one._asdict() for one in check.arrived]
+    return check.faults, {"readings_hz": check.readings_hz, "messages": arrived}
 
 
 @command("replay FILE... [--config bridge.toml] [OPTIONS]")
@@ -191,7 +203,7 @@ def replay(
         result = played(files, config, speed_of(speed), log, reading.options)
     print_result(result, summary(result), json)
     if not all(run["identical"] for run in result.get("runs", ())):
-        raise DataError("the replay did not publish what the log holds")
+        raise FailedResult("the replay did not publish what the log holds")
 
 
 @command("dialect -o DIR")

@@ -1,8 +1,10 @@
-"""Calibrate."""
+"""Fit a calibration to logs: with or without a fleet's prior, of one compass or of each."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,11 +13,13 @@ from cyclopts import Parameter, validators
 
 from magbridge.cli.common import (
     AS_THEY_SAY,
+    NO_SCALAR,
     Base,
     Heading,
     Output,
     Plot,
     ReadingOptions,
+    ScalarOptions,
     Whole,
     check_inputs,
     command,
@@ -23,9 +27,8 @@ from magbridge.cli.common import (
     logs_to_read,
     print_result,
 )
-from magbridge.cli.fits import drifting, fitted, fleet_start, from_fleet, naming, undeclared_columns
 from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, note_unused_grid
-from magbridge.errors import DataError, WrongUse
+from magbridge.errors import CalibrationError, DataError, OutOfRange, WrongUse
 from magbridge.files import digest
 from magbridge.progress import waiting
 from magbridge.wording import counted
@@ -36,35 +39,165 @@ if TYPE_CHECKING:
     from magbridge.calibration.fitting.fit import Fit
     from magbridge.calibration.fitting.observations import Observations
     from magbridge.calibration.model import Calibration
-
-__all__ = ["scalar_options"]
+    from magbridge.field.grid import AnomalyGrid
+    from magbridge.fleet.start import FleetPrediction
 
 MAX_LISTED_CONTRIBUTIONS = 5
 """Contributions to a scalar's reading that the summary lists."""
 ALL_COMPASSES = "all"
 """``--compass all``: a calibration for each compass."""
+SCALAR_REFERENCE_SIGMA_NT = 1.0
+"""nT, 1-sigma of a scalar magnetometer's reading that serves as the reference."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ModelOptions:
+    """What is fitted.
+
+    Parameters
+    ----------
+    parameter
+        A column that gives the position of a moving mass, or a current; may be repeated. auto: the log's
+        currents, throttles, motors and masses that predict held-out parts better; the command prints by how
+        much (method auto).
+    order
+        Highest total degree of the polynomials in the parameters.
+    method
+        auto is the one to use: survey where only the main field or a map is known at the log's positions
+        (the crustal field is estimated with the calibration), else the fit to a known field. For comparison:
+        nominal (one ellipsoid for all positions), cubic (the paper's), runs (an ellipsoid for each run,
+        then polynomials through them: the paper's first stage), horizontal (one ellipsoid, levelled by
+        roll and pitch: the alternative that the paper names).
+    vehicle
+        A vehicle.toml with the positions of the moving masses relative to the sensor (method auto); with
+        --fleet, the vehicle's name in the fleet, which is known for logs that are catalogued.
+    position_sigma
+        1-sigma in m by which dead-reckoned positions slowly drift, where the crustal field is estimated with
+        the calibration: the track is corrected to where the field repeats itself; 0: positions are exact.
+    filter_cutoff
+        Cut-off frequency in Hz of the sensor's first-order anti-alias filter; 0: no filter. The fit undoes
+        its attenuation in turns; correct and the bridge then undo its lag in the vector and the heading.
+    fleet
+        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from the prediction
+        of the vehicle's earlier deployments and its fleet, and the command prints the gain (method auto). Two
+        runs are then often enough.
+    refit
+        Which refit it flies with, if its logs are not catalogued; by default a new one.
+    """
+
+    parameter: tuple[str, ...] = ()
+    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
+    method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto"
+    vehicle: str = ""
+    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0
+    filter_cutoff: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0
+    fleet: str = ""
+    refit: str = ""
+
+    @property
+    def masses(self) -> Path | None:
+        """The vehicle.toml, if one is given."""
+        return Path(self.vehicle) if self.vehicle and not self.fleet else None
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The parameters that are named, without ``auto``."""
+        return tuple(name for name in self.parameter if name != "auto")
+
+    def check(self) -> None:
+        """WrongUse: options that do not go together."""
+        if self.masses and self.method != "auto":
+            raise WrongUse(
+                f"--vehicle: method {self.method} does not use the positions of the masses; auto does"
+            )
+        if "auto" in self.parameter and (self.method != "auto" or self.fleet or self.masses):
+            raise WrongUse("--parameter auto: goes with method auto, and without --vehicle and --fleet")
+        if self.fleet and self.method != "auto":
+            raise WrongUse("--fleet: goes with method auto")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ReferenceOptions:
+    """What the field was, and what headings refer to.
+
+    Parameters
+    ----------
+    grid
+        An anomaly grid to add to the IGRF.
+    base
+        A base station's log (total_field, or a vector): the Earth's field variation, to add to the reference.
+        A log of an observatory (IAGA-2002) among the logs is added in the same way.
+    reference
+        mean: use the mean length of the log's own readings as the reference, if neither the log nor --date
+        gives the Earth's field. The total field then has the sensor's own scale, which site_bias counts: by
+        default 2 %. scalar: use the reading of the column that --scalar names, for a scalar magnetometer away
+        from the vehicle's iron or compensated already; its column's sigma is site_bias, by default 1 nT.
+    site_bias
+        1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
+        the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
+        main-field models do not reach of the crust (error model of the World Magnetic Model 2020). The
+        corrected field's sigma counts it, and level_sigma says how much is common to all samples.
+    """
+
+    grid: Path | None = None
+    base: Base = None
+    reference: Literal["mean", "scalar"] | None = None
+    site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None
+    heading_reference: Heading = None
+
+    def apply(self, deployment: xr.Dataset, scalar: str) -> tuple[xr.Dataset, float | None]:
+        """Return a log with the reference that is asked for, and the 1-sigma of its level, nT."""
+        if self.reference == "mean":
+            return _about_mean(deployment, self.site_bias)
+        if self.reference == "scalar":
+            values = deployment[scalar].to_numpy().astype(float)
+            sigma = SCALAR_REFERENCE_SIGMA_NT if self.site_bias is None else self.site_bias
+            return deployment.assign(reference_field=("time", values)), sigma
+        return deployment, self.site_bias
+
+
+PHYSICAL_MODEL = ModelOptions()
+MAIN_FIELD = ReferenceOptions()
+"""The defaults: method auto, and the field as the log or the IGRF gives it."""
+
+
+@dataclass
+class _Request:
+    """A call of ``calibrate`` for one compass."""
+
+    files: tuple[Path, ...]
+    output: Path
+    model: ModelOptions
+    truth: ReferenceOptions
+    scalar: ScalarOptions
+    plot: Path | None
+    force: bool
+    reading: ReadingOptions
+    anomalies: AnomalyGrid | None = field(default=None)
+
+    def of_compass(self, number: int) -> _Request:
+        """Return the same call for one of several compasses, with files of its own."""
+
+        def numbered(path: Path) -> Path:
+            return path.with_name(f"{path.stem}_{number}{path.suffix}")
+
+        return replace(
+            self,
+            output=numbered(self.output),
+            plot=self.plot and numbered(self.plot),
+            reading=replace(self.reading, compass=str(number)),
+        )
 
 
 @command("calibrate FILE... --parameter NAME... -o cal.json [OPTIONS]")
-def calibrate(  # noqa: PLR0915 - a statement or two for each option
+def calibrate(
     *files: Path,
     output: Output,
-    parameter: tuple[str, ...] = (),
-    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
-    method: Literal["auto", "survey", "nominal", "cubic", "runs", "horizontal"] = "auto",
-    vehicle: str = "",
-    grid: Path | None = None,
-    base: Base = None,
-    reference: Literal["mean", "scalar"] | None = None,
-    site_bias: Annotated[float | None, Parameter(validator=validators.Number(gte=0, lte=1e5))] = None,
-    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
-    filter_cutoff: Annotated[float, Parameter(validator=validators.Number(gte=0, lt=inf))] = 0.0,
-    fleet: str = "",
-    refit: str = "",
-    heading_reference: Heading = None,
-    scalar: str = "",
-    lag: str = "auto",
-    lever: str = "",
+    model: ModelOptions = PHYSICAL_MODEL,
+    truth: ReferenceOptions = MAIN_FIELD,
+    scalar: ScalarOptions = NO_SCALAR,
     plot: Plot = None,
     force: bool = False,
     reading: ReadingOptions = AS_THEY_SAY,
@@ -82,177 +215,200 @@ def calibrate(  # noqa: PLR0915 - a statement or two for each option
         The logs of the calibration runs.
     output
         The calibration to write (cal.json).
-    parameter
-        A column that gives the position of a moving mass, or a current; may be repeated. auto: the log's
-        currents, throttles, motors and masses that predict held-out parts better; the command prints by how
-        much (method auto).
-    order
-        Highest total degree of the polynomials in the parameters.
-    method
-        auto is the one to use: survey where only the main field or a map is known at the log's positions
-        (the crustal field is estimated with the calibration), else the fit to a known field. For comparison:
-        nominal (one ellipsoid for all positions), cubic (the paper's), runs (an ellipsoid for each run,
-        then polynomials through them: the paper's first stage), horizontal (one ellipsoid, levelled by
-        roll and pitch: the alternative that the paper names).
-    vehicle
-        A vehicle.toml with the positions of the moving masses relative to the sensor (method auto); with
-        --fleet, the vehicle's name in the fleet, which is known for logs that are catalogued.
-    grid
-        An anomaly grid to add to the IGRF.
-    base
-        A base station's log (total_field, or a vector): the Earth's field variation, to add to the reference.
-        A log of an observatory (IAGA-2002) among the logs is added in the same way.
-    reference
-        mean: use the mean length of the log's own readings as the reference, if neither the log nor --date
-        gives the Earth's field. The total field then has the sensor's own scale, which site_bias counts: by
-        default 2 %. scalar: use the reading of the column that --scalar names, for a scalar magnetometer away
-        from the vehicle's iron or compensated already; its column's sigma is site_bias, by default 1 nT.
-    site_bias
-        1-sigma in nT of a constant error of the reference field over the whole site. By default 0 where
-        the log has reference_field, the map's own sigma with --grid (20 if it states none), else 145: what
-        main-field models do not reach of the crust (error model of the World Magnetic Model 2020). The
-        corrected field's sigma counts it, and level_sigma says how much is common to all samples.
-    position_sigma
-        1-sigma in m by which dead-reckoned positions slowly drift, where the crustal field is estimated with
-        the calibration: the track is corrected to where the field repeats itself; 0: positions are exact.
-    filter_cutoff
-        Cut-off frequency in Hz of the sensor's first-order anti-alias filter; 0: no filter. The fit undoes
-        its attenuation in turns; correct and the bridge then undo its lag in the vector and the heading.
-    fleet
-        A fleet's catalogue, a folder or postgresql://USER@HOST/DATABASE: the fit starts from the prediction
-        of the vehicle's earlier deployments and its fleet, and the command prints the gain (method auto). Two
-        runs are then often enough.
-    refit
-        Which refit it flies with, if its logs are not catalogued; by default a new one.
-    scalar
-        The column of a scalar magnetometer beside the vector sensor, nT: its compensation by the vector's
-        direction and by telemetry is fitted, too, and stands in the same file. The channels are those of
-        --parameter; without it, or with auto, all telemetry of the log.
-    lag
-        Time in s by which the scalar is behind the vector; auto estimates it.
-    lever
-        Position of the scalar sensor: m forward, starboard and down of the log's positions, as 1.5,0,-0.3.
     plot
         A PNG, PDF or SVG to draw: the error of each sample, raw and corrected, against time, heading and
         each parameter.
     force
         Write the calibration although the data do not support the fit.
     json
-        Print the result as JSON, with the paper's M, S and T at the middle of each parameter's range.
+        Print the result, or the error, as one JSON object, with the paper's M, S and T at the middle of each
+        parameter's range. With --compass all, one result for each compass.
     """
-    given: dict[str, Any] = dict(locals())
-    masses = Path(vehicle) if vehicle and not fleet else None
-    _refuse_together(parameter, method, masses, fleet)
-    logs_to_read(files, output, masses, grid, base)
+    model.check()
+    scalar.check(is_reference=truth.reference == "scalar")
+    logs_to_read(files, output, model.masses, truth.grid, truth.base)
     check_inputs((*files, output), plot)
-    if reading.compass == ALL_COMPASSES:
-        _each_compass(**given)
-        return
 
-    from magbridge.calibration.file import save
-    from magbridge.calibration.fitting.lowpass import unfiltered
-    from magbridge.calibration.fitting.mounted_masses import read_vehicle
-    from magbridge.calibration.fitting.observe import observations
-    from magbridge.calibration.fitting.parameter_choice import AUTO
-    from magbridge.calibration.fitting.sources import unused_logs
-    from magbridge.columns import CHANNELS, require
     from magbridge.field.read import read_grid
+
+    anomalies = read_grid(truth.grid) if truth.grid else None
+    request = _Request(files, output, model, truth, scalar, plot, force, reading, anomalies)
+    results = _each_compass(request) if reading.compass == ALL_COMPASSES else {"": _calibrate(request)}
+    facts: dict[str, Any] = {number: found for number, (found, _) in results.items()}
+    text = "\n".join(sentence for _, sentence in results.values())
+    print_result(facts.get("", {"compasses": facts}), text, json)
+
+
+def _calibrate(request: _Request) -> tuple[dict[str, Any], str]:
+    """Read the logs, fit and write the calibration of one compass; return the result as facts and text."""
+    from magbridge.calibration.file import save
+    from magbridge.columns import CHANNELS, require
     from magbridge.field.reference import with_true_heading
     from magbridge.logs import read_each
     from magbridge.logs.deployment import join
 
-    beside = scalar_options(scalar, reference, lag, lever)
-    named_channels = tuple(name for name in parameter if name != AUTO)
-    start = fleet_start(fleet, vehicle, refit, files) if fleet else None
-    parameter = parameter or (start.names if start else ())
-    anomalies = read_grid(grid) if grid else None
+    model, truth, scalar = request.model, request.truth, request.scalar.scalar
+    start = _fleet_start(model, request.files) if model.fleet else None
     with waiting("reading"):
-        logs = by_base_station(read_each(files, options=reading.options), base)
+        logs = by_base_station(read_each(request.files, options=request.reading.options), truth.base)
         deployment = join(logs)
-    require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *named_channels))
-    deployment = with_true_heading(deployment, heading_reference)
+    require(deployment, (*CHANNELS, *((scalar,) if scalar else ()), *model.named))
+    deployment = with_true_heading(deployment, truth.heading_reference)
     note_losses(deployment.attrs)
-    if reference == "mean":
-        deployment, site_bias = _about_mean(deployment, site_bias)
-    if reference == "scalar":
-        deployment = deployment.assign(reference_field=("time", deployment[scalar].to_numpy().astype(float)))
-        site_bias = 1.0 if site_bias is None else site_bias
-    note_unused_grid(grid, deployment)
-    options: dict[str, Any] = {"vehicle": read_vehicle(masses)} if masses else {}
-    with naming(deployment), waiting("fitting"):
-        parameter = chosen_parameters(parameter, deployment, grid=anomalies, order=order, site_bias=site_bias)
-        data = replace(
-            observations(deployment, parameter, grid=anomalies),
-            inputs=_digests((*files, *reading.sensor_log, *([base] if base else []))),
-        )
-        for line in unused_logs(logs, data):
-            complain(line)
-        data = unfiltered(data, filter_cutoff) if filter_cutoff else data
-        options |= drifting(position_sigma, data, method)
-        if start:
-            found, doubt, worth = from_fleet(start, data, order, site_bias=site_bias, **options)
-        else:
-            found, doubt, worth = *fitted(logs, data, method, order, site_bias=site_bias, **options), {}
-    if plot:
+    deployment, site_bias = truth.apply(deployment, scalar)
+    note_unused_grid(truth.grid, deployment)
+    found, data, worth = _fit(request, logs, deployment, site_bias, start)
+    if request.plot:
         from magbridge.calibration.fitting.draw import draw_fit
 
-        draw_fit(found.calibration, data, plot)
-    refused = not (found.supported or force)
-    for warning in (*found.warnings[refused:], *doubt, *undeclared_columns(deployment, data, found)):
-        complain(warning)
-    if refused:
-        raise DataError(f"{output}: not written, because {found.warnings[0]}; --force writes it all the same")
-    calibration, text = found.calibration, ""
-    left_out, facts = deployment.sizes["time"] - len(data), _facts(found, data)
-    if scalar and reference != "scalar":
+        draw_fit(found.calibration, data, request.plot)
+    _refuse_unsupported(request, found)
+    calibration, facts, text = found.calibration, _facts(found, data), ""
+    if scalar and truth.reference != "scalar":
         with waiting("fitting the scalar"):
-            known = anomalies is not None or ("reference_field" in deployment and reference is None)
-            own = {"grid": anomalies, "map_known": known, **beside}
-            calibration, text = _with_scalar(deployment, calibration, scalar, named_channels, facts, own)
-    save(calibration, output)
-    print_result(
-        {"file": str(output), "method": method, **facts, "left_out": left_out, **worth},
-        f"{output}: {method}, {_summary(facts)}"
-        + (f"; {counted(left_out, 'row')} without every value left out" if left_out else "")
-        + text,
-        json,
-    )
+            calibration, text = _with_scalar(request, deployment, calibration, facts)
+    save(calibration, request.output)
+    left_out = deployment.sizes["time"] - len(data)
+    rows = f"; {counted(left_out, 'row')} without every value left out" if left_out else ""
+    facts = {"file": str(request.output), "method": model.method, **facts, "left_out": left_out, **worth}
+    return facts, f"{request.output}: {model.method}, {_summary(facts)}{rows}{text}"
 
 
-def scalar_options(scalar: str, reference: str | None, lag: str, lever: str) -> dict[str, Any]:
-    """Return lag and lever arm as numbers; WrongUse: not numbers, or options without --scalar."""
-    if not scalar:
-        if reference == "scalar" or lag != "auto" or lever:
-            raise WrongUse("--reference scalar, --lag and --lever: give --scalar COLUMN, too")
-        return {}
+def _fit(
+    request: _Request,
+    logs: list[xr.Dataset],
+    deployment: xr.Dataset,
+    site_bias: float | None,
+    start: FleetPrediction | None,
+) -> tuple[Fit, Observations, dict[str, Any]]:
+    """Return the fit, its samples, and what a fleet's prior was worth; print what they leave in doubt."""
+    from magbridge.calibration.fitting.lowpass import unfiltered
+    from magbridge.calibration.fitting.mounted_masses import read_vehicle
+    from magbridge.calibration.fitting.observe import observations
+    from magbridge.calibration.fitting.sources import unused_logs
+
+    model, anomalies = request.model, request.anomalies
+    names = model.parameter or (start.names if start else ())
+    options: dict[str, Any] = {"vehicle": read_vehicle(model.masses)} if model.masses else {}
+    with _naming(deployment), waiting("fitting"):
+        names = chosen_parameters(names, deployment, grid=anomalies, order=model.order, site_bias=site_bias)
+        read = (*request.files, *request.reading.sensor_log, *filter(None, [request.truth.base]))
+        data = replace(observations(deployment, names, grid=anomalies), inputs=_digests(read))
+        for line in unused_logs(logs, data):
+            complain(line)
+        data = unfiltered(data, model.filter_cutoff) if model.filter_cutoff else data
+        if model.position_sigma:
+            if not (data.lacks_rock and model.method in ("auto", "survey")):
+                raise WrongUse(
+                    "--position-sigma: positions matter only where the field is mapped (method survey)"
+                )
+            options["position_sigma"] = model.position_sigma
+        if start:
+            found, remarks, worth = _from_fleet(start, data, model.order, site_bias=site_bias, **options)
+        else:
+            found, remarks = _fitted(logs, data, model, site_bias=site_bias, **options)
+            worth = {}
+    refused = not (found.supported or request.force)
+    for line in (*found.warnings[refused:], *remarks, *_undeclared_columns(deployment, data, found)):
+        complain(line)
+    return found, data, worth
+
+
+def _refuse_unsupported(request: _Request, found: Fit) -> None:
+    """DataError: the data do not support the fit, and it is not to be written all the same."""
+    if not (found.supported or request.force):
+        raise DataError(
+            f"{request.output}: not written, because {found.warnings[0]}; --force writes it all the same"
+        )
+
+
+@contextmanager
+def _naming(deployment: xr.Dataset) -> Iterator[None]:
+    """Name the logs in error messages about them."""
     try:
-        behind = None if lag == "auto" else float(lag)
-        arm = tuple(float(part) for part in lever.split(",")) if lever else (0.0, 0.0, 0.0)
-    except ValueError:
-        raise WrongUse(
-            f"--lag {lag}, --lever {lever or 0}: expected auto or s, and m as F,R,D such as 1.5,0,-0.3"
-        ) from None
-    if len(arm) != 3 or not all(map(isfinite, (*arm, behind or 0.0))):
-        raise WrongUse(f"--lever {lever}: expected three numbers, F,R,D in m, such as 1.5,0,-0.3")
-    return {"lag": behind, "lever": arm}
+        yield
+    except (CalibrationError, OutOfRange) as error:
+        raise DataError(f"{deployment.attrs['source']}: {error}") from error
+
+
+def _fitted(
+    logs: list[xr.Dataset], data: Observations, model: ModelOptions, **options: Any
+) -> tuple[Fit, list[str]]:
+    """Return the fit, and why several logs are not of one vehicle, if they are not."""
+    from magbridge.calibration.fitting.fit import fit
+    from magbridge.calibration.fitting.sources import heterogeneous_logs
+
+    def refitted(part: Observations) -> Fit:
+        return fit(part, model.method, model.order)
+
+    try:
+        found = fit(data, model.method, model.order, **options)
+    except CalibrationError as error:
+        if reason := heterogeneous_logs(logs, data, None, refitted):
+            raise CalibrationError(reason) from error
+        raise
+    reason = heterogeneous_logs(logs, data, found, refitted)
+    return found, [reason] if reason else []
+
+
+def _from_fleet(
+    start: FleetPrediction, data: Observations, order: int, **options: Any
+) -> tuple[Fit, list[str], dict[str, Any]]:
+    """Return the fit that starts there, and what that is worth against one that does not: lines, facts."""
+    from magbridge.calibration.fitting.fit import fit
+    from magbridge.fleet.start import gained
+
+    found = fit(data, order=order, known=start.known, **options)
+    try:
+        alone = fit(data, order=order, **options)
+    except CalibrationError:
+        alone = None
+    facts, lines = gained(found, alone, start)
+    return found, lines, {"fleet": facts}
+
+
+def _fleet_start(model: ModelOptions, files: tuple[Path, ...]) -> FleetPrediction:
+    """Return a fleet's prior for these logs."""
+    from magbridge.fleet.start import start
+
+    with waiting("learning"):
+        return start(model.fleet, model.vehicle, model.refit, {digest(file) for file in files})
+
+
+def _undeclared_columns(deployment: xr.Dataset, data: Observations, found: Fit) -> list[str]:
+    """Return a line for each column of the log that changes the field and is not a parameter."""
+    import numpy as np
+
+    from magbridge.calibration.fitting.parameter_choice import undeclared
+    from magbridge.logs.info import telemetry
+
+    rows = np.searchsorted(deployment["time"].to_numpy(), data.time)
+    others = [name for name in telemetry(deployment) if name not in data.names]
+    return undeclared(found.calibration, data, {name: deployment[name].to_numpy()[rows] for name in others})
 
 
 def _with_scalar(
-    deployment: xr.Dataset,
-    calibration: Calibration,
-    scalar: str,
-    names: tuple[str, ...],
-    facts: dict[str, Any],
-    options: dict[str, Any],
+    request: _Request, deployment: xr.Dataset, calibration: Calibration, facts: dict[str, Any]
 ) -> tuple[Calibration, str]:
     """Return the calibration with its scalar sensor, and a summary; add to the facts to print as JSON."""
     from magbridge.calibration.figure_of_merit import merit_text
     from magbridge.calibration.fitting.scalar_log import calibrate_scalar, telemetry_columns
 
-    names = names or telemetry_columns(deployment, scalar)
-    fit = calibrate_scalar(deployment, calibration, scalar, names, **options)
+    scalar, truth = request.scalar, request.truth
+    names = request.model.named or telemetry_columns(deployment, scalar.scalar)
+    is_known = request.anomalies is not None or ("reference_field" in deployment and truth.reference is None)
+    fit = calibrate_scalar(
+        deployment,
+        calibration,
+        scalar.scalar,
+        names,
+        grid=request.anomalies,
+        map_known=is_known,
+        lag=scalar.lag_s,
+        lever=scalar.lever_m or (0.0, 0.0, 0.0),
+    )
     facts["scalar"] = {
-        "column": scalar,
+        "column": scalar.scalar,
         "channels": list(names),
         "rms_before_nT": fit.rms_before,
         "rms_nT": fit.rms_after,
@@ -260,27 +416,15 @@ def _with_scalar(
         "left_out": fit.left_out,
         "figure_of_merit": fit.merit and {**fit.merit, "fitted": True},
     }
-    largest = sorted(fit.contribution.items(), key=lambda one: -one[1])
-    parts = ", ".join(
-        f"{name} {value:.2g}" for name, value in largest[:MAX_LISTED_CONTRIBUTIONS] if value > 0.0
-    )
+    largest = sorted(fit.contribution.items(), key=lambda one: -one[1])[:MAX_LISTED_CONTRIBUTIONS]
+    parts = ", ".join(f"{name} {value:.2g}" for name, value in largest if value > 0.0)
     text = (
-        f"; scalar {scalar}: {fit.rms_before:.2f} -> {fit.rms_after:.2f} nT about the mean with "
+        f"; scalar {scalar.scalar}: {fit.rms_before:.2f} -> {fit.rms_after:.2f} nT about the mean with "
         f"{counted(len(names), 'channel')} ({parts} nT)"
     )
     if fit.merit:
         text += f"; {merit_text(fit.merit)} (fitted)"
     return replace(calibration, sensors=(fit.sensor,)), text
-
-
-def _refuse_together(parameter: tuple[str, ...], method: str, vehicle: Path | None, fleet: str) -> None:
-    """WrongUse: options that do not go together."""
-    if vehicle and method != "auto":
-        raise WrongUse(f"--vehicle: method {method} does not use the positions of the masses; auto does")
-    if "auto" in parameter and (method != "auto" or fleet or vehicle):
-        raise WrongUse("--parameter auto: goes with method auto, and without --vehicle and --fleet")
-    if fleet and method != "auto":
-        raise WrongUse("--fleet: goes with method auto")
 
 
 def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dataset, float]:
@@ -304,34 +448,24 @@ def _about_mean(deployment: xr.Dataset, site_bias: float | None) -> tuple[xr.Dat
     return deployment, GAIN_SIGMA * mean if site_bias is None else site_bias
 
 
-def _compass_path(path: Path, compass: int) -> Path:
-    """Return the name of a file for one of several compasses."""
-    return path.with_name(f"{path.stem}_{compass}{path.suffix}")
-
-
-def _each_compass(
-    files: tuple[Path, ...], output: Path, plot: Path | None, reading: ReadingOptions, **options: Any
-) -> None:
+def _each_compass(request: _Request) -> dict[str, tuple[dict[str, Any], str]]:
     """Calibrate every compass of the logs; DataError: not one could be."""
     from magbridge.logs import read_each
     from magbridge.logs.compasses import compasses_in
 
-    first = replace(reading, compass=None)
+    first = replace(request.reading, compass=None)
     with waiting("reading"):
-        found = {one.number for log in read_each(files, options=first.options) for one in compasses_in(log)}
-    failed = 0
-    for number in sorted(found) or [0]:
-        own: dict[str, Any] = {
-            "output": _compass_path(output, number),
-            "plot": plot and _compass_path(plot, number),
-        }
+        logs = read_each(request.files, options=first.options)
+        numbers = {one.number for log in logs for one in compasses_in(log)} or {0}
+    results: dict[str, tuple[dict[str, Any], str]] = {}
+    for number in sorted(numbers):
         try:
-            calibrate(*files, reading=replace(reading, compass=str(number)), **own, **options)
+            results[str(number)] = _calibrate(request.of_compass(number))
         except DataError as error:
-            failed += 1
             complain(f"compass {number}: {error}")
-    if failed == max(len(found), 1):
-        raise DataError(f"{files[0]}: not one of its compasses could be calibrated")
+    if not results:
+        raise DataError(f"{request.files[0]}: not one of its compasses could be calibrated")
+    return results
 
 
 def _facts(found: Fit, data: Observations) -> dict[str, Any]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import datetime as dt
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -15,21 +16,15 @@ import msgspec
 from cyclopts import App, Parameter, Token
 
 from magbridge import __version__
-from magbridge.errors import FormatError, WrongUse
+from magbridge.errors import DataError, FormatError, WrongUse
 from magbridge.files import existing
 from magbridge.logs import Options, suffixes
 from magbridge.logs.registry import is_bag
 
-__all__ = [
-    "AS_THEY_SAY", "Base", "Day", "Folder", "Grid", "Heading", "Json", "Log", "Output", "Plot",
-    "ReadingOptions", "Whole", "app", "check_inputs", "command", "complain", "file_to_write",
-    "folder_to_write", "logs_to_read", "print_result",
-]  # fmt: skip
-
 
 def _default(value: object) -> object:
     """Return the default as the help shows it; None where it is not shown."""
-    return None if value is False or value == () else value
+    return None if value is False or value in {(), ""} else value
 
 
 app = App(
@@ -153,8 +148,61 @@ class ReadingOptions:
         return replace(self.options, sensor_log=(), clock_offset_s=0.0)
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ScalarOptions:
+    """A scalar magnetometer on the same vehicle.
+
+    Parameters
+    ----------
+    scalar
+        The column of a scalar magnetometer, nT. calibrate also fits its compensation, by the vector's
+        direction and by telemetry, into the same file. survey makes the map of it: lag, lever arm and heading
+        error are fitted together with the crustal field and the lines' levels. The channels that disturb it
+        are those of --parameter; auto, and in calibrate also no --parameter: all telemetry of the log.
+    lag
+        Time in s by which the scalar is behind the vector and the positions; auto estimates it.
+    lever
+        Position of the scalar sensor: m forward, starboard and down of the log's positions, as 1.5,0,-0.3. If
+        not given, survey estimates forward and starboard, and calibrate takes 0.
+    """
+
+    scalar: str = ""
+    lag: str = "auto"
+    lever: str = ""
+
+    def check(self, *, is_reference: bool = False) -> None:
+        """WrongUse: lag or lever arm are not numbers, or an option needs --scalar."""
+        if not self.scalar and (is_reference or self.lag != "auto" or self.lever):
+            raise WrongUse("--reference scalar, --lag and --lever: give --scalar COLUMN, too")
+        try:
+            are_finite = isfinite(self.lag_s or 0.0), all(map(isfinite, self.lever_m or ()))
+        except ValueError:
+            are_finite = False, False
+        if not all(are_finite):
+            raise WrongUse(
+                f"--lag {self.lag}, --lever {self.lever or '0,0,0'}: expected auto or a number of s, and "
+                "three numbers of m, F,R,D such as 1.5,0,-0.3"
+            )
+
+    @property
+    def lag_s(self) -> float | None:
+        """Lag, s; None: to be estimated."""
+        return None if self.lag == "auto" else float(self.lag)
+
+    @property
+    def lever_m(self) -> tuple[float, float, float] | None:
+        """Forward, starboard and down, m; None if not given."""
+        if not self.lever:
+            return None
+        forward, starboard, down = (float(part) for part in self.lever.split(","))
+        return forward, starboard, down
+
+
 AS_THEY_SAY = ReadingOptions()
 """Logs are read as they say themselves."""
+NO_SCALAR = ScalarOptions()
+"""No scalar magnetometer."""
 Output = Annotated[Path, Parameter(name=["--output", "-o"], validator=file_to_write())]
 Log = Annotated[Path, Parameter(name=["--output", "-o"], validator=_log_to_write)]
 Folder = Annotated[Path, Parameter(validator=folder_to_write)]
@@ -166,7 +214,7 @@ Heading = Annotated[
 ]
 Plot = Annotated[Path | None, Parameter(validator=file_to_write(".png", ".pdf", ".svg"))]
 Whole = Annotated[int, Parameter(converter=_whole_number)]
-Json = Annotated[bool, Parameter(help="Print the result as JSON.")]
+Json = Annotated[bool, Parameter(help="Print the result, or the error, as one JSON object.")]
 
 
 def check_inputs(
@@ -196,11 +244,27 @@ def logs_to_read(files: tuple[Path, ...], output: Path | None = None, *others: P
             existing(other)
 
 
-def print_result(result: dict[str, Any], sentence: str, as_json: bool) -> None:
+class FailedResult(DataError):
+    """An error that the result, which is already printed, describes: JSON output has no second object."""
+
+    def __init__(self, sentence: str, exit_code: int = 1) -> None:
+        self.exit_code = exit_code
+        super().__init__(sentence)
+
+
+def print_result(result: Mapping[str, Any], sentence: str, as_json: bool) -> None:
     """Print the result, for people or for machines."""
     from magbridge.arrays import plain
 
-    print(msgspec.json.encode(result, enc_hook=plain).decode() if as_json else sentence)
+    if as_json:
+        print(msgspec.json.encode(result, enc_hook=plain).decode())
+    elif sentence:
+        print(sentence)
+
+
+def print_error(sentence: str, code: int) -> None:
+    """Print the JSON object of a command that has no result: its error message and its exit code."""
+    print(msgspec.json.encode({"error": " ".join(sentence.split()), "exit_code": code}).decode())
 
 
 def complain(sentence: str, code: int = 0) -> int:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.common import Folder, Whole, command, complain, file_to_write
+from magbridge.cli.common import Folder, Json, Whole, command, complain, file_to_write, print_result
 from magbridge.cli.remarks import warnings_of
 from magbridge.errors import DataError, WrongUse
 
@@ -35,6 +35,7 @@ def export(
     table: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
     parameter: str = "",
     dip: Annotated[float, Parameter(validator=validators.Number(gt=-90, lt=90))] = 60.0,
+    json: Json = False,
 ) -> None:
     """Write a calibration for other programs, and say what they cannot hold of it.
 
@@ -101,7 +102,8 @@ def export(
     for file, text in texts.items():
         with new_folder(file.parent), atomic_path(file) as path:
             path.write_text(text, encoding="utf-8")
-        print(f"{file}: written")
+    files = [str(file) for file in texts]
+    print_result({"files": files}, "\n".join(f"{file}: written" for file in files), json)
 
 
 def _filter_lag(known: Calibration, file: Path) -> list[str]:

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter, validators
 
-from magbridge.cli.common import Day, Json, Output, Whole, app, complain, logs_to_read, print_result
+from magbridge.cli.common import (
+    Day,
+    FailedResult,
+    Json,
+    Output,
+    Whole,
+    app,
+    complain,
+    logs_to_read,
+    print_result,
+)
 from magbridge.errors import DataError, WrongUse
 from magbridge.progress import track, waiting
 from magbridge.wording import counted
@@ -183,7 +193,7 @@ def process(
         json,
     )
     if todo and len(failures) >= len(todo) and not there.rows("calibrations", ["job"]):
-        raise DataError(f"{there.name}: not one deployment could be calibrated")
+        raise FailedResult(f"{there.name}: not one deployment could be calibrated")
 
 
 @fleet.command

@@ -58,8 +58,7 @@ def info(*files: Path, reading: ReadingOptions = AS_THEY_SAY, json: Json = False
         if not json:
             note_losses(log.attrs)
             _show(name, found[name])
-    if json:
-        print_result(found, "", as_json=True)
+    print_result(found, "", json)
 
 
 def _show(file: str, facts: dict[str, Any]) -> None:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from magbridge.cli.calibrate import scalar_options
 from magbridge.cli.common import (
     AS_THEY_SAY,
+    NO_SCALAR,
     Base,
     Json,
     Output,
     Plot,
     ReadingOptions,
+    ScalarOptions,
     Whole,
     command,
     complain,
@@ -39,26 +41,81 @@ if TYPE_CHECKING:
 Written = Annotated[Path | None, Parameter(validator=file_to_write())]
 
 
+@Parameter(name="*")
+@dataclass(frozen=True)
+class CorrectionOptions:
+    """How raw logs are corrected.
+
+    Parameters
+    ----------
+    parameter
+        A column that gives the position of a moving mass, or a current; may be repeated. auto: those of the
+        log that predict held-out parts better.
+    order
+        Highest total degree of the polynomials in the parameters.
+    calibration
+        A calibration (cal.json) to correct with instead; may be repeated, once for each raw log in order.
+    save
+        The calibration found, to write (cal.json).
+    position_sigma
+        As of calibrate: by how many m dead-reckoned positions slowly drift, while the calibration is found.
+    base
+        A base station's log (total_field, or a vector): its variation is subtracted. A log of an
+        observatory (IAGA-2002) among the logs is used in the same way.
+    """
+
+    parameter: tuple[str, ...] = ()
+    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3
+    calibration: tuple[Path, ...] = ()
+    save: Written = None
+    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0
+    base: Base = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class MapOptions:
+    """What is made of the corrected samples.
+
+    Parameters
+    ----------
+    spacing
+        m between nodes of the map; by default an eighth of the crustal field's length.
+    altitude
+        m above the sea to which the map is continued upward; by default that of the survey.
+    predict
+        A table with longitude and latitude (and height or depth): anomaly and anomaly_sigma there are
+        written to the output, instead of a map.
+    geotiff
+        The map as GeoTIFF, too.
+    tracks
+        The tracks, as GeoJSON or KML.
+    crossovers
+        A table of the crossovers with their mis-ties before and after levelling.
+    plot
+        A PNG, PDF or SVG to draw: map, sigma, track, residuals, crossovers.
+    """
+
+    spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None
+    altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None
+    predict: Path | None = None
+    geotiff: Annotated[Path | None, Parameter(validator=file_to_write(".tif", ".tiff"))] = None
+    tracks: Annotated[Path | None, Parameter(validator=file_to_write(".geojson", ".json", ".kml"))] = None
+    crossovers: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None
+    plot: Plot = None
+
+
+SELF_CALIBRATED = CorrectionOptions()
+MAP_ONLY = MapOptions()
+
+
 @command("survey LOG... -o map.nc [OPTIONS]")
 def survey(
     *logs: Path,
     output: Output,
-    parameter: tuple[str, ...] = (),
-    order: Annotated[Whole, Parameter(validator=validators.Number(gte=1, lte=6))] = 3,
-    calibration: tuple[Path, ...] = (),
-    save: Written = None,
-    position_sigma: Annotated[float, Parameter(validator=validators.Number(gte=0, lte=1e5))] = 0.0,
-    base: Base = None,
-    scalar: str = "",
-    lag: str = "auto",
-    lever: str = "",
-    spacing: Annotated[float | None, Parameter(validator=validators.Number(gt=0, lt=inf))] = None,
-    altitude: Annotated[float | None, Parameter(validator=validators.Number(gte=-1e6, lte=1e6))] = None,
-    predict: Path | None = None,
-    geotiff: Annotated[Path | None, Parameter(validator=file_to_write(".tif", ".tiff"))] = None,
-    tracks: Annotated[Path | None, Parameter(validator=file_to_write(".geojson", ".json", ".kml"))] = None,
-    crossovers: Annotated[Path | None, Parameter(validator=file_to_write(".csv"))] = None,
-    plot: Plot = None,
+    correction: CorrectionOptions = SELF_CALIBRATED,
+    scalar: ScalarOptions = NO_SCALAR,
+    products: MapOptions = MAP_ONLY,
     reading: ReadingOptions = AS_THEY_SAY,
     json: Json = False,
 ) -> None:
@@ -76,84 +133,37 @@ def survey(
         and line_type where there are any), also a plain table without times.
     output
         The map, netCDF (.nc): what navigate --map takes. With --predict: the predictions (.csv).
-    parameter
-        A column that gives the position of a moving mass, or a current; may be repeated. auto: those of the
-        log that predict held-out parts better.
-    order
-        Highest total degree of the polynomials in the parameters.
-    calibration
-        A calibration (cal.json) to correct with instead; may be repeated, once for each raw log in order.
-    save
-        The calibration found, to write (cal.json).
-    position_sigma
-        As of calibrate: by how many m dead-reckoned positions slowly drift, while the calibration is found.
-    base
-        A base station's log (total_field, or a vector): its variation is subtracted. A log of an
-        observatory (IAGA-2002) among the logs is used in the same way.
-    scalar
-        The column of a scalar magnetometer, nT, to make the map of. Lag, lever arm and heading error are
-        fitted together with the crustal field and the lines' levels. A calibration that has this sensor
-        compensates it first; without one --parameter names the channels that disturb it (auto: all
-        telemetry).
-    lag
-        Time in s by which the scalar is behind the positions; auto estimates it.
-    lever
-        Position of the scalar sensor: m forward, starboard and down of the log's positions, as 1.5,0,-0.3; if
-        not given, forward and starboard are estimated.
-    spacing
-        m between nodes of the map; by default an eighth of the crustal field's length.
-    altitude
-        m above the sea to which the map is continued upward; by default that of the survey.
-    predict
-        A table with longitude and latitude (and height or depth): anomaly and anomaly_sigma there are
-        written to the output, instead of a map.
-    geotiff
-        The map as GeoTIFF, too.
-    tracks
-        The tracks, as GeoJSON or KML.
-    crossovers
-        A table of the crossovers with their mis-ties before and after levelling.
-    plot
-        A PNG, PDF or SVG to draw: map, sigma, track, residuals, crossovers.
     """
     from magbridge.survey.run import facts, summary
     from magbridge.survey.run import survey as make
     from magbridge.survey.write import write_crossovers, write_tracks
 
-    logs_to_read(logs, output, base, predict, *calibration)
-    if predict is None and output.suffix.lower() != ".nc":
+    logs_to_read(logs, output, correction.base, products.predict, *correction.calibration)
+    if products.predict is None and output.suffix.lower() != ".nc":
         raise WrongUse(f"{output}: a map's name must end in .nc")
-    if (calibration or scalar) and save:
+    if (correction.calibration or scalar.scalar) and correction.save:
         raise WrongUse("--save: with --calibration or --scalar none is found")
-    beside = scalar_options(scalar, None, lag, lever)
+    scalar.check()
     with waiting("surveying"):
-        options: dict[str, Any] = {"position_sigma": position_sigma} if position_sigma else {}
-        if scalar:
-            given = {"lag": beside["lag"], "lever": beside["lever"] if lever else None}
-            done = _scalar_survey(logs, scalar, parameter, calibration, base, reading, given)
+        if scalar.scalar:
+            done = _scalar_survey(logs, scalar, correction, reading)
         else:
-            done = make(_samples(logs, parameter, order, calibration, save, base, options, reading))
+            done = make(_samples(logs, correction, reading))
     for warning in done.warnings:
         complain(warning)
-    if predict:
-        _predict(done, predict, output)
+    if products.predict:
+        _predict(done, products.predict, output)
     else:
-        _map(done, output, spacing, altitude, geotiff, plot)
-    if tracks:
-        write_tracks(done.samples, tracks)
-    if crossovers:
-        write_crossovers(done.found, done.samples, done.before, done.after, crossovers)
+        _map(done, output, products)
+    if products.tracks:
+        write_tracks(done.samples, products.tracks)
+    if products.crossovers:
+        write_crossovers(done.found, done.samples, done.before, done.after, products.crossovers)
     print_result(facts(done, output), f"{output}: {summary(done)}", json)
 
 
 def _scalar_survey(
-    files: tuple[Path, ...],
-    scalar: str,
-    parameters: tuple[str, ...],
-    calibration: tuple[Path, ...],
-    base: Path | None,
-    reading: ReadingOptions,
-    given: dict[str, Any],
+    files: tuple[Path, ...], scalar: ScalarOptions, correction: CorrectionOptions, reading: ReadingOptions
 ) -> Result:
     """Return the survey of a scalar magnetometer."""
     from magbridge.calibration.file import load
@@ -162,29 +172,21 @@ def _scalar_survey(
     from magbridge.logs import read_each
     from magbridge.survey.run import scalar_survey
 
-    logs = by_base_station(read_each(list(files), options=reading.options), base)
+    column = scalar.scalar
+    logs = by_base_station(read_each(list(files), options=reading.options), correction.base)
     logs = [with_true_heading(log) for log in logs]
     note_losses(*(log.attrs for log in logs))
-    known = [load(path) for path in calibration]
-    for path, found in zip(calibration, known, strict=True):
-        if all(sensor.column != scalar for sensor in found.sensors):
-            complain(f"{path}: has no scalar sensor {scalar!r}: it is not compensated")
-    names = [name for name in parameters if name != "auto"]
-    if "auto" in parameters:
-        names = sorted({name for log in logs for name in telemetry_columns(log, scalar)})
-    return scalar_survey(logs, scalar, names, known, **given)
+    known = [load(path) for path in correction.calibration]
+    for path, found in zip(correction.calibration, known, strict=True):
+        if all(sensor.column != column for sensor in found.sensors):
+            complain(f"{path}: has no scalar sensor {column!r}: it is not compensated")
+    names = [name for name in correction.parameter if name != "auto"]
+    if "auto" in correction.parameter:
+        names = sorted({name for log in logs for name in telemetry_columns(log, column)})
+    return scalar_survey(logs, column, names, known, lag=scalar.lag_s, lever=scalar.lever_m)
 
 
-def _samples(
-    files: tuple[Path, ...],
-    parameters: tuple[str, ...],
-    order: int,
-    calibration: tuple[Path, ...],
-    save: Path | None,
-    base: Path | None,
-    options: dict[str, Any],
-    reading: ReadingOptions,
-) -> Samples:
+def _samples(files: tuple[Path, ...], correction: CorrectionOptions, reading: ReadingOptions) -> Samples:
     """Return the corrected samples of all files."""
     from magbridge.calibration.file import load
     from magbridge.columns import CHANNELS
@@ -198,42 +200,36 @@ def _samples(
     parts = [read_table(path) for path in tables]
     if not others:
         return joined(parts)
-    deployments = read_each(others, options=reading.options)
-    deployments = by_base_station(deployments, base)
+    deployments = by_base_station(read_each(others, options=reading.options), correction.base)
     note_losses(*(one.attrs for one in deployments))
     raw = [one for one in deployments if all(name in one for name in CHANNELS)]
-    known = [load(path) for path in calibration]
+    known = [load(path) for path in correction.calibration]
     for log in deployments if known else []:
         if {"latitude", "longitude"} <= set(log.variables) and (holes := int((~placed(log)).sum())):
             complain(f"{log.attrs['source']}: {counted(holes, 'sample')} without a position: left out")
-    for path, one in zip(calibration, known, strict=True):
-        for doubt in warnings_of(one, path):
-            complain(doubt)
+    for path, one in zip(correction.calibration, known, strict=True):
+        for line in warnings_of(one, path):
+            complain(line)
     if raw and not known:
-        found = _calibrated(raw, parameters, order, save, options, strict=reading.strict)
+        found = _calibrated(raw, correction, strict=reading.strict)
         known = [found.calibration if found.creep is None else found.creep.calibration]
         deployments = [without_creep(one, found.creep) for one in deployments]
     return joined([*parts, samples_of(deployments, known)])
 
 
-def _calibrated(
-    logs: list[xr.Dataset],
-    parameters: tuple[str, ...],
-    order: int,
-    save: Path | None,
-    options: dict[str, Any],
-    *,
-    strict: bool,
-) -> Fit:
+def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict: bool) -> Fit:
     """Return the fit that the raw logs give themselves; write it where that is asked for."""
-    from magbridge.calibration.file import save as write
+    from magbridge.calibration.file import save
     from magbridge.calibration.fitting.fit import fit
     from magbridge.calibration.fitting.observe import observations
     from magbridge.columns import require
     from magbridge.logs.deployment import join
 
-    together = join(logs)
-    parameters = chosen_parameters(parameters, together, order=order, **options)
+    together, order = join(logs), correction.order
+    options: dict[str, Any] = {}
+    if correction.position_sigma:
+        options["position_sigma"] = correction.position_sigma
+    parameters = chosen_parameters(correction.parameter, together, order=order, **options)
     require(together, parameters)
     data = observations(together, parameters)
     found = fit(data, order=order, **options)
@@ -246,8 +242,8 @@ def _calibrated(
         raise DataError(
             "the survey does not support a calibration (see the warnings), and --strict was given"
         )
-    if save:
-        write(found.calibration, save)
+    if correction.save:
+        save(found.calibration, correction.save)
     return found
 
 
@@ -261,23 +257,18 @@ def _predict(done: Result, points: Path, output: Path) -> None:
     write_points(longitude, latitude, anomaly, sigma, output)
 
 
-def _map(
-    done: Result,
-    output: Path,
-    spacing: float | None,
-    altitude: float | None,
-    geotiff: Path | None,
-    plot: Path | None,
-) -> None:
+def _map(done: Result, output: Path, products: MapOptions) -> None:
     """Write the map in every form that is asked for."""
     from magbridge.survey.maps import anomaly_map
     from magbridge.survey.write import write_geotiff
 
+    spacing, altitude = products.spacing, products.altitude
     grid = anomaly_map(done.gridded, done.samples, spacing=spacing, altitude=altitude, name=output.name)
     grid.save(output)
-    if geotiff:
-        write_geotiff(grid, geotiff)
-    if plot:
+    if products.geotiff:
+        write_geotiff(grid, products.geotiff)
+    if products.plot:
         from magbridge.survey.draw import draw_survey
 
-        draw_survey(grid, done.samples, done.residual, done.found, (done.before, done.after), plot)
+        changes = done.before, done.after
+        draw_survey(grid, done.samples, done.residual, done.found, changes, products.plot)

@@ -40,8 +40,9 @@ def test_each_compass_gets_a_calibration_of_its_own(flight: Path, here: Path, co
     output = command("calibrate", flight, "--compass", "all", "-o", "cal.json", "--json")
     assert sorted(path.name for path in here.iterdir()) == ["cal_0.json", "cal_1.json"]
     assert "compass 2: " in output.err
-    for number, line in enumerate(output.out.splitlines()):
-        result = json.loads(line)
+    results = json.loads(output.out)["compasses"]
+    assert list(results) == ["0", "1"]
+    for number, result in enumerate(results.values()):
         assert result["file"] == f"cal_{number}.json"
         np.testing.assert_allclose(result["paper"]["T_nT"], 100 * OFFSETS[number], rtol=0, atol=60)
         assert result["rms_nT"] < 40  # steps of 100 nT: 29
