@@ -1,14 +1,19 @@
 """Print lines and modules of each part of the project against its budget in tools/limits.toml.
 
-    python tools/size.py          the table
-    python tools/size.py --gate   the table, and exit code 1 where a part exceeds its ceiling
+    python tools/size.py             the table
+    python tools/size.py --comments  the table of code and comments of each numerical package
+    python tools/size.py --gate      both tables, and exit code 1 where a part exceeds its ceiling or has
+                                     too few comments
 
 Standard library only.
 """
 
 from __future__ import annotations
 
+import ast
+import io
 import sys
+import tokenize
 import tomllib
 from pathlib import Path
 
@@ -16,6 +21,10 @@ ROOT = Path(__file__).resolve().parents[1]
 LIMITS = ROOT / "tools" / "limits.toml"
 GENERATED = "mavlink/dialect.py", "mavlink/enums.py"
 """Modules that tools/dialect.py writes; the budget is for code that people maintain."""
+
+NUMERICAL = "estimation", "calibration", "diagnose", "learning", "health", "survey", "field", "navigate"
+"""Packages of which a reader needs comments that lead from the equations to the lines."""
+INSTRUCTIONS = "# noqa", "# fmt:", "# type:", "# pragma", "# ruff"
 
 
 def count(folder: Path) -> tuple[int, int]:
@@ -40,17 +49,63 @@ def parts(groups: dict[str, list[str]]) -> dict[str, tuple[int, int]]:
     return {name: (lines, modules) for name, (lines, modules) in counts.items()}
 
 
+def code_and_comments(source: str) -> tuple[int, int]:
+    """Return the lines of code and the lines with a comment of a module.
+
+    A docstring, a blank line and an instruction to a tool (``noqa``, ``fmt``, ``type``) count as neither.
+    """
+    strings = {  # a statement that is only a string: the docstring of a module, class, function or constant
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    }
+    code: set[int] = set()
+    comments: set[int] = set()
+    layout = tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            if not token.string.startswith(INSTRUCTIONS):
+                comments.add(token.start[0])
+        elif token.type not in layout and token.start[0] not in strings:
+            code.update(range(token.start[0], token.end[0] + 1))
+    return len(code), len(comments)
+
+
+def print_comments(required: dict[str, float]) -> bool:
+    """Print code and comments of each numerical package; return whether one has too few comments."""
+    too_few = False
+    print(f"{'package':34} {'code':>7} {'comments':>8} {'per 100':>7} {'required':>8} {'one in':>7}")
+    for name in NUMERICAL:
+        counts = [
+            code_and_comments(path.read_text(encoding="utf-8"))
+            for path in (ROOT / "magbridge" / name).rglob("*.py")
+        ]
+        code, comments = map(sum, zip(*counts, strict=True))
+        per_100 = 100 * comments / code
+        least = required.get(name, required.get("default", 0.0))
+        too_few |= per_100 < least
+        one_in = f"{code / comments:.0f}" if comments else "-"
+        print(f"{name:34} {code:7,} {comments:8} {per_100:7.1f} {least:8.1f} {one_in:>7}")
+    return too_few
+
+
 def main() -> int:
-    """Print the table; return the exit code."""
+    """Print the tables; return the exit code."""
     limits = tomllib.loads(LIMITS.read_text(encoding="utf-8"))["size"]
+    gate = "--gate" in sys.argv
     over = False
+    if gate or "--comments" in sys.argv:
+        over = print_comments(limits.get("comments", {}))
+        print()
+    if "--comments" in sys.argv:
+        return int(over and gate)
     print(f"{'part':34} {'lines':>7} {'budget':>7} {'excess':>7} {'modules':>8}")
     for name, (lines, modules) in parts(limits["folders"]).items():
         budget = limits["budget"][name]
         over |= lines > limits["ceiling"].get(name, budget)
         print(f"{name:34} {lines:7,} {budget:7,} {max(0, lines - budget):7,} {modules:8}")
     print(f"modules of the package: budget {limits['max_modules']}")
-    return int(over and "--gate" in sys.argv)
+    return int(over and gate)
 
 
 if __name__ == "__main__":

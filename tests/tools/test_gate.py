@@ -90,3 +90,16 @@ def test_every_part_has_its_folders_and_its_budget() -> None:
     limits = tomllib.loads(size.LIMITS.read_text("utf-8"))["size"]
     assert {*limits["folders"], "package"} == set(limits["budget"])
     assert set(size.parts(limits["folders"])) == set(limits["budget"])
+
+
+def test_comments_are_counted_separately_from_code_and_docstrings() -> None:
+    source = (
+        '"""A module\nof two lines."""\n\nLIMIT = 3\n"""Its meaning."""\n'
+        "# Normal equations:\ntotal = (  # with the prior\n    1\n\n)\nimport os  # noqa: E402\n"
+    )
+    assert size.code_and_comments(source) == (5, 2)
+
+
+def test_a_package_with_too_few_comments_fails_the_gate() -> None:
+    assert not size.print_comments({"default": 0.0})
+    assert size.print_comments({"default": 0.0, "health": 100.0})
