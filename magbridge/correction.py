@@ -52,6 +52,8 @@ class Correction:
     ----------
     notices : list of str
         Messages about flagged samples since the caller last emptied the list, each once.
+    corrector : Corrector
+        Applies the calibration.
     stated_sigma : float
         1-sigma of the last sample's total field without what the plausibility checks added, nT.
     """
@@ -76,7 +78,7 @@ class Correction:
         for name in learner.watched if learner is not None else ():
             self.aligner.watch(name, MAX_AGE)
         self._wants_temperature = TEMPERATURE in self.aligner.by_name
-        self._corrector = Corrector(calibration)
+        self.corrector = Corrector(calibration)
         self._raised = Corrector(calibration.at_level()) if calibration.level else None
         # a field without a calibration is not expected to be the Earth's
         self._messages = Messages()
@@ -93,7 +95,7 @@ class Correction:
     @property
     def calibration(self) -> Calibration:
         """The calibration that is in use."""
-        return self._corrector.calibration
+        return self.corrector.calibration
 
     def as_declared(self, attrs: Mapping[str, Any]) -> None:
         """Align as the bridge did whose log declares its settings among its attributes.
@@ -138,12 +140,12 @@ class Correction:
         depth : float
             m; NaN where not known.
         """
-        if self.learner is not None and self.learner.calibration is not self._corrector.calibration:
+        if self.learner is not None and self.learner.calibration is not self.corrector.calibration:
             self._use(self.learner.calibration)
         if self._wants_temperature and isfinite(reading.temperature):  # not every reading need have one
             self.aligner.telemetry(TEMPERATURE, time_us, reading.temperature)
         sample = self.aligner.reading(reading, time_us, restarted=restarted, missing=missing)
-        (F, sigma, x, y, z, sx, sy, sz), quality = self._corrector.numbers(
+        (F, sigma, x, y, z, sx, sy, sz), quality = self.corrector.numbers(
             sample.time_us, sample.field, sample.values, sample.quality
         )
         parts = self.parts
@@ -222,7 +224,7 @@ class Correction:
             one, value = self.aligner.tracks[index].input, sample.values[index]
             half = 0.5 * MASS_FRACTION * (one.high - one.low)
             spans.append((index, value - half, value + half))
-        return list(self._corrector.changes(sample.field, sample.values, spans))
+        return list(self.corrector.changes(sample.field, sample.values, spans))
 
     def _hold(self, name: str, value: float) -> None:
         """Hold the last known value of a condition."""
@@ -235,7 +237,7 @@ class Correction:
         An effect that the fit could not see over half the range is as large as the sample's own `sigma`, nT,
         without the level of the reference. It grows in proportion to the distance.
         """
-        calibration = self._corrector.calibration
+        calibration = self.corrector.calibration
         own = max(sigma * sigma - calibration.reference.level_sigma**2, calibration.noise.sensor**2)
         variance = 0.0
         for condition, value in self._conditions.values():
@@ -264,7 +266,7 @@ class Correction:
         self.learner.sample(
             sample.time_us,
             sample.field,
-            self._corrector.regressors,
+            self.corrector.regressors,
             sample.values,
             quality,
             faulty=self.health is not None and self.health.is_fault,
@@ -281,7 +283,7 @@ class Correction:
         self.aligner.follow(calibration.channels)
         self._conditions = {}  # a learned calibration holds under the conditions that it was learned in
         values = [track.last for track in self.aligner.tracks]
-        by = self._corrector.replace(calibration, values)
+        by = self.corrector.replace(calibration, values)
         if not calibration.level:
             self._raised = None
         elif self._raised is not None:
@@ -307,7 +309,7 @@ class Correction:
     def _more(self, sample: Sample) -> float:
         """Return the variance to add: ``s^2 + sum ((F(hi) - F(lo)) / 2)^2``, s and spans the sample's."""
         more = sample.sigma * sample.sigma
-        for change in self._corrector.changes(sample.field, sample.values, sample.spans):
+        for change in self.corrector.changes(sample.field, sample.values, sample.spans):
             more += 0.25 * change * change
         if (
             not more < MAX_MEASURED_NT * MAX_MEASURED_NT

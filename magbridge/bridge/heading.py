@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 
 from magbridge.align import Sample
-from magbridge.calibration.correct import vector_covariance
+from magbridge.calibration.corrector import Corrector
 from magbridge.calibration.heading import heading_of_sample, model_declination_sigma
-from magbridge.calibration.model import Boresight, Calibration
+from magbridge.calibration.model import Calibration
 from magbridge.config import HeadingOutput
 from magbridge.link.attitude import HEADING_SENDERS, NO_ATTITUDE, Attitude, nmea_sentences
 from magbridge.link.component import Component
@@ -70,8 +70,8 @@ class LiveHeading:
         self._attitude_us = -(1 << 62)
         self._roll = self._pitch = 0.0
         self._rates = (0.0, 0.0, 0.0)
-        self._covariance: list[float] = []
-        self._turn: list[float] = []
+        self._covariance: tuple[float, ...] = ()
+        self._turn: tuple[float, ...] = ()
         self._covariance_us = 0
         self._calibration: Calibration | None = None
         self._main: tuple[Vector, float] | None = None
@@ -88,7 +88,7 @@ class LiveHeading:
         self._rates = message["rollspeed"], message["pitchspeed"], message["yawspeed"]
 
     def compute(
-        self, sample: Sample, corrected: Corrected, calibration: Calibration, main: Vector, crustal: float
+        self, sample: Sample, corrected: Corrected, corrector: Corrector, main: Vector, crustal: float
     ) -> Attitude:
         """Return the attitude at a sample, with its heading; unknown without a recent ATTITUDE.
 
@@ -96,14 +96,14 @@ class LiveHeading:
         ----------
         sample, corrected
             As aligned, and as corrected.
-        calibration : Calibration
-            With which it was corrected.
+        corrector : Corrector
+            Has just corrected the sample.
         main : tuple of 3 float
             nT, main field, north-east-down; NaN where unknown.
         crustal : float
             nT, 1-sigma of the crustal field that the main-field model lacks.
         """
-        boresight = calibration.boresight
+        boresight = corrector.calibration.boresight
         since_us = sample.time_us - self._attitude_us
         if boresight is None or abs(since_us) > MAX_ATTITUDE_AGE_US or not isfinite(corrected.total_field):
             return NO_ATTITUDE
@@ -111,7 +111,11 @@ class LiveHeading:
         if not abs(pitch) < MAX_PITCH_RAD:
             return NO_ATTITUDE
         self._decline(main, crustal)
-        self._update_covariance(sample, calibration, boresight)
+        is_old = abs(sample.time_us - self._covariance_us) >= COVARIANCE_INTERVAL_US
+        if is_old or corrector.calibration is not self._calibration:
+            self._covariance = corrector.vector_covariance()
+            self._turn = tuple(entry for row in boresight.covariance for entry in row)
+            self._covariance_us, self._calibration = sample.time_us, corrector.calibration
         x, y, z = corrected.field_sigma
         published = x * x + y * y + z * z
         magnetic, true, sigma = heading_of_sample(
@@ -145,19 +149,6 @@ class LiveHeading:
         self._declination = degrees(atan2(east, north))
         sigma = model_declination_sigma(np.array([hypot(north, east)]), crustal)
         self._declination_sigma = sigma.item()
-
-    def _update_covariance(self, sample: Sample, calibration: Calibration, boresight: Boresight) -> None:
-        """Compute the covariances of vector (nT^2) and boresight (rad^2) if the last ones are old."""
-        is_old = abs(sample.time_us - self._covariance_us) >= COVARIANCE_INTERVAL_US
-        if self._covariance and not is_old and calibration is self._calibration:
-            return
-        channels = np.array([sample.values[: len(calibration.channels)]], float).reshape(1, -1)
-        times = np.array([sample.time_us * 1e-6])
-        # effects begin in a fresh state here: their part of the covariance is that of the steady state
-        covariance = vector_covariance(calibration, np.array([sample.field]), channels, times)
-        self._covariance = covariance.ravel().tolist()
-        self._turn = np.array(boresight.covariance).ravel().tolist()
-        self._covariance_us, self._calibration = sample.time_us, calibration
 
     def send(self, attitude: Attitude, time_us: int, quality: int) -> None:
         """Send the heading of a sample if it is due and accurate; `time_us` is the sample's time."""

@@ -311,7 +311,7 @@ class Pipeline:
         assert isinstance(correction, Correction)
         main = self._position.direction(time_us, time_us + self.component.codec.utc_offset_us)
         crustal = correction.aligner.settings.reference_sigma
-        return self.heading.compute(sample, corrected, correction.calibration, main, crustal)
+        return self.heading.compute(sample, corrected, correction.corrector, main, crustal)
 
     def _receive_link(self, data: bytes, time_us: int) -> None:
         component = self.component

@@ -17,7 +17,7 @@ from magbridge.calibration.corrector import (
     omega,
     ranges,
 )
-from magbridge.calibration.kernel import Kernel, apply, prepare
+from magbridge.calibration.kernel import Kernel, apply, prepare, variances
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import LogSeries, Step
 from magbridge.errors import CalibrationError
@@ -116,10 +116,7 @@ def vector_covariance(
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             linear, V = _prepare_many(kernel, phi)
             d = field[part].T - np.stack(linear[9:12])
-            products = np.stack([d[i] * d[j] for i, j in PAIRS])
-            for (i, j), entry in zip(PAIRS, V, strict=True):
-                value = sum(q * e for q, e in zip(entry[:6], products, strict=True))
-                value = value + sum(q * x for q, x in zip(entry[6:9], d, strict=True)) + entry[9]
+            for (i, j), value in zip(PAIRS, variances(d[0], d[1], d[2], V), strict=True):
                 out[part, i, j] = out[part, j, i] = value
     return out
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from math import inf, isnan, nan, sqrt
 from typing import Final
 
-from magbridge.calibration.kernel import Linear, Numbers, Prepared, apply, linear, prepare
+from magbridge.calibration.kernel import Linear, Numbers, Prepared, apply, linear, prepare, variances
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.terms import Step
 from magbridge.errors import CalibrationError
@@ -61,6 +61,13 @@ class Corrector:
     def regressors(self) -> list[float]:
         """The regressors at the last sample: the monomials, then those of effects."""
         return self._last
+
+    def vector_covariance(self) -> tuple[float, ...]:
+        """Return the covariance of the last sample's vector without the boresight's part, 9 numbers, nT^2."""
+        numbers, V = self._prepared
+        (hx, hy, hz), (tx, ty, tz) = self._field, numbers[9:]
+        xx, yy, zz, xy, xz, yz = variances(hx - tx, hy - ty, hz - tz, V)
+        return xx, xy, xz, xy, yy, yz, xz, yz, zz
 
     def replace(self, calibration: Calibration, values: Sequence[float] = ()) -> float:
         """Continue with other coefficients of the same terms, or with effects added or removed at the end.

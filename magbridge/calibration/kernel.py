@@ -34,7 +34,7 @@ import numpy as np
 from magbridge.arrays import FloatArray, IndexArray
 from magbridge.estimation.residual import PAIRS
 
-__all__ = ["TABLE_SUMS", "Kernel", "Linear", "Numbers", "Prepared", "apply", "linear", "prepare"]
+__all__ = ["TABLE_SUMS", "Kernel", "Linear", "Numbers", "Prepared", "apply", "linear", "prepare", "variances"]
 
 TABLE_SUMS = 81
 """Sums that the table gives: A' and T (12), then the 69 combinations of their covariance."""
@@ -166,6 +166,15 @@ def prepare(t: list[Any]) -> Prepared:
     return t[:12], V
 
 
+def variances(dx: Any, dy: Any, dz: Any, V: list[list[Any]]) -> list[Any]:
+    """Return V's entries xx, yy, zz, xy, xz, yz, nT^2: ``Q_ij . (d d^T) + L_ij . d + O_ij``."""
+    exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
+    return [
+        q0 * exx + q1 * eyy + q2 * ezz + q3 * exy + q4 * exz + q5 * eyz + l0 * dx + l1 * dy + l2 * dz + o
+        for q0, q1, q2, q3, q4, q5, l0, l1, l2, o in V
+    ]
+
+
 def apply(
     hx: Any,
     hy: Any,
@@ -199,11 +208,7 @@ def apply(
     F = root(bx * bx + by * by + bz * bz)
     over = 1.0 / (F + 1e-300)  # a vector of length zero has no direction, but must not raise
     ux, uy, uz = bx * over, by * over, bz * over
-    exx, eyy, ezz, exy, exz, eyz = dx * dx, dy * dy, dz * dz, dx * dy, dx * dz, dy * dz
-    vxx, vyy, vzz, vxy, vxz, vyz = [
-        q0 * exx + q1 * eyy + q2 * ezz + q3 * exy + q4 * exz + q5 * eyz + l0 * dx + l1 * dy + l2 * dz + o
-        for q0, q1, q2, q3, q4, q5, l0, l1, l2, o in V
-    ]
+    vxx, vyy, vzz, vxy, vxz, vyz = variances(dx, dy, dz, V)
     variance = (
         ux * ux * vxx + uy * uy * vyy + uz * uz * vzz
         + 2.0 * (ux * uy * vxy + ux * uz * vxz + uy * uz * vyz)

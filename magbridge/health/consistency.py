@@ -134,7 +134,7 @@ class ConsistencyCheck:
         self._outliers = 0
         self._last_unit = np.zeros(3)
         self._temperature = 0.0
-        self._weights: list[tuple[int, float]] = []
+        self._variance = 0.0
         self.is_wrong = False
 
     def is_due(self, time_us: int, speed: float) -> bool:
@@ -235,24 +235,25 @@ class ConsistencyCheck:
             self.is_wrong = largest > CLEAR_LOG_RATIO
         else:
             self.is_wrong = matters and largest > CONSISTENCY_ALARM_LOG_RATIO
-        self._weights = []
+        self._variance = 0.0
         if not self.is_wrong:
             return
         rows = np.flatnonzero(statistic > largest - COMPETING_LOG_RATIO).tolist()
         shares = [exp(float(statistic[row]) - largest) for row in rows]
-        total = sum(shares)
-        self._weights = [(row, share / total) for row, share in zip(rows, shares, strict=True)]
+        self._variance = self._mixture_variance(rows, shares)
         kind = ERROR_KINDS[min(int(self._test.kind[best]), len(ERROR_KINDS) - 1)]
         text = f"field depends on the attitude or a mass, {size:.0f} nT: {kind} wrong"
         self._messages.report("consistency", text)
 
-    def variance(self) -> float:
-        """Return the variance (nT²) to add to that of samples like the last one that was tested."""
-        if not self.is_wrong:
-            return 0.0
-        variance = 0.0
-        for row, share in self._weights:
+    def _mixture_variance(self, rows: list[int], shares: list[float]) -> float:
+        """Return the variance (nT²) of the error of the tested sample, over the errors that fit."""
+        variance, total = 0.0, sum(shares)
+        for row, share in zip(rows, shares, strict=True):
             f = self._last_signatures[row]
             error = float(f @ self._test.amplitude[row])
-            variance += share * (error * error + float(f @ self._test.covariance(row) @ f))
+            variance += share / total * (error * error + float(f @ self._test.covariance(row) @ f))
         return variance
+
+    def variance(self) -> float:
+        """Return the variance (nT²) to add to that of samples like the last one that was tested."""
+        return self._variance

@@ -43,6 +43,7 @@ class Codec:
         self._mav = dialect.MAVLink(None, system, component)
         if signing is not None:
             self._mav.signing = signing
+        self._packers: dict[int, Any] = {}
         self.frames = self.bytes_skipped = 0
         self._rest = b""
         self._looked = 0
@@ -115,8 +116,10 @@ class Codec:
         """Return the frame of a packed payload (``layout.struct.pack(...)``): the cheapest way to send."""
         if self.signing is not None:
             self.signing.set_clock(self.utc_us)
-        packed = dialect.MAVLink_message(layout.id, layout.name)
-        frame: bytes = packed._pack(self._mav, layout.extra, payload)  # noqa: SLF001 - pymavlink's own packer
+        packer = self._packers.get(layout.id)
+        if packer is None:
+            packer = self._packers[layout.id] = dialect.MAVLink_message(layout.id, layout.name)
+        frame: bytes = packer._pack(self._mav, layout.extra, payload)  # noqa: SLF001 - pymavlink's own packer
         self._mav.seq = self._mav.seq + 1 & 0xFF
         return frame
 

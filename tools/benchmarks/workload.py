@@ -31,6 +31,8 @@ TELEMETRY = ("battpos",) * 8 + ("ballast",) * 8 + ("ATTITUDE",) * 3 + ("GLOBAL_P
 """Messages of one second, in addition to the autopilot's heartbeat."""
 HORIZONTAL, VERTICAL, NOISE = 19_000.0, 48_640.0, 0.5
 """nT: the Earth's field at 49.5 N, 57.8 W, and the noise of an axis."""
+IRON_NT = 0.02
+"""Scale of the coefficients, nT; the workload has no iron, so that larger ones would be a fault."""
 DECLINATION = -0.32
 """rad."""
 OPTIONS = {"sensitivity": 5e-5, "reference_voltage": 5.0}
@@ -49,7 +51,7 @@ def calibration() -> Calibration:
             Parameter("ballast", "cm3", 0.0, 400.0, 200.0, 200.0),
         ),
         terms=terms,
-        coefficients=random.normal(size=size) * 5.0,
+        coefficients=random.normal(size=size) * IRON_NT,
         covariance=root @ root.T / size,
         noise=Noise(1.0),
         reference=Reference(52_217.0),
