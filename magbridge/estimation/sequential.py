@@ -101,7 +101,7 @@ class SequentialTest:
         """Discard all evidence; the estimate of the excess noise stays."""
         rows = len(self.kind)
         self._M = np.zeros((rows, 3, 3))
-        self._energy = np.zeros((rows, 3, 3))
+        self._energy, self._mean = np.zeros((rows, 3, 3)), np.zeros((rows, 3))
         self._y = np.zeros((rows, 3))
         self._squares, self._samples = np.zeros(rows), np.zeros(rows)
         self.absorbed = np.zeros((self._states, rows, 3))
@@ -129,7 +129,7 @@ class SequentialTest:
             begins[shortest] |= unpromising[shortest]
         if begins.any():
             self._M[begins] = self._energy[begins] = 0.0
-            self._y[begins] = 0.0
+            self._y[begins] = self._mean[begins] = 0.0
             self._squares[begins] = self._samples[begins] = 0.0
             self.absorbed[:, begins] = 0.0
             self.onset[begins], self.count[begins] = time, 1
@@ -167,12 +167,15 @@ class SequentialTest:
             self._samples *= self._keep
         self._M += phi[:, :, None] * phi[:, None, :] / S
         self._energy += signatures[:, :, None] * signatures[:, None, :]
+        self._mean += (signatures - self._mean) / self.count[:, None]
         self._y += phi * (v / S)
         self._squares += v * v / S
         self._samples += 1.0
         self.amplitude, self.statistic = self._mixture(np.ones(len(phi)))
         if null is not None:
-            self.statistic = self.statistic - self._mixture(null * null)[1]
+            # what the model allows of one kind may look like a change of another kind
+            allowed = self._mixture(null * null)[1].reshape(-1, len(RESTART_PERIODS)).max(axis=0)
+            self.statistic = self.statistic - np.tile(allowed, len(phi) // len(RESTART_PERIODS))
         return float(self.statistic.max())
 
     def _mixture(self, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -201,3 +204,8 @@ class SequentialTest:
         """Return the root mean square of what a row's change adds to the residual."""
         a = self.amplitude[row]
         return float(np.sqrt(max(float(a @ self._energy[row] @ a) / float(self.count[row]), 0.0)))
+
+    def variation(self, row: int) -> float:
+        """Return the root mean square about its mean of what a row's change adds to the residual."""
+        constant = float(self._mean[row] @ self.amplitude[row])
+        return float(np.sqrt(max(self.rms(row) ** 2 - constant * constant, 0.0)))

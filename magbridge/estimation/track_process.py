@@ -10,17 +10,21 @@ Gauss-Markov process of Matern covariance with smoothness 3/2: its value b and s
 
 A fraction of the samples' noise is white, the rest is an AR(1) process. That is the third state, and the
 constant is the fourth.
+
+Where the course changes by :math:`\psi`, the slope along the track becomes
+:math:`b' \cos\psi + g \sin\psi`. The slope g across the track has the variance of b', and is independent of
+b and b' in an isotropic field. So the second column of F is multiplied by :math:`\cos\psi`.
 """
 
 from __future__ import annotations
 
-from math import exp, sqrt
+from math import atan2, cos, exp, hypot, isfinite, nan, sqrt
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
 
-__all__ = ["CORRELATION_LENGTH_M", "TRACK_STATES", "TrackProcess"]
+__all__ = ["CORRELATION_LENGTH_M", "TRACK_STATES", "Course", "TrackProcess"]
 
 TRACK_STATES = 4
 """Crustal field (nT) and its slope (nT/m), slow noise (nT), and the constant (nT)."""
@@ -28,6 +32,34 @@ CORRELATION_LENGTH_M = 1_000.0
 """Length over which the crustal field changes, where a survey does not tell it."""
 MIN_WHITE_NT = 0.05
 """1-sigma of the white noise that every sample has."""
+COURSE_LENGTH_M = 10.0
+"""Distance over which a course is measured."""
+
+
+class Course:
+    """The course of a track, measured from its displacements.
+
+    Attributes
+    ----------
+    angle : float
+        Course over the last completed :data:`COURSE_LENGTH_M`, rad; NaN before the first.
+    """
+
+    def __init__(self) -> None:
+        self.angle = nan
+        self._north = self._east = 0.0
+
+    def move(self, north: float, east: float) -> float:
+        """Add a displacement, m; return the change of the course that it completes (rad), else 0."""
+        if not isfinite(north + east):
+            return 0.0
+        self._north += north
+        self._east += east
+        if hypot(self._north, self._east) < COURSE_LENGTH_M:
+            return 0.0
+        before, self.angle = self.angle, atan2(self._east, self._north)
+        self._north = self._east = 0.0
+        return self.angle - before if isfinite(before) else 0.0
 
 
 class TrackProcess:
@@ -78,8 +110,11 @@ class TrackProcess:
         self.initial = np.diag([spread**2, (spread * self._lambda) ** 2, slow, constant**2])
         self.white_variance = max(sensor**2 - slow, MIN_WHITE_NT**2) + reference**2
 
-    def transition(self, metres: float, seconds: float) -> tuple[FloatArray, FloatArray]:
-        """Return transition F and process noise Q, both (4, 4), over a distance and a time."""
+    def transition(self, metres: float, seconds: float, turn: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Return transition F and process noise Q, both (4, 4), over a distance and a time.
+
+        The course has changed by `turn`, rad, before that distance.
+        """
         rate = self._lambda
         x = min(rate * metres, 300.0)
         rho, interval = self._decay
@@ -87,6 +122,7 @@ class TrackProcess:
         fall = exp(-x)
         F[0, 0], F[0, 1] = fall * (1.0 + x), fall * x / rate
         F[1, 0], F[1, 1] = -fall * rate * x, fall * (1.0 - x)
+        F[:, 1] *= cos(turn)
         F[2, 2] = rho ** min(seconds / interval, 1e4) if rho > 0.0 else 0.0
         F[3, 3] = 1.0
         Q = self.initial - F @ self.initial @ F.T

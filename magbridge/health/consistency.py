@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from math import exp, isfinite
+from math import exp, isfinite, nan
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -91,6 +91,8 @@ class TestedSample(NamedTuple):
     """Change of the total field where each mass moves by :data:`MASS_FRACTION` of its range, nT."""
     speed: float
     """Speed at which the crustal field is crossed, m/s."""
+    course: float
+    """Course of the vehicle, rad; NaN where it is not known."""
 
 
 class ConsistencyCheck:
@@ -121,6 +123,7 @@ class ConsistencyCheck:
         self._masses = masses
         self._test = SequentialTest(4 + masses, TRACK_STATES, RETENTION_SAMPLES, NOISE_DOF)
         self._log_roughness, self._straight_samples = 0.0, 0
+        self._course = nan
         self._scale = np.full(masses, np.nan)
         self.restart()
 
@@ -160,7 +163,7 @@ class ConsistencyCheck:
             self._test_sample(self._pending.popleft())
 
     def _test_sample(self, sample: TestedSample) -> None:
-        time_us, unit, total, sigma, temperature, mass_changes, speed = sample
+        time_us, unit, total, sigma, temperature, mass_changes, speed, course = sample
         seconds = 1e-6 * (time_us - self._time_us)
         if not 0.0 < seconds < MAX_GAP_S:
             if self._time_us == 0 or seconds < 0.0:
@@ -170,7 +173,9 @@ class ConsistencyCheck:
         self._time_us = time_us
         if isfinite(temperature):
             self._temperature = temperature
-        F, Q = self._process.transition(speed * exp(self._log_roughness / 3.0) * seconds, seconds)
+        turn, self._course = course - self._course, course
+        metres = speed * exp(self._log_roughness / 3.0) * seconds
+        F, Q = self._process.transition(metres, seconds, turn if isfinite(turn) else 0.0)
         self._filter.predict(F, Q)
         absorbed = self._test.absorbed
         absorbed[:] = np.tensordot(F, absorbed, axes=1)
@@ -228,7 +233,8 @@ class ConsistencyCheck:
         """Begin or end an alarm, and weigh the errors that fit."""
         statistic = self._test.statistic
         best = int(np.argmax(statistic))
-        size = self._test.rms(best)
+        # the part that does not vary is not distinguished from the reference's own error
+        size = self._test.variation(best)
         # an error that sigma covers is not an alarm, nor is one while the crust's roughness is not known
         matters = size > sigma and self._straight_samples >= MIN_STRAIGHT_SAMPLES
         if self.is_wrong:

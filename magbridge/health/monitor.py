@@ -7,6 +7,8 @@ from math import inf, sqrt
 from typing import Final
 
 from magbridge.calibration.model import Noise
+from magbridge.estimation.track_process import Course
+from magbridge.field.geodesy import separation
 from magbridge.health.axes import RepetitionCheck
 from magbridge.health.consistency import ConsistencyCheck, TestedSample
 from magbridge.health.level import LevelCheck
@@ -61,14 +63,17 @@ class HealthMonitor:
         self._scatter = Scatter(noise, messages)
         self._trend = TrendCheck(self._scatter, messages)
         self._consistency = ConsistencyCheck(noise, masses, messages)
-        self._has_position = False
+        self._position: tuple[float, float] | None = None
+        self._course = Course()
         self._unit: Vector = (0.0, 0.0, 0.0)
 
     def set_position(self, time_us: int, latitude: float, longitude: float) -> None:
         """Record the vehicle's position, deg; the speed separates noise from crustal field."""
-        if not self._has_position:
-            self._has_position = True
+        if self._position is None:
             self._trend.set_speed(SUPPOSED_SPEED)
+        elif (latitude, longitude) != self._position:
+            self._course.move(*separation(*self._position, latitude, longitude))
+        self._position = latitude, longitude
         if self._scatter.set_position(time_us, latitude, longitude):
             self._trend.set_speed(self._scatter.speed)
 
@@ -145,7 +150,17 @@ class HealthMonitor:
         speed = trend.crossing_speed
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, speed):
             anomaly = total - reference if reference == reference else total  # noqa: PLR0124 - NaN
-            new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, tuple(mass_changes()), speed)
+            changes, course = tuple(mass_changes()), self._course.angle
+            new = TestedSample(
+                time_us,
+                unit,
+                anomaly,
+                own_sigma,
+                temperature,
+                tuple(mass_changes()),
+                speed,
+                self._course.angle,
+            )
             consistency.add(new)
         consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))
         return variance + self._scatter.excess() + consistency.variance()

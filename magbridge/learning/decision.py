@@ -17,7 +17,7 @@ from magbridge.learning.estimator import Estimator, Nuisance
 from magbridge.learning.judge import BEYOND_CHANCE, CANDIDATE, FIRST, PUBLISHED, Judge
 from magbridge.learning.knowledge import Knowledge
 from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import LearningSample, Observation
+from magbridge.learning.samples import LearningSample, Observation, Way
 
 __all__ = ["NO_METHOD", "Decision", "Publication"]
 
@@ -212,15 +212,13 @@ class Decision:
         self._publication.judge.restart()
         self.settle(knowledge, "gone")
 
-    def take(
-        self, knowledge: Knowledge, sample: LearningSample, way: tuple[float, float], *, frozen: bool
-    ) -> bool:
+    def take(self, knowledge: Knowledge, sample: LearningSample, way: Way, *, frozen: bool) -> bool:
         """Predict a sample, compare the calibrations, learn from it, and decide what to publish.
 
-        `way` is the distance (m) and time (s) since the previous sample. Return True if learning has to
+        `way` leads from the previous sample to this one. Return True if learning has to
         restart from the first calibration.
         """
-        now, signs = knowledge.predict(sample, *way)
+        now, signs = knowledge.predict(sample, way)
         best = knowledge.bank.best
         if knowledge.outlying(learnable=self._standing.learnable):
             self._standing.count(best.residual, best.variance, telling=False)
@@ -238,7 +236,7 @@ class Decision:
             return False  # neither published nor judged
         return self._decide(knowledge, difference * now.s, frozen=frozen)
 
-    def _judge(self, knowledge: Knowledge, sample: LearningSample, way: tuple[float, float]) -> Observation:
+    def _judge(self, knowledge: Knowledge, sample: LearningSample, way: Way) -> Observation:
         """Predict a sample by every calibration; return the published one's observation."""
         publication, judge = self._publication, self._publication.judge
 
@@ -246,7 +244,7 @@ class Decision:
             return knowledge.observe(sample.field, nine, sample.reference)
 
         direction = observe(publication.nine(sample.phi)[FIRST]).direction
-        if judge.is_due(*way, direction) and knowledge.start is None:
+        if judge.is_due(way.metres, way.seconds, direction) and knowledge.start is None:
             publication.propose(knowledge.bank.best.coefficients)
         seen = [observe(nine) for nine in publication.nine(sample.phi)]
         for which, nine in publication.replaced(sample.phi).items():
@@ -266,9 +264,9 @@ class Decision:
         if bank.map_doubted != doubted:
             publication.judge.restart(knowledge.believed)
 
-    def _begin(self, knowledge: Knowledge, sample: LearningSample, way: tuple[float, float]) -> None:
+    def _begin(self, knowledge: Knowledge, sample: LearningSample, way: Way) -> None:
         """Learn from a sample while the batch fit runs, before a filter can be linearised."""
-        if not knowledge.begin(sample, *way):
+        if not knowledge.begin(sample, way):
             self._count(learned=True)
             return
         self._publication.propose(knowledge.bank.quiet.coefficients)

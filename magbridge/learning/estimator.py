@@ -23,6 +23,7 @@ from magbridge.estimation.kalman import KalmanFilter
 from magbridge.estimation.track_process import CORRELATION_LENGTH_M as LENGTH
 from magbridge.estimation.track_process import TRACK_STATES as STATES
 from magbridge.estimation.track_process import TrackProcess
+from magbridge.learning.samples import Way
 
 __all__ = ["EXTRA_STATES", "LENGTH", "SLOPE_STATES", "STATES", "Estimator", "Nuisance"]
 
@@ -196,10 +197,11 @@ class Estimator:
         if self._sloping:
             state[self.offsets] += seconds * state[self.slope]
 
-    def propagate(self, metres: float, seconds: float) -> FloatArray:
-        """Propagate over a distance (m) and a time (s); return the transition (4, 4) of the nuisance."""
+    def propagate(self, way: Way) -> FloatArray:
+        """Propagate over the way to the next sample; return the transition (4, 4) of the nuisance."""
+        metres, seconds, _ = way
         P = self.filter.covariance
-        F, Q = self._nuisance.transition(metres, seconds)
+        F, Q = self._nuisance.transition(*way)
         self.advance(self.filter.mean, F, seconds)
         self.advance(P, F, seconds)
         self.advance(P.T, F, seconds)

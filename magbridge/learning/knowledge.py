@@ -15,7 +15,7 @@ from magbridge.learning.bank import EstimatorBank
 from magbridge.learning.estimator import Estimator, Nuisance
 from magbridge.learning.judge import Coverage
 from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import LearningSample, Observation, observe
+from magbridge.learning.samples import LearningSample, Observation, Way, observe
 from magbridge.learning.start import BatchFit
 from magbridge.records import Vector
 
@@ -113,8 +113,8 @@ class Knowledge:
         now = self._observation_with(quiet)(sample.field, sample.phi, sample.reference)
         self.keep(sample, now.e - quiet.expected)
 
-    def predict(self, sample: LearningSample, metres: float, seconds: float) -> tuple[Observation, Signs]:
-        """Predict a sample with every estimator, `metres` and `seconds` after the previous one.
+    def predict(self, sample: LearningSample, way: Way) -> tuple[Observation, Signs]:
+        """Predict a sample with every estimator, on the way from the previous one.
 
         Returns
         -------
@@ -126,8 +126,9 @@ class Knowledge:
         before, self._before = self._before, sample.phi
         quiet = self.bank.quiet
         for other in self.bank.all[1:]:
-            other.propagate(metres, seconds)
-        self.detector.propagate(quiet, quiet.propagate(metres, seconds), seconds)
+            other.propagate(way)
+        seconds = way.seconds
+        self.detector.propagate(quiet, quiet.propagate(way), seconds)
         live = {id(one): self._predict(one, sample) for one in self.bank.all}
         best = live[id(self.bank.best)]
         self.coverage.add(best.s * self._model.derivative(sample.phi, best.by_nine), best.direction)
@@ -166,11 +167,11 @@ class Knowledge:
         self.detector.updated(quiet.update(learn=learn))
         return alarm, learn
 
-    def begin(self, sample: LearningSample, metres: float, seconds: float) -> bool:
+    def begin(self, sample: LearningSample, way: Way) -> bool:
         """Add a sample to the batch fit; return True if the fit of all samples was repeated."""
         assert self.start is not None
         quiet = self.bank.quiet
-        if not self.start.add(sample.field, sample.phi, sample.reference, metres, seconds):
+        if not self.start.add(sample.field, sample.phi, sample.reference, way):
             quiet.update(learn=True)
             return False
         fitted = self.start.fit(quiet.coefficients, self.nuisance)

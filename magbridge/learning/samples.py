@@ -8,16 +8,17 @@ telemetry has come.
 from __future__ import annotations
 
 from collections import deque
-from math import sqrt
+from math import hypot, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from magbridge.arrays import FloatArray
+from magbridge.estimation.track_process import Course
 from magbridge.field.geodesy import separation
 from magbridge.records import Vector
 
-__all__ = ["Intake", "LearningSample", "Observation", "observe"]
+__all__ = ["Intake", "LearningSample", "Observation", "Way", "observe"]
 
 
 class Observation(NamedTuple):
@@ -107,6 +108,15 @@ class LearningSample(NamedTuple):
     faulty: bool
 
 
+class Way(NamedTuple):
+    """The way from one sample to the next."""
+
+    metres: float
+    seconds: float
+    turn: float
+    """Change of the course, rad."""
+
+
 class Intake:
     """Holds the samples that wait.
 
@@ -122,6 +132,7 @@ class Intake:
         self._last_us = self._looked_us = self._taken_us = self._reported_us = 0
         self._where: tuple[float, float] | None = None
         self._newest = False
+        self._course = Course()
 
     def due(self, time_us: int, *, fit: bool) -> bool:
         """Return whether it is time for another sample, `fit` to learn from or not."""
@@ -160,9 +171,10 @@ class Intake:
         self._reported_us = self._last_us
         return True
 
-    def moved(self, sample: LearningSample) -> tuple[float, float]:
-        """Return m and s since the last sample that was taken, which this one is now."""
+    def moved(self, sample: LearningSample) -> Way:
+        """Return the way from the last sample that was taken, which this one is now."""
         before, last_us = self._where or sample.where, self._last_us or sample.time_us
         self._where, self._last_us = sample.where, sample.time_us
         north, east = separation(*before, *sample.where)
-        return (north * north + east * east) ** 0.5, max(sample.time_us - last_us, 0) * 1e-6
+        seconds = max(sample.time_us - last_us, 0) * 1e-6
+        return Way(hypot(north, east), seconds, self._course.move(north, east))

@@ -20,7 +20,7 @@ from magbridge.calibration.terms import Polynomial, full_order
 from magbridge.estimation.priors import polynomial_prior
 from magbridge.learning.estimator import STATES, Nuisance
 from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import Observation, observe
+from magbridge.learning.samples import Observation, Way, observe
 from magbridge.records import Vector
 
 __all__ = ["LAST_FIT_SAMPLES", "BatchFit", "BatchResult", "class_prior"]
@@ -102,12 +102,12 @@ class BatchFit:
         values, vectors = np.linalg.eigh(covariance)
         seen = values > values[-1] * 1e-14
         self._root = vectors[:, seen] * np.sqrt(values[seen])
-        self._samples: list[tuple[Vector, FloatArray, float, float, float]] = []
+        self._samples: list[tuple[Vector, FloatArray, float, Way]] = []
         self._next = FIRST
 
-    def add(self, field: Vector, phi: FloatArray, reference: float, metres: float, seconds: float) -> bool:
-        """Keep a sample, its regressors (m,), reference, way and time since the last; say whether to fit."""
-        self._samples.append((field, phi, reference, metres, seconds))
+    def add(self, field: Vector, phi: FloatArray, reference: float, way: Way) -> bool:
+        """Keep a sample, its regressors (m,), reference and way from the last; return whether to fit."""
+        self._samples.append((field, phi, reference, way))
         if len(self._samples) < self._next:
             return False
         self._next *= 2
@@ -150,8 +150,8 @@ class BatchFit:
         n, K = len(self._samples), len(c)
         out = np.empty((n, K + 1))
         states, P = np.zeros((STATES, K + 1)), nuisance.initial.copy()
-        for k, (field, phi, reference, metres, seconds) in enumerate(self._samples):
-            F, Q = nuisance.transition(metres, seconds)
+        for k, (field, phi, reference, way) in enumerate(self._samples):
+            F, Q = nuisance.transition(*way)
             one: Observation = observe(field, phi @ weights, self._field, reference)
             row = np.concatenate([[one.e], self._model.derivative(phi, one.by_nine)])
             h = nuisance.row(one.s)

@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 
 from magbridge.estimation.kalman import KalmanFilter
 from magbridge.estimation.sequential import SequentialTest
-from magbridge.estimation.track_process import TrackProcess
+from magbridge.estimation.track_process import Course, TrackProcess
 
 
 def test_filter_agrees_with_batch_least_squares() -> None:
@@ -101,3 +101,35 @@ def test_track_process_is_matern() -> None:
     x = 3.0**0.5 * 500.0 / 800.0
     np.testing.assert_allclose((F @ process.initial)[0, 0], 60.0**2 * (1.0 + x) * np.exp(-x))
     np.testing.assert_allclose(F @ process.initial @ F.T + Q, process.initial, atol=1e-9)
+
+
+def test_turn_of_the_track_leaves_the_crustal_field_and_forgets_its_slope() -> None:
+    """A right angle makes the slope unknown; a turn back inverts it."""
+    process = TrackProcess(1.0, 60.0)
+    F, Q = process.transition(1e-3, 1e-3, np.pi / 2.0)
+    np.testing.assert_allclose(F[:2, :2], [[1.0, 0.0], [0.0, 0.0]], atol=1e-5)
+    np.testing.assert_allclose(Q[1, 1], process.initial[1, 1], rtol=1e-4)
+    F, Q = process.transition(1e-3, 1e-3, np.pi)
+    np.testing.assert_allclose(F[1, 1], -1.0, rtol=1e-4)
+    np.testing.assert_allclose(Q[1, 1], 0.0, atol=1e-6)
+
+
+def test_course_changes_once_it_is_measured() -> None:
+    course = Course()
+    assert np.isnan(course.angle)
+    turns = [course.move(3.0, 0.0) for _ in range(8)] + [course.move(0.0, 6.0) for _ in range(4)]
+    np.testing.assert_allclose(sum(turns), np.pi / 2.0)
+    np.testing.assert_allclose(course.angle, np.pi / 2.0)
+    assert course.move(np.nan, 0.0) == 0.0
+
+
+def test_constant_part_of_a_change_does_not_vary() -> None:
+    """A change that alternates by 2 about 5."""
+    kalman, test = KalmanFilter(np.zeros(1), np.zeros((1, 1))), SequentialTest(1, 1)
+    for k in range(200):
+        kalman.innovate(5.0 + 2.0 * (-1.0) ** k, np.zeros(1), 0.01)
+        test.begin(float(k), 0.0)
+        test.test(kalman, np.tile([5.0 + 2.0 * (-1.0) ** k, 0.0, 0.0], (6, 1)))
+        test.update(kalman.update())
+    assert 5.0 < test.rms(5) < 5.8
+    assert 1.9 < test.variation(5) < 2.1

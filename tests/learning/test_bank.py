@@ -12,7 +12,7 @@ from magbridge.calibration.model import Calibration
 from magbridge.learning.bank import EstimatorBank
 from magbridge.learning.estimator import MEAN_SAMPLES, Estimator, Nuisance
 from magbridge.learning.model import LearnedTerms
-from magbridge.learning.samples import observe
+from magbridge.learning.samples import Way, observe
 
 PER_DEGREE = np.array([4.0, -3.0, 5.0])
 
@@ -40,7 +40,7 @@ def flown(temperature: np.ndarray, per_degree: np.ndarray) -> tuple[EstimatorBan
         corrector.numbers(0, (x, y, z), (mass,), 0)
         phi = model.regressors(corrector.regressors, (degrees,))
         for one in bank.all:
-            one.propagate(1.4, 4.0)
+            one.propagate(Way(1.4, 4.0, 0.0))
             seen = observe((x, y, z), phi @ model.weights(one.coefficients), FIELD, FIELD)
             one.predict(seen.e, seen.s, model.derivative(phi, seen.by_nine))
             one.follow(seen.s)
@@ -104,7 +104,7 @@ def test_no_drift_gets_less_certain_than_the_steepest() -> None:
     """A month straight and level tells nothing, and overflows nothing."""
     drifting = bank_of(calibration())[0].all[-1]
     for _ in range(30 * 24):
-        drifting.propagate(5000.0, 3600.0)
+        drifting.propagate(Way(5000.0, 3600.0, 0.0))
     assert 19.0 < np.sqrt(drifting.filter.covariance[drifting.slope, drifting.slope]).max() * 3600.0 < 30.0
 
 
