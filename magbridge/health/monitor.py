@@ -151,16 +151,7 @@ class HealthMonitor:
         if steady and not self.flags and trend.is_established and consistency.is_due(time_us, speed):
             anomaly = total - reference if reference == reference else total  # noqa: PLR0124 - NaN
             changes, course = tuple(mass_changes()), self._course.angle
-            new = TestedSample(
-                time_us,
-                unit,
-                anomaly,
-                own_sigma,
-                temperature,
-                tuple(mass_changes()),
-                speed,
-                self._course.angle,
-            )
+            new = TestedSample(time_us, unit, anomaly, own_sigma, temperature, changes, speed, course)
             consistency.add(new)
         consistency.confirm(time_us - round(1e6 * min(age, MAX_AGE_S)))
         return variance + self._scatter.excess() + consistency.variance()
