@@ -36,8 +36,6 @@ from magbridge.diagnose.evidence import (
 from magbridge.diagnose.joint import Joint, Statistic
 from magbridge.diagnose.state import SearchState, refined
 
-__all__ = ["CompetingHypothesis", "exchanged", "pairs_of", "sets_of"]
-
 AT_ONCE = 4
 """Regressors of a model, beyond which no two are replaced at once: each two take a table of all pairs."""
 PAIR_COLUMNS = 128

@@ -40,11 +40,6 @@ from magbridge.diagnose.texts import (
 )
 from magbridge.estimation.residual import residuals, residuals_of, rms
 
-__all__ = [
-    "IMPLAUSIBLE_MULTIPLE", "Assessment", "DiagnosisResult", "Fitness", "assess", "delays", "level",
-    "not_separated", "separation", "telemetry_delay", "times_usual", "useful",
-]  # fmt: skip
-
 CANCEL = 0.7
 """Two causes cancel each other where their sum is less than this share of the larger one."""
 IMPLAUSIBLE_MULTIPLE = 5.0

@@ -14,12 +14,6 @@ from magbridge.arrays import BoolArray, FloatArray
 from magbridge.calibration.terms import Effect
 from magbridge.diagnose.problem import Problem
 
-__all__ = [
-    "AXIS_NAMES", "Candidate", "Columns", "GridPoint", "Group", "Interpolated", "Mixture", "absent_before",
-    "effect_columns", "join_columns", "of_effect", "of_reference", "parts", "per", "places", "size_of",
-    "slices", "times",
-]  # fmt: skip
-
 Columns = Callable[[slice], FloatArray]
 """A function from a slice of m rows to (m, k): what one unit of each of k coefficients, if the calibration
 lacks it, adds to the residual. Best stored column by column."""
@@ -149,9 +143,11 @@ def effect_columns(
     Its regressors are `phi` less `origin`; `phi` is (r, n), or a function from m rows to (r, m); by default
     they are those of the effect's own array form.
     """
-    if phi is None:
-        whole = effect.batch(problem.series(effect)) if effect.remembers else None
-        phi = whole if whole is not None else lambda rows: effect.batch(problem.series(effect, rows))
+    if phi is None and effect.remembers:
+        # Single precision: a search tries dozens of histories, of 5 MB for a month each in double
+        phi = effect.batch(problem.series(effect)).astype(np.float32)
+    elif phi is None:
+        phi = lambda rows: effect.batch(problem.series(effect, rows))  # noqa: E731
     tensor = -effect.columns(problem.calibration.reference.field)
     pairs = [(int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0))]
     M = np.stack([tensor[:, r, s] for r, s in pairs])

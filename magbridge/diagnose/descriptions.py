@@ -31,12 +31,7 @@ from magbridge.diagnose.causes.timing import field_rates, mass_rates
 from magbridge.diagnose.columns import Candidate, Columns, effect_columns, size_of
 from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.packets import packets, passage
-from magbridge.diagnose.problem import Problem, pieces, rates
-
-__all__ = [
-    "Description", "bends", "crossing", "delayed", "descriptions", "lower_end", "near_surface", "repeated",
-    "response", "swings",
-]  # fmt: skip
+from magbridge.diagnose.problem import Problem, rates, row_blocks
 
 BEND = 32
 """Order of the polynomials of an axis' response: fine enough for a converter's coarsest steps."""
@@ -129,13 +124,13 @@ def hysteresis(values: FloatArray) -> Columns:
     """Functions of a channel's past (n,): curved branches of hysteresis, narrow and wide; its direction."""
     scaled = _scaled(values)
     y = scaled(slice(None))
-    plays = [play(y, width) for width in PLAYS]
+    plays = [play(y, width).astype(np.float32) for width in PLAYS]
     change = np.diff(y, prepend=y[0])
     way = np.where(np.abs(change) > 1e-3, np.sign(change), 0.0).astype(np.int8)
 
     def columns(rows: slice) -> FloatArray:
         v, w = scaled(rows), way[rows]
-        branches = [np.stack(powers(x[rows], 3)) - np.stack(powers(v, 3)) for x in plays]
+        branches = [np.stack(powers(x[rows].astype(float), 3)) - np.stack(powers(v, 3)) for x in plays]
         return np.concatenate([*branches, [w, w * v]]).T
 
     return _centred(columns, len(values))
@@ -191,7 +186,7 @@ def _followed(time: FloatArray, values: FloatArray, lags: Sequence[float]) -> Co
 
 
 def _centred(columns: Columns, n: int) -> Columns:
-    mean = sum(columns(rows).sum(axis=0) for rows in pieces(n)) / n
+    mean = sum(columns(rows).sum(axis=0) for rows in row_blocks(n)) / n
     return lambda rows: columns(rows) - mean
 
 

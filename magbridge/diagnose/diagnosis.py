@@ -21,8 +21,6 @@ from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.search import Outliers, SearchOutcome
 from magbridge.estimation.residual import rms
 
-__all__ = ["MIN_RMS_REDUCTION", "Diagnosis", "Finding", "counted", "small", "verdict_of"]
-
 MIN_RMS_REDUCTION = 0.01
 """Least fraction of the refitted calibration's RMS that the findings have to remove."""
 

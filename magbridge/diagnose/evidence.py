@@ -57,14 +57,6 @@ from magbridge.diagnose.joint import ALL_PRODUCTS, FLAT_PRECISION, Joint, Statis
 from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import DERIVATIVE_ROWS, Problem, side_by_side
 
-__all__ = [
-    "CONFOUNDED", "FALSE_ALARM_RATE", "IDEAL", "MOST_REMAINING", "ODDS", "REMNANT", "SMOOTH", "Best",
-    "Hypothesis", "Information", "Isolability", "Visible", "bayes_factor_threshold", "certainty",
-    "evidence_of", "information", "isolability", "likeness", "log_bayes", "log_odds",
-    "look_elsewhere_factors", "most_visible", "one_sided", "regressor_error", "score", "shaped_ratio",
-    "wald_ratio",
-]  # fmt: skip
-
 FALSE_ALARM_RATE = 0.01
 """Family-wise false-alarm rate."""
 ODDS = float(np.log(20.0))

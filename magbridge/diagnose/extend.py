@@ -36,15 +36,10 @@ from magbridge.calibration.terms import Effect
 from magbridge.diagnose.columns import Candidate, Columns, slices
 from magbridge.diagnose.evidence import IDEAL, Information, information, score
 from magbridge.diagnose.joint import Joint, JointDesign, fit_joint, normal
-from magbridge.diagnose.problem import Problem, derivatives, isotropic, linearised, samples_of
+from magbridge.diagnose.problem import Problem, derivatives, isotropic, linearised, row_blocks, samples_of
 from magbridge.diagnose.survey import Survey
 from magbridge.estimation.residual import residuals_of, robust_scale
 from magbridge.version import __version__
-
-__all__ = [
-    "MODES", "extend", "flyable", "loosened", "relinearised", "with_map_error", "with_misfit",
-    "without_effects_at",
-]  # fmt: skip
 
 Placed = tuple[Candidate, slice]
 """A candidate, and where its columns are."""
@@ -382,7 +377,8 @@ def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> 
     rebuilt = replace(problem, residual=e, jacobian=g, reference_jacobian=reference_jacobian)
     # The residual at the calibration as given, extrapolated linearly from this point. Errors of the
     # reference, slow noise and the axes' delays are in both, because `extended` corrects none of them
-    rebuilt.residual[:] += rebuilt.coefficient_jacobian @ fit.z[problem.known]
+    for rows in row_blocks(len(rebuilt)):
+        rebuilt.residual[rows] += rebuilt.coefficient_jacobian[rows] @ fit.z[problem.known]
     for piece, place in zip(pieces, slices(pieces), strict=True):
         if not piece.effects:
             columns.append(piece.columns)

@@ -48,8 +48,6 @@ from magbridge.rows import correct_rows
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Extension", "check_written", "corrected", "error_without", "extension_of"]
-
 TIGHTENING = (1.0, 0.3, 0.1)
 """Factors on the prior sigma of the calibration's coefficients that are tried until an extension passes."""
 MAX_DEPARTURE_SIGMA = 4.0

@@ -47,14 +47,8 @@ import numpy as np
 from magbridge.arrays import BoolArray, FloatArray, IndexArray, IntArray
 from magbridge.diagnose.columns import Columns, places, size_of, times
 from magbridge.diagnose.noise import ResidualNoise, fit_noise
-from magbridge.diagnose.problem import DELAYS, Problem, pieces, side_by_side
+from magbridge.diagnose.problem import DELAYS, Problem, row_blocks, side_by_side
 from magbridge.estimation.residual import robust_scale
-
-__all__ = [
-    "ALL_PRODUCTS", "CONFIDENCE_LEVEL", "FLAT_PRECISION", "LONG", "PRIOR_SIZES", "RIDGE", "HeldOut",
-    "Improvement", "Joint", "JointDesign", "Ridge", "Statistic", "fit_joint", "held_out", "in_threads",
-    "normal", "paired", "precomputed", "volume_of",
-]  # fmt: skip
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -91,7 +85,7 @@ def precomputed(n: int, columns: Sequence[Columns]) -> list[Columns]:
         return list(columns)
 
     def stored(column: Columns) -> FloatArray:
-        return np.concatenate([column(rows).T for rows in pieces(n)], axis=1).T
+        return np.concatenate([column(rows).T for rows in row_blocks(n)], axis=1).T
 
     return [made.__getitem__ for made in in_threads(n, stored, columns)]
 
@@ -107,7 +101,7 @@ class JointDesign:
     """
 
     def __init__(self, problem: Problem, columns: Sequence[Columns]) -> None:
-        self.problem, self.columns, self.pieces = problem, columns, pieces(len(problem))
+        self.problem, self.columns, self.pieces = problem, columns, row_blocks(len(problem))
         sizes, self.q = [size_of(column) for column in columns], len(problem.centre)
         self.at, self.effects = places(sizes, self.q), sum(sizes)
 
@@ -153,7 +147,7 @@ def normal(
             b += A.T @ y[rows]
         return P, b
 
-    every = pieces(len(y))[::stride]
+    every = row_blocks(len(y))[::stride]
     each = -(-len(every) // THREADS) if len(y) > LONG else len(every)
     shares = in_threads(len(y), share, [every[n : n + each] for n in range(0, len(every), each)])
     P = np.asarray(sum(P for P, _ in shares))

@@ -25,11 +25,9 @@ from magbridge.diagnose.evidence import FALSE_ALARM_RATE, REMNANT, Hypothesis, i
 from magbridge.diagnose.joint import Joint, JointDesign, Ridge, Statistic, in_threads, precomputed
 from magbridge.diagnose.noise import ResidualNoise, fit_noise
 from magbridge.diagnose.observed import Memory, memory
-from magbridge.diagnose.problem import Problem, pieces
+from magbridge.diagnose.problem import Problem, row_blocks
 from magbridge.diagnose.search import Outliers
 from magbridge.estimation.residual import rms, robust_scale
-
-__all__ = ["Leftover", "far_from_white", "leftover", "switching", "unlisted", "varying"]
 
 MAX_TESTED_COEFFICIENTS = 6
 """Coefficients of a cause of which this is asked: with more, it takes almost any shape."""
@@ -72,7 +70,7 @@ def varying(
     half = np.array([[max(0.5 * float(np.ptp(value)), 1e-12)] for value in values])
     regressor, n = candidate.columns, len(problem)
     # an RMS of one: its coefficients are in nT, as those of other descriptions are
-    power = sum(float(np.sum(regressor(rows) ** 2)) for rows in pieces(n)) / (n * candidate.size)
+    power = sum(float(np.sum(regressor(rows) ** 2)) for rows in row_blocks(n)) / (n * candidate.size)
 
     def columns(rows: slice) -> FloatArray:
         part = regressor(rows).T / np.sqrt(max(power, 1e-300))

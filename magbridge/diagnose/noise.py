@@ -37,8 +37,6 @@ from magbridge.diagnose.problem import DERIVATIVE_ROWS
 from magbridge.diagnose.survey import MAX_LAG, Past
 from magbridge.estimation.residual import robust_scale
 
-__all__ = ["BRIEFEST", "MAX_NOISE_ORDER", "TAILS", "ResidualNoise", "autoregressive_order", "fit_noise"]
-
 BAND = 32
 """Rows that are filtered by one product of matrices."""
 SOLVED = 4096

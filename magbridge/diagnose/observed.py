@@ -35,8 +35,6 @@ from magbridge.diagnose.problem import Problem
 from magbridge.diagnose.survey import Survey
 from magbridge.estimation.residual import rms
 
-__all__ = ["WHITE", "Memory", "Returns", "Seen", "memory", "returns", "seen"]
-
 CORRELATION_LAGS_S = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 60.0, 120.0, 300.0, 700.0, 1700.0, 4000.0, 10000.0)
 """Lags that are tried, s."""
 MIN_EXPLAINED_FRACTION = 0.1

@@ -36,8 +36,6 @@ from magbridge.diagnose.joint import Joint, in_threads
 from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["Packets", "packets", "passage"]
-
 CYCLES = 0.75, 7.0
 """Least and most cycles f L."""
 SHORTEST, LONGEST = 4, 1.0 / 6.0

@@ -37,8 +37,6 @@ from magbridge.diagnose.joint import RIDGE, Joint, fit_joint, in_threads, precom
 from magbridge.diagnose.noise import ResidualNoise
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["SearchState", "refined", "sharpen"]
-
 MAX_SCREENED_SAMPLES = 65_536
 """Samples of a long log, in pieces spread evenly over it, by which a round chooses what it fits to all."""
 JOINTLY_FITTED_CAUSES = 9

@@ -31,10 +31,6 @@ from magbridge.wording import counted
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "ANY", "MAX_LAG", "Past", "Survey", "TelemetryChannel", "assemble", "days_of", "kinds_of", "load_survey",
-]  # fmt: skip
-
 ANY = ("temperature", "current", "pressure", "position")
 DRIVE = ("current", "position")
 """Quantities of a drive: its current flows when it turns, and the part that it turns may carry iron."""

@@ -15,11 +15,6 @@ from typing import Any, NamedTuple
 
 from magbridge.diagnose.columns import Candidate
 
-__all__ = [
-    "CONDITION_CODES", "MAX_UNFOLDED_NUMBERS", "Diagnostic", "chance", "label", "measured", "names_of",
-    "number", "series_of", "sizes", "write_text",
-]  # fmt: skip
-
 SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 MAX_UNFOLDED_NUMBERS = 12
 """Numbers that a table shows unfolded."""

@@ -14,8 +14,6 @@ from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["MAX_BEND_NT", "InterferenceTone", "Nonlinearity", "OffsetDrift", "OffsetStep", "Saturation"]
-
 ONSETS = 40
 """Moments tried for a step, evenly over the samples. Four times as many gain only 0.6 in log odds."""
 TONES = 5

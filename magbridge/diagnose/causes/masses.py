@@ -12,8 +12,6 @@ from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect, per
 from magbridge.diagnose.problem import FALL, Problem
 
-__all__ = ["ActuatorOrder", "Hysteresis", "UnmodelledActuator"]
-
 SOURCE_DISTANCES = (0.25, 0.5)
 """Distances of sources from a mass' path that are tried, in half travels; nearer iron would be struck."""
 SOURCE_SPACING = 1.25

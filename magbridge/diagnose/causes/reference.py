@@ -14,8 +14,6 @@ from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import Candidate, Interpolated, of_reference
 from magbridge.diagnose.problem import Problem
 
-__all__ = ["DiurnalVariation", "MapError", "ReferenceBias"]
-
 MAX_MAP_ERROR_CELLS = 300
 """Most cells at which a map's error is described."""
 FINEST = 125.0

@@ -15,8 +15,6 @@ from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.problem import Problem, cached_per_problem
 
-__all__ = ["CurrentField", "PressureOffset", "TemperatureOffset", "TemperatureScale"]
-
 TELEMETRY_LAGS_S = (0.0, 700.0, 1700.0, 4000.0, 10000.0)
 """s, spaced so closely that any lag between two of them is matched to within a fifth (RMS)."""
 STAGES = 2
@@ -28,13 +26,13 @@ MAX_JOINT_CURRENTS = 12
 
 @cached_per_problem
 def _levels(problem: Problem) -> Callable[[str, float], Callable[[slice], FloatArray]]:
-    """Return the lagged temperatures, cached: origins and causes share them, each of 5 MB for a month."""
+    """Return the lagged temperatures, cached: origins and causes share them, each of 3 MB for a month."""
     survey = problem.survey  # a cache that referred to the problem would keep it alive
 
     @lru_cache(len(TELEMETRY_LAGS_S) * len(problem.channels_of("temperature")))
     def level(name: str, lag: float) -> Callable[[slice], FloatArray]:
-        values = lagged(survey.time, survey.channels[name].values, lag, STAGES)
-        return lambda rows: values[None, rows]
+        values = lagged(survey.time, survey.channels[name].values, lag, STAGES).astype(np.float32)
+        return lambda rows: values[None, rows].astype(float)
 
     return level
 

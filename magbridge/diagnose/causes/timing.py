@@ -14,8 +14,6 @@ from magbridge.diagnose.causes.base import Cause
 from magbridge.diagnose.columns import AXIS_NAMES, Candidate, GridPoint, of_effect
 from magbridge.diagnose.problem import MAX_MISSING_SAMPLES, Problem, cached_per_problem, rates
 
-__all__ = ["ChannelSkew", "ClockOffset", "EddyCurrent", "FilterLag", "field_rates", "mass_rates"]
-
 SHIFTS_S = (0.5, 2.0, 6.0, 20.0, 60.0)
 """Shifts of the telemetry that are tried, s: those between half an interval and a fiftieth of the log."""
 MIN_SHIFT = 0.1

@@ -18,8 +18,6 @@ from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.texts import label
 from magbridge.pictures import literal
 
-__all__ = ["CHANNELS", "channels", "ends", "measured", "rolling", "spectrum", "terms", "track"]
-
 BEFORE, AFTER, INK, FAINT = "#c8553d", "#1f6f8b", "#22303c", "#9aa5b1"
 """Vermilion and blue, which any eye distinguishes; in grey print the second is darker."""
 MIN_FONT_PT = 9.0

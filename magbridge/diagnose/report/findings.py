@@ -17,8 +17,6 @@ from magbridge.diagnose.joint import CONFIDENCE_LEVEL, Improvement, normal
 from magbridge.diagnose.observed import Seen
 from magbridge.diagnose.texts import Diagnostic
 
-__all__ = ["FINDINGS_FORMAT", "findings", "findings_json", "parameters"]
-
 FINDINGS_FORMAT = 3
 """Of ``findings.json``, as ``docs/findings.schema.json`` describes it; raised when a name changes."""
 

@@ -40,8 +40,6 @@ from magbridge.estimation.residual import rms
 from magbridge.files import atomic_path, new_folder
 from magbridge.wording import counted
 
-__all__ = ["marked_up", "report_html", "write"]
-
 MARKS: dict[Fitness, str] = {"yes": "good", "conditional": "doubt", "no": "none"}
 """How an answer is marked."""
 KIND_SUBJECTS = {
