@@ -103,11 +103,18 @@ def settle(
     Slow noise absorbs part of the signal that descriptions represent, and so makes names look better. So if
     the names found without slow noise are not asserted, or something switches, no search with it is made.
     """
-    plain = search(problem, candidates, causes)
+
+    def rival(problem: Problem, model: Sequence[Candidate], fit: Joint, further: Candidate) -> float | None:
+        free = leftover(problem, model, fit, tone, but=[further])
+        if free is None:
+            return None
+        return _foretold(problem, [candidate.columns for candidate in model], fit, free)
+
+    plain = search(problem, candidates, causes, rival)
     asserted, rest = accept(problem, plain, tone)
     if not asserted or plain.switches:
         return plain, asserted, rest
-    outcome = beside_slow_noise(plain, candidates, causes)
+    outcome = beside_slow_noise(plain, candidates, causes, rival)
     return outcome, *((True, rest) if outcome is plain else accept(outcome.problem, outcome, tone))
 
 
@@ -244,6 +251,10 @@ def _examine(
     progress("searching")
     tone = _strongest_tone(problem, candidates)
     outcome, stand, rest = settle(problem, candidates, len(causes), tone)
+    # The search is over: for a month its arrays would fill hundreds of megabytes during the extension
+    rest = rest and rest._replace(fitted=())
+    for one in (problem, outcome.problem):
+        one.let_go()
     problem = outcome.problem
     found = outcome.chosen, outcome.competing, outcome.fit
     named, competing, fit = found if stand else ((), (), outcome.null)

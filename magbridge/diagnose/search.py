@@ -22,7 +22,7 @@ candidates under the noise that is left, the other causes projected out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -56,14 +56,19 @@ from magbridge.diagnose.problem import Problem, with_slow_noise
 from magbridge.diagnose.state import SearchState, refined, sharpen
 from magbridge.estimation.residual import robust_scale
 
-__all__ = ["LOST", "Outliers", "SearchOutcome", "beside_slow_noise", "outliers", "search", "switches"]
-
+Rival = Callable[[Problem, Sequence[Candidate], Joint, Candidate], float | None]
+"""Problem, model, fit, further cause -> held-out score of the model with the best free description in place
+of the further cause; None where no description is significant."""
 LOST, PLACES = 2, 6
 """Regressors of a model, and shifts of the level from which on the table has no cause for the signal."""
 AFTERWARDS = 16
 """Samples beyond the noise's order in which a shift of the level is looked for."""
 MAX_REGRESSORS = 6
 """Regressors found one by one in a log, at most."""
+
+
+def no_rival(problem: Problem, model: Sequence[Candidate], fit: Joint, further: Candidate) -> None:
+    """Return None: no free description is compared."""
 
 
 class Outliers(NamedTuple):
@@ -215,11 +220,22 @@ class SearchOutcome:
 
 
 def search(
-    problem: Problem, candidates: Sequence[Candidate], causes: int, plain: Joint | None = None
+    problem: Problem,
+    candidates: Sequence[Candidate],
+    causes: int,
+    rival: Rival = no_rival,
+    plain: Joint | None = None,
 ) -> SearchOutcome:
     """Find the causes that the data support, among the candidates of so many `causes`, under one noise.
 
-    `plain` is the null without slow noise, where the problem has such.
+    Parameters
+    ----------
+    problem, candidates, causes
+        The comparison, the candidates, and the number of causes that they belong to.
+    rival : callable
+        Free descriptions, one of which each further cause must beat on held-out dives.
+    plain : Joint, optional
+        The null without slow noise, where the problem has such.
     """
     rough = fit_joint(problem, [], 1, rounds=2)
     order = autoregressive_order(rough.residual, problem.survey.slots)
@@ -228,7 +244,7 @@ def search(
     p_value = min((h.p_value for h in first), default=1.0)
     model, base = _likeliest(state, first) if first else ([], state.null)
     ended = switches(base, model, state.causes)
-    chosen, base = _backward_elimination(state, model, base)
+    chosen, base = _backward_elimination(state, model, base, rival)
     model = [h.candidate for h in chosen]
     info = state.conditional_on(model, base)
     competing = sets_of(state, info, model, base) if model else ()
@@ -242,13 +258,15 @@ def search(
     )  # fmt: skip
 
 
-def beside_slow_noise(found: SearchOutcome, candidates: Sequence[Candidate], causes: int) -> SearchOutcome:
+def beside_slow_noise(
+    found: SearchOutcome, candidates: Sequence[Candidate], causes: int, rival: Rival = no_rival
+) -> SearchOutcome:
     """Repeat the search of the causes found, with slow noise; return the likelier outcome."""
     noisy, null = with_slow_noise(found.problem), found.null
     slow = fit_joint(noisy, [], null.noise.past.order, blocks=null.noise.uneven, like=null)
     if slow.log_likelihood <= null.log_likelihood:
         return found
-    return max(found, search(noisy, candidates, causes, null), key=lambda outcome: outcome.evidence)
+    return max(found, search(noisy, candidates, causes, rival, null), key=lambda outcome: outcome.evidence)
 
 
 def _likeliest(state: SearchState, first: list[Hypothesis]) -> tuple[list[Candidate], Joint]:
@@ -329,11 +347,12 @@ def _added(state: SearchState, model: list[Candidate], best: Hypothesis) -> tupl
 
 
 def _backward_elimination(
-    state: SearchState, model: list[Candidate], base: Joint
+    state: SearchState, model: list[Candidate], base: Joint, rival: Rival = no_rival
 ) -> tuple[list[Hypothesis], Joint]:
     """Drop causes without which the model is likelier, or which fail their test given the others.
 
-    Then drop the remnants of a Gaussian process, and causes that the held-out dives contradict.
+    Then drop the remnants of a Gaussian process, and further causes that the held-out dives contradict or
+    that a free description predicts better.
     """
     chosen: list[Hypothesis] = []
     k = 0
@@ -352,32 +371,43 @@ def _backward_elimination(
         fit = state.fit([*others, own], np.append(base.z, last), plain=False, like=base, rounds=1)
         chosen.append(Hypothesis(own, ratio, evidence_of(own, ratio, own.freedom), p_value, fit))
         k += 1
-        if k == len(model) > 1 and (surplus := _surplus(state, chosen, base)) is not None:
+        if k == len(model) > 1 and (surplus := _surplus(state, chosen, base, rival)) is not None:
             model = model[:surplus] + model[surplus + 1 :]
             base, chosen, k = state.fit(model), [], 0
     return chosen, base
 
 
-def _surplus(state: SearchState, chosen: Sequence[Hypothesis], base: Joint) -> int | None:
-    """Return the place of the weakest cause if it is redundant given a Gaussian process or a similar cause.
+def _surplus(
+    state: SearchState, chosen: Sequence[Hypothesis], base: Joint, rival: Rival = no_rival
+) -> int | None:
+    """Return the place of the weakest cause if it is redundant given the others.
 
-    A process represents part of every slow shape, and its remnant of a map's error passes for a second one.
-    Two correlated causes share a signal; if the second gains nothing on held-out dives, it is redundant.
+    A process represents part of every slow shape, and its remnant of a map's error passes for a second cause.
+    Two correlated causes share a signal; if the second gains nothing on held-out dives, it is redundant. Any
+    further cause may be what the regressors of the others leave: its name must predict the held-out dives
+    better than the best free description does in its place.
     """
     smooth = max((_remnant(h) for h in chosen if h.candidate.nonparametric), default=0.0)
     k = min(range(len(chosen)), key=lambda n: chosen[n].signal_to_noise)
     model = [h.candidate for h in chosen]
-    if model[k].nonparametric or not (smooth or _like_another(state, model, base, k)):
-        return None
     others = model[:k] + model[k + 1 :]
-    if chosen[k].signal_to_noise < smooth:
+    if not model[k].nonparametric and chosen[k].signal_to_noise < smooth:
         return k
-    counts = slice(None) if smooth else ~state.problem.survey.learned
-    power = [
-        np.sum(held_out(state.problem, [candidate.columns for candidate in some], fit).residual[counts] ** 2)
-        for some, fit in ((others, state.fit(others)), (model, base))
-    ]
-    return k if power[0] < power[1] else None
+    problem, without = state.problem, state.fit(others)
+    # Squared residuals of held-out dives without and with the cause, where a correlated one may replace it
+    if not model[k].nonparametric and (smooth or _like_another(state, model, base, k)):
+        counts = slice(None) if smooth else ~problem.survey.learned
+        power = [
+            np.sum(held_out(problem, [c.columns for c in some], fit).residual[counts] ** 2)
+            for some, fit in ((others, without), (model, base))
+        ]
+        if power[0] < power[1]:
+            return k
+    described = rival(problem, others, without, model[k])
+    if described is None:
+        return None
+    named = held_out(problem, [c.columns for c in model], base, interleaved=True).score
+    return k if described > named else None
 
 
 def _like_another(state: SearchState, model: Sequence[Candidate], base: Joint, k: int) -> bool:

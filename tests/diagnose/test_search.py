@@ -114,6 +114,17 @@ def test_of_two_similar_causes_one_without_gain_on_new_dives_is_dropped(alike: b
     assert dropped >= 6 if alike else dropped == 0
 
 
+def test_a_further_cause_must_predict_better_than_a_free_description() -> None:
+    rng, n = np.random.default_rng(4), 600
+    shapes = {"offset_step": (np.arange(n) > 200.0).astype(float), "current_field": rng.normal(size=n)}
+    candidates = [fault(cause, shape, 10.0) for cause, shape in shapes.items()]
+    signal = 5.0 * shapes["offset_step"] + 1.0 * shapes["current_field"]
+    problem = replace(right(n), residual=signal + rng.normal(size=n))
+    for score, expected in ((-np.inf, {"offset_step", "current_field"}), (np.inf, {"offset_step"})):
+        found = search(problem, candidates, 2, lambda *_, score=score: score)
+        assert {one.candidate.cause for one in found.chosen} == expected
+
+
 def test_one_cause_gives_way_to_two_given_a_third() -> None:
     """It was found first since it resembles their sum; neither of the two alone is better."""
     rng = np.random.default_rng(1)
