@@ -119,6 +119,7 @@ class _Table:
         base: Joint,
         places: Sequence[int],
     ) -> None:
+        # Free the causes in question; all others of the model stay projected out
         first = state.at[-1].stop
         here = [slices(model, first)[n] for n in places]
         self.info = info.released(base, *here)
@@ -137,6 +138,7 @@ class _Table:
         """Score every candidate alone, and together with each other one."""
         m, info = len(self.candidates), self.info
         free = [n for n, candidate in enumerate(self.candidates) if candidate.spectra is None]
+        # E_ab = E_a + E_(b|a) for all pairs: for each a, every b of one size at once
         stacks = [_Stack(places, self.at, self.candidates, info) for places in self._by_size(free)]
         self.scores = [score(info, own, c) for own, c in zip(self.at, self.candidates, strict=True)]
         conditional_on, self.ratio = np.full((m, m), -np.inf), np.zeros((m, m))
@@ -148,6 +150,7 @@ class _Table:
                 at = np.ix_(np.array(places), stack.places)
                 conditional_on[at] = alone[:, None] + evidence
                 self.ratio[at], self.freedom[at] = ratio, freedom
+        # Either of the two may come first
         self.evidence = np.maximum(conditional_on, conditional_on.T)
         np.fill_diagonal(self.evidence, -np.inf)
 
@@ -179,12 +182,14 @@ class _Table:
         m, groups = len(self.state.candidates), [candidate.group for candidate in self.standing]
         # under the noise that is left, which is less, ratios exceed what the model as a whole has gained
         whole = self.state.ratio(self.base)
+        # One cause stands: a pair pays for its second cause
         if len(groups) == 1:
             standing, grid = self.scores[m], [self.scores[n].evidence for n in self.state.groups[groups[0]]]
             needed = bayes_factor_threshold(min(standing.ratio, whole))
             # the pair pays for one more cause, which must not be what the single one's regressor leaves
             price = needed + float(np.log(len(self.state.look_elsewhere)))
             return standing.evidence + _average(np.array(grid)) + price, needed
+        # Two causes stand: their joint evidence, whichever comes first
         found = []
         for a, b in ((m, m + 1), (m + 1, m)):
             first = self.scores[a]
@@ -201,6 +206,7 @@ class _Table:
 
     def pair(self, A: Group, B: Group) -> Pair | None:
         """Return the best of two grids, unless what stands beats it by the Bayes-factor threshold."""
+        # A pair that is the standing one, or contains a single standing cause, is no alternative
         current = [candidate.group for candidate in self.standing]
         block = self.evidence[np.ix_(self.members[A], self.members[B])]
         top = float(block.max())
@@ -210,6 +216,7 @@ class _Table:
             or not np.isfinite(top)
         ):
             return None
+        # The price of the two grids, compared with what the standing causes paid
         rows, columns = np.unravel_index(int(np.argmax(block)), block.shape)
         a, b = self.members[A][int(rows)], self.members[B][int(columns)]
         one, two = self.candidates[a], self.candidates[b]
@@ -276,6 +283,7 @@ def competing_hypotheses(
     state: SearchState, info: Information, model: list[Candidate], base: Joint, k: int
 ) -> tuple[CompetingHypothesis, ...]:
     """Return the competing hypotheses of the k-th cause of `model`, whose columns are the last of `info`."""
+    # Score every group in the place of the k-th cause
     own = slices(model, state.at[-1].stop)[k]
     alone = info.released(base, own)
     standing = score(alone, own, model[k])
@@ -285,6 +293,7 @@ def competing_hypotheses(
         candidate = state.candidates[member]
         if group == model[k].group or group[0] in {other.cause for other in model if other is not model[k]}:
             continue
+        # Log evidence of the grids' averages, with the look-elsewhere of both
         cheaper = price - paid - float(np.log(candidate.look_elsewhere / model[k].look_elsewhere))
         behind = standing.evidence - s.evidence - cheaper
         if (
@@ -324,6 +333,7 @@ def sets_of(
 def exchanged(state: SearchState, model: list[Candidate], base: Joint) -> tuple[list[Candidate], Joint]:
     """Replace one regressor or two by others, or drop one, while the evidence of the whole model grows."""
     pieces = [piece for candidate in model for piece in candidate.pieces]
+    # Steepest ascent over the neighbours of the model, each fitted with its noise
     for _ in range(MAX_EXCHANGES):
         best, better = state.value(pieces, base), (pieces, base)
         for new, at in _changes(state, pieces, base):

@@ -111,6 +111,7 @@ def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration
     if not any(candidate.about != "vehicle" for candidate in possible):
         return None
     survey = problem.survey
+    # Mean change of the residual, and its sigma by the mean derivative
     before = residuals_of(*samples_of(survey, problem.calibration))
     samples, coefficients = samples_of(survey, extended)
     after, g = residuals(samples, coefficients)
@@ -125,6 +126,7 @@ def level(problem: Problem, possible: Sequence[Candidate], extended: Calibration
 
 def delays(problem: Problem, fit: Joint) -> Delays | None:
     """Return the axes' delays where they look interpolated: a noise that no calibration can undo."""
+    # Delays relative to x: a common delay is invisible in the total field
     places, to_x = np.arange(len(fit.z))[DELAYS], np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
     later = AXIS_DELAY_SIGMA_S * to_x @ fit.z[places]
     covariance = AXIS_DELAY_SIGMA_S**2 * to_x @ fit.covariance[np.ix_(places, places)] @ to_x.T
@@ -138,6 +140,7 @@ def motion(problem: Problem, finding: Finding) -> MotionShare | None:
     """Return how far a cause acts only while masses move: one that moved unseen between rows looks so."""
     survey = problem.survey
     p = survey.values([parameter.name for parameter in problem.calibration.parameters])
+    # Samples next to a motion, and the cause's share of power there
     steps = np.any(np.diff(p, axis=0) != 0.0, axis=1)
     moving = np.append(steps, False) | np.append(False, steps)
     power = (finding.candidate.columns(slice(0, len(survey))) @ finding.coefficients) ** 2
@@ -173,6 +176,7 @@ def telemetry_delay(diagnosis: Diagnosis, finding: Finding) -> TelemetryDelay | 
 def slow_share(problem: Problem, finding: Finding) -> float:
     """Return the share of a cause's power, about its mean, that a trend and a bend over the log explain."""
     field, time = finding.field(problem), problem.survey.time
+    # Parabola over the log: the part of the field's variance that it removes
     x = (time - time.mean()) / max(float(np.ptp(time)), 1e-300)
     smooth = np.polynomial.Polynomial.fit(x, field, 2)(x)
     return 1.0 - float(np.var(field - smooth) / max(np.var(field), 1e-300))
@@ -349,6 +353,7 @@ def assess(diagnosis: Diagnosis) -> DiagnosisResult:
 
 def _fitness(diagnosis: Diagnosis, use: bool, against: Sequence[Diagnostic]) -> tuple[Fitness, Reason]:
     """Return whether the written calibration is fit for use, and the code of the reason."""
+    # The first objection decides; without any, another day is needed for an unconditional yes
     objections: dict[Reason, bool] = {
         "nothing_added": not diagnosis.named,
         "refused": bool(diagnosis.refused),

@@ -99,6 +99,7 @@ def join_columns(columns: Sequence[Columns]) -> Mixture:
     """Return all columns side by side as one mixture, in which shared parts occur once."""
     listed = [parts(one) for one in columns]
     sizes = [blocks[0][1].shape[1] for blocks in listed]
+    # Parts that several columns share occur once, with the weights of all of them
     found: dict[Columns, FloatArray] = {}
     for blocks, own in zip(listed, places(sizes), strict=True):
         for X, M in blocks:
@@ -148,9 +149,11 @@ def effect_columns(
         phi = effect.batch(problem.series(effect)).astype(np.float32)
     elif phi is None:
         phi = lambda rows: effect.batch(problem.series(effect, rows))  # noqa: E731
+    # C_krs of the effect: only the pairs (r, s) of nonzero entries are computed
     tensor = -effect.columns(problem.calibration.reference.field)
     pairs = [(int(r), int(s)) for r, s in np.argwhere(tensor.any(axis=0))]
     M = np.stack([tensor[:, r, s] for r, s in pairs])
+    # (phi - origin) C = phi C - origin C: one history serves every origin
     made = Products(problem, phi if callable(phi) else _rows(phi), tuple(pairs))
     if not origin:
         return Mixture(((made, M),))
@@ -246,6 +249,7 @@ class Candidate:
     def joined_with(self, candidate: Candidate) -> Candidate:
         """Return both as one: a cause that takes more than one regressor to describe."""
         parts, one, two = (self, candidate), self.point, candidate.point
+        # Names of the second piece are numbered, for people to tell them apart
         taken = self.names + tuple(one.shape)
         number = 2 + sum(name.startswith(f"{candidate.names[0]} (") for name in taken)
         mark = "" if set(taken).isdisjoint(candidate.names) else f" ({number})"

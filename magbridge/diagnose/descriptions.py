@@ -124,6 +124,7 @@ def hysteresis(values: FloatArray) -> Columns:
     """Functions of a channel's past (n,): curved branches of hysteresis, narrow and wide; its direction."""
     scaled = _scaled(values)
     y = scaled(slice(None))
+    # Branches v^k - x^k of the play operator at two widths, and the direction of motion
     plays = [play(y, width).astype(np.float32) for width in PLAYS]
     change = np.diff(y, prepend=y[0])
     way = np.where(np.abs(change) > 1e-3, np.sign(change), 0.0).astype(np.int8)
@@ -158,6 +159,7 @@ def near_surface(time: FloatArray, depth: FloatArray) -> Columns:
 def repeated(problem: Problem) -> Columns:
     """Half waves in the course of a dive, the same in all."""
     dive, time = problem.survey.dive, problem.survey.time
+    # Phase in the dive, 0 to 1, of the usual duration
     start = np.flatnonzero(np.diff(dive, prepend=dive[0] - 1))
     since = time - np.repeat(time[start], np.diff([*start, len(dive)]))
     # the median: a long last dive must not stretch the others

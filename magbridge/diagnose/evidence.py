@@ -147,6 +147,7 @@ def information(
     The first `unshared` of them share no parts with any other, and their products with each other are not
     computed. With a `stride`, only every so many pieces of the log count.
     """
+    # Sums are taken over the distinct parts X_i; the candidates are their mixtures X_i M_i
     q, shared = len(problem.centre), join_columns(columns).parts
     alone = places((sum(len(M) for _, M in parts(one)) for one in columns[:unshared]), q)
     others = slice(alone[-1].stop if alone else q, None)
@@ -158,6 +159,7 @@ def information(
         asked if unshared else ALL_PRODUCTS,
         stride,
     )
+    # Project the calibration out, with its prior: S = G_bb - G_bq (G_qq + prior)^-1 G_qb
     pull = base.prior[:q] * (problem.centre - base.z)
     K = np.linalg.solve(G[:q, :q] + np.diag(base.prior[:q]), G[:q, q:])
     M = csr_array(np.concatenate([M for _, M in shared]))
@@ -179,6 +181,7 @@ class Score:
 
 def score(info: Information, place: slice, candidate: Candidate) -> Score:
     """Score the candidate whose columns stand at `place`; one of the wrong sign scores zero."""
+    # A size that cannot be negative has no evidence where its score is negative
     b, statistic = info.score[place], Statistic(info.matrix[place, place], candidate.spectra)
     freedom = int(statistic.freedom)
     if not freedom or (candidate.positive and b.min() < 0.0):
@@ -202,6 +205,7 @@ def evidence_of(candidate: Candidate, ratio: float, freedom: int) -> float:
 
 def log_bayes(ratio: float | FloatArray, freedom: float | FloatArray) -> FloatArray:
     """Log evidence (Bayes factor against no effect) of likelihood ratios (...,) of `freedom` coefficients."""
+    # (R - k)/2 - (k/2) log(R/k), and 0 below R = k: Zellner's prior with the likeliest g
     over = np.maximum(ratio / np.maximum(freedom, 1e-12), 1.0)
     return np.asarray(0.5 * freedom * (over - 1.0 - np.log(over)))
 
@@ -246,6 +250,7 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
 
     All together they are tested at `level`.
     """
+    # Draws of the scores N(0, S) under no effect
     rng = np.random.default_rng(20131212)  # the same answer every time
     values, vectors = np.linalg.eigh(S)
     draws = (vectors * np.sqrt(np.maximum(values, 0.0))) @ rng.standard_normal((len(S), SIMULATIONS))
@@ -253,6 +258,7 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
     seen = [(place, statistic) for place, statistic in every if statistic.freedom]
     if not seen:
         return 0.0
+    # Importance sampling: each hypothesis in turn is moved beyond its limit, then those that pass are counted
     limits = [float(chi2.isf(level / len(seen), statistic.freedom)) for _, statistic in seen]
     for k, (place, statistic) in enumerate(seen):
         some, away = draws[:, k :: len(seen)], statistic.vectors / np.sqrt(statistic.values)
@@ -264,6 +270,7 @@ def _independent(S: FloatArray, places: Sequence[slice], level: float) -> float:
         statistic.ratio(draws[place]) >= (1.0 - 1e-9) * limit
         for (place, statistic), limit in zip(seen, limits, strict=True)
     ]
+    # N = n E[1 / m] (Owen, Maximov & Chertkov 2019)
     return len(seen) * float(np.mean(1.0 / np.sum(passed, axis=0)))
 
 
@@ -281,10 +288,12 @@ def log_odds(
     profiled, too, and do not pay for it.
     """
     regressors, free = sum(len(c.pieces) for c in model), sum(c.size for c in model if c.spectra is None)
+    # Price of each further regressor, of the grids, and of the spectra that were tried
     further = max(regressors - 1, 0) * (ODDS + float(np.log(len(look_elsewhere))))
     prices = sum(len(c.pieces) * float(np.log(look_elsewhere[c.cause])) for c in model)
     prices += sum(float(np.log(len(c.spectra))) for c in model if c.spectra is not None)
     known = sum(c.point.likelier + float(np.log(2.0)) * c.positive for c in model)
+    # A Gaussian process has paid for its size already; the others pay by the part that it leaves
     worth = float(log_bayes(shaped, free)) if free else 0.5 * shaped
     return 0.5 * (ratio - shaped) + worth + known - further - prices
 
@@ -307,6 +316,7 @@ def certainty(residual: FloatArray, noise: ResidualNoise, columns: Sequence[Colu
     level is known worst.
     """
     n, p = len(residual), len(noise.ar)
+    # Covariance C of the autoregressive coefficients: the inverse of their regression's information
     rows = np.flatnonzero(noise.past.whole)
     if len(rows) <= 2 * p:
         return [float(n)] * len(columns)
@@ -316,6 +326,7 @@ def certainty(residual: FloatArray, noise: ResidualNoise, columns: Sequence[Colu
         before = np.array([residual[some - k] for k in range(1, p + 1)]) / noise.scale[some]
         information += before @ before.T
     C = np.linalg.pinv(information)
+    # Derivative D of each column's whitened power by those coefficients, over pieces spread along the log
     pieces = range(0, max(n - PIECE, 0) + 1, max(PIECE, n // PIECES))
     found = []
     for column in columns:
@@ -413,6 +424,7 @@ def isolability(
 ) -> Isolability:
     """Evaluate `info`; the candidate that the log shows best stands for the whole grid of its cause."""
     at = slices(candidates)
+    # One candidate for each cause and channel, with the price of all hypotheses behind it
     picked = most_visible(candidates, info, at)
     among = [candidates[k].tail * causes * look_elsewhere.get(candidates[k].cause, 1.0) for k in picked]
     visible = [_visible(candidates[k], info, at[k], count) for k, count in zip(picked, among, strict=True)]
@@ -437,6 +449,7 @@ def most_visible(candidates: Sequence[Candidate], info: Information, places: Seq
 
 def _visible(candidate: Candidate, info: Information, place: slice, hypotheses: float) -> Visible:
     """Return the signal-to-noise and the sizes at which a candidate is found among so many hypotheses."""
+    # Noncentrality at which a noncentral chi-square passes the threshold in 95 %
     freedom = max(score(info, place, candidate).freedom, 1)
     sure = float(np.sqrt(chndtrinc(chdtri(freedom, FALSE_ALARM_RATE / hypotheses), freedom, 0.05)))
     power = np.diag(info.matrix[place, place])
@@ -459,6 +472,7 @@ def _plausible(size: float) -> float:
 
 def likeness(info: Information, first: Candidate, a: slice, second: Candidate, b: slice) -> float:
     """Correlation of two signatures: root of the mean share that one can imitate of the other, the larger."""
+    # Share of A's power that B imitates, C B^-1 C^T, and the reverse
     A, B, C = info.matrix[a, a], info.matrix[b, b], info.matrix[a, b]
     p, q = (FREE if candidate.spectra is None else 1.0 for candidate in (first, second))
     M = C @ np.linalg.solve(B + q * np.eye(len(B)), C.T)

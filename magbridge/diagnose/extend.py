@@ -144,6 +144,7 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
     piece, own = placed_piece
     q, first = len(fit.z), len(info.score) - fit.coefficients.size
     here = slice(own.start - first, own.stop - first)
+    # Release this piece, project the other causes out
     rest = np.setdiff1d(np.arange(first, len(info.score)), np.r_[own])
     prior = np.diag(fit.prior[q + rest - first])
     K = np.linalg.solve(info.matrix[np.ix_(rest, rest)] + prior, info.matrix[rest])
@@ -162,6 +163,7 @@ def _elsewhere(info: Information, fit: Joint, placed_piece: Placed, points: Sequ
 
     evidence, c, C = moments(piece, own)
     others = [moments(candidate, place) for candidate, place in points]
+    # Posterior weights of the grid's points, then the mixture's second moment
     logs = np.array([evidence - piece.point.narrow, *(e for e, _, _ in others)])
     weight = np.exp(logs - logs.max())
     apart = zip(weight[1:] / weight.sum(), others, strict=True)
@@ -180,6 +182,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
     pieces = [piece for candidate in model for piece in candidate.pieces]
     kept = np.concatenate([np.empty(0, bool), *(np.full(c.size, bool(c.effects)) for c in pieces)])
     b = fit.coefficients * widths
+    # Posterior of (z, b) to coefficients: c = c_0 + L z, and b in its own units
     K, k = calibration.coefficients.size, int(kept.sum())
     M = np.zeros((K + k, q + len(b)))
     M[:K, :q] = problem.directions
@@ -194,6 +197,7 @@ def extend(problem: Problem, model: Sequence[Candidate], fit: Joint) -> Calibrat
             reference = msgspec.structs.replace(
                 reference, bias=reference.bias + float(b[at]), bias_sigma=sigma
             )
+    # The noise may have become smaller than the calibration states, not larger by one log
     residual = robust_scale(fit.residual - np.median(fit.residual))  # of the bulk, not of outliers
     noise = msgspec.structs.replace(
         calibration.noise, sensor=min(calibration.noise.sensor, residual) or residual
@@ -221,6 +225,7 @@ def flyable(survey: Survey, calibration: Calibration) -> tuple[Calibration, list
         The calibration without those effects, and their places among the effects that it was given with.
     """
     dropped: list[int] = []
+    # Greedy: each rate is dropped if the residual with live differences is smaller without it
     for place, effect in enumerate(calibration.effects):
         if not isinstance(effect, (RateEffect, ClockEffect)):
             continue
@@ -302,6 +307,7 @@ def relinearised(
     # The calibration as given is the point that a step which overshoots is halved towards
     origin = replace(fit, z=np.zeros_like(fit.z), coefficients=np.zeros_like(fit.coefficients))
     last, last_cost = origin, _cost(problem.residual, origin, problem)
+    # Halve a step until the nonlinear posterior does not fall
     for _ in range(MAX_STEPS):
         for _ in range(MAX_HALVINGS):
             settled, columns = _linearised_at(problem, model, fit)
@@ -315,6 +321,7 @@ def relinearised(
                 fit, z=0.5 * (fit.z + last.z), coefficients=0.5 * (fit.coefficients + last.coefficients)
             )
             settled.let_go()
+        # Converged: the linear model predicts the nonlinear residual to a tenth of the noise
         missed = float(np.sqrt(np.mean((actual - fit.residual) ** 2)))
         if missed < MAX_MISMATCH * float(np.median(fit.noise.scale)) and cost <= last_cost:
             break
@@ -347,6 +354,7 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
 
     .. math:: C \leftarrow C + \frac{IDEAL^2 W}{MODES}\, C_{:b} C_{bb}^{-1} C_{b:}
     """
+    # C + (IDEAL^2 W / MODES) C_:b C_bb^-1 C_b:, for each cause
     C, q = fit.covariance.copy(), len(fit.z)
     for place in slices(model):
         own = slice(q + place.start, q + place.stop)
@@ -357,6 +365,7 @@ def with_misfit(model: Sequence[Candidate], fit: Joint) -> Joint:
 
 def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> tuple[Problem, list[Columns]]:
     """Return the problem and a column block for each piece of the model, linearised at `fit`."""
+    # Residual and derivatives of the extended calibration's own equations
     extended = extend(problem, model, fit)
     samples, coefficients = samples_of(problem.survey, extended)
     pieces = [piece for candidate in model for piece in candidate.pieces]
@@ -368,6 +377,7 @@ def _linearised_at(problem: Problem, model: Sequence[Candidate], fit: Joint) -> 
         if rates is not None:
             central = rates(slice(0, len(problem)))
             samples.phi[:, place : place + len(central)] = central.T
+    # Causes that appeared later have no regressors in the logs that were learned from
     absent = [np.full(sum(_counts_of(piece.effects, extended)), piece.since) for piece in pieces]
     late = samples.phi.shape[1] - added + np.flatnonzero(np.concatenate([np.empty(0, bool), *absent]))
     samples.phi[np.ix_(problem.survey.learned, late)] = 0.0

@@ -130,6 +130,7 @@ def extension_of(
         The first of the attempts, each with a tighter prior than the one before, that passes all checks; the
         first attempt with its reason for refusal where none passes.
     """
+    # From the prior as given to a tighter one, until the corrected field passes every check
     first = None
     for factor in TIGHTENING:
         attempt = _attempt(problem, model, fit, counts, grid, factor)
@@ -155,6 +156,7 @@ def _attempt(
         problem = tightened(problem, factor)
         columns, noise = [candidate.columns for candidate in model], fit.noise
         fit = fit_joint(problem, columns, noise.past.order, start, blocks=noise.uneven, ridge=ridge)
+    # Converge, hold every fold out, then widen the covariance for nonlinear parameters and misfit
     settled, blocks, fit = relinearised(problem, model, fit)
     out = held_out(settled, blocks, fit)
     fit = with_misfit(model, loosened(settled, model, blocks, fit, grid))
@@ -189,6 +191,7 @@ def _held_out_error(
 ) -> tuple[FloatArray, FloatArray]:
     """Return held-out errors (n,), nT: of the corrected field, and as predicted for the reference."""
     q, survey = len(fit.z), problem.survey
+    # Each fold is corrected by a calibration that was fitted to the others
     error, reference_error = np.zeros(len(problem)), np.zeros(len(problem))
     wrong = [(c, place) for c, place in zip(model, slices(model), strict=True) if c.about != "vehicle"]
     for k, c in enumerate(held.coefficients):
@@ -214,6 +217,7 @@ def _refusal(
     # A rate of change that was dropped is in the linear prediction alone
     if not dropped and found > max(MAX_PROMISE_RATIO * promised, float(np.hypot(promised, noise))):
         return "not_linear", (promised, found)
+    # Trust region: the corrected field may not move where the log determines nothing
     allowed, moved = _departure(problem, extension)
     if moved > allowed:
         return "outside_prior", (allowed, moved)
@@ -242,12 +246,14 @@ def _departure(problem: Problem, extension: Extension) -> tuple[float, float]:
     _, moved_coefficients = samples_of(problem.survey, own)
     few = samples.part(slice(None, None, step))
     probes = _turned(few)
+    # Move of the field at the probes, and the sigma that the calibration as given allows
     e, g = residuals(probes, coefficients)
     shift = np.abs(residuals(probes, moved_coefficients)[0] - e)
     J = derivatives(calibration, probes, g, np.eye(K))
     before = np.einsum("ij,jk,ik->i", J, calibration.covariance + floor(calibration), J)
     after = np.einsum("ij,jk,ik->i", J, own.covariance, J)
     limit = MAX_DEPARTURE_SIGMA * np.sqrt(before + problem.calibration.noise.sensor**2)
+    # Moves that the log determines are not limited; of the others 1 % may exceed the limit
     excess = np.where(after < DETERMINED * before, 0.0, shift / limit)
     worst = int(np.argsort(excess)[int((1.0 - MAX_FRACTION_OUTSIDE) * (len(excess) - 1))])
     return float(limit[worst]), float(excess[worst] * limit[worst])

@@ -138,6 +138,7 @@ def normal(
     """
     k = size_of(X)
 
+    # Sums over a share of the pieces; the shares are added in their order
     def share(part: Sequence[slice]) -> tuple[FloatArray, FloatArray]:
         P, b = np.zeros((k, k)), np.zeros(k)
         for rows in part:
@@ -206,6 +207,7 @@ class Statistic:
             self.freedom = np.asarray(np.isfinite(self.values).sum(axis=-1))
             return
         root = np.sqrt(spectra)
+        # w^1/2 S w^1/2 = V diag(lambda) V^T, one decomposition for each spectrum
         values, vectors = np.linalg.eigh(S * root[:, :, None] * root[:, None, :])
         self.values, self.vectors = np.maximum(values, 0.0), root[:, :, None] * vectors
         self.freedom = np.asarray(1)
@@ -229,10 +231,12 @@ class Statistic:
     def best(self, b: FloatArray) -> Ridge:
         """Return the best size and spectrum for a score b (k,)."""
         assert self.spectra is not None
+        # E(g, w) on the grid of sizes and spectra: its maximum gives both
         tables = [self._evidences(k, b[:, None])[:, 0] for k in range(len(self.spectra))]
         k = int(np.argmax([table.max() for table in tables]))
         at = int(np.argmax(tables[k]))
         values, g = self.values[k], PRIOR_SIZES[at]
+        # Posterior mean in the eigenbasis: g y / (1 + g lambda)
         c = g * (self.vectors[k].T @ b) / (1.0 + g * values)
         price = 0.5 * float(c @ c / g + np.log1p(g * values).sum())
         ratio, norm = 2.0 * float(tables[k][at]), float(np.sqrt(c**2 @ values))
@@ -311,9 +315,11 @@ def fit_joint(
     stride : int
         Pieces of the log of which one counts in the normal equations; the noise is that of every sample.
     """
+    # Coefficients c = (z, b): the calibration's, then the effects'. Prior precision 1 for z, `ridge` for b
     X = JointDesign(problem, precomputed(len(problem), columns))
     q, k = X.q, X.effects
     prior = np.append(np.ones(q), np.broadcast_to(ridge, k))
+    # Blocks of one common prior size, which is chosen in each step: delays, slow noise, Gaussian processes
     common = [(slice(q + DELAYS.start, q), np.ones((1, 3)))]
     if problem.waves.size:
         common.append((problem.slow, 1.0 / problem.waves[None]))
@@ -336,16 +342,19 @@ def fit_joint(
         first.append(_plain(X, problem.residual, prior, centre, stride))
     for own, _ in common:
         prior[own] = FLAT_PRECISION  # no size is known yet
+    # The best start by the penalised likelihood, each under its own noise
     tries = in_threads(len(problem), lambda c: (c, *evaluated(c)), first)
     c, residual, noise = max(tries, key=lambda entry: value(entry[0], entry[2]))
     del tries  # of a month each is 15 MB
     for step in range(rounds + 1):
+        # Fisher scoring: whitened normal equations (P + prior) dc = b - prior (c - centre)
         P, b = normal(X.rows, noise.response(residual), noise, stride=stride)
         for own, spectrum in common:
             prior[own] = _sized(P, b + P @ c + prior * centre, prior, own, spectrum)
         P += np.diag(prior)
         if step == rounds:
             break
+        # A step is kept only if the likelihood grows with the noise fitted again
         moved = c + np.linalg.solve(P, b - prior * (c - centre))
         tried = evaluated(moved)
         gained = value(moved, tried[1]) - value(c, noise)
@@ -354,6 +363,7 @@ def fit_joint(
         if gained < 0.02:  # converged: P need not be computed again
             break
     covariance: FloatArray = np.asarray(np.linalg.inv(P), float)
+    # Laplace's approximation: coefficients of one common size are integrated out
     volume = sum(volume_of(covariance[own, own], prior[own]) for own, _ in common)
     return Joint(value(c, noise) - volume, c[:q], c[q:], covariance, noise, residual, prior)
 
@@ -368,6 +378,7 @@ def volume_of(covariance: FloatArray, prior: FloatArray) -> float:
 
 def _sized(P: FloatArray, h: FloatArray, prior: FloatArray, place: slice, spectra: FloatArray) -> FloatArray:
     """Prior precision of the coefficients at `place`, by their likeliest common size and spectrum."""
+    # Schur complement: information and score of the block, all other coefficients projected out
     others = np.delete(np.arange(len(h)), place)
     K = np.linalg.solve(P[np.ix_(others, others)] + np.diag(prior[others]), P[others, place])
     S, b = P[place, place] - P[place, others] @ K, h[place] - K.T @ h[others]
@@ -379,6 +390,7 @@ def _plain(
 ) -> FloatArray:
     """Least squares as if the noise were white, outliers cut off."""
     level = robust_scale(residual - np.median(residual)) + 1e-12
+    # First all samples, then again with those beyond 8 sigma cut off
     P, b = normal(X.rows, residual, stride=stride)
     c = centre + np.linalg.solve(P / level**2 + np.diag(prior), (b - P @ centre) / level**2)
     residual = residual - X.times(c)
@@ -419,10 +431,12 @@ def held_out(
     centre = np.append(problem.centre, np.zeros(X.effects))
     c = np.append(fit.z, fit.coefficients)
     y = noise.response(problem.residual - X.times(c))
+    # Folds: every count-th dive, or stretches of dives of equal number
     dive = np.unique(problem.survey.dive if groups is None else groups, return_inverse=True)[1]
     count, dives = min(FOLDS, int(dive.max()) + 1), int(dive.max()) + 1
     ends = np.cumsum([len(some) for some in np.array_split(np.arange(dives), count)])
     of = dive % count if interleaved else np.searchsorted(ends, dive, side="right")
+    # Information and score of each fold, about the fit c to all dives
     P, b = np.zeros((count, c.size, c.size)), np.zeros((count, c.size))
     for rows in X.pieces:
         A = noise.whitened(X.rows, rows)
@@ -430,6 +444,7 @@ def held_out(
             fold_rows = A[of[rows] == k]
             P[k] += fold_rows.T @ fold_rows
             b[k] += fold_rows.T @ (y[rows][of[rows] == k] + fold_rows @ c)
+    # Without fold f: (P - P_f)^-1 (b - b_f), one solution of the normal equations for each fold
     whole_P, whole_b = P.sum(axis=0) + np.diag(prior), b.sum(axis=0) + prior * centre
     others = whole_P - P
     without = np.linalg.solve(others, (whole_b - b)[:, :, None])[:, :, 0]
@@ -437,6 +452,7 @@ def held_out(
     corrected[:, problem.slow] = 0.0  # the corrected field keeps its slow noise
     for rows in X.pieces:
         residual[rows] = problem.residual[rows] - np.einsum("ij,ij->i", X.rows(rows), corrected[of[rows]])
+    # The score S of this module's notes: likelihood less the price of predicting each fold
     away = c - without
     price = np.einsum("fi,fij,fj->", away, others, away)
     price += np.sum(np.linalg.slogdet(whole_P)[1] - np.linalg.slogdet(others)[1])
@@ -475,6 +491,7 @@ def paired(
     counts : (n,) bool array
         Samples that count.
     """
+    # Sums of squares of each dive: the bootstrap then draws dives, not samples
     number = np.unique(dive[counts], return_inverse=True)[1]
     b, a = np.bincount(number, error_before[counts] ** 2), np.bincount(number, error_after[counts] ** 2)
     rng = np.random.default_rng(20131213)  # the same answer every time

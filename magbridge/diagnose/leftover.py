@@ -65,6 +65,7 @@ def varying(
     """
     if candidate.spectra is not None or candidate.size > MAX_TESTED_COEFFICIENTS:
         return None
+    # Regressor times (1, v_1, v_2, ...), every v from -1 to 1
     values = _followed(problem, candidate.channel)
     low = np.array([[value.min()] for value in values])
     half = np.array([[max(0.5 * float(np.ptp(value)), 1e-12)] for value in values])
@@ -157,6 +158,7 @@ def along_one_direction(S: FloatArray, b: FloatArray, width: FloatArray, free: R
     `free` estimate. The two free numbers of the direction pay as in
     :func:`~.evidence.log_bayes`.
     """
+    # Start from the first singular vector of the free estimate, then alternate
     count = len(width) // 3
     direction = np.linalg.svd(free.estimate.reshape(count, 3), full_matrices=False)[2][0]
     for _ in range(TURNS):
@@ -197,6 +199,7 @@ def leftover(
     made = precomputed(len(problem), [one.columns for one in listed])
     listed = [one._replace(columns=columns) for one, columns in zip(listed, made, strict=True)]
     columns = [candidate.columns for candidate in model]
+    # Screen all descriptions by their score; weigh the best under each noise by the whole likelihood
     found: list[tuple[FittedDescription, Scored]] = []
     for noise in (fit.noise, _calm(problem, columns, fit, listed[:2])):
         scored = _scored(problem, noise, fit, columns, listed)
@@ -207,6 +210,7 @@ def leftover(
     evidence = likeliest.evidence
     # half of a chi-square's tail: a size that cannot be negative is zero as often as not (Self & Liang 1987)
     tail = 0.5 * float(chi2.sf(2.0 * max(evidence, 0.0), 1))
+    # Bonferroni over descriptions and widths
     count = sum(len(one.widths) for one in listed)
     p_value = min(1.0, count * tail)
     # stricter where no cause was found: the distribution is only asymptotic
@@ -249,6 +253,7 @@ def _calm(
     level = np.full(len(problem), robust_scale(np.diff(fit.residual)) / np.sqrt(2.0) + 1e-12)
     ar, innovations = np.zeros_like(fit.noise.ar), fit.residual / level
     noise = replace(fit.noise, ar=ar, scale=level, nu=1e6, innovations=innovations)
+    # Curves and noise in turn, from white noise: its level is that of the differences
     width = np.concatenate([one.widths[1][1] for one in slow])
     for _ in range(CALM):
         info = information(problem, noise, fit, [*(one.columns for one in slow), *model]).fitted(fit)
@@ -265,6 +270,7 @@ def _weighed(problem: Problem, model: Sequence[Columns], fit: Joint, scored: Sco
     c, columns = best.estimate, one.columns
     moved = -scored.shift @ c
     residual = fit.residual - JointDesign(problem, [*model, columns]).times(np.append(moved, c))
+    # Gain in likelihood with the noise fitted again, less the change of the prior
     noise = fit_noise(residual, fit.noise.past, blocks=fit.noise.uneven, like=fit.noise)
     z = fit.z + moved[:q]
     pull = float(fit.prior[:q] @ ((z - problem.centre) ** 2 - (fit.z - problem.centre) ** 2))
@@ -336,6 +342,7 @@ def _passing(wrong: Outliers | None) -> Leftover | None:
 
 def _loud(problem: Problem, error: FloatArray, counts: BoolArray) -> Leftover | None:
     """Describe a structureless residual beyond the calibration's stated noise and coefficient errors."""
+    # Chi-square of the error by the variance that the calibration states
     power = float(np.sum(error[counts] ** 2 / np.maximum(problem.stated[counts], 1e-12)))
     n = int(counts.sum())
     if problem.calibration.noise.sensor <= 0.0 or power < LOUD**2 * n:

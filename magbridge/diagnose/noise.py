@@ -130,6 +130,7 @@ class ResidualNoise:
         (m - skip, k) array
             Stored column by column.
         """
+        # Band matrix of f (1, -a) in blocks of BAND rows: one dense product for each block
         p, k, own = len(self.ar), values.shape[1], len(values) - skip
         count = -(-own // BAND)
         V = np.asfortranarray(values).T[:, max(skip - p, 0) :]
@@ -166,6 +167,7 @@ class ResidualNoise:
     def filter_back(self, y: FloatArray) -> FloatArray:
         """(n,) y (n,) filtered backwards: the product with the transpose of :meth:`filter`'s matrix."""
         y = np.sqrt(self.kappa) * y / self.scale
+        # Transposed filter: samples after a gap have weights of their own
         early, gaps = self.past.rows, self.near_gaps
         whole = np.where(self.past.whole, y, 0.0)
         out = whole.copy()
@@ -204,6 +206,7 @@ class Predictors:
     def __init__(self, history: Past, ar: FloatArray) -> None:
         self.past, self.ar, lags = history, ar, history.lags
         here = lags < MAX_LAG
+        # G a = c for each pattern of lags; f from the variance of its error
         C = autocovariance(ar, int(lags[here].max(initial=0)))
         self.a, self.f = np.zeros(lags.shape), np.ones(len(lags))
         own = np.arange(lags.shape[1])
@@ -236,12 +239,14 @@ def autocovariance(ar: FloatArray, reach: int) -> FloatArray:
     Levinson's recursion backwards gives the best coefficients for 0, 1, ... p samples (Brockwell & Davis
     1991, sec. 5.2).
     """
+    # Levinson backwards: from the coefficients of order p to those of order 0
     p, shorter, variance = len(ar), [ar], 1.0
     while shorter[-1].size:
         a = shorter[-1]
         k = a[-1]
         shorter.append((a[:-1] + k * a[-2::-1]) / (1.0 - k * k))
         variance /= 1.0 - k * k
+    # Forwards: each autocovariance from those before it
     C = np.zeros(max(p, reach) + 1)
     C[0] = variance
     for m in range(1, p + 1):
@@ -267,6 +272,7 @@ def autoregressive_order(residual: FloatArray, slots: IntArray) -> int:
     n = len(residual)
     scale = robust_scale(residual) + 1e-12
     r = np.clip(residual, -6.0 * scale, 6.0 * scale)
+    # Levinson's recursion on the autocovariances, Akaike's criterion at every order
     c = np.array([_product(r, slots, k) for k in range(MAX_NOISE_ORDER + 1)])
     a, v, costs = np.zeros(0), c[0] + 1e-300, {}
     for p in range(1, MAX_NOISE_ORDER + 1):
@@ -318,6 +324,7 @@ def fit_noise(
         nu, scale = like.nu, like.scale
         weight = (nu + 1.0) / (nu + ((residual - lags @ like.ar) / scale) ** 2)
     v, log_likelihood = residual, -np.inf
+    # In turn: autoregression by weighted least squares, innovations, tails and level, weights
     for _ in range(NOISE_ITERATIONS):
         if whole.sum() > 2 * order:
             ar = _stable(_regressed(lags, residual, whole * weight / scale**2), 0 if brief else n)
@@ -356,6 +363,7 @@ def _counts(n: int) -> IntArray:
 
 def _stable(ar: FloatArray, n: int) -> FloatArray:
     """Move roots that lie outside the unit circle, or too close to it for n samples, back inside."""
+    # Roots beyond the longest allowed time constant are moved to it
     roots, longest = np.roots(np.append(1.0, -ar)), np.clip(n / TIMES, BRIEFEST, SLOWEST)
     size, largest = np.abs(roots), 1.0 - 1.0 / longest
     if size.max(initial=0.0) < largest:
@@ -369,6 +377,7 @@ def _uneven(v: FloatArray, count: IntArray) -> bool:
         return False
     size = np.abs(v)
     clipped = np.minimum(size, 5.0 * np.median(size))
+    # Chi-square of the blocks' means, at four sigma
     mean = _sums(clipped, count) / count
     expected = clipped.var() / count
     chi2 = float(np.sum((mean - clipped.mean()) ** 2 / expected))
@@ -382,6 +391,7 @@ def _sums(values: FloatArray, count: IntArray) -> FloatArray:
 
 def _tails(v: FloatArray, count: IntArray, nu: float) -> tuple[float, FloatArray, float]:
     """Find the best tails, uphill from `nu`, the level of each sample under them, and the log likelihood."""
+    # Hill climbing over the list of tails, which has one peak
     at = TAILS.index(nu)
     square = v * v
     start = np.full(count.size, robust_scale(v) + 1e-12)
@@ -403,6 +413,7 @@ def _levels(square: FloatArray, count: IntArray, nu: float, level: FloatArray) -
     """
     n = len(square)
     power = level**2
+    # Expectation maximisation of a Student scale, all blocks at once
     for _ in range(ALTERNATIONS):
         before, each = power, _each(power, count)
         weighted = square if nu > GAUSSIAN else (nu + 1.0) * each * square / (nu * each + square)

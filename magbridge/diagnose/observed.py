@@ -112,6 +112,7 @@ def seen(problem: Problem, signal: FloatArray, component: FloatArray | None = No
     size = rms(signal)
     if not total:
         return Seen(None, 0.0, None, size, 0.0)
+    # A constant along each axis is not asked for: project it out of signal and series
     base = np.linalg.qr(axes)[0]
     y, own = (x - base @ (base.T @ x) for x in (y, signal[part] if component is None else component[part]))
 
@@ -156,6 +157,7 @@ def _by_chance(share: float, terms: int, residual: FloatArray) -> float:
 
 def _remembered(e: FloatArray) -> int:
     """Return the samples after which the autocorrelation of e (n,) has fallen to 1/e."""
+    # Wiener-Khinchin, padded against wrapping
     spectrum = np.abs(np.fft.rfft(e, 2 * len(e))) ** 2
     correlation = np.fft.irfft(spectrum)[: len(e)]
     below = np.flatnonzero(correlation <= correlation[0] / np.e)
@@ -199,6 +201,7 @@ def memory(problem: Problem, residual: FloatArray) -> Memory:
     joined = survey.follows()[1:]
     white = rms(np.diff(e)[joined]) / 2.0**0.5 if joined.any() else size
     samples = int(np.clip(len(e) // 16, 2, 64))
+    # Share of the power that averages over some samples do not remove
     means = e[: len(e) // samples * samples].reshape(-1, samples).mean(axis=1)
     time = _remembered(e) * survey.interval
     return Memory(size, white, time, float(np.mean(means**2)) / size**2, samples, means.size)
@@ -239,6 +242,7 @@ def returns(survey: Survey) -> Returns | None:
     f -= f.mean(axis=0)
     count = np.bincount(of)[:, None]
     means = np.stack([np.bincount(of, column) for column in f.T], axis=1) / count
+    # Smallest ratio of the power within places to the whole, over all slow curves (generalised eigenvalue)
     within = f - means[of]
     separable = float(eigh(within.T @ within, f.T @ f, eigvals_only=True)[0])
     longest = float(np.max(np.where(passed, time[last] - time[first], 0.0)))

@@ -73,6 +73,7 @@ class Packets(NamedTuple):
 def packets(problem: Problem, fit: Joint) -> Packets | None:
     """Find the packets in what a fit has left, the loudest first."""
     survey = problem.survey
+    # Lengths by powers of two; each has frequencies and moments of its own
     n = int(survey.slots[-1]) + 1
     lengths = SHORTEST * 2 ** np.arange(max(int(np.log2(max(LONGEST * n / SHORTEST, 0.5))) + 1, 0))
     if n > MAX_SAMPLE_INTERVALS * len(survey) or not lengths.size:
@@ -82,6 +83,7 @@ def packets(problem: Problem, fit: Joint) -> Packets | None:
     log_prior = log_prior - np.log(len(lengths))
     found: list[int] = []
     price = 0.0
+    # Matching pursuit: the loudest place, then those outside of its bandwidth and duration
     while len(found) < MAX_PACKETS and ratio.any():
         k = int(np.argmax(ratio))
         band = np.hypot(1.0 / length, 1.0 / length[k]) / (2.0 * np.pi)
@@ -124,6 +126,7 @@ def _places(problem: Problem, fit: Joint, length: int) -> FloatArray:
         each = np.pad(np.bincount(slots, values), (wide // 2, wide - wide // 2 - 1))
         return np.asarray(sliding_window_view(each, wide)[::every], float)
 
+    # B by a short-time Fourier transform of the scores, S by the power of the slope in each window
     f = np.fft.rfftfreq(FINER * length)
     asked = (f * length >= CYCLES[0]) & (f * length <= CYCLES[1]) & (f <= 1.0 / SHORTEST)
     B = np.fft.rfft(windows(slope * noise.filter_back(noise.response(fit.residual))) * window, FINER * length)
@@ -167,6 +170,7 @@ def passage(problem: Problem, fit: Joint) -> tuple[Columns, float]:
     Frumkis & Kaplan 2002, Sens. Actuators A 102:67).
     """
     t = problem.survey.time - problem.survey.time[0]
+    # Score and information of each quarter of a duration, then matched filters at all moments
     improvement = fit.noise.whiten(problem.reference_jacobian)
     matched, power = improvement * fit.noise.response(fit.residual), improvement * improvement
     shape = _passing(QUARTERS / 4.0)

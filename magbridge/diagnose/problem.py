@@ -94,6 +94,7 @@ def waves() -> FloatArray:
 
 def slow_columns(slopes: FloatArray, rows: slice) -> FloatArray:
     """(m, k) what a nanotesla of each coefficient adds to some rows of a residual of `slopes` (n, 3)."""
+    # cos(pi k t / T) at the middle of each sample's interval
     n, part = len(slopes), slopes.T[:, rows]
     phase = np.pi * (np.arange(n)[rows] + 0.5) / n
     wave = np.stack(powers(np.exp(1j * phase), LAST)).real  # cos(k phase), by one product each
@@ -117,6 +118,7 @@ def rates(survey: Survey, H: FloatArray, order: int = 1) -> FloatArray:
     which would pass for an effect; the spline treats both directions of time equally and has none.
     """
     t, out = survey.time, np.zeros_like(H)
+    # One spline for each leg, so that none reaches across a gap
     starts = np.flatnonzero(~survey.follows(MAX_MISSING_SAMPLES))
     for start, end in zip(starts, np.append(starts[1:], len(t)), strict=True):
         if end - start > 2:
@@ -139,6 +141,7 @@ def interpolation_error(survey: Survey, H: FloatArray) -> FloatArray:
     .. math:: H(t + \tau) - \frac{\tau}{h} \left(H(t + \tau) - H(t - h + \tau)\right)
               \approx H + \tau \left(\dot H - \frac{H_0 - H_-}{h}\right)
     """
+    # tau (dH/dt - (H_0 - H_-) / h), per unit of tau
     rate, follows = rates(survey, H), survey.follows()
     at = np.flatnonzero(follows & rate.any(axis=0))
     out = np.zeros_like(H)
@@ -161,6 +164,7 @@ def derivatives(
     calibration: Calibration, samples: ResidualSamples, g: FloatArray, L: FloatArray, dtype: type = float
 ) -> FloatArray:
     """(n, q): derivatives of the residual by all coefficients, times L (K, q), in bounded memory."""
+    # Sum over r, s of phi_r C_krs g_s, by one product of matrices for each block of rows
     tensor, _ = coefficient_tensor(calibration)  # C_krs of :mod:`.problem`
     M = np.tensordot(L.T, tensor, 1).reshape(L.shape[1], tensor[0].size).T
     out: FloatArray = np.empty((L.shape[1], len(g)), dtype)
@@ -208,6 +212,7 @@ def _constants(calibration: Calibration) -> list[slice]:
 
 def _factor(covariance: FloatArray) -> FloatArray:
     """L with ``L L^T`` the covariance, of as many columns as it has rank."""
+    # Of the correlations: coefficients have units that differ by orders of magnitude
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + 1e-12
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     kept = values > 1e-12 * values[-1]
@@ -218,6 +223,7 @@ def prior(
     survey: Survey, calibration: Calibration, samples: ResidualSamples, e: FloatArray, g: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return L (K, q) and m (q,) of the prior ``c = c_0 + L z``, ``z ~ N(m, 1)``, :func:`floor` included."""
+    # Posterior and drift add as covariances; the mean is carried over to the new factor
     L, centre = _without_repeats(survey, calibration, samples, e, g)
     broad = _factor(L @ L.T + floor(calibration))
     return broad, np.asarray(np.linalg.lstsq(broad, L @ centre, rcond=None)[0], float)
@@ -238,17 +244,20 @@ def _without_repeats(
     repeated = np.flatnonzero(survey.fitted)
     if not repeated.size:
         return L, centre
+    # Information A^T A of the repeated samples under the calibration's own noise
     J = derivatives(calibration, samples.part(repeated), g[repeated], L)
     noise = calibration.noise
     steps = np.asarray(survey.steps[repeated] * (survey.interval / noise.interval if noise.interval else 1.0))
     white = np.column_stack([J, e[repeated]])
     white = whiten(white, steps, noise.autocorrelation, noise.white) / noise_sigma(calibration, e)
+    # P_0 = 1 - H, and P_0 m = A^T y with the directions that only these samples determined left out
     A, y = white[:, :-1], white[:, -1]
     values, vectors = np.linalg.eigh(np.eye(len(centre)) - A.T @ A)
     held = (
         values > MIN_PRECISION
     )  # other directions were learned from the repeated samples alone, which count anyway
     pull = vectors @ np.where(held, vectors.T @ (A.T @ y), 0.0)
+    # Those directions keep the physical bound as their prior
     bound = L / _physical(calibration)[:, None]
     values, vectors = np.linalg.eigh((vectors * np.where(held, values, 0.0)) @ vectors.T + bound.T @ bound)
     root = np.sqrt(np.maximum(values, BROADEST))
@@ -384,6 +393,7 @@ def cached_per_problem(made: Callable[[Problem], T]) -> Callable[[Problem], T]:
 def samples_of(survey: Survey, calibration: Calibration) -> tuple[ResidualSamples, FloatArray]:
     """Return the residual's samples, with effects among the regressors, and its coefficients (9 m,)."""
     phi = regressors(calibration, survey.field, survey.values(calibration.channels), survey.time)
+    # The residual takes A - 1 in nT of the usual field
     unit = calibration.reference.field
     W = calibration.kernel.weights.copy()
     W[0, :3] -= 1.0
@@ -432,14 +442,17 @@ def pose(survey: Survey, calibration: Calibration) -> Problem:
     """Linearise the comparison about `calibration`."""
     samples, coefficients = samples_of(survey, calibration)
     n = len(survey)
+    # Residual and derivatives at readings without noise, and the prior of the coefficients
     e, g, reference_jacobian, reading = linearised(samples, coefficients)
     L, centre = prior(survey, calibration, samples, e, g)
+    # Information of these data in units of the prior: directions below MIN_INFORMATION are not fitted
     seen = np.zeros((L.shape[1],) * 2)
     for start in range(0, n, DERIVATIVE_ROWS):
         rows = slice(start, start + DERIVATIVE_ROWS)
         J = derivatives(calibration, samples.part(rows), g[rows], L)
         seen += J.T @ J
     values, vectors = np.linalg.eigh(seen / noise_sigma(calibration, e) ** 2)
+    # Their covariance goes into `unseen`, which the extended calibration keeps
     keep = values > MIN_INFORMATION
     V, rest = vectors[:, keep], L @ vectors[:, ~keep]
     delay_jacobian = -AXIS_DELAY_SIGMA_S * g[:, 6:] * interpolation_error(survey, reading.T).T

@@ -65,6 +65,7 @@ def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> 
     their regressors.
     """
     model = [h.candidate for h in outcome.chosen]
+    # Names: their likelihood ratio with all prices
     uneven = [
         one for candidate in model if (one := varying(problem, candidate, outcome.look_elsewhere)) is not None
     ]
@@ -88,6 +89,7 @@ def accept(problem: Problem, outcome: SearchOutcome, tone: Candidate | None) -> 
         names -= ODDS
     if free is None:
         return True, rest
+    # Free descriptions of the whole signal: by evidence, and by prediction of held-out dives
     ours = _foretold(problem, [candidate.columns for candidate in model], outcome.fit, residual)
     behind = max(free.evidence_of_choice - names, _foretold(problem, [], outcome.null, free) - ours - AGAINST)
     if behind <= 0.0:
@@ -167,6 +169,7 @@ def odds_over_random_walk(outcome: SearchOutcome, hypothesis: Hypothesis) -> flo
     slots, noise = outcome.problem.survey.slots, outcome.null.noise
     others = [one.candidate for one in outcome.chosen if one is not hypothesis]
     columns, spectra = [one.columns for one in others], [one.spectra for one in others]
+    # The model without this cause, once with a random walk, once with its own noise
     walking = with_slow_noise(outcome.problem, 2)
     rough = fit_joint(walking, columns, 1, spectra=spectra, rounds=2)
     order = autoregressive_order(rough.residual, slots)

@@ -100,6 +100,7 @@ def outliers(fit: Joint, causes: int) -> Outliers | None:
     n = len(v)
     if np.abs(v).max() < 5.0:
         return None
+    # Likelihood ratio of the mixture against heavy tails alone
     alone = max(_mixture(v, nu, 0.0)[0] for nu in TAILS)
     value, member = max((_mixture(v, nu, 3.0 / n) for nu in TAILS[1:]), key=lambda found: found[0])
     ratio = 2.0 * (value - alone)
@@ -131,6 +132,7 @@ def _lasting(fit: Joint, rows: IndexArray) -> bool:
 
     .. math:: \lambda_x = \left(\sum_l x_l v_{i+l}\right)^2 \Big/ \sum_l x_l^2
     """
+    # Whitened impulse h and shift s, then lambda of both at every row
     impulse = np.concatenate([[1.0], -fit.noise.ar, np.zeros(AFTERWARDS)])
     both = np.stack([impulse, np.cumsum(impulse)])
     v = np.append(fit.noise.innovations, np.zeros(impulse.size))[rows[:, None] + np.arange(impulse.size)]
@@ -159,6 +161,7 @@ def _neighbours(fit: Joint, rows: IndexArray) -> float:
         sliding_window_view(x, 3).T
         for x in (noise.filter_back(noise.whiten(fit.residual)) * noise.scale, noise.innovations)
     )
+    # Amplitudes of three impulses at every sample: Toeplitz, since the filter is the same everywhere
     c = solve_toeplitz([float(h[: len(h) - k] @ h[k:]) for k in range(3)], b)
     before = np.arange(b.shape[1])
     after = np.minimum(before + 2 + p, b.shape[1] + 1)  # the last sample that one of the impulses reaches
@@ -178,6 +181,7 @@ def _mixture(v: FloatArray, nu: float, eps: float) -> tuple[float, FloatArray]:
     at_zero = gammaln(0.5 * (nu + 1.0)) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
     member = np.zeros(len(v))
     value = -np.inf
+    # Expectation maximisation over scale, share and width of the wide component
     for _ in range(25):
         x = v / s
         log_t = at_zero - np.log(s) - 0.5 * (nu + 1.0) * np.log1p(x * x / nu)
@@ -237,6 +241,7 @@ def search(
     plain : Joint, optional
         The null without slow noise, where the problem has such.
     """
+    # Order of the noise, forward selection with exchanges, backward elimination, competing hypotheses
     rough = fit_joint(problem, [], 1, rounds=2)
     order = autoregressive_order(rough.residual, problem.survey.slots)
     state = SearchState(problem, candidates, order, causes)
@@ -326,6 +331,7 @@ def _next(found: list[Hypothesis], strengths: Mapping[str, float], ratio: float)
     def remnant(cause: str) -> float:
         return max((size for other, size in strengths.items() if other != cause), default=0.0)
 
+    # Significant, and stronger than what the regressors of other causes leave
     significant = [
         h for h in found if h.p_value < FALSE_ALARM_RATE and h.signal_to_noise >= remnant(h.candidate.cause)
     ]

@@ -112,6 +112,7 @@ class SearchState:
         ratio = self.ratio(fit, null)
         if not model:
             return 0.5 * ratio
+        # Odds of the model, less the parameters' narrowness and the errors of idealised regressors
         causes, narrow = {candidate.cause for candidate in model}, sum(c.point.narrow for c in model)
         shaped = shaped_ratio(ratio, model, fit, slow=null is not None)
         return (
@@ -133,6 +134,7 @@ class SearchState:
 
     def round(self, model: list[Candidate], base: Joint) -> list[Hypothesis]:
         """Fit the best causes given `model`, each on its own, and list them, the likeliest first."""
+        # Score all candidates: under the noise of the model, then under that without the best of every cause
         stride = max(len(self.problem) // MAX_SCREENED_SAMPLES, 1)
         screened = self._information_under(base.noise, model, base, stride) if stride > 1 else None
         as_fitted = (screened or self.conditional_on(model, base)).fitted(base)
@@ -142,6 +144,7 @@ class SearchState:
         for info in (as_fitted, self._cleared(model, base, as_fitted, stride)):
             for group, best in self.best(info).items():
                 under.setdefault(group, []).append(best)
+        # The likeliest of each group are fitted jointly with calibration and noise
         listed = sorted(under.values(), key=lambda won: -max(best.score.evidence for best in won))
         # the largest, which take longest, first: then the threads end together
         tried = sorted(listed[:JOINTLY_FITTED_CAUSES], key=lambda won: -self.candidates[won[0].place].size)
@@ -159,6 +162,7 @@ class SearchState:
 
     def _cleared(self, model: list[Candidate], base: Joint, info: Information, stride: int) -> Information:
         """Information under the noise that remains when the best candidate of every cause is fitted."""
+        # The best candidate of each cause, all in one model with the prior of plausible sizes
         top: dict[str, Best] = {}
         for (cause, _), best in self.best(info).items():
             top[cause] = max(top.get(cause, best), best, key=lambda one: one.score.evidence)
@@ -177,6 +181,7 @@ class SearchState:
             brief=self.brief,
             stride=stride,
         )
+        # How well the noise's level is known at the frequencies of each group (F test)
         if not model:
             middle = [self.columns[members[len(members) // 2]] for members in self.groups.values()]
             certain = certainty(everything.residual, everything.noise, middle)
@@ -195,6 +200,7 @@ class SearchState:
         found = []
         for k in {best.place for best in won}:
             candidate, here = self.candidates[k], [best for best in won if best.place == k]
+            # Start from the estimate under each noise in which this point won
             starts = [
                 np.append(info.moved(base, self.at[k], s.estimate), s.estimate) for _, _, s, info in here
             ]
@@ -221,6 +227,7 @@ class SearchState:
         """
         hypotheses = self.look_elsewhere.get(candidate.cause, 1.0) * float(np.exp(-candidate.point.likelier))
         tests = candidate.tail * hypotheses * self.causes
+        # Fisher's F, with as many degrees of freedom in the denominator as the level of the noise has
         freedom, certain = max(freedom, 1), self.certain.get(candidate.group, np.inf)
         return min(1.0, tests * float(fdtrc(freedom, certain, ratio / freedom)))
 
@@ -247,6 +254,7 @@ def sharpen(state: SearchState, model: list[Candidate], hypothesis: Hypothesis, 
     best, narrow = hypothesis, 0.0
     if best.candidate.point.rebuild is None:
         return best
+    # Coordinate-wise: one parameter after the other, each kept only where the likelihood grows
     for position, name in enumerate(best.candidate.point.shape):
         candidate, start, narrower = _profiled(state, model, best, base, position, name)
         narrow += narrower
@@ -268,6 +276,7 @@ def _profiled(
     rebuild = best.candidate.point.rebuild
     assert rebuild is not None
     columns = [candidate.columns for candidate in model]
+    # Two stages: all values of the bracket at once, then again between the neighbours of the best
     low, high = _bracket(state, best.candidate, name)
     narrower = 0.0
     for stage in range(STAGES):

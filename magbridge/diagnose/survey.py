@@ -95,6 +95,7 @@ def kinds_of(name: str, unit: str) -> tuple[str, ...]:
     unit : str
         As declared; empty if it is not.
     """
+    # A unit decides where it is specific; else the words of the name; else every kind is possible
     if unit in UNIT_KINDS:
         return UNIT_KINDS[unit]
     parts = [part.lower() for part in PART.findall(name)]
@@ -121,6 +122,7 @@ def dives_of(table: Table) -> IntArray:
 
     Of two logs, that which was learned from and that which is diagnosed, one may count its dives alone.
     """
+    # As the log counts; a log that lacks the count has its dives found by itself
     for name in ("dive", "run"):
         if name in table and np.unique(table[name]).size > 3:
             dive = np.unique(table[name], return_inverse=True)[1].astype(np.int64)
@@ -130,6 +132,7 @@ def dives_of(table: Table) -> IntArray:
             return dive
     if "depth" in table and np.nanmax(table["depth"]) > 5.0:
         depth = held(table["depth"])
+        # A dive begins where the vehicle leaves the surface
         shallow = depth < 0.15 * np.quantile(depth, 0.98)
         start = shallow & ~np.append(False, shallow[:-1])
         if 4 <= start.sum() <= 0.05 * len(depth):
@@ -156,6 +159,7 @@ def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
     fresh = np.flatnonzero(~learned)
     t = time[fresh]
     bounds = []
+    # A day ends after 24 h, or with a night without samples
     for k, moment in enumerate(t.tolist()):
         if moment - start >= DAY_S or moment - last > NIGHT_S:
             start = moment
@@ -171,6 +175,7 @@ def days_of(time: FloatArray, learned: BoolArray) -> IntArray | None:
 def held(values: FloatArray) -> FloatArray:
     """Fill the gaps of (n,) values with the last known one, and the beginning with the first."""
     known = np.flatnonzero(np.isfinite(values))
+    # Index of the last known value at every sample
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), known[0]))
     return np.asarray(values[np.maximum(last, known[0])])
 
@@ -213,10 +218,12 @@ class Past:
     def __init__(self, steps: IntArray, order: int) -> None:
         n, self.order = len(steps), order
         index = np.arange(n)
+        # A sample has a whole past if the last gap is at least `order` samples ago
         broken = np.where(steps == 1, 0, index)
         broken[:1] = 0
         self.whole = index - np.maximum.accumulate(broken) >= order
         self.rows = np.flatnonzero(~self.whole)
+        # Equal patterns of lags share one predictor: only the distinct ones are kept
         place = np.append(np.cumsum(np.minimum(steps, MAX_LAG)), -MAX_LAG)
         before = np.maximum(self.rows[:, None] - np.arange(1, order + 1), -1)
         lags = np.minimum(place[self.rows, None] - place[before], MAX_LAG)
@@ -335,6 +342,7 @@ def assemble(
     """
     time = table["time"]
     step = np.diff(time, prepend=np.nan)
+    # Steps in whole sampling intervals; a change of log is as a gap
     interval = float(np.nanquantile(step, SHORT))
     steps = np.where(step > 0.5 * interval, np.minimum(np.rint(step / interval), MAX_LAG), MAX_LAG).astype(
         np.int64
@@ -392,6 +400,7 @@ def _place(table: dict[str, FloatArray]) -> FloatArray | None:
     if not {"latitude", "longitude"} <= set(table):
         return None
     latitude, longitude = table["latitude"], table["longitude"]
+    # m from the middle of the track, on the sphere
     along = wrap(longitude - longitude[0])  # also across the date line
     middle = float(np.median(latitude)), float(longitude[0] + np.median(along))
     north, east = separation(*middle, latitude, longitude)
@@ -425,6 +434,7 @@ def load_survey(
         A column is missing, too few samples are complete, or a parameter is out of all range: one line
         that says which.
     """
+    # A training log that is diagnosed as well is read once, as diagnosed
     own = [any(ds is one for one in training_logs) for ds in datasets]
     apart = [ds for ds in training_logs if not any(ds is one for one in datasets)]
     logs = (*datasets, *apart)
@@ -479,6 +489,7 @@ def _comparable(table: dict[str, FloatArray], calibration: Calibration, source: 
         raise DataError(f"{source}: {counted(size, 'sample')}, at least {MIN_SURVEY_SAMPLES} needed")
     for name in CHANNELS:
         table[name][~(np.abs(table[name]) < MAX_MEASURED_NT)] = np.nan
+    # Rows that have field, reference and the position of every mass
     whole = np.all([np.isfinite(table[name]) for name in needed], axis=0)
     if whole.sum() < MIN_SURVEY_SAMPLES:
         worst = min(needed, key=lambda name: int(np.isfinite(table[name]).sum()))

@@ -62,6 +62,7 @@ class Cause(ABC):
         calibration, K = problem.calibration, problem.calibration.coefficients.size
         size = K + candidate.size
         survey = replace(problem.survey, field=problem.reading)
+        # Central difference of the nonlinear residual by each coefficient
         columns, worst = candidate.columns(slice(0, len(problem))), 0.0
         for k in range(candidate.size):
             sides = []

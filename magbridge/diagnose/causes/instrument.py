@@ -42,11 +42,13 @@ class OffsetStep(Cause):
         fresh = t[~survey.learned]
         onsets = np.quantile(fresh, np.linspace(0.02, 0.98, ONSETS)) if fresh.size else t[:0]
         first = fresh.min() - 1.0
+        # Moments: power cycles, quantiles of the time, and the change of logs
         cycles = {*survey.cycles, *([first] if survey.learned.any() else [])}
         grid = np.unique([first, *onsets, *cycles])
 
         def rebuild(onset: float) -> Candidate:
             effect = TimeEffect(cause=self.name, shape="step", start=onset)
+            # Half of the prior for all power cycles together, half for all other moments
             alike = len(cycles) if max(onset, first) in cycles else len(grid) - len(cycles)
             likelier = float(np.log(0.5 * len(grid) / alike)) if cycles else 0.0
             point = GridPoint({"onset": (onset, "s")}, rebuild, likelier)
@@ -116,12 +118,14 @@ def _loudest_periods(problem: Problem) -> list[float]:
     slots = np.rint((t - t[0]) / interval).astype(np.int64)
     if slots[-1] > 8 * len(t):
         return []
+    # Differences flatten the noise's spectrum; zero padding places it on a fine grid
     flat = np.append(0.0, np.diff(problem.residual) * survey.follows()[1:])
     size = 1 << int(np.ceil(np.log2(slots[-1] + 1)) + 1)
     body = problem.jacobian[:, 6:]
     lines = np.array([np.fft.rfft(np.bincount(slots, flat * slope, minlength=size)) for slope in body.T])
     # power in all three axes together; the inverse keeps what they share from counting twice
     power = np.einsum("if,ij,jf->f", lines.conj(), np.linalg.inv(body.T @ body), lines).real
+    # Peaks over the local mean of the spectrum, from 20 periods per log on
     frequency = np.fft.rfftfreq(size, interval)
     width = min(201, len(power))
     smooth = np.convolve(power, np.ones(width) / width, mode="same") + 1e-300

@@ -76,6 +76,7 @@ class ActuatorOrder(Cause):
         calibration = problem.calibration
         if not calibration.parameters:
             return []
+        # What the calibration's polynomials lack, up to one order more
         present = {e for term in calibration.terms if isinstance(term, Polynomial) for e in term.exponents}
         order = max(sum(e) for e in present) + 1
         missing = [e for e in full_order(len(calibration.parameters), order) if e not in present]
@@ -100,6 +101,7 @@ class ActuatorOrder(Cause):
         """Return sources all along one mass' path, and a little beyond its ends, of one common size."""
         low, high = problem.survey.channels[name].extent
         scale = 0.5 * distance * (high - low)
+        # Sources at equal distances, from one end of the path to a little beyond the other
         gaps = int(np.ceil(2.0 / (SOURCE_SPACING * distance)))
         centre = 0.5 * (low + high - gaps * SOURCE_SPACING * scale)
         effect = SourcesEffect(

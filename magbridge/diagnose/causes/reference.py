@@ -67,6 +67,7 @@ class MapError(Cause):
         Z, cell = _cells(place)
         weights, corners = _corner_weights(place, cell)
         seen = diags_array(problem.reference_jacobian) @ weights
+        # Sources below the deepest place, and correlation lengths, both in units of the cells
         depths, lengths = place[:, 2].max() + cell * SCALES, 2.0 * cell * SCALES
         lacking = _expanded([partial(_lacking, d=d) for d in depths], Z, corners)
         drawn = _expanded([partial(_matern, length=length) for length in lengths], Z, corners)
@@ -96,17 +97,20 @@ def _expanded(
     (m, k), (k,), (l, k) array
         The functions, of unit variance; their prior variances; those by each covariance, relative to these.
     """
+    # Mean of all covariances, each scaled to unit mean variance, in its eigenfunctions
     each = np.array([K(Z, Z) for K in covariances])
     equal = len(Z) / len(each) / each.trace(axis1=1, axis2=2)
     values, V = np.linalg.eigh(np.tensordot(equal, each, 1))
     values, V = values[kept := values > FAINT * len(Z)], V[:, kept]
     mean = sum(share * K(x, Z) for share, K in zip(equal, covariances, strict=True))
+    # Prior variances by each single covariance: the diagonal of V^T K_l V
     own = equal[:, None] * np.einsum("ik,lij,jk->lk", V, each, V, optimize=True)
     return mean @ (V / values), values, np.maximum(own / values, FAINT)
 
 
 def _cells(place: FloatArray) -> tuple[FloatArray, float]:
     """Return mean places (m, 3) in at most :data:`MAX_MAP_ERROR_CELLS` cells of the track and their side."""
+    # Coarser cells until there are few enough
     side = FINEST
     while (found := _each(np.floor(place / side)))[1].max() >= MAX_MAP_ERROR_CELLS:
         side *= 1.1
@@ -126,6 +130,7 @@ def _corner_weights(place: FloatArray, side: float) -> tuple[csr_array, FloatArr
     """(n, c) weights of linear interpolation between the corners (c, d), m, of the visited cells."""
     low = np.floor(place / side)
     high = place / side - low
+    # Trilinear weights of the corners of each sample's cell
     steps = list(np.ndindex((2,) * place.shape[1]))
     share = np.concatenate([np.prod(np.where(step, high, 1.0 - high), axis=1) for step in steps])
     corners, of = _each(np.concatenate([low + step for step in steps]))
@@ -140,6 +145,7 @@ def _lacking(a: FloatArray, b: FloatArray, d: float) -> FloatArray:
     def reciprocal(upper: FloatArray | float, lower: FloatArray | float) -> FloatArray:
         return np.asarray(((upper + lower) ** 2 + r2) ** -0.5)
 
+    # C(z, z') - C(z, -a) - C(-a, z') + C(-a, -a), each from its distance to the sources
     here, there, high = d - a[:, 2:], d - b[:, 2], d + ALTITUDE
     return reciprocal(here, there) - reciprocal(here, high) - reciprocal(high, there) + reciprocal(high, high)
 
@@ -164,6 +170,7 @@ class DiurnalVariation(Cause):
         """Return all harmonics of a day of which the log has a quarter, and those without the slowest."""
         t = problem.survey.time
         span = float(t[-1] - t[0])
+        # Harmonics of which the log has at least a quarter of a period
         harmonics = [h for h in (1, 2, 3) if 86400.0 / h < 4.0 * span]
         made = []
         for some in (harmonics[k:] for k in range(len(harmonics))):

@@ -50,6 +50,8 @@ class _Thermal(Cause):
         for name in problem.channels_of("temperature"):
             values = problem.survey.channels[name].values
             low, high = problem.survey.channels[name].extent
+            # The effect is zero at an unknown temperature: the log's mean, or outside of its range on either
+            # side
             origins = [float(np.mean(values)), 2 * low - high, 2 * high - low]
             if problem.survey.fitted.any():  # the values during the calibration are in the data
                 origins = origins[:1]
@@ -118,6 +120,7 @@ class _Proportional(Cause):
         for name in problem.channels_of(self.kind):
             channel = problem.survey.channels[name]
             unit = f"nT/{channel.unit}" if channel.unit else "nT per 1"
+            # A coefficient of one width makes the plausible offset at the channel's extreme
             width = self.largest / max(map(abs, channel.extent))
             effect = ChannelEffect(cause=self.name, channel=name)
             made.append(of_effect(problem, effect, width, unit, channel=name))

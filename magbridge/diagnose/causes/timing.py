@@ -40,11 +40,14 @@ def mass_rates(problem: Problem) -> FloatArray:
     survey, calibration = problem.survey, problem.calibration
     kernel = calibration.kernel
     p, t = survey.values([parameter.name for parameter in calibration.parameters]), survey.time
+    # Speeds of the intervals after and before each sample; none across a gap
     after = np.diff(p, axis=0, append=p[-1:]) / np.diff(t, append=t[-1] + 1.0)[:, None]
     after[:-1] *= survey.follows(MAX_MISSING_SAMPLES)[1:, None]
     before = np.roll(after, 1, axis=0)
+    # In motion where both have the same sign; the larger is that of an interval in motion throughout
     larger = np.where(np.abs(before) > np.abs(after), before, after)
     moved = CENTRAL_STEP_S * np.where(before * after > 0.0, larger, 0.0)
+    # Central difference of theta(p) along that motion
     theta = kernel.rate_weights.T @ (kernel.monomials_of(p + moved) - kernel.monomials_of(p - moved))
     return np.asarray(theta / (2.0 * CENTRAL_STEP_S))
 
@@ -107,6 +110,7 @@ def _averaged(problem: Problem, shift: float) -> Callable[[slice], FloatArray]:
 
     def rows_of(rows: slice) -> FloatArray:
         later = t[rows] + shift
+        # Sample that stands next to the shifted time: both must be in one leg
         near = np.clip(np.searchsorted(t, later, side="left" if shift > 0.0 else "right"), 0, len(t) - 1)
         near -= 0 if shift > 0.0 else 1
         moved = np.stack([np.interp(later, t, column) for column in p.T], axis=1)
@@ -131,6 +135,7 @@ class _Delay(Cause):
         """Return the delay by the rates of the masses, and by shifts of their telemetry."""
         if not problem.calibration.parameters:
             return []
+        # Shifts from half an interval to a fiftieth of the log; a filter delays only the field
         interval, longest = problem.survey.interval, 0.02 * float(np.ptp(problem.survey.time))
         shifts = [shift for shift in SHIFTS_S if 0.5 * interval <= shift <= longest]
         late = self.sign < 0.0

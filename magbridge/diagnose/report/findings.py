@@ -112,6 +112,7 @@ def _rms(finding: Finding, samples: int) -> dict[str, Any]:
     ``f = sqrt(b^T M b)``, ``M = X^T X / n``, ``df/db = M b / f``.
     """
     b = finding.coefficients
+    # M = X^T X / n, summed in pieces
     M = normal(finding.candidate.columns, np.zeros(samples))[0] / samples
     f = float(np.sqrt(b @ M @ b))
     slope = M @ b / max(f, 1e-12)
