@@ -9,7 +9,7 @@ from typing import Any
 
 from magbridge.calibration.model import Calibration
 from magbridge.correction import TEMPERATURE
-from magbridge.logs.telemetry_fields import MAVLINK_FIELDS, Value
+from magbridge.logs.telemetry_fields import MAVLINK_FIELDS
 from magbridge.sensors.options import options_of
 
 __all__ = ["Answers", "bridge_toml"]
@@ -134,12 +134,11 @@ def _source(name: str, unit: str) -> list[str]:
     The columns that magbridge reads from a telemetry log are named in
     :mod:`magbridge.logs.telemetry_fields`; a calibration that was fitted to such a log has these names.
     """
-    for message, columns in MAVLINK_FIELDS.items():
-        if name in columns:
-            value = Value(name, message, columns[name])
-            if unit in ("", value.unit):
-                scale = [f"scale = {value.scale:g}"] if value.scale != 1.0 else []
-                return [f'message = "{message}"', f'field = "{columns[name]}"', *scale]
+    for fields in MAVLINK_FIELDS.values():
+        for one in fields:
+            if one.column == name and unit in ("", one.unit):
+                scale = [f"scale = {one.factor:g}"] if one.factor != 1.0 else []
+                return [f'message = "{one.record}"', f'field = "{one.field}"', *scale]
     return [
         'message = "NAMED_VALUE_FLOAT"',
         f"match = {{name = {_text(name[:10])}}}    # at most 10 characters",

@@ -359,14 +359,14 @@ def in_hundredths(flash: Flash, fields: Fields) -> tuple[Fields, list[str]]:
     return found, notes
 
 
-def _converted(one: FieldMap, declared: tuple[str, float] | None) -> FieldMap:
+def _converted(field: FieldMap, declared: tuple[str, float] | None) -> FieldMap:
     """Return a field with the declared unit, where that is one of its kind."""
     if declared is None or declared[0] not in UNIT_FACTORS:
-        return one
+        return field
     unit, scale = UNIT_FACTORS[declared[0]]
-    if one.unit not in (unit, "1"):
-        return one
-    return one._replace(unit=unit, factor=float(np.copysign(scale * declared[1], one.factor)))
+    if field.unit not in (unit, "1"):
+        return field
+    return field._replace(unit=unit, factor=float(np.copysign(scale * declared[1], field.factor)))
 
 
 def _declared(flash: Flash) -> dict[tuple[str, str], tuple[str, float]]:

@@ -2,113 +2,123 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from math import isnan, nan
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from magbridge.arrays import FloatArray
+from magbridge.arrays import BoolArray, FloatArray
 from magbridge.columns import CHANNEL_TIMES, CORRECTED
+from magbridge.logs.fields import DEG_PER_RAD, FieldMap, by_record
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.enums import MAG_RAW_FLAGS
 from magbridge.mavlink.messages import split_index
 
 __all__ = [
-    "IMUS",
-    "MAVLINK_FIELDS",
-    "POWER_CYCLE",
-    "SOURCES",
-    "TELEMETRY",
-    "UNKNOWN_INT",
-    "Columns",
-    "DeclaredField",
-    "Value",
-    "correction",
-    "is_of_main_sensor",
-    "sample",
+    "MAVLINK_FIELDS", "POWER_CYCLE", "SOURCES", "TELEMETRY", "UNKNOWN_INT", "DeclaredField", "MessageField",
+    "are_of_main_sensor", "source_columns",
 ]  # fmt: skip
 
-Columns = dict[str, float]
-
-MAVLINK_FIELDS: dict[str, dict[str, str]] = {
-    # message: {column: field}
-    "ATTITUDE": {"roll": "roll", "pitch": "pitch", "heading": "yaw"},
-    "GLOBAL_POSITION_INT": {"latitude": "lat", "longitude": "lon", "depth": "relative_alt"},
-    "SYS_STATUS": {"battery_current": "current_battery", "battery_voltage": "voltage_battery"},
-    "SCALED_PRESSURE": {"pressure": "press_abs", "pressure_temperature": "temperature"},
-    "SCALED_PRESSURE2": {"pressure2": "press_abs", "pressure2_temperature": "temperature"},
-    "SCALED_PRESSURE3": {"pressure3": "press_abs", "pressure3_temperature": "temperature"},
-    "SERVO_OUTPUT_RAW": {f"servo{k}": f"servo{k}_raw" for k in range(1, 17)},
-    "ESC_TELEMETRY_1_TO_4": {f"esc{k + 1}_current": f"current[{k}]" for k in range(4)},
-    "ESC_TELEMETRY_5_TO_8": {f"esc{k + 5}_current": f"current[{k}]" for k in range(4)},
-    "HIGHRES_IMU": {"imu_temperature": "temperature"},
-    "RAW_IMU": {"imu_temperature": "temperature", "mag1_x": "xmag", "mag1_y": "ymag", "mag1_z": "zmag"},
-    "SCALED_IMU2": {"mag2_x": "xmag", "mag2_y": "ymag", "mag2_z": "zmag"},
-    "SCALED_IMU3": {"mag3_x": "xmag", "mag3_y": "ymag", "mag3_z": "zmag"},
-}
-MAVLINK_UNITS = {
-    # the dialect's: (ours, factor)
-    "rad": ("deg", 57.29577951308232),
-    "degE7": ("deg", 1e-7),
-    "gauss": ("nT", 1e5),
-    "mgauss": ("nT", 1e2),
-    "cA": ("A", 1e-2),
-    "mV": ("V", 1e-3),
-    "cdegC": ("degC", 1e-2),
-    "mm": ("m", 1e-3),
-}
+Payloads = NDArray[np.uint8]
+"""(n, size): the payloads of messages of one kind, without zeros cut off."""
 UNKNOWN_INT = 0x7FFFFFFF
-UNKNOWN_VALUES: dict[tuple[str, str], tuple[int, ...]] = {
-    # what these fields hold when their sender does not know the value; the dialect does not declare it
-    ("GLOBAL_POSITION_INT", "lat"): (0, UNKNOWN_INT),
-    ("GLOBAL_POSITION_INT", "lon"): (0, UNKNOWN_INT),
-    ("GLOBAL_POSITION_INT", "relative_alt"): (UNKNOWN_INT,),
-    **{("SERVO_OUTPUT_RAW", f"servo{k}_raw"): (0,) for k in range(1, 17)},
-    # "0: IMU does not provide temperature values"; one that is at 0 degC sends 1
-    ("RAW_IMU", "temperature"): (0,),
+MAVLINK_FIELDS = by_record(
+    (
+        FieldMap("ATTITUDE", "roll", "roll", "deg", DEG_PER_RAD),
+        FieldMap("ATTITUDE", "pitch", "pitch", "deg", DEG_PER_RAD),
+        FieldMap("ATTITUDE", "yaw", "heading", "deg", DEG_PER_RAD),
+        FieldMap("GLOBAL_POSITION_INT", "lat", "latitude", "deg", 1e-7, (0, UNKNOWN_INT)),
+        FieldMap("GLOBAL_POSITION_INT", "lon", "longitude", "deg", 1e-7, (0, UNKNOWN_INT)),
+        FieldMap("GLOBAL_POSITION_INT", "relative_alt", "depth", "m", -1e-3, (UNKNOWN_INT,)),
+        FieldMap("SYS_STATUS", "current_battery", "battery_current", "A", 1e-2),
+        FieldMap("SYS_STATUS", "voltage_battery", "battery_voltage", "V", 1e-3),
+        FieldMap("SCALED_PRESSURE", "press_abs", "pressure", "hPa"),
+        FieldMap("SCALED_PRESSURE", "temperature", "pressure_temperature", "degC", 1e-2),
+        FieldMap("SCALED_PRESSURE2", "press_abs", "pressure2", "hPa"),
+        FieldMap("SCALED_PRESSURE2", "temperature", "pressure2_temperature", "degC", 1e-2),
+        FieldMap("SCALED_PRESSURE3", "press_abs", "pressure3", "hPa"),
+        FieldMap("SCALED_PRESSURE3", "temperature", "pressure3_temperature", "degC", 1e-2),
+        *(
+            FieldMap("SERVO_OUTPUT_RAW", f"servo{k}_raw", f"servo{k}", "us", missing=(0,))
+            for k in range(1, 17)
+        ),
+        *(
+            FieldMap("ESC_TELEMETRY_1_TO_4", f"current[{k}]", f"esc{k + 1}_current", "A", 1e-2)
+            for k in range(4)
+        ),
+        *(
+            FieldMap("ESC_TELEMETRY_5_TO_8", f"current[{k}]", f"esc{k + 5}_current", "A", 1e-2)
+            for k in range(4)
+        ),
+        FieldMap("HIGHRES_IMU", "temperature", "imu_temperature", "degC"),
+        # "0: IMU does not provide temperature values"; one that is at 0 degC sends 1
+        FieldMap("RAW_IMU", "temperature", "imu_temperature", "degC", 1e-2, (0,)),
+        *(FieldMap("RAW_IMU", f"{axis}mag", f"mag1_{axis}", "nT", 1e2) for axis in "xyz"),
+        *(FieldMap("SCALED_IMU2", f"{axis}mag", f"mag2_{axis}", "nT", 1e2) for axis in "xyz"),
+        *(FieldMap("SCALED_IMU3", f"{axis}mag", f"mag3_{axis}", "nT", 1e2) for axis in "xyz"),
+    )
+)
+"""Message to its fields; the values that the dialect declares to be invalid are missing, too."""
+SOURCES = {
+    "MAG_RAW": (
+        *(FieldMap("MAG_RAW", axis, f"mag_{axis}", "nT") for axis in "xyz"),
+        FieldMap("MAG_RAW", "temperature", "sensor_temperature", "degC"),
+        FieldMap("MAG_RAW", "supply", "sensor_supply", "V"),
+        FieldMap("MAG_RAW", "power_cycle", "power_cycle", ""),
+    ),
+    "MAG_FIELD": tuple(
+        FieldMap("MAG_FIELD", field, column, "")
+        for column, field in zip(
+            CORRECTED, ("total_field", "total_field_sigma", "x", "y", "z", "anomaly", "flags"), strict=True
+        )
+    ),
+    "HIGHRES_IMU": tuple(FieldMap("HIGHRES_IMU", f"{axis}mag", f"mag_{axis}", "nT", 1e5) for axis in "xyz"),
+    **{
+        message: tuple(FieldMap(message, f"{axis}mag", f"mag_{axis}", "nT", 1e2) for axis in "xyz")
+        for message in ("RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
+    },
+    "ATTITUDE": (),
+    "GLOBAL_POSITION_INT": (),
 }
+"""The messages that make a row, the best first, and the fields whose values the row has from them."""
+POWER_CYCLE = int(MAG_RAW_FLAGS.POWER_CYCLE)
+"""Flag of MAG_RAW: its power cycle is counted."""
 
 
-class Value:
-    """How one column is read from a message: ``scale * field + offset``, in `unit`."""
+class MessageField:
+    """How a column is read from the payloads of a message: ``factor * field + offset``, in `unit`.
 
-    def __init__(self, column: str, message: str, field: str) -> None:
-        name, self._index = split_index(field)
-        self._field = spec(message).fields[name]
-        self._unknown = UNKNOWN_VALUES.get((message, name), ())
-        self.column = column
-        self.unit, self.scale = MAVLINK_UNITS.get(self._field.unit, (self._field.unit or "1", 1.0))
-        if name == "relative_alt":
-            self.scale = -self.scale  # depth
-        self.offset = 0.0
+    Attributes
+    ----------
+    column, unit : str
+        Of the column.
+    message : int
+        Id of the message.
+    factor, offset : float
+        Of the field's numbers.
+    """
 
-    def get(self, payload: bytes) -> float:
-        """Return the value; NaN where the sender does not know."""
-        value: Any = self._field.get(payload)
-        if self._index is not None:
-            value = value[self._index]
-        unknown = value == self._field.invalid or value in self._unknown
-        return nan if unknown else float(value * self.scale + self.offset)
+    def __init__(self, source: FieldMap, offset: float = 0.0) -> None:
+        name, index = split_index(source.field)
+        field = spec(source.record).fields[name]
+        if field.code == "s":
+            raise ValueError(f"{source.record}.{name}: expected a field of numbers")
+        self.message = spec(source.record).id
+        self.column, self.unit, self.factor, self.offset = source.column, source.unit, source.factor, offset
+        self._layout = np.dtype(f"<{field.code}")
+        self._start = field.offset + (index or 0) * self._layout.itemsize
+        self._missing = [*source.missing, *(() if field.invalid is None else (field.invalid,))]
 
-    def column_of(self, payloads: NDArray[np.uint8]) -> FloatArray:
-        """Return the values (n,) of payloads (n, size), each as :meth:`get`."""
-        layout = np.dtype(f"<{self._field.code}")
-        start = self._field.offset + (self._index or 0) * layout.itemsize
-        raw = payloads[:, start : start + layout.itemsize].copy().view(layout)[:, 0]
-        invalid = () if self._field.invalid is None else (self._field.invalid,)
-        unknown = np.isin(raw, [*self._unknown, *invalid])
-        return np.where(unknown, np.nan, raw.astype(np.float64) * self.scale + self.offset)
+    def values(self, payloads: Payloads) -> FloatArray:
+        """Return the values (n,) of the column in payloads (n, size); NaN where the sender knows none."""
+        raw = payloads[:, self._start : self._start + self._layout.itemsize].copy().view(self._layout)[:, 0]
+        values = raw.astype(np.float64) * self.factor + self.offset
+        return np.where(np.isin(raw, self._missing), np.nan, values) if self._missing else values
 
 
-class DeclaredField(Value):
+class DeclaredField(MessageField):
     """A column that the log itself declares, by a ``MAG_COLUMN``.
 
     Attributes
     ----------
-    message : int
-        Id of the message that holds it.
     match : dict of str to str
         Values that other fields of the message must have, as text.
     component : int or None
@@ -116,88 +126,69 @@ class DeclaredField(Value):
     """
 
     def __init__(self, declaration: Message) -> None:
-        super().__init__(declaration["column"], declaration["message"], declaration["field"])
-        self.unit, self.scale, self.offset = (
-            declaration["unit"] or "1",
-            declaration["scale"],
-            declaration["offset"],
-        )
-        self._unknown = ()
         layout = spec(declaration["message"])
-        self.message = layout.id
+        unit = declaration["unit"] or "1"
+        source = FieldMap(
+            layout.name, declaration["field"], declaration["column"], unit, declaration["scale"]
+        )
+        super().__init__(source, declaration["offset"])
         self.component: int | None = declaration["component"] or None
         self.match = dict(part.split("=", 1) for part in declaration["match"].split(",") if part)
         self._others = [(layout.fields[name], text) for name, text in self.match.items()]
 
-    def find(self, payload: bytes) -> float | None:
-        """Return the value, as :meth:`get`; None where the message is about something else."""
-        if any(str(field.get(payload)) != text for field, text in self._others):
-            return None
-        return self.get(payload)
+    def matches(self, payloads: Payloads) -> BoolArray:
+        """Return the payloads (n,) of the messages that hold the column."""
+        found = np.ones(len(payloads), bool)
+        for field, text in self._others:
+            part = payloads[:, field.offset : field.offset + field.struct.size]
+            kinds, first, kind = np.unique(part, axis=0, return_index=True, return_inverse=True)
+            equal = [str(field.get(payloads[k].tobytes())) == text for k in first.tolist()]
+            found &= np.array(equal, bool)[kind.ravel()] if len(kinds) else found
+        return found
 
 
 TELEMETRY = {
-    spec(message).id: [Value(column, message, field) for column, field in columns.items()]
-    for message, columns in MAVLINK_FIELDS.items()
+    spec(message).id: [MessageField(one) for one in fields] for message, fields in MAVLINK_FIELDS.items()
 }
 """Message id to the columns in the message."""
-
-SAMPLE, CORRECTION = spec("MAG_RAW").struct, spec("MAG_FIELD").struct
-POWER_CYCLE = int(MAG_RAW_FLAGS.POWER_CYCLE)
-"""Flag of MAG_RAW: its power cycle is counted."""
-
-
-def sample(payload: bytes) -> Columns:
-    """Return the time of a ``MAG_RAW``, and the columns whose values it holds."""
-    time_us, _, x, y, z, _, _, _, *delays, temperature, supply, cycle, _, flags = SAMPLE.unpack(payload)
-    row = {"time": time_us / 1e6}
-    if not (isnan(x) and isnan(y) and isnan(z)):
-        row |= {"mag_x": x, "mag_y": y, "mag_z": z}
-    if any(delays):
-        row |= {name: (time_us + delay) / 1e6 for name, delay in zip(CHANNEL_TIMES, delays, strict=True)}
-    if not isnan(temperature):
-        row["sensor_temperature"] = temperature
-    if not isnan(supply):
-        row["sensor_supply"] = supply
-    if flags & POWER_CYCLE:
-        row["power_cycle"] = cycle
-    return row
-
-
-def correction(payload: bytes) -> Columns:
-    """Return the time of a ``MAG_FIELD``, and the columns of a corrected sample."""
-    time_us, total, _, _, sigma, x, y, z, _, _, _, anomaly, _, _, flags, *_ = CORRECTION.unpack(payload)
-    return {
-        "time": time_us / 1e6,
-        **dict(zip(CORRECTED, (total, sigma, x, y, z, anomaly, flags), strict=True)),
-    }
-
-
-SENSOR_IDS = {spec(message).id: spec(message).fields["sensor_id"] for message in ("MAG_RAW", "MAG_FIELD")}
-
-
-def is_of_main_sensor(number: int, payload: bytes) -> bool:
-    """Return True unless a message (by id) is a sample of a sensor after the first."""
-    field = SENSOR_IDS.get(number)
-    return field is None or not field.get(payload)
-
-
-IMUS = {
-    message: [Value(f"mag_{axis}", message, f"{axis}mag") for axis in "xyz"]
-    for message in ("HIGHRES_IMU", "RAW_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
+SOURCE_FIELDS = {
+    spec(message).id: [MessageField(one) for one in fields] for message, fields in SOURCES.items()
 }
-"""Messages of an autopilot that hold its compass' field, the best first."""
-
-
-def _field_of(message: str) -> Callable[[bytes], Columns]:
-    return lambda payload: {value.column: value.get(payload) for value in IMUS[message]}
-
-
-SOURCES: dict[str, Callable[[bytes], Columns]] = {
-    "MAG_RAW": sample,
-    "MAG_FIELD": correction,
-    **{message: _field_of(message) for message in IMUS},
-    "ATTITUDE": lambda _: {},
-    "GLOBAL_POSITION_INT": lambda _: {},
+RAW, FIELD = spec("MAG_RAW").id, spec("MAG_FIELD").id
+SENSOR_IDS = {spec(name).id: spec(name).fields["sensor_id"].offset for name in ("MAG_RAW", "MAG_FIELD")}
+STAMP_FIELDS = {
+    spec(name).id: MessageField(FieldMap(name, "time_usec", "time", "us"))
+    for name in ("MAG_RAW", "MAG_FIELD")
 }
-"""The messages that make a row, the best first, and the function that reads the row's columns from them."""
+DELAY_FIELDS = [
+    MessageField(FieldMap("MAG_RAW", f"delay_{axis}", name, "us"))
+    for axis, name in zip("xyz", CHANNEL_TIMES, strict=True)
+]
+RAW_FLAGS = MessageField(FieldMap("MAG_RAW", "flags", "flags", ""))
+
+
+def are_of_main_sensor(number: int, payloads: Payloads) -> BoolArray:
+    """Return the messages (n,) of one id that are not samples of a sensor after the first."""
+    if number not in SENSOR_IDS:
+        return np.ones(len(payloads), bool)
+    return np.asarray(payloads[:, SENSOR_IDS[number]] == 0)
+
+
+def source_columns(number: int, payloads: Payloads) -> dict[str, FloatArray]:
+    """Return the columns (n,) of the rows that messages of one id make, NaN where they hold no value.
+
+    ``time`` is among them for the messages of a bridge.
+    """
+    columns = {one.column: one.values(payloads) for one in SOURCE_FIELDS[number]}
+    if number not in SENSOR_IDS:
+        return columns
+    time_us = STAMP_FIELDS[number].values(payloads)
+    columns["time"] = time_us / 1e6
+    if number == RAW:
+        delays_us = [field.values(payloads) for field in DELAY_FIELDS]
+        in_turn = np.any(delays_us, axis=0)
+        for one, delay_us in zip(DELAY_FIELDS, delays_us, strict=True):
+            columns[one.column] = np.where(in_turn, (time_us + delay_us) / 1e6, np.nan)
+        counted = RAW_FLAGS.values(payloads).astype(np.int64) & POWER_CYCLE
+        columns["power_cycle"] = np.where(counted > 0, columns["power_cycle"], np.nan)
+    return columns

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magbridge.arrays import IndexArray
-from magbridge.columns import AGE, CHANNELS
+from magbridge.columns import AGE, CHANNEL_TIMES, CHANNELS, CORRECTED
 from magbridge.errors import FormatError
 from magbridge.logs.compasses import LogCompass
 from magbridge.logs.deployment import CHANGES_SETTING
@@ -21,10 +21,9 @@ from magbridge.logs.telemetry_fields import (
     SOURCES,
     TELEMETRY,
     DeclaredField,
-    Value,
-    correction,
-    is_of_main_sensor,
-    sample,
+    MessageField,
+    are_of_main_sensor,
+    source_columns,
 )
 from magbridge.mavlink import Message, spec
 from magbridge.mavlink.tlog import RecordBlock, blocks
@@ -36,7 +35,7 @@ RAW, FIELD, COLUMN, STEP = (spec(f"MAG_{name}").id for name in ("RAW", "FIELD", 
 START, BYTES = spec("MAG_BRIDGE_START").id, spec("MAG_SENSOR_BYTES").id
 SET, VALUE = spec("PARAM_SET").id, spec("PARAM_VALUE").id
 NAMED = spec("NAMED_VALUE_FLOAT")
-BRIDGE_UNITS = {"sensor_supply": "V"}
+RAW_COLUMNS = {one.column: one.unit for one in SOURCES["MAG_RAW"]}
 COMPASS_NUMBERS = {"HIGHRES_IMU": 0, "RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
 """Message to the number of the compass whose field it holds; of several for one, the first is read."""
 AUTOPILOT = 1
@@ -75,6 +74,8 @@ class LogContents:
         A bridge's own log: the time stamps carry the :class:`~magbridge.records.Channel`.
     stepped_us : int
         µs by which the bridge's clock was set in the course of the log.
+    span_s : float
+        s from the first to the last of the messages that make the rows.
     """
 
     def __init__(self, path: Path) -> None:
@@ -82,11 +83,12 @@ class LogContents:
         self.ours = False
         self.stepped_us = 0
         self._senders: dict[int, Counter[tuple[int, int]]] = {}
+        self._spans: dict[tuple[int, int, int], tuple[int, int]] = {}
         self._known: dict[tuple[int, int, int], dict[str, str]] = {}
         self._named: dict[int, dict[bytes, str]] = {}
         self._speakers: dict[tuple[int, bytes], Counter[int]] = {}
         self._declared: dict[str, DeclaredField] = {}
-        self._open: dict[tuple[int, int, int], list[Value]] = {}
+        self._open: dict[tuple[int, int, int], list[MessageField]] = {}
         self._asked: dict[str, float] = {}
         self._read(path)
         for self.source in SOURCES:
@@ -114,6 +116,12 @@ class LogContents:
             if n and number not in found:
                 found[number] = LogCompass(number, n, 0.0, message)
         return [found[number] for number in sorted(found)]
+
+    @property
+    def span_s(self) -> float:
+        """The s from the first to the last of the messages that make the rows."""
+        first_us, last_us = self._spans[spec(self.source).id, self.system, self.component]
+        return (last_us - first_us) / 1e6
 
     def of_compass(self, message: str) -> LogContents:
         """Return the survey with the rows made by another message."""
@@ -162,7 +170,7 @@ class LogContents:
                 self.declared.append(one)
             else:
                 letters = one.match["name"].encode().ljust(10, b"\0")
-                self.named.setdefault(letters, []).append((one.column, one.scale, one.offset))
+                self.named.setdefault(letters, []).append((one.column, one.factor, one.offset))
         for letters, name in self._named.get(self.system, {}).items():
             if letters not in self.named:
                 own = f"named_{name}" if name in self.columns or name in RESERVED_COLUMNS else name
@@ -193,6 +201,9 @@ class LogContents:
                     number, system, component = code >> 16, code >> 8 & 0xFF, code & 0xFF
                     of_kind = which[codes == code]
                     self._senders.setdefault(number, Counter())[system, component] += len(of_kind)
+                    first_us, last_us = block.time_us[of_kind[[0, -1]]].tolist()
+                    first_us, _ = self._spans.get((number, system, component), (first_us, last_us))
+                    self._spans[number, system, component] = first_us, last_us
                     if code not in settled and self._look(block, number, of_kind):
                         settled.add(code)
 
@@ -222,25 +233,34 @@ class LogContents:
                 self._named.setdefault(system, {})[name] = block.message(int(records[k]))["name"]
                 self._speakers.setdefault((system, name), Counter())[component] += n
             return False
-        if number in (RAW, FIELD, COLUMN, STEP):
+        if number in (RAW, FIELD):
             known = self._known.setdefault((system, component, number), {})
+            payloads = block.payloads(records)
+            payloads = payloads[are_of_main_sensor(number, payloads)]
+            if number == FIELD and len(payloads):
+                known |= dict.fromkeys(CORRECTED, "")
+                return True
+            return number == RAW and self._raw(known, payloads)
+        if number in (COLUMN, STEP):
             for k in records.tolist():
-                message = block.message(k)
-                if is_of_main_sensor(number, message.payload):
-                    self._declares(message, known)
-                    if number == FIELD:
-                        return True
+                self._declares(block.message(k))
             return False
         return True
 
-    def _declares(self, message: Message, known: dict[str, str]) -> None:
-        """Note what one of the messages of a bridge, or of :mod:`magbridge.logs`, declares."""
-        number = message.id
-        if number in (RAW, FIELD):
-            for column in (sample if number == RAW else correction)(message.payload):
-                if column != "time":
-                    known.setdefault(column, BRIDGE_UNITS.get(column, ""))
-        elif number == STEP:
+    def _raw(self, known: dict[str, str], payloads: NDArray[np.uint8]) -> bool:
+        """Note which columns samples of a bridge have; return whether they have all."""
+        columns = source_columns(RAW, payloads)
+        there = [
+            name for name in (*CHANNELS, *CHANNEL_TIMES, *RAW_COLUMNS) if not np.isnan(columns[name]).all()
+        ]
+        there = [*CHANNELS, *there] if {*CHANNELS} & {*there} else there
+        for name in there:
+            known.setdefault(name, RAW_COLUMNS.get(name, ""))
+        return {*CHANNEL_TIMES, *RAW_COLUMNS} <= known.keys()
+
+    def _declares(self, message: Message) -> None:
+        """Note what a message of a bridge, or of :mod:`magbridge.logs`, declares."""
+        if message.id == STEP:
             self.stepped_us += message["step"]
         elif not message["message"]:
             self.attrs[message["column"]] = message["unit"] or message["scale"]
@@ -252,7 +272,7 @@ class LogContents:
         """Note which fields of a message have a value; return whether all have."""
         known = self._known.setdefault(sender, {})
         still = self._open.setdefault(sender, list(TELEMETRY[sender[2]]))
-        for value in [one for one in still if not np.isnan(one.column_of(payloads)).all()]:
+        for value in [one for one in still if not np.isnan(one.values(payloads)).all()]:
             still.remove(value)
             known.setdefault(value.column, value.unit)
         return not still

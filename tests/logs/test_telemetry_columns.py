@@ -1,20 +1,22 @@
-"""A station's log read as columns equals the reading message by message; the senders are separated."""
+"""A station's log: blocks of any size give the same columns; the senders are separated."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from magbridge import logs
 from magbridge.logs import telemetry
 from magbridge.logs.compasses import compasses_of
 from magbridge.logs.deployment import noted
 from magbridge.logs.options import Options
-from magbridge.logs.telemetry_survey import LogContents
-from magbridge.mavlink import Codec, LogReader, pack_record
+from magbridge.mavlink import Codec, pack_record
+from magbridge.mavlink.tlog import blocks
 
 T0, S = 1_700_000_000_000_000, 1_000_000
 
@@ -36,25 +38,15 @@ class Log:
         return path
 
 
-def one_by_one(path: Path) -> Any:
-    """Return the log as it is read message by message."""
-    rows = telemetry.TelemetryRows(path, LogContents(path))
-    with path.open("rb") as file:
-        rows.reader = LogReader(file)
-        for record in rows.reader:
-            rows.put(record)
-    return rows.pop_rows(len(rows.rows))
-
-
 @pytest.mark.real
 @pytest.mark.parametrize("name", ["small.tlog", "damaged.tlog"])
-def test_both_readings_are_the_same(name: str, real_data: Path) -> None:
+def test_blocks_of_any_size_give_the_same(
+    name: str, real_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = real_data / "ardusub" / name
-    at_once, slowly = logs.read(path), one_by_one(path)
-    assert set(at_once.data_vars) == set(slowly.data_vars)
-    np.testing.assert_array_equal(at_once["time"], slowly["time"])
-    for column in slowly.data_vars:
-        np.testing.assert_array_equal(at_once[column], slowly[column], err_msg=str(column))
+    whole = logs.read(path)
+    monkeypatch.setattr(telemetry, "blocks", partial(blocks, block_bytes=5_000))
+    xr.testing.assert_identical(whole, logs.read(path))
 
 
 def test_a_named_value_never_takes_a_column_with_a_source(tmp_path: Path) -> None:
