@@ -33,8 +33,7 @@ from magbridge.errors import FormatError, MissingExtra
 from magbridge.logs.autopilot import BootRun, Magnetometer, Series, pieces
 from magbridge.logs.compasses import LogCompass, rate
 from magbridge.logs.deployment import NOTES, noted
-
-__all__ = ["MESSAGE_KINDS"]
+from magbridge.logs.fields import FieldMap, by_record, fields_of
 
 try:
     from rosbags.highlevel import AnyReader, AnyReaderError
@@ -242,6 +241,22 @@ FRAMES_HISTORY = (
     "ROS frames turned: ENU to NED, FLU to FRD; BatteryState.current counted positive when discharging"
 )
 MAGNETIC_FIELD = "sensor_msgs/MagneticField"
+FIX = "sensor_msgs/NavSatFix"
+TOPIC = "@"
+"""Stands for the name of the topic in the name of a column."""
+ROS_FIELDS = by_record(
+    (
+        FieldMap(FIX, "latitude", "latitude", "deg"),
+        FieldMap(FIX, "longitude", "longitude", "deg"),
+        FieldMap(FIX, "altitude", "altitude", "m"),
+        # ROS counts a current as negative when the battery discharges
+        FieldMap("sensor_msgs/BatteryState", "current", "battery#_current", "A", -1.0),
+        FieldMap("sensor_msgs/BatteryState", "voltage", "battery#_voltage", "V"),
+        FieldMap("sensor_msgs/FluidPressure", "fluid_pressure", "pressure#", "hPa", 0.01),
+        FieldMap("std_msgs/Float32", "data", TOPIC, "1"),
+        FieldMap("std_msgs/Float64", "data", TOPIC, "1"),
+    )
+)
 ABSOLUTE = ("map", "earth", "utm", "enu")
 """Names of frames whose x axis points east."""
 
@@ -269,10 +284,6 @@ def _name(topic: str, *more: str) -> str:
     return re.sub(r"\W+", "_", "_".join([topic.strip("/"), *more])).strip("_").lower()
 
 
-def _numbered(number: int) -> str:
-    return str(number + 1) if number else ""
-
-
 def _angles(v: Values) -> Columns:
     """Yield roll, pitch and heading (deg) of the quaternion from FLU to ENU, if it is known."""
     x, y, z, w = (v[f"q{axis}"] for axis in "xyzw")
@@ -298,17 +309,6 @@ def _imu_row(m: Any) -> dict[str, float]:
     return {**_axes("q", m.orientation, "xyzw"), "unknown": float(m.orientation_covariance[0])}
 
 
-def _fix_row(m: Any) -> dict[str, float]:
-    return {"lat": m.latitude, "lon": m.longitude, "alt": m.altitude} if m.status.status >= 0 else {}
-
-
-def _fix(_: str, __: int, v: Values) -> Columns:
-    if v:
-        yield "latitude", "deg", v["lat"]
-        yield "longitude", "deg", v["lon"]
-        yield "altitude", "m", v["alt"]
-
-
 def _odometry_row(m: Any) -> dict[str, float]:
     pose, linear = m.pose.pose, m.twist.twist.linear
     absolute = float(m.header.frame_id.rpartition("/")[2].lower() in ABSOLUTE)
@@ -332,11 +332,6 @@ def _odometry(topic: str, number: int, v: Values) -> Columns:
     yield from _angles(v)
 
 
-def _battery(_: str, number: int, v: Values) -> Columns:
-    yield f"battery{_numbered(number)}_current", "A", -v["current"]  # ROS: negative when discharging
-    yield f"battery{_numbered(number)}_voltage", "V", v["voltage"]
-
-
 def _joints(_: str, __: int, v: Values) -> Columns:
     for name, values in v.items():
         yield _name(name), "1", values  # rad, or m of a joint that slides: the message does not say
@@ -348,20 +343,24 @@ def _channels(_: str, __: int, v: Values) -> Columns:
             yield name, "us", values
 
 
-def _by_topic(unit: str, field: str = "data") -> Callable[[str, int, Values], Columns]:
-    def columns(topic: str, _: int, v: Values) -> Columns:
-        yield _name(topic), unit, v[field]
+def _fields(name: str, *, header: bool = True) -> MessageKind:
+    """Return a type of message that is read by :data:`ROS_FIELDS`."""
+    fields = ROS_FIELDS[name]
 
-    return columns
+    def row(message: Any) -> dict[str, float]:
+        known = name != FIX or message.status.status >= 0
+        return {one.field: float(getattr(message, one.field)) for one in fields} if known else {}
+
+    def columns(topic: str, number: int, v: Values) -> Columns:
+        for column, unit, values in fields_of(fields, v, number):
+            yield column.replace(TOPIC, _name(topic)), unit, values
+
+    return MessageKind(name, row, columns, header)
 
 
 def _temperature(topic: str, _: int, v: Values) -> Columns:
     name = _name(topic)
     yield name if "temp" in name else f"{name}_temperature", "degC", v["temperature"]
-
-
-def _pressure(_: str, number: int, v: Values) -> Columns:
-    yield f"pressure{_numbered(number)}", "hPa", 0.01 * v["pressure"]
 
 
 def _nothing(_: str, __: int, ___: Values) -> Columns:
@@ -373,29 +372,19 @@ MESSAGE_KINDS = {
     for kind in (
         MessageKind(MAGNETIC_FIELD, lambda m: _axes("", m.magnetic_field), _nothing, doubles=12),
         MessageKind("sensor_msgs/Imu", _imu_row, lambda _, __, v: _angles(v), doubles=37),
-        MessageKind("sensor_msgs/NavSatFix", _fix_row, _fix),
         MessageKind("nav_msgs/Odometry", _odometry_row, _odometry),
-        MessageKind(
-            "sensor_msgs/BatteryState",
-            lambda m: {"current": float(m.current), "voltage": float(m.voltage)},
-            _battery,
-        ),
         MessageKind(
             "sensor_msgs/JointState",
             lambda m: dict(zip(m.name, map(float, m.position), strict=False)),
             _joints,
         ),
         MessageKind("sensor_msgs/Temperature", lambda m: {"temperature": float(m.temperature)}, _temperature),
-        MessageKind("sensor_msgs/FluidPressure", lambda m: {"pressure": float(m.fluid_pressure)}, _pressure),
         MessageKind(
             "mavros_msgs/RCOut",
             lambda m: {f"servo{k}": float(value) for k, value in enumerate(m.channels, 1)},
             _channels,
         ),
-        *(
-            MessageKind(f"std_msgs/{name}", lambda m: {"data": float(m.data)}, _by_topic("1"), header=False)
-            for name in ("Float32", "Float64")
-        ),
+        *(_fields(name, header=not name.startswith("std_msgs/")) for name in ROS_FIELDS),
     )
 }
 """Type to the values that are read. mavros' other topics are of these types, except its outputs to the

@@ -30,33 +30,36 @@ from magbridge.columns import COLUMNS, factor
 from magbridge.errors import FormatError
 from magbridge.logs.cf import epoch, floats
 from magbridge.logs.deployment import deployment, with_losses
+from magbridge.logs.fields import FieldMap
 from magbridge.logs.headings import aliases
 
 __all__ = ["chunks"]
 
-MEANINGS = {
-    # standard name: column, factor
-    "latitude": ("latitude", 1.0),
-    "longitude": ("longitude", 1.0),
-    "depth": ("depth", 1.0),
-    "platform_roll": ("roll", 1.0),
-    "platform_roll_angle": ("roll", 1.0),
-    "platform_roll_starboard_down": ("roll", 1.0),
-    "platform_roll_starboard_up": ("roll", -1.0),
-    "platform_pitch": ("pitch", 1.0),
-    "platform_pitch_angle": ("pitch", 1.0),
-    "platform_pitch_fore_up": ("pitch", 1.0),
-    "platform_pitch_fore_down": ("pitch", -1.0),
-    "platform_yaw": ("heading", 1.0),
-    "platform_yaw_angle": ("heading", 1.0),
-    "platform_yaw_fore_starboard": ("heading", 1.0),
-    "platform_orientation": ("heading", 1.0),
-    "platform_heading": ("heading", 1.0),
-    "sea_water_temperature": ("water_temperature", 1.0),
-    "sea_water_pressure": ("water_pressure", 1.0),
-}
-OG1_COLUMNS = {"temp": "water_temperature", "pres": "water_pressure"}
-"""OG1.0's names, in small letters, of columns whose name is not simply ours in capitals."""
+NAMED_FIELDS = (
+    FieldMap("standard_name", "latitude", "latitude", ""),
+    FieldMap("standard_name", "longitude", "longitude", ""),
+    FieldMap("standard_name", "depth", "depth", ""),
+    FieldMap("standard_name", "platform_roll", "roll", ""),
+    FieldMap("standard_name", "platform_roll_angle", "roll", ""),
+    FieldMap("standard_name", "platform_roll_starboard_down", "roll", ""),
+    FieldMap("standard_name", "platform_roll_starboard_up", "roll", "", -1.0),
+    FieldMap("standard_name", "platform_pitch", "pitch", ""),
+    FieldMap("standard_name", "platform_pitch_angle", "pitch", ""),
+    FieldMap("standard_name", "platform_pitch_fore_up", "pitch", ""),
+    FieldMap("standard_name", "platform_pitch_fore_down", "pitch", "", -1.0),
+    FieldMap("standard_name", "platform_yaw", "heading", ""),
+    FieldMap("standard_name", "platform_yaw_angle", "heading", ""),
+    FieldMap("standard_name", "platform_yaw_fore_starboard", "heading", ""),
+    FieldMap("standard_name", "platform_orientation", "heading", ""),
+    FieldMap("standard_name", "platform_heading", "heading", ""),
+    FieldMap("standard_name", "sea_water_temperature", "water_temperature", ""),
+    FieldMap("standard_name", "sea_water_pressure", "water_pressure", ""),
+    FieldMap("name", "temp", "water_temperature", ""),
+    FieldMap("name", "pres", "water_pressure", ""),
+)
+"""Columns by the standard name of a variable, and by the names of OG1.0 that are not simply ours in capitals;
+the unit is the variable's."""
+FIELDS_BY_NAME = {(one.record, one.field): one for one in NAMED_FIELDS}
 FLAG_VARIABLE = re.compile(r"(.+)_(?:qc|qartod_\w*|flag)", re.IGNORECASE)
 """Name of a variable with the flags of another."""
 BAD = re.compile(r"bad|fail|missing|reject|erroneous|not_used")
@@ -179,8 +182,9 @@ def _meaning(variable: Any, called: str) -> tuple[str, float]:
     """Return the column that a variable is, and the factor that its sign needs; `called` goes by its name."""
     if hasattr(variable, "column"):
         return str(variable.column), 1.0
-    standard = str(getattr(variable, "standard_name", ""))
-    column, sign = MEANINGS.get(standard, (OG1_COLUMNS.get(called, called), 1.0))
+    standard = "standard_name", str(getattr(variable, "standard_name", ""))
+    field = FIELDS_BY_NAME.get(standard) or FIELDS_BY_NAME.get(("name", called))
+    column, sign = (called, 1.0) if field is None else (field.column, field.factor)
     if _is_ours(variable):
         column = variable.name.lower()
     if column == "depth" and str(getattr(variable, "positive", "down")).lower() == "up":
