@@ -49,7 +49,7 @@ def load_toml(path: str | Path) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise ConfigError(path, "", "expected text in UTF-8") from error
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(path, "", f"not TOML: {error}") from error
+        raise ConfigError(path, "", f"expected TOML, got text that is not TOML: {error}") from error
 
 
 def check_entries(table: Mapping[str, Any], key: str, kind: Any, path: str | Path, prefix: str = "") -> None:

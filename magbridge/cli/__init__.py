@@ -84,6 +84,8 @@ def _explained(error: Exception) -> tuple[str, int]:
             sentence, code = str(MissingExtra(str(error.name), extra)), 2
         case UnicodeEncodeError():  # netCDF and JSON take no name that is not of the locale
             sentence = f"{error.object}: a name that cannot be written in {error.encoding}: rename it"
+        case IsADirectoryError(filename=name) if name:
+            sentence = f"{name}: expected a file, got a folder; name a file in it"
         case OSError(strerror=str(reason)):  # the system refuses a file, a folder or memory
             sentence = f"{error.filename}: {reason}" if error.filename else reason
         case _:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from pathlib import Path
@@ -27,8 +25,8 @@ from magbridge.cli.common import (
     logs_to_read,
     print_result,
 )
-from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, note_unused_grid
-from magbridge.errors import CalibrationError, DataError, OutOfRange, WrongUse
+from magbridge.cli.remarks import by_base_station, chosen_parameters, naming, note_losses, note_unused_grid
+from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.files import digest
 from magbridge.progress import waiting
 from magbridge.wording import counted
@@ -290,7 +288,7 @@ def _fit(
     model, anomalies = request.model, request.anomalies
     names = model.parameter or (start.names if start else ())
     options: dict[str, Any] = {"vehicle": read_vehicle(model.masses)} if model.masses else {}
-    with _naming(deployment), waiting("fitting"):
+    with naming(deployment), waiting("fitting"):
         names = chosen_parameters(names, deployment, grid=anomalies, order=model.order, site_bias=site_bias)
         read = (*request.files, *request.reading.sensor_log, *filter(None, [request.truth.base]))
         data = replace(observations(deployment, names, grid=anomalies), inputs=_digests(read))
@@ -320,15 +318,6 @@ def _refuse_unsupported(request: _Request, found: Fit) -> None:
         raise DataError(
             f"{request.output}: not written, because {found.warnings[0]}; --force writes it all the same"
         )
-
-
-@contextmanager
-def _naming(deployment: xr.Dataset) -> Iterator[None]:
-    """Name the logs in error messages about them."""
-    try:
-        yield
-    except (CalibrationError, OutOfRange) as error:
-        raise DataError(f"{deployment.attrs['source']}: {error}") from error
 
 
 def _fitted(

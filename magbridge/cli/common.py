@@ -21,6 +21,12 @@ from magbridge.files import existing
 from magbridge.logs import Options, suffixes
 from magbridge.logs.registry import is_bag
 
+__all__ = [
+    "AS_THEY_SAY", "NO_SCALAR", "Base", "Day", "FailedResult", "Folder", "Grid", "Heading", "Json", "Log",
+    "Output", "Plot", "ReadingOptions", "ScalarOptions", "Whole", "app", "check_inputs", "command",
+    "complain", "file_to_write", "folder_to_write", "logs_to_read", "print_error", "print_result",
+]  # fmt: skip
+
 
 def _default(value: object) -> object:
     """Return the default as the help shows it; None where it is not shown."""

@@ -21,6 +21,7 @@ from magbridge.cli.common import (
     print_result,
 )
 from magbridge.cli.remarks import note_losses, note_missing, note_settings, refuse_unsuited, warnings_of
+from magbridge.errors import DataError
 from magbridge.progress import waiting
 from magbridge.wording import counted
 
@@ -204,6 +205,11 @@ def _bound(
     place = ["latitude", "longitude"]
     with waiting("reading"):
         plan = read(files, required=place, options=reading.options).dropna("time", subset=place)
+    if plan.sizes["time"] < 2:
+        raise DataError(
+            f"{plan.attrs['source']}: expected a plan of at least two rows with latitude and longitude, got "
+            f"{plan.sizes['time']}; give the track's corners"
+        )
     grid, options = _continued(read_grid(map), options or NavigationOptions(), plan)
     track = [plan[name].to_numpy().astype(float) for name in ("time", "latitude", "longitude")]
     sigma = calibration.noise.sensor if calibration else 1.0

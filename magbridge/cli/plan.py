@@ -18,7 +18,7 @@ from magbridge.cli.common import (
     logs_to_read,
     print_result,
 )
-from magbridge.cli.remarks import note_losses
+from magbridge.cli.remarks import naming, note_losses
 from magbridge.errors import WrongUse
 from magbridge.progress import waiting
 
@@ -68,7 +68,7 @@ def plan(
         deployment = with_true_heading(read(mission, options=reading.options), heading_reference)
     note_losses(deployment.attrs)
     known = load(calibration) if calibration else None
-    with waiting("planning"):
+    with naming(deployment), waiting("planning"):
         if survey is None:
             assert known is not None
             found = flight_plan.flight_plan(known, deployment, runs=runs, roll=roll)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magbridge.cli.common import complain
-from magbridge.errors import FormatError, WrongUse
+from magbridge.errors import CalibrationError, DataError, FormatError, OutOfRange, WrongUse
 from magbridge.wording import counted
 
 if TYPE_CHECKING:
@@ -16,12 +17,21 @@ if TYPE_CHECKING:
     from magbridge.calibration.model import Calibration
 
 __all__ = [
-    "by_base_station", "chosen_parameters", "note_losses", "note_missing", "note_no_date", "note_settings",
-    "note_unused_grid", "refuse_unsuited", "warnings_of",
+    "by_base_station", "chosen_parameters", "naming", "note_losses", "note_missing", "note_no_date",
+    "note_settings", "note_unused_grid", "refuse_unsuited", "warnings_of",
 ]  # fmt: skip
 
 MAX_NAMED_LOSSES = 5
 """Losses that are named, a line each; the others are counted."""
+
+
+@contextmanager
+def naming(deployment: xr.Dataset) -> Iterator[None]:
+    """Name the logs in the error messages of what is done with them: raise these as :class:`DataError`."""
+    try:
+        yield
+    except (CalibrationError, OutOfRange) as error:
+        raise DataError(f"{deployment.attrs['source']}: {error}") from error
 
 
 def warnings_of(calibration: Calibration, file: Path) -> list[str]:

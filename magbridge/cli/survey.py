@@ -26,7 +26,7 @@ from magbridge.cli.common import (
     logs_to_read,
     print_result,
 )
-from magbridge.cli.remarks import by_base_station, chosen_parameters, note_losses, warnings_of
+from magbridge.cli.remarks import by_base_station, chosen_parameters, naming, note_losses, warnings_of
 from magbridge.errors import CalibrationError, DataError, WrongUse
 from magbridge.progress import waiting
 from magbridge.wording import counted
@@ -231,8 +231,9 @@ def _calibrated(logs: list[xr.Dataset], correction: CorrectionOptions, *, strict
         options["position_sigma"] = correction.position_sigma
     parameters = chosen_parameters(correction.parameter, together, order=order, **options)
     require(together, parameters)
-    data = observations(together, parameters)
-    found = fit(data, order=order, **options)
+    with naming(together):
+        data = observations(together, parameters)
+        found = fit(data, order=order, **options)
     if not found.supported and data.lacks_rock and found.calibration.method == "auto":
         with suppress(CalibrationError):  # a map must not attribute the crustal field to the vehicle
             found = fit(data, "survey", order=order, **options)

@@ -14,7 +14,15 @@ from magbridge.monitor.charts import TelemetryChart, TotalField, TrackMap
 from magbridge.monitor.history import TIERS
 from magbridge.monitor.learning_panel import LearningPanel
 from magbridge.monitor.link import StationLink, monotonic_s
-from magbridge.monitor.panels import Figures, Flags, Health, NavigationPanel, ParameterPanel, Texts
+from magbridge.monitor.panels import (
+    Figures,
+    Flags,
+    Health,
+    NavigationPanel,
+    ParameterPanel,
+    SensorPanel,
+    Texts,
+)
 from magbridge.monitor.rose import CompassRose
 from magbridge.monitor.state import BridgeState
 from magbridge.monitor.track import Background
@@ -82,6 +90,7 @@ class Page:
                     self._flags = Flags()
                 with ui.element().classes(f"{GRID} sm:grid-cols-2 content-start"):
                     self._health = Health(state, moment)
+            self._sensors = SensorPanel()
             self._navigation = NavigationPanel(state, moment)
             self._learning = LearningPanel(self._station, state)
             with ui.element().classes(f"{GRID} lg:grid-cols-[minmax(0,2fr)_minmax(0,3fr)] items-start"):
@@ -106,8 +115,8 @@ class Page:
         self._offer(list(states))
         state, moment = self._state, monotonic_s()
         self._show_stream(state, moment)
-        panels = self._figures, self._rose, self._flags, self._health, self._navigation, self._learning
-        for panel in (*panels, self._texts, self._parameters):
+        panels = self._figures, self._rose, self._flags, self._health, self._sensors, self._navigation
+        for panel in (*panels, self._learning, self._texts, self._parameters):
             panel.show(state, moment)
         self._sound = self._alarms.sound
         self._alarms.show(state, moment)

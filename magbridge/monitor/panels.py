@@ -27,9 +27,9 @@ from magbridge.monitor.widgets import (
     nothing,
     slanted,
 )
-from magbridge.monitor.words import FLAG_TEXTS, duration, health, measured, silence, whereabouts
+from magbridge.monitor.words import FLAG_TEXTS, duration, health, measured, sensor_rows, silence, whereabouts
 
-__all__ = ["Figures", "Flags", "Health", "NavigationPanel", "ParameterPanel", "Texts"]
+__all__ = ["Figures", "Flags", "Health", "NavigationPanel", "ParameterPanel", "SensorPanel", "Texts"]
 
 TUNABLES = {
     one.name: one
@@ -104,6 +104,33 @@ class Health:
             label.style(slanted(old))
             if not old:
                 label.style(f"color: {INK if well or not state.status else RED}")
+
+
+class SensorPanel:
+    """The sensors of a bridge that has several; hidden otherwise."""
+
+    def __init__(self) -> None:
+        self._changes = Changes()
+        with ui.element().classes("w-full") as self._box, card("Sensors, nT ± 2σ"):
+            self._table = ui.element().classes(
+                "w-full grid gap-x-6 gap-y-1 text-sm grid-cols-1 sm:grid-cols-[auto_auto_auto_auto_1fr]"
+            )
+
+    def show(self, state: BridgeState, now_s: float) -> None:
+        """Show a row for each."""
+        rows = sensor_rows(state, now_s)
+        self._box.set_visibility(bool(rows))
+        if not self._changes.new("rows", rows, self._table):
+            return
+        with self._table:
+            for name in ("sensor", "total field", "minus the first", "line", "flags"):
+                ui.label(name).classes(f"{MUTED} max-sm:hidden")
+            for row in rows:
+                ui.label(row.name).classes("font-medium max-sm:pt-2")
+                ui.label(row.total).classes("tabular-nums")
+                ui.label(row.difference).classes("tabular-nums").style(f"color: {INK if row.agrees else RED}")
+                ui.label(row.line).style(f"color: {INK if row.is_well else RED}")
+                ui.label(row.flags or "none").classes(MUTED)
 
 
 class NavigationPanel:

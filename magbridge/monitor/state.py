@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from math import inf, isclose, isfinite, nan
+from dataclasses import field as dataclass_field
+from math import hypot, inf, isclose, isfinite, nan
 from typing import Any, NamedTuple
 
 from magbridge.mavlink import Message, by_id
@@ -13,13 +14,17 @@ from magbridge.monitor.alarms import Alarms
 from magbridge.monitor.history import Series, TrackPoint, Trail
 from magbridge.records import Quality
 
-__all__ = ["TEMPERATURE_SERIES", "BridgeState", "RemoteParameter", "Text"]
+__all__ = ["TEMPERATURE_SERIES", "BridgeState", "RemoteParameter", "SensorState", "Text"]
 
 HOLD = 3.0
 """s for which a flag is still shown after it was last set."""
 REQUEST_RETRY_S = 1.5
 """s after which a request without an answer is repeated."""
 WAITING = "no answer yet"
+MAX_SENSORS = 8
+"""Sensors of a bridge that are kept at most."""
+MIN_COMPARISON_TIME_S = 1.0
+"""Samples of two sensors are compared where they are no further from each other, s, or than two intervals."""
 SAMPLES, PARAMETERS, TELEMETRY = 3000, 512, 12
 """Samples, parameters, and series of telemetry that are kept at most."""
 LOCATED = {MAG_NAVIGATION_STATE.TRACKING, MAG_NAVIGATION_STATE.DEAD_RECKONING}
@@ -51,6 +56,39 @@ class RemoteParameter:
     error: str = ""
 
 
+@dataclass
+class SensorState:
+    """One sensor of a bridge: its last MAG_FIELD and MAG_SENSOR (empty before the first), and their times."""
+
+    number: int
+    field: dict[str, Any] = dataclass_field(default_factory=dict)
+    report: dict[str, Any] = dataclass_field(default_factory=dict)
+    sampled: float = -inf
+    interval: float = 0.0
+    """`sampled`, `interval`: When the last MAG_FIELD came, and s between the last two; 0 before two."""
+
+    @property
+    def label(self) -> str:
+        """Name in the configuration, or the number before a MAG_SENSOR has told it."""
+        return str(self.report.get("name", "")) or f"sensor {self.number}"
+
+    def take(self, fields: dict[str, Any], now_s: float) -> None:
+        """Take a MAG_FIELD that came at `now_s`."""
+        self.interval = now_s - self.sampled if self.field else 0.0
+        self.field, self.sampled = fields, now_s
+
+    def difference(self, first: SensorState) -> tuple[float, float]:
+        """Return the total field minus that of the first sensor, and its 1-sigma, nT; NaN where not known."""
+        if not (self.field and first.field):
+            return nan, nan
+        apart_s = abs(self.field["time_usec"] - first.field["time_usec"]) * 1e-6
+        if apart_s > max(MIN_COMPARISON_TIME_S, 2.0 * max(self.interval, first.interval)):
+            return nan, nan
+        both = self.field, first.field
+        own, other = (one["total_field"] for one in both)
+        return own - other, hypot(*(one["total_field_sigma"] for one in both))
+
+
 class BridgeState:
     """All that a page shows of one bridge.
 
@@ -75,8 +113,10 @@ class BridgeState:
         Its messages received, and those missing by their sequence numbers.
     field, status, navigation, learning : dict
         The last MAG_FIELD, MAG_STATUS, MAG_NAVIGATION and MAG_LEARNING; empty before the first.
+    sensors : dict of int to SensorState
+        By sensor_id, as they are heard: with one sensor, that one.
     flags : dict of str to tuple of 2 float
-        The flags shown, by their public names: since when, and when last set.
+        The flags of the first sensor, by their public names: since when, and when last set.
     samples : deque of dict
         The last MAG_FIELDs.
     total : Series
@@ -102,6 +142,7 @@ class BridgeState:
         self.status: dict[str, Any] = {}
         self.navigation: dict[str, Any] = {}
         self.learning: dict[str, Any] = {}
+        self.sensors: dict[int, SensorState] = {}
         self.flags: dict[str, tuple[float, float]] = {}
         self.samples: deque[dict[str, Any]] = deque(maxlen=SAMPLES)
         self.total, self.telemetry = Series(), dict[str, Series]()
@@ -116,7 +157,7 @@ class BridgeState:
         self._handlers = by_id(
             MAG_FIELD=self._field, MAG_RAW=self._raw, MAG_STATUS=self._status,
             MAG_NAVIGATION=self._navigation, MAG_LEARNING=self._learning,
-            STATUSTEXT=self._text, PARAM_VALUE=self._value,
+            MAG_SENSOR=self._sensor, STATUSTEXT=self._text, PARAM_VALUE=self._value,
         )  # fmt: skip
         place = dict.fromkeys(("GLOBAL_POSITION_INT", "GPS_RAW_INT"), self._position)
         self._others = by_id(NAMED_VALUE_FLOAT=self._named_value, **place)
@@ -168,7 +209,13 @@ class BridgeState:
             one.error = "expected a number"
 
     def _field(self, message: Message, now_s: float) -> None:
-        if message["sensor_id"]:  # the page shows the main sensor
+        sensor = self._sensor_of(message)
+        if sensor is not None:
+            sensor.take(message.fields, now_s)
+        if number := message["sensor_id"]:
+            two_sigma = 2.0 * message["total_field_sigma"]
+            moment = message["time_usec"] * 1e-6
+            self._measured(f"Sensor {number}: total field, nT", moment, message["total_field"], two_sigma)
             return
         self.interval = now_s - self.sampled if self.field else 0.0
         self.field, self.sampled = message.fields, now_s
@@ -180,6 +227,18 @@ class BridgeState:
             self.field["time_usec"] * 1e-6, self.field["total_field"], 2 * self.field["total_field_sigma"]
         )
 
+    def _sensor(self, message: Message, now_s: float) -> None:  # noqa: ARG002 - handlers are alike
+        if sensor := self._sensor_of(message):
+            sensor.report = message.fields
+
+    def _sensor_of(self, message: Message) -> SensorState | None:
+        """Return the sensor that a message is about; None where there are too many."""
+        number = message["sensor_id"]
+        if number not in self.sensors and len(self.sensors) < MAX_SENSORS:
+            self.sensors[number] = SensorState(number)
+            self.sensors = dict(sorted(self.sensors.items()))
+        return self.sensors.get(number)
+
     def _raw(self, message: Message, now_s: float) -> None:  # noqa: ARG002 - handlers are alike
         if not message["sensor_id"]:
             self._measured(TEMPERATURE_SERIES, message["time_usec"] * 1e-6, message["temperature"])
@@ -187,11 +246,11 @@ class BridgeState:
     def _named_value(self, message: Message, now_s: float) -> None:
         self._measured(message["name"], self.time(now_s), message["value"])
 
-    def _measured(self, name: str, time: float, value: float) -> None:
+    def _measured(self, name: str, time: float, value: float, two_sigma: float = 0.0) -> None:
         if isfinite(value) and name not in self.telemetry and len(self.telemetry) < TELEMETRY:
             self.telemetry[name] = Series()
         if name in self.telemetry:
-            self.telemetry[name].add(time, value)
+            self.telemetry[name].add(time, value, two_sigma)
 
     def _position(self, message: Message, now_s: float) -> None:  # noqa: ARG002 - handlers are alike
         if message.fields.get("fix_type", FIX_2D) >= FIX_2D and (message["lat"] or message["lon"]):
@@ -203,6 +262,7 @@ class BridgeState:
         before, self.status = self.status.get("uptime", 0), message.fields
         if self.status["uptime"] < before:  # the bridge restarted, perhaps with other parameters
             self.parameters.clear()
+            self.sensors.clear()
             self.learning = {}
             self._count = 0
             self.lost = self._lost_before  # its sequence numbers restarted

@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 from enum import IntEnum
 from math import exp, hypot, isfinite, nan, sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
+from magbridge.calibration.scalar import DISAGREEMENT_SIGMA
 from magbridge.field.geodesy import worse_axis
 from magbridge.learning.judge import JUDGE_MEMORY_SAMPLES
 from magbridge.mavlink.enums import (
@@ -17,17 +18,11 @@ from magbridge.mavlink.enums import (
     MAG_PORT_STATE,
 )
 from magbridge.monitor.state import BridgeState
+from magbridge.records import Quality
 
 __all__ = [
-    "FLAG_TEXTS",
-    "conditions",
-    "duration",
-    "health",
-    "learned_worth",
-    "learnt",
-    "measured",
-    "silence",
-    "whereabouts",
+    "FLAG_TEXTS", "SensorRow", "conditions", "duration", "health", "learned_worth", "learnt", "measured",
+    "sensor_rows", "silence", "whereabouts",
 ]  # fmt: skip
 
 SILENT, SLOW = 3.0, 30.0
@@ -104,6 +99,49 @@ def measured(state: BridgeState) -> dict[str, tuple[str, str]]:
     for name, axis in {"Forward": "x", "Starboard": "y", "Down": "z"}.items():
         shown[name] = _number(get(axis, nan), ".1f", 2 * get(f"sigma_{axis}", nan))
     return shown
+
+
+class SensorRow(NamedTuple):
+    """One sensor of several, in words: of a value also if it is in order."""
+
+    name: str
+    total: str
+    """Total field ± 2 sigma, nT."""
+    difference: str
+    """Total field minus the first sensor's ± 2 sigma, nT; a dash for the first."""
+    agrees: bool
+    line: str
+    is_well: bool
+    """`line`, `is_well`: State of its line with the rate of its samples, and if that is in order."""
+    flags: str
+
+
+def sensor_rows(state: BridgeState, now_s: float) -> list[SensorRow]:
+    """Return a row for each sensor of a bridge that has several; none for a single sensor."""
+    if len(state.sensors) < 2:
+        return []
+    first = next(iter(state.sensors.values()))
+    rows = []
+    for sensor in state.sensors.values():
+        get, report = sensor.field.get, sensor.report.get
+        two_sigma = 2.0 * get("total_field_sigma", nan)
+        total = " ".join(_number(get("total_field", nan), ".2f", two_sigma)).strip()
+        value, sigma = (nan, nan) if sensor is first else sensor.difference(first)
+        line = report("state", MAG_PORT_STATE.OK)
+        is_late = _late(sensor.sampled, sensor.interval, now_s)
+        text = "no samples" if is_late and line == MAG_PORT_STATE.OK else _word(MAG_PORT_STATE, line)
+        rows.append(
+            SensorRow(
+                sensor.label,
+                total,
+                " ".join(_number(value, "+.2f", 2.0 * sigma)).strip(),
+                not abs(value) > DISAGREEMENT_SIGMA * sigma,
+                f"{text}, {_figure(report('sample_rate', nan), '.2f', 'Hz')}",
+                line == MAG_PORT_STATE.OK and not is_late,
+                Quality(get("flags", 0)).names(),
+            )
+        )
+    return rows
 
 
 def health(state: BridgeState, now_s: float) -> dict[str, tuple[str, bool]]:
@@ -220,6 +258,13 @@ def conditions(state: BridgeState, now_s: float) -> dict[str, str]:
         text, _ = health(state, now_s)[line]
         if state.status and not starting and text in {"silent", "lost", "failed"}:
             wrong[line] = f"{line}: {text}"
+    for row, sensor in zip(sensor_rows(state, now_s), state.sensors.values(), strict=False):
+        if not sensor.number or starting:  # the first sensor has rows of its own above
+            continue
+        if not row.is_well:
+            wrong[f"sensor {sensor.number}"] = f"Sensor {row.name}: {row.line.split(',')[0]}"
+        for name in set(row.flags.split()) - ROUTINE:
+            wrong[f"sensor {sensor.number} {name}"] = f"Sensor {row.name}: {FLAG_TEXTS[name]}"
     if state.navigation.get("state") == MAG_NAVIGATION_STATE.LOST:
         wrong["navigation"] = "The position by the field is lost"
     return wrong

@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import Command
 from disks import full_disk
@@ -242,3 +243,25 @@ def test_what_cannot_be_printed_is_not_an_error(
     done = run("info", "log.csv", **plain, **encoding)
     assert done.returncode == 0
     assert rb"\xb5V" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("survey dumb.csv -o x.nc", "dumb.csv: only 0 of 60 samples have every value"),
+        ("plan --mission bare.csv --survey 1", "bare.csv: "),
+        ("navigate bare.csv --map grid.nc --bound -o x.nc", "bare.csv: expected a plan of at least two rows"),
+        ("map folder.nc -o x.nc", "folder.nc: expected a file, got a folder"),
+    ],
+)
+def test_a_file_without_a_value_is_named(
+    arguments: str, words: str, deployment: Path, command: Command
+) -> None:
+    rows = read(deployment).isel(time=slice(0, 60))
+    write(rows.assign({name: np.nan * rows[name] for name in rows}), "bare.csv")
+    write(rows.assign({name: np.nan * rows[name] for name in CHANNELS}), "dumb.csv")
+    Path("folder.nc").mkdir()
+    if "grid.nc" in arguments:
+        command("simulate", "demo", "-o", "twin.nc", "--map", "grid.nc", "--seed", "5")
+    assert command.refuses(*arguments.split()).startswith(words)
+    assert not Path("x.nc").exists()

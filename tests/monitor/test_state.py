@@ -22,7 +22,16 @@ from magbridge.monitor.history import TIERS
 from magbridge.monitor.rose import heading_text, rose_picture
 from magbridge.monitor.state import TEMPERATURE_SERIES, BridgeState
 from magbridge.monitor.track import series as track_series
-from magbridge.monitor.words import duration, health, learnt, measured, silence, whereabouts
+from magbridge.monitor.words import (
+    conditions,
+    duration,
+    health,
+    learnt,
+    measured,
+    sensor_rows,
+    silence,
+    whereabouts,
+)
 from magbridge.records import Quality
 from magbridge.version import __version__
 
@@ -418,3 +427,28 @@ def test_an_order_that_goes_back_to_zero_was_taken(air: Air) -> None:
     air.feed(NOW + 1.1, "PARAM_VALUE", param_id="MB_LEARN_CMD", param_value=0.0, param_count=1)
     assert air.state.parameters["MB_LEARN_CMD"].error == ""
     assert air.state.parameters["MB_LEARN_CMD"].asked is None
+
+
+def test_every_sensor_has_a_row_with_its_disagreement(air: Air) -> None:
+    for k in range(8):
+        now = NOW + 2.0 * k
+        air.field(now, 52_000.0)
+        assert sensor_rows(air.state, now) == [] or k  # one sensor has no row
+        air.field(now + 0.1, 52_003.0 if k < 7 else 52_300.0, sensor_id=1, flags=Quality.IMPLAUSIBLE)
+        air.field(now + 0.1, 52_001.0, sensor_id=2, total_field_sigma=nan)
+        air.feed(now, "MAG_SENSOR", sensor_id=0, state=1, name="flux", sample_rate=0.5)
+        air.feed(now, "MAG_SENSOR", sensor_id=1, state=1, name="tail", sample_rate=nan)
+    state, now = air.state, NOW + 15.0
+    first, tail, third = sensor_rows(state, now)
+    assert (first.name, first.difference, first.agrees, first.line) == ("flux", "–", True, "ok, 0.50 Hz")
+    assert (tail.name, tail.difference, tail.agrees) == ("tail", "+300.00 ± 2.83", False)
+    assert (tail.total, tail.flags) == ("52\u202f300.00 ± 2.00", "implausible")
+    assert (third.name, third.difference, third.agrees) == ("sensor 2", "+1.00", True)
+    assert state.field["total_field"] == 52_000.0
+    assert state.telemetry["Sensor 1: total field, nT"].latest == 52_300.0
+    assert conditions(state, now)["sensor 1 implausible"].startswith("Sensor tail: It cannot be")
+    air.feed(now, "MAG_SENSOR", sensor_id=1, state=3, name="tail")
+    assert conditions(state, now + 0.1)["sensor 1"] == "Sensor tail: lost"
+    for number in range(256):
+        air.field(now, sensor_id=number)
+    assert len(state.sensors) == 8
