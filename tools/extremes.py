@@ -233,7 +233,8 @@ def main() -> None:
                     raise
             files.close()
             fed, part = fed + index + 1, part + 1
-    print(f"{fed} events in {time.monotonic() - begun:.0f} s: no exception", file=sys.stderr)
+        print(f"\r{fed} events", end="", file=sys.stderr, flush=True)
+    print(f"\r{fed} events in {time.monotonic() - begun:.0f} s: no exception", file=sys.stderr)
 
 
 if __name__ == "__main__":

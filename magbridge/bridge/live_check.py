@@ -160,9 +160,7 @@ class LiveCheck:
     def _compare(self, pipeline: Pipeline) -> None:
         """List the messages that arrived, and report the missing ones."""
         streams, system = pipeline.component.streams, self._link.system
-        needed = {
-            (system, self._link.autopilot, number): streams.rate_of(number) for number in streams.needed
-        }
+        needed = {(system, *stream): streams.rate_of(stream) for stream in streams.needed}
         for key in sorted(needed.keys() | self._counts.keys(), key=lambda key: (key not in needed, key)):
             sender = f"{key[0]}:{key[1]}"
             self.arrived.append(Arrived(spec(key[2]).name, sender, self._rate(key), needed.get(key, 0.0)))
@@ -179,8 +177,13 @@ class LiveCheck:
             self._warn("link", self._no_autopilot())
             return
         for one in self.arrived:
-            if one.rate_hz < MIN_RATE_FRACTION * one.needed_hz:
-                self._warn("link", _too_rare(one, streams.denied.get(one.name, "")))
+            is_autopilot = one.sender == f"{system}:{self._link.autopilot}"
+            # another component may send what is expected of the autopilot
+            rate_hz = max(one.rate_hz, streams.measured.get(one.name, 0.0)) if is_autopilot else one.rate_hz
+            if rate_hz < MIN_RATE_FRACTION * one.needed_hz:
+                self._warn(
+                    "link", _too_rare(one, streams.denied.get(one.name, ""), is_autopilot=is_autopilot)
+                )
         for name in self._config.telemetry:
             if not self._values[name]:
                 self._warn(f"telemetry.{name}", self._no_value(name))
@@ -221,12 +224,14 @@ class LiveCheck:
         self.faults.append(ConfigFault(fatal=False, text=f"{place}: {text}"))
 
 
-def _too_rare(arrived: Arrived, denied: str) -> str:
+def _too_rare(arrived: Arrived, denied: str, *, is_autopilot: bool) -> str:
     """Return the fault of a message that arrives too rarely, with the remedy."""
     arrives = f"arrives at {arrived.rate_hz:.2g} Hz" if arrived.rate_hz else "does not arrive"
     why = f" ({denied})" if denied else ""
     remedy = f"request it of PX4 by `mavlink stream -s {arrived.name} -r {arrived.needed_hz:g}`"
-    if group := ARDUPILOT_GROUPS.get(arrived.name):
+    if not is_autopilot:
+        remedy = f"set its rate in {arrived.sender}, or correct telemetry.*.component"
+    elif group := ARDUPILOT_GROUPS.get(arrived.name):
         remedy = f"set SRn_{group} (MAVn_{group} since ArduPilot 4.7) to {arrived.needed_hz:g}, or {remedy}"
     return f"{arrived.name} {arrives} and is needed at {arrived.needed_hz:g} Hz{why}: {remedy}"
 

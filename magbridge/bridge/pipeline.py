@@ -131,7 +131,12 @@ class Pipeline:
             kept=start.parameters,
             status=self._status,
             speaking=lambda: self.streams[0].line.state == MAG_PORT_STATE.OK,
-            streams=self._streams(),
+            streams=needed_rates(
+                config.link.autopilot,
+                config.telemetry.values(),
+                attitude=self._direction is not None,
+                navigation=config.navigation is not None,
+            ),
         )
         own = config.link
         self._sources = Sources(config.telemetry, own.system, own.autopilot, self.component.announcer)
@@ -173,15 +178,6 @@ class Pipeline:
                 component.announcer.send_statustext(NOT_USED.format(sensor.driver), MAV_SEVERITY.ERROR)
             publisher = component.another_publisher(number, calibration_id(used) if used else 0)
             yield SensorStream(sensor, driver, correction, component, self._start.time_us, publisher)
-
-    def _streams(self) -> dict[str, tuple[float, float]]:
-        """Return the rates at which the bridge needs messages of the autopilot."""
-        config = self._config
-        return needed_rates(
-            attitude=self._direction is not None,
-            navigation=config.navigation is not None,
-            telemetry=tuple(wanted.message for wanted in config.telemetry.values()),
-        )
 
     @property
     def declarations(self) -> list[bytes]:

@@ -100,7 +100,7 @@ class SensorLine:
         self._received_us, self._known = time_us, True
         if self.state != OK:
             self.state = OK
-            self._announcer.state(self.timer, f"{self._name} speaks")
+            self._announcer.state(self.timer, f"{self._name} sends readings")
 
     def read(self, field: Vector, time_us: int) -> None:
         """Check the values of a reading (nT); announce one that stays the same for long."""

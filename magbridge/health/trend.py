@@ -171,9 +171,8 @@ class TrendCheck:
         S = p_level + noise
         e = total - level
         scatter.follow(time_us, total)
-        predicted = now._replace(
-            time_us=time_us, level=level, p_level=p_level, p_cross=p_cross, p_slope=p_slope
-        )
+        # the jumps so far stay as they are; _replace would take twice as long
+        predicted = TrendState(time_us, level, now.slope, p_level, p_cross, p_slope, *now[6:])
         if e * e <= GATE * S:
             self._before = level if e * e > GATE * (p_still + noise) else nan
             return self._accept(predicted, e, S, sigma, noise)
@@ -199,12 +198,14 @@ class TrendCheck:
         self._accepted += 1
         self._agreed = 0
         k_level, k_slope = predicted.p_level / S, predicted.p_cross / S
-        self._now = predicted._replace(
-            level=predicted.level + k_level * e,
-            slope=predicted.slope + k_slope * e,
-            p_level=predicted.p_level * (1.0 - k_level),
-            p_cross=predicted.p_cross * (1.0 - k_level),
-            p_slope=max(predicted.p_slope - k_slope * predicted.p_cross, 0.0),
+        self._now = TrendState(
+            predicted.time_us,
+            predicted.level + k_level * e,
+            predicted.slope + k_slope * e,
+            predicted.p_level * (1.0 - k_level),
+            predicted.p_cross * (1.0 - k_level),
+            max(predicted.p_slope - k_slope * predicted.p_cross, 0.0),
+            *predicted[6:],
         )
         self._sigma, self.has_moved = sigma, False
         self._adapt(min(e * e / S, MAX_TREND_SQUARE))

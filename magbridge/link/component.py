@@ -16,7 +16,7 @@ from magbridge.link.parameter_service import ParameterService
 from magbridge.link.parameters import Parameters, Tunable, rates
 from magbridge.link.publish import PUBLISHED, Publisher
 from magbridge.link.reports import Condition, Reports
-from magbridge.link.requests import StreamRequests
+from magbridge.link.requests import Stream, StreamRequests
 from magbridge.link.vehicle import VehicleState
 from magbridge.mavlink import BAD_DATA, REFUSED, Codec, FrameLogWriter, Message, Signing, by_id, spec
 from magbridge.mavlink.enums import MAV_SEVERITY
@@ -89,7 +89,7 @@ class Component:
         kept: Mapping[str, float] | None = None,
         status: Callable[[], Condition] = Condition,
         speaking: Callable[[], bool] = bool,
-        streams: Mapping[str, tuple[float, float]] | None = None,
+        streams: Mapping[Stream, tuple[float, float]] | None = None,
     ) -> None:
         self._link = link
         self.codec = Codec(link.system, link.component, signing)

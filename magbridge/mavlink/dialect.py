@@ -372,7 +372,7 @@ enums["MAG_QUALITY"][8] = EnumEntry("MAG_QUALITY_SATURATED", """A channel stood 
 MAG_QUALITY_UNCALIBRATED = 16
 enums["MAG_QUALITY"][16] = EnumEntry("MAG_QUALITY_UNCALIBRATED", """No calibration, or one that does not belong to this sensor.""")
 MAG_QUALITY_OFFSET_SUSPECT = 32
-enums["MAG_QUALITY"][32] = EnumEntry("MAG_QUALITY_OFFSET_SUSPECT", """The sensor was powered on anew since the calibration.""")
+enums["MAG_QUALITY"][32] = EnumEntry("MAG_QUALITY_OFFSET_SUSPECT", """The sensor was powered on again after the calibration.""")
 MAG_QUALITY_NO_BORESIGHT = 64
 enums["MAG_QUALITY"][64] = EnumEntry("MAG_QUALITY_NO_BORESIGHT", """The vector is known only up to one rotation; its magnitude is right.""")
 MAG_QUALITY_GAP = 128
@@ -392,7 +392,7 @@ enums["MAG_RAW_FLAGS"].bitmask = True
 MAG_RAW_FLAGS_SATURATED = 1
 enums["MAG_RAW_FLAGS"][1] = EnumEntry("MAG_RAW_FLAGS_SATURATED", """A channel stood at the end of its range.""")
 MAG_RAW_FLAGS_COUNTS = 2
-enums["MAG_RAW_FLAGS"][2] = EnumEntry("MAG_RAW_FLAGS_COUNTS", """The instrument speaks counts; count_x, count_y, count_z are valid.""")
+enums["MAG_RAW_FLAGS"][2] = EnumEntry("MAG_RAW_FLAGS_COUNTS", """The instrument sends counts; count_x, count_y, count_z are valid.""")
 MAG_RAW_FLAGS_SEQUENCE = 4
 enums["MAG_RAW_FLAGS"][4] = EnumEntry("MAG_RAW_FLAGS_SEQUENCE", """The instrument numbers its frames; sequence is valid.""")
 MAG_RAW_FLAGS_POWER_CYCLE = 8
@@ -406,11 +406,11 @@ enums["MAG_PORT_STATE"].bitmask = False
 MAG_PORT_STATE_ABSENT = 0
 enums["MAG_PORT_STATE"][0] = EnumEntry("MAG_PORT_STATE_ABSENT", """Not configured, or not opened yet.""")
 MAG_PORT_STATE_OK = 1
-enums["MAG_PORT_STATE"][1] = EnumEntry("MAG_PORT_STATE_OK", """Open and speaking.""")
+enums["MAG_PORT_STATE"][1] = EnumEntry("MAG_PORT_STATE_OK", """Open; readings or frames arrive.""")
 MAG_PORT_STATE_SILENT = 2
-enums["MAG_PORT_STATE"][2] = EnumEntry("MAG_PORT_STATE_SILENT", """Open, but nothing intelligible comes.""")
+enums["MAG_PORT_STATE"][2] = EnumEntry("MAG_PORT_STATE_SILENT", """Open, but no valid reading or frame arrives.""")
 MAG_PORT_STATE_LOST = 3
-enums["MAG_PORT_STATE"][3] = EnumEntry("MAG_PORT_STATE_LOST", """Gone; the bridge keeps trying to open it.""")
+enums["MAG_PORT_STATE"][3] = EnumEntry("MAG_PORT_STATE_LOST", """Lost; the bridge tries to open it again.""")
 MAG_PORT_STATE_ENUM_END = 4
 enums["MAG_PORT_STATE"][4] = EnumEntry("MAG_PORT_STATE_ENUM_END", """""")
 
@@ -454,7 +454,7 @@ enums["MAG_NAVIGATION_STATE"][1] = EnumEntry("MAG_NAVIGATION_STATE_SEARCHING", "
 MAG_NAVIGATION_STATE_TRACKING = 2
 enums["MAG_NAVIGATION_STATE"][2] = EnumEntry("MAG_NAVIGATION_STATE_TRACKING", """One hypothesis holds; fixes are sent.""")
 MAG_NAVIGATION_STATE_DEAD_RECKONING = 3
-enums["MAG_NAVIGATION_STATE"][3] = EnumEntry("MAG_NAVIGATION_STATE_DEAD_RECKONING", """Outside the map, or the field says nothing here.""")
+enums["MAG_NAVIGATION_STATE"][3] = EnumEntry("MAG_NAVIGATION_STATE_DEAD_RECKONING", """Outside the map, or the field here contains no information on the position.""")
 MAG_NAVIGATION_STATE_LOST = 4
 enums["MAG_NAVIGATION_STATE"][4] = EnumEntry("MAG_NAVIGATION_STATE_LOST", """The field and the map disagree; no fix is sent.""")
 MAG_NAVIGATION_STATE_ENUM_END = 5
@@ -502,7 +502,7 @@ enums["MAG_LEARNING_STATE"].bitmask = False
 MAG_LEARNING_STATE_OFF = 0
 enums["MAG_LEARNING_STATE"][0] = EnumEntry("MAG_LEARNING_STATE_OFF", """Nothing.""")
 MAG_LEARNING_STATE_FROZEN = 1
-enums["MAG_LEARNING_STATE"][1] = EnumEntry("MAG_LEARNING_STATE_FROZEN", """It judges and doubts, but learns nothing.""")
+enums["MAG_LEARNING_STATE"][1] = EnumEntry("MAG_LEARNING_STATE_FROZEN", """The learner tests and raises alarms, but does not update the calibration.""")
 MAG_LEARNING_STATE_LEARNING = 2
 enums["MAG_LEARNING_STATE"][2] = EnumEntry("MAG_LEARNING_STATE_LEARNING", """It learns; the first calibration is published.""")
 MAG_LEARNING_STATE_LEARNED = 3
@@ -516,7 +516,7 @@ enums["MAG_CAUSE"].bitmask = True
 MAG_CAUSE_OFFSET_STEP = 1
 enums["MAG_CAUSE"][1] = EnumEntry("MAG_CAUSE_OFFSET_STEP", """The offset jumped.""")
 MAG_CAUSE_OFFSET_DRIFT = 2
-enums["MAG_CAUSE"][2] = EnumEntry("MAG_CAUSE_OFFSET_DRIFT", """The offset creeps.""")
+enums["MAG_CAUSE"][2] = EnumEntry("MAG_CAUSE_OFFSET_DRIFT", """The offset drifts.""")
 MAG_CAUSE_TEMPERATURE_OFFSET = 4
 enums["MAG_CAUSE"][4] = EnumEntry("MAG_CAUSE_TEMPERATURE_OFFSET", """The offset follows the sensor's temperature.""")
 MAG_CAUSE_UNMODELLED_ACTUATOR = 8
@@ -524,9 +524,9 @@ enums["MAG_CAUSE"][8] = EnumEntry("MAG_CAUSE_UNMODELLED_ACTUATOR", """The offset
 MAG_CAUSE_CURRENT_FIELD = 16
 enums["MAG_CAUSE"][16] = EnumEntry("MAG_CAUSE_CURRENT_FIELD", """The offset follows a current.""")
 MAG_CAUSE_CLOCK_OFFSET = 32
-enums["MAG_CAUSE"][32] = EnumEntry("MAG_CAUSE_CLOCK_OFFSET", """Telemetry and sensor are not of one time.""")
+enums["MAG_CAUSE"][32] = EnumEntry("MAG_CAUSE_CLOCK_OFFSET", """The clocks of telemetry and sensor differ.""")
 MAG_CAUSE_MAP_ERROR = 64
-enums["MAG_CAUSE"][64] = EnumEntry("MAG_CAUSE_MAP_ERROR", """The Earth's field is another than the reference.""")
+enums["MAG_CAUSE"][64] = EnumEntry("MAG_CAUSE_MAP_ERROR", """The Earth's field differs from the reference.""")
 MAG_CAUSE_ENUM_END = 65
 enums["MAG_CAUSE"][65] = EnumEntry("MAG_CAUSE_ENUM_END", """""")
 
@@ -666,7 +666,7 @@ setattr(MAVLink_mag_field_message, "name", mavlink_msg_deprecated_name_property(
 
 class MAVLink_mag_status_message(MAVLink_message):
     """
-    How the bridge is. Counters run from its start.
+    State of the bridge. Counters run from its start.
     """
 
     id = MAVLINK_MSG_ID_MAG_STATUS
@@ -1823,17 +1823,17 @@ class MAVLink(object):
         x                         : X channel. [nT] (type:float)
         y                         : Y channel. [nT] (type:float)
         z                         : Z channel. [nT] (type:float)
-        count_x                   : The converter's own number, x channel. (type:int32_t)
-        count_y                   : The converter's own number, y channel. (type:int32_t)
-        count_z                   : The converter's own number, z channel. (type:int32_t)
-        delay_x                   : When the x channel was sampled, after time_usec. [us] (type:int32_t)
-        delay_y                   : When the y channel was sampled, after time_usec. [us] (type:int32_t)
-        delay_z                   : When the z channel was sampled, after time_usec. [us] (type:int32_t)
-        temperature               : At the fluxgate. [degC] (type:float)
+        count_x                   : Count of the converter, x channel. (type:int32_t)
+        count_y                   : Count of the converter, y channel. (type:int32_t)
+        count_z                   : Count of the converter, z channel. (type:int32_t)
+        delay_x                   : Time from time_usec until the x channel was sampled. [us] (type:int32_t)
+        delay_y                   : Time from time_usec until the y channel was sampled. [us] (type:int32_t)
+        delay_z                   : Time from time_usec until the z channel was sampled. [us] (type:int32_t)
+        temperature               : Temperature of the fluxgate. [degC] (type:float)
         supply                    : Supply voltage of the instrument. [V] (type:float)
         power_cycle               : How often the instrument was powered on, modulo 65536. (type:uint16_t)
-        sensor_id                 : Which sensor. (type:uint8_t)
-        flags                     : What this sample carries. (type:uint8_t, values:MAG_RAW_FLAGS)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
+        flags                     : Flags of this sample. (type:uint8_t, values:MAG_RAW_FLAGS)
 
         """
         return MAVLink_mag_raw_message(time_usec, sequence, x, y, z, count_x, count_y, count_z, delay_x, delay_y, delay_z, temperature, supply, power_cycle, sensor_id, flags)
@@ -1848,17 +1848,17 @@ class MAVLink(object):
         x                         : X channel. [nT] (type:float)
         y                         : Y channel. [nT] (type:float)
         z                         : Z channel. [nT] (type:float)
-        count_x                   : The converter's own number, x channel. (type:int32_t)
-        count_y                   : The converter's own number, y channel. (type:int32_t)
-        count_z                   : The converter's own number, z channel. (type:int32_t)
-        delay_x                   : When the x channel was sampled, after time_usec. [us] (type:int32_t)
-        delay_y                   : When the y channel was sampled, after time_usec. [us] (type:int32_t)
-        delay_z                   : When the z channel was sampled, after time_usec. [us] (type:int32_t)
-        temperature               : At the fluxgate. [degC] (type:float)
+        count_x                   : Count of the converter, x channel. (type:int32_t)
+        count_y                   : Count of the converter, y channel. (type:int32_t)
+        count_z                   : Count of the converter, z channel. (type:int32_t)
+        delay_x                   : Time from time_usec until the x channel was sampled. [us] (type:int32_t)
+        delay_y                   : Time from time_usec until the y channel was sampled. [us] (type:int32_t)
+        delay_z                   : Time from time_usec until the z channel was sampled. [us] (type:int32_t)
+        temperature               : Temperature of the fluxgate. [degC] (type:float)
         supply                    : Supply voltage of the instrument. [V] (type:float)
         power_cycle               : How often the instrument was powered on, modulo 65536. (type:uint16_t)
-        sensor_id                 : Which sensor. (type:uint8_t)
-        flags                     : What this sample carries. (type:uint8_t, values:MAG_RAW_FLAGS)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
+        flags                     : Flags of this sample. (type:uint8_t, values:MAG_RAW_FLAGS)
 
         """
         self.send(self.mag_raw_encode(time_usec, sequence, x, y, z, count_x, count_y, count_z, delay_x, delay_y, delay_z, temperature, supply, power_cycle, sensor_id, flags), force_mavlink1=force_mavlink1)
@@ -1881,9 +1881,9 @@ class MAVLink(object):
         sigma_z                   : 1-sigma of z. [nT] (type:float)
         anomaly                   : total_field minus the Earth's main field at the vehicle's position. [nT] (type:float)
         telemetry_age             : Age, at the sample's time, of the oldest parameter that went into the correction. [s] (type:float)
-        latency                   : From the sample to this message. [s] (type:float)
-        flags                     : Why the sample is doubtful. (type:uint16_t, values:MAG_QUALITY)
-        sensor_id                 : Which sensor. (type:uint8_t)
+        latency                   : Time from the sample to this message. [s] (type:float)
+        flags                     : Flags of a sample that may be wrong. (type:uint16_t, values:MAG_QUALITY)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
         magnetic_heading          : Heading clockwise from magnetic north, 0 to 360; unknown where heading_sigma is 0. [deg] (type:float)
         heading                   : Heading clockwise from true north, 0 to 360; NaN where the declination is unknown. [deg] (type:float)
         heading_sigma             : 1-sigma of the heading; 0: no heading. [deg] (type:float)
@@ -1909,9 +1909,9 @@ class MAVLink(object):
         sigma_z                   : 1-sigma of z. [nT] (type:float)
         anomaly                   : total_field minus the Earth's main field at the vehicle's position. [nT] (type:float)
         telemetry_age             : Age, at the sample's time, of the oldest parameter that went into the correction. [s] (type:float)
-        latency                   : From the sample to this message. [s] (type:float)
-        flags                     : Why the sample is doubtful. (type:uint16_t, values:MAG_QUALITY)
-        sensor_id                 : Which sensor. (type:uint8_t)
+        latency                   : Time from the sample to this message. [s] (type:float)
+        flags                     : Flags of a sample that may be wrong. (type:uint16_t, values:MAG_QUALITY)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
         magnetic_heading          : Heading clockwise from magnetic north, 0 to 360; unknown where heading_sigma is 0. [deg] (type:float)
         heading                   : Heading clockwise from true north, 0 to 360; NaN where the declination is unknown. [deg] (type:float)
         heading_sigma             : 1-sigma of the heading; 0: no heading. [deg] (type:float)
@@ -1921,13 +1921,13 @@ class MAVLink(object):
 
     def mag_status_encode(self, time_usec: int, vehicle_clock_offset: int, uptime: int, calibration_id: int, samples: int, samples_lost: int, sensor_bytes_skipped: int, sensor_frames_bad: int, link_frames: int, link_frames_lost: int, link_bytes_skipped: int, link_refused: int, log_records: int, log_lost: int, telemetry_stale: int, sample_rate: float, sensor_clock_drift: float, vehicle_clock_sigma: float, vehicle_clock_drift: float, vehicle_reboots: int, sensor_state: int, autopilot_state: int, log_state: int) -> MAVLink_mag_status_message:
         """
-        How the bridge is. Counters run from its start.
+        State of the bridge. Counters run from its start.
 
         time_usec                 : UNIX time. [us] (type:uint64_t)
         vehicle_clock_offset        : The autopilot's TIMESYNC clock minus UNIX time; 0 while unknown. [us] (type:int64_t)
-        uptime                    : Since the bridge started. [s] (type:uint32_t)
+        uptime                    : Time since the bridge started. [s] (type:uint32_t)
         calibration_id            : As in MAG_FIELD. (type:uint32_t)
-        samples                   : Readings that the sensor gave. (type:uint32_t)
+        samples                   : Readings received from the sensor. (type:uint32_t)
         samples_lost              : Readings missing by the instrument's own numbering. (type:uint32_t)
         sensor_bytes_skipped        : Bytes from the sensor that belonged to no frame. [bytes] (type:uint32_t)
         sensor_frames_bad         : Frames from the sensor with a wrong checksum. (type:uint32_t)
@@ -1938,27 +1938,27 @@ class MAVLink(object):
         log_records               : Records made for the log; those that log_lost counts were not written. (type:uint32_t)
         log_lost                  : Records that the log could not take. (type:uint32_t)
         telemetry_stale           : One bit a parameter, in the order of the configuration: older than its max_age. (type:uint32_t)
-        sample_rate               : Readings a second, lately. [Hz] (type:float)
-        sensor_clock_drift        : The instrument's clock against the bridge's: positive is fast. [ppm] (type:float)
+        sample_rate               : Rate of the last readings. [Hz] (type:float)
+        sensor_clock_drift        : Rate of the instrument's clock relative to the bridge's; positive: fast. [ppm] (type:float)
         vehicle_clock_sigma        : 1-sigma of vehicle_clock_offset. [s] (type:float)
-        vehicle_clock_drift        : The autopilot's clock against the bridge's. [ppm] (type:float)
-        vehicle_reboots           : How often the autopilot's boot clock began anew. (type:uint16_t)
-        sensor_state              : The sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
-        autopilot_state           : The autopilot, by its heartbeats. (type:uint8_t, values:MAG_PORT_STATE)
-        log_state                 : The log. (type:uint8_t, values:MAG_LOG_STATE)
+        vehicle_clock_drift        : Rate of the autopilot's clock relative to the bridge's; positive: fast. [ppm] (type:float)
+        vehicle_reboots           : Number of restarts of the autopilot's boot clock. (type:uint16_t)
+        sensor_state              : State of the sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
+        autopilot_state           : State of the link to the autopilot, by its heartbeats. (type:uint8_t, values:MAG_PORT_STATE)
+        log_state                 : State of the log. (type:uint8_t, values:MAG_LOG_STATE)
 
         """
         return MAVLink_mag_status_message(time_usec, vehicle_clock_offset, uptime, calibration_id, samples, samples_lost, sensor_bytes_skipped, sensor_frames_bad, link_frames, link_frames_lost, link_bytes_skipped, link_refused, log_records, log_lost, telemetry_stale, sample_rate, sensor_clock_drift, vehicle_clock_sigma, vehicle_clock_drift, vehicle_reboots, sensor_state, autopilot_state, log_state)
 
     def mag_status_send(self, time_usec: int, vehicle_clock_offset: int, uptime: int, calibration_id: int, samples: int, samples_lost: int, sensor_bytes_skipped: int, sensor_frames_bad: int, link_frames: int, link_frames_lost: int, link_bytes_skipped: int, link_refused: int, log_records: int, log_lost: int, telemetry_stale: int, sample_rate: float, sensor_clock_drift: float, vehicle_clock_sigma: float, vehicle_clock_drift: float, vehicle_reboots: int, sensor_state: int, autopilot_state: int, log_state: int, force_mavlink1: bool = False) -> None:
         """
-        How the bridge is. Counters run from its start.
+        State of the bridge. Counters run from its start.
 
         time_usec                 : UNIX time. [us] (type:uint64_t)
         vehicle_clock_offset        : The autopilot's TIMESYNC clock minus UNIX time; 0 while unknown. [us] (type:int64_t)
-        uptime                    : Since the bridge started. [s] (type:uint32_t)
+        uptime                    : Time since the bridge started. [s] (type:uint32_t)
         calibration_id            : As in MAG_FIELD. (type:uint32_t)
-        samples                   : Readings that the sensor gave. (type:uint32_t)
+        samples                   : Readings received from the sensor. (type:uint32_t)
         samples_lost              : Readings missing by the instrument's own numbering. (type:uint32_t)
         sensor_bytes_skipped        : Bytes from the sensor that belonged to no frame. [bytes] (type:uint32_t)
         sensor_frames_bad         : Frames from the sensor with a wrong checksum. (type:uint32_t)
@@ -1969,14 +1969,14 @@ class MAVLink(object):
         log_records               : Records made for the log; those that log_lost counts were not written. (type:uint32_t)
         log_lost                  : Records that the log could not take. (type:uint32_t)
         telemetry_stale           : One bit a parameter, in the order of the configuration: older than its max_age. (type:uint32_t)
-        sample_rate               : Readings a second, lately. [Hz] (type:float)
-        sensor_clock_drift        : The instrument's clock against the bridge's: positive is fast. [ppm] (type:float)
+        sample_rate               : Rate of the last readings. [Hz] (type:float)
+        sensor_clock_drift        : Rate of the instrument's clock relative to the bridge's; positive: fast. [ppm] (type:float)
         vehicle_clock_sigma        : 1-sigma of vehicle_clock_offset. [s] (type:float)
-        vehicle_clock_drift        : The autopilot's clock against the bridge's. [ppm] (type:float)
-        vehicle_reboots           : How often the autopilot's boot clock began anew. (type:uint16_t)
-        sensor_state              : The sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
-        autopilot_state           : The autopilot, by its heartbeats. (type:uint8_t, values:MAG_PORT_STATE)
-        log_state                 : The log. (type:uint8_t, values:MAG_LOG_STATE)
+        vehicle_clock_drift        : Rate of the autopilot's clock relative to the bridge's; positive: fast. [ppm] (type:float)
+        vehicle_reboots           : Number of restarts of the autopilot's boot clock. (type:uint16_t)
+        sensor_state              : State of the sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
+        autopilot_state           : State of the link to the autopilot, by its heartbeats. (type:uint8_t, values:MAG_PORT_STATE)
+        log_state                 : State of the log. (type:uint8_t, values:MAG_LOG_STATE)
 
         """
         self.send(self.mag_status_encode(time_usec, vehicle_clock_offset, uptime, calibration_id, samples, samples_lost, sensor_bytes_skipped, sensor_frames_bad, link_frames, link_frames_lost, link_bytes_skipped, link_refused, log_records, log_lost, telemetry_stale, sample_rate, sensor_clock_drift, vehicle_clock_sigma, vehicle_clock_drift, vehicle_reboots, sensor_state, autopilot_state, log_state), force_mavlink1=force_mavlink1)
@@ -1994,15 +1994,15 @@ class MAVLink(object):
         covariance_ee             : Variance east. [m^2] (type:float)
         innovation                : Measured minus predicted anomaly. [nT] (type:float)
         innovation_variance        : Its variance. [nT^2] (type:float)
-        gate                      : The largest innovation^2 / innovation_variance that is taken in. (type:float)
+        gate                      : Largest innovation^2 / innovation_variance with which the filter is updated. (type:float)
         bias                      : Calibration bias, estimated. [nT] (type:float)
         bias_sigma                : Its 1-sigma. [nT] (type:float)
         current_north             : Drift north, estimated. [m/s] (type:float)
         current_east              : Drift east, estimated. [m/s] (type:float)
-        state                     : What the filter says of itself. (type:uint8_t, values:MAG_NAVIGATION_STATE)
-        accepted                  : 1: the innovation was within the gate and taken in. (type:uint8_t)
+        state                     : State of the filter. (type:uint8_t, values:MAG_NAVIGATION_STATE)
+        accepted                  : 1: the innovation was within the gate and updated the filter. (type:uint8_t)
         gps_state                 : Whether the positions of the GPS receiver are used. (type:uint8_t, values:MAG_GPS_STATE)
-        gps_reason                : Why they are not used. (type:uint8_t, values:MAG_GPS_REASON)
+        gps_reason                : Reason why they are not used. (type:uint8_t, values:MAG_GPS_REASON)
 
         """
         return MAVLink_mag_navigation_message(time_usec, lat, lon, covariance_nn, covariance_ne, covariance_ee, innovation, innovation_variance, gate, bias, bias_sigma, current_north, current_east, state, accepted, gps_state, gps_reason)
@@ -2020,15 +2020,15 @@ class MAVLink(object):
         covariance_ee             : Variance east. [m^2] (type:float)
         innovation                : Measured minus predicted anomaly. [nT] (type:float)
         innovation_variance        : Its variance. [nT^2] (type:float)
-        gate                      : The largest innovation^2 / innovation_variance that is taken in. (type:float)
+        gate                      : Largest innovation^2 / innovation_variance with which the filter is updated. (type:float)
         bias                      : Calibration bias, estimated. [nT] (type:float)
         bias_sigma                : Its 1-sigma. [nT] (type:float)
         current_north             : Drift north, estimated. [m/s] (type:float)
         current_east              : Drift east, estimated. [m/s] (type:float)
-        state                     : What the filter says of itself. (type:uint8_t, values:MAG_NAVIGATION_STATE)
-        accepted                  : 1: the innovation was within the gate and taken in. (type:uint8_t)
+        state                     : State of the filter. (type:uint8_t, values:MAG_NAVIGATION_STATE)
+        accepted                  : 1: the innovation was within the gate and updated the filter. (type:uint8_t)
         gps_state                 : Whether the positions of the GPS receiver are used. (type:uint8_t, values:MAG_GPS_STATE)
-        gps_reason                : Why they are not used. (type:uint8_t, values:MAG_GPS_REASON)
+        gps_reason                : Reason why they are not used. (type:uint8_t, values:MAG_GPS_REASON)
 
         """
         self.send(self.mag_navigation_encode(time_usec, lat, lon, covariance_nn, covariance_ne, covariance_ee, innovation, innovation_variance, gate, bias, bias_sigma, current_north, current_east, state, accepted, gps_state, gps_reason), force_mavlink1=force_mavlink1)
@@ -2038,8 +2038,8 @@ class MAVLink(object):
         In logs only: bytes as they came from the sensor; the record's time
         stamp is their arrival.
 
-        sensor_id                 : Which sensor. (type:uint8_t)
-        length                    : How many of data are valid. [bytes] (type:uint8_t)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
+        length                    : Number of valid bytes in data. [bytes] (type:uint8_t)
         data                      : The bytes. (type:uint8_t)
 
         """
@@ -2050,8 +2050,8 @@ class MAVLink(object):
         In logs only: bytes as they came from the sensor; the record's time
         stamp is their arrival.
 
-        sensor_id                 : Which sensor. (type:uint8_t)
-        length                    : How many of data are valid. [bytes] (type:uint8_t)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
+        length                    : Number of valid bytes in data. [bytes] (type:uint8_t)
         data                      : The bytes. (type:uint8_t)
 
         """
@@ -2063,7 +2063,7 @@ class MAVLink(object):
         or not yet.
 
         ahead                     : 1: these bytes were there already, but stand in later records too; only a replay needs them. (type:uint8_t)
-        length                    : How many of data are valid. [bytes] (type:uint8_t)
+        length                    : Number of valid bytes in data. [bytes] (type:uint8_t)
         data                      : The bytes. (type:uint8_t)
 
         """
@@ -2075,7 +2075,7 @@ class MAVLink(object):
         or not yet.
 
         ahead                     : 1: these bytes were there already, but stand in later records too; only a replay needs them. (type:uint8_t)
-        length                    : How many of data are valid. [bytes] (type:uint8_t)
+        length                    : Number of valid bytes in data. [bytes] (type:uint8_t)
         data                      : The bytes. (type:uint8_t)
 
         """
@@ -2140,9 +2140,9 @@ class MAVLink(object):
 
         time_usec                 : UNIX time. [us] (type:uint64_t)
         dropped                   : Bytes that could not be sent since the start. [bytes] (type:uint32_t)
-        port                      : Which port. (type:uint8_t, values:MAG_PORT_NAME)
-        state                     : What it is now. (type:uint8_t, values:MAG_PORT_STATE)
-        reason                    : Why and which, where it is not open. (type:char)
+        port                      : Number of the port. (type:uint8_t, values:MAG_PORT_NAME)
+        state                     : State of the port. (type:uint8_t, values:MAG_PORT_STATE)
+        reason                    : Device and reason, where the port is not open. (type:char)
 
         """
         return MAVLink_mag_port_message(time_usec, dropped, port, state, reason)
@@ -2154,9 +2154,9 @@ class MAVLink(object):
 
         time_usec                 : UNIX time. [us] (type:uint64_t)
         dropped                   : Bytes that could not be sent since the start. [bytes] (type:uint32_t)
-        port                      : Which port. (type:uint8_t, values:MAG_PORT_NAME)
-        state                     : What it is now. (type:uint8_t, values:MAG_PORT_STATE)
-        reason                    : Why and which, where it is not open. (type:char)
+        port                      : Number of the port. (type:uint8_t, values:MAG_PORT_NAME)
+        state                     : State of the port. (type:uint8_t, values:MAG_PORT_STATE)
+        reason                    : Device and reason, where the port is not open. (type:char)
 
         """
         self.send(self.mag_port_encode(time_usec, dropped, port, state, reason), force_mavlink1=force_mavlink1)
@@ -2173,7 +2173,7 @@ class MAVLink(object):
         unit                      : Unit of the column. (type:char)
         message                   : Name of the message. (type:char)
         field                     : Name of its field, with an index in brackets where it is an array. (type:char)
-        match                     : What other fields must be: name=value, separated by commas. (type:char)
+        match                     : Values that other fields must have: name=value, separated by commas. (type:char)
         column                    : Name of the column. (type:char)
         component                 : The only component whose message counts; 0: the autopilot's, else that of the first. (type:uint8_t)
 
@@ -2192,7 +2192,7 @@ class MAVLink(object):
         unit                      : Unit of the column. (type:char)
         message                   : Name of the message. (type:char)
         field                     : Name of its field, with an index in brackets where it is an array. (type:char)
-        match                     : What other fields must be: name=value, separated by commas. (type:char)
+        match                     : Values that other fields must have: name=value, separated by commas. (type:char)
         column                    : Name of the column. (type:char)
         component                 : The only component whose message counts; 0: the autopilot's, else that of the first. (type:uint8_t)
 
@@ -2234,8 +2234,8 @@ class MAVLink(object):
         better                    : Log-likelihood ratio of the learned over the first calibration, lately; below 0 the first one predicts better. (type:float)
         alarm_amplitude           : Root mean square of the unexplained part. [nT] (type:float)
         causes                    : Which causes fit. (type:uint16_t, values:MAG_CAUSE)
-        state                     : What it does. (type:uint8_t, values:MAG_LEARNING_STATE)
-        sensor_id                 : Which sensor. (type:uint8_t)
+        state                     : State of the learner. (type:uint8_t, values:MAG_LEARNING_STATE)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
 
         """
         return MAVLink_mag_learning_message(time_usec, alarm_since, calibration_id, first_calibration_id, samples, rms_first, rms_published, rms_learned, better, alarm_amplitude, causes, state, sensor_id)
@@ -2255,8 +2255,8 @@ class MAVLink(object):
         better                    : Log-likelihood ratio of the learned over the first calibration, lately; below 0 the first one predicts better. (type:float)
         alarm_amplitude           : Root mean square of the unexplained part. [nT] (type:float)
         causes                    : Which causes fit. (type:uint16_t, values:MAG_CAUSE)
-        state                     : What it does. (type:uint8_t, values:MAG_LEARNING_STATE)
-        sensor_id                 : Which sensor. (type:uint8_t)
+        state                     : State of the learner. (type:uint8_t, values:MAG_LEARNING_STATE)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
 
         """
         self.send(self.mag_learning_encode(time_usec, alarm_since, calibration_id, first_calibration_id, samples, rms_first, rms_published, rms_learned, better, alarm_amplitude, causes, state, sensor_id), force_mavlink1=force_mavlink1)
@@ -2274,8 +2274,8 @@ class MAVLink(object):
         frames_bad                : Frames with a wrong checksum. (type:uint32_t)
         sample_rate               : Rate of the last readings. [Hz] (type:float)
         clock_drift               : The instrument's clock relative to the bridge's: positive is fast. [ppm] (type:float)
-        sensor_id                 : Which sensor. (type:uint8_t)
-        state                     : The sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
+        state                     : State of the sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
         name                      : Name of the sensor in the configuration. (type:char)
 
         """
@@ -2294,8 +2294,8 @@ class MAVLink(object):
         frames_bad                : Frames with a wrong checksum. (type:uint32_t)
         sample_rate               : Rate of the last readings. [Hz] (type:float)
         clock_drift               : The instrument's clock relative to the bridge's: positive is fast. [ppm] (type:float)
-        sensor_id                 : Which sensor. (type:uint8_t)
-        state                     : The sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
+        sensor_id                 : Number of the sensor. (type:uint8_t)
+        state                     : State of the sensor's line. (type:uint8_t, values:MAG_PORT_STATE)
         name                      : Name of the sensor in the configuration. (type:char)
 
         """

@@ -31,7 +31,7 @@ def test_sensor_unplugged_in_the_middle_of_a_frame(rig: Rig, table: Row) -> None
     rig.run(0.3)
     rig.fluxgate.plug()
     gone, back = time.monotonic() - away, rig.until_well()
-    rig.until_reported("digitizer speaks", mark)
+    rig.until_reported("digitizer sends readings", mark)
     after = rig.fresh_status()
     assert rig.undue_flags(mark) == "gap"
     lost = after["samples_lost"] - before["samples_lost"]

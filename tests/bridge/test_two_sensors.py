@@ -159,7 +159,7 @@ def test_each_sensor_has_its_id_its_messages_and_its_state(tmp_path: Path) -> No
         (1, "tail", 1),
     }
     assert states_sent[-1]["sample_rate"] == pytest.approx(2.0, rel=0.01)
-    assert "tail speaks" in bench.texts()
+    assert "tail sends readings" in bench.texts()
 
 
 @pytest.mark.parametrize("wrong", [0, 1])

@@ -54,7 +54,7 @@ def test_mavproxy(make_rig: MakeRig, start_peer: Start, python: Path) -> None:
     rig.fluxgate.speaks = False
     peer.until("digitizer is silent")  # a STATUSTEXT
     rig.fluxgate.speaks = True
-    peer.until("digitizer speaks", len(peer.lines))
+    peer.until("digitizer sends readings", len(peer.lines))
     peer.ask("long GET_MESSAGE_INTERVAL 60102")
     peer.until("Got COMMAND_ACK: GET_MESSAGE_INTERVAL: ACCEPTED")
     peer.end()

@@ -87,7 +87,7 @@ def test_every_instrument_s_protocol_arrives_whole(
     part = result["parts"][0]
     assert part["corrected_rms_nT"] == pytest.approx(part["raw_rms_nT"], abs=30 * step + 15)
     assert set(result["flags"]) <= {"uncalibrated", "no_boresight", "gap"}
-    assert any("speaks" in text for text in result["said"])
+    assert any("sends readings" in text for text in result["said"])
 
 
 def test_a_log_of_a_replay_is_replayed_bit_for_bit(

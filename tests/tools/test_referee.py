@@ -20,7 +20,7 @@ from magbridge.config import Link
 from magbridge.link.component import Component
 from magbridge.link.fixes import Kind
 from magbridge.link.requests import needed_rates
-from magbridge.mavlink import Codec
+from magbridge.mavlink import Codec, spec
 from magbridge.mavlink.enums import MAV_RESULT
 
 BRIDGE = Codec(1, 191)
@@ -164,7 +164,7 @@ def test_the_bridge_requests_the_rates_that_a_started_autopilot_does_not_send(
     make: type[Autopilot], rates: dict[str, float], before: float, status: str
 ) -> None:
     autopilot = make(ORIGIN, START_US, rates=rates, vehicle=FIXED_WING)
-    needed = needed_rates(attitude=True, navigation=True, telemetry=())
+    needed = needed_rates(1, attitude=True, navigation=True)
     bridge = Component(Link("udpout:127.0.0.1:14550"), {}, start_us=START_US, streams=needed)
     measured, answers = [], b""
     for k in range(500):
@@ -176,7 +176,7 @@ def test_the_bridge_requests_the_rates_that_a_started_autopilot_does_not_send(
         answers = b""
         measured.append(dict(bridge.streams.measured))
     assert measured[120]["ATTITUDE"] == pytest.approx(min(before, 10.0), rel=0.1)  # the steps are 0.1 s
-    rate = dict(zip(needed, (pair[0] for pair in needed.values()), strict=True))
+    rate = {spec(number).name: aircraft for (_, number), (aircraft, _) in needed.items()}
     rate[status] = rate.pop("EKF_STATUS_REPORT")
     for name, wanted in rate.items():
         assert measured[-1][name] >= 0.9 * wanted, name

@@ -112,7 +112,7 @@ def sail(
     The autopilot sends its telemetry every `step_s`, at most; with `requests`, the bridge requests rates.
     """
     start_us = round(passage.time[0] * 1e6) // 4 * 4
-    needed = needed_rates(attitude=True, navigation=True, telemetry=()) if requests else None
+    needed = needed_rates(1, attitude=True, navigation=True) if requests else None
     component = Component(
         Link("udpout:127.0.0.1:14550"), {"MAG_NAVIGATION": -1.0}, start_us=start_us, streams=needed
     )
