@@ -91,6 +91,7 @@ class SlowFunctions:
         out = np.zeros((len(t), int(self.edges[-1])))
         for k in np.unique(of).tolist():
             mine, order = of == k, np.arange(1, self.count[k] + 1)
+            # Half waves of each stretch (Karhunen-Loeve of a random walk), and its level against the others.
             phase = np.pi * (t[mine] - self.start[k])[:, None] / self.span[k]
             columns = [np.sqrt(2.0) * np.cos(order * phase), np.ones_like(phase)[:, : int(self.levels)]]
             out[mine, self.edges[k] : self.edges[k + 1]] = np.hstack(columns)
@@ -151,6 +152,7 @@ def with_blocks(family: PriorFamily, groups: tuple[ParameterBlock, ...]) -> Prio
     many = sum(len(group.shape) for group in groups)
     free = [group for group in groups if group.spread]
     design = np.zeros((q + many, h + len(free)))
+    # Unknowns of the blocks follow those of the family; a block with a free width adds one hyperparameter.
     design[:q, :h] = family.design
     constant = [family.constant]
     row = q

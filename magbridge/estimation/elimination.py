@@ -101,6 +101,7 @@ class SampleSums:
         """Return the products of the whitened rows."""
         if not rho:
             return self.every
+        # The three terms of the formula above, for this rho.
         ends = self.every.times((1.0 - rho) / (1.0 + rho)).plus(self.ends, rho / (1.0 + rho))
         return ends.plus(self.changes, rho / (1.0 - rho * rho))
 
@@ -110,9 +111,11 @@ def sum_rows(pieces: Iterable[LinearisedRows]) -> SampleSums:
     total: list[ColumnProducts] | None = None
     samples = pairs = 0
     for V, B, followers, overlap in pieces:
+        # Pieces overlap by one row, so that differences across their border count once.
         new, follows = slice(int(overlap), None), followers.copy()
         follows[0] = False
         ahead = np.append(follows[1:], False)
+        # 1 for a sample with one neighbour, 2 for one with none, 0 inside a stretch.
         ends = 2.0 - follows - ahead
         if overlap:  # it was an end as long as nothing came after it
             ends[0] = -float(ahead[0])
@@ -170,13 +173,16 @@ def eliminate_field(sums: SampleSums, field: GaussianField, ratio: float, rho: f
     """
     if field.condition > WORST:
         raise np.linalg.LinAlgError("the nodes are too fine for so long a field")
+    # Normal equations of (z, w) with the field's prior precision Q / ratio^2 on w.
     products = sums.whitened(rho)
     precision = csr_array(products.BB + field.precision / ratio**2)
+    # Schur's complement: eliminate w, V^T V - V^T B N^-1 B^T V.
     factor = SparseFactor(precision)
     solved = -factor.solve(products.VB.T)
     left = products.VV + products.VB @ solved
     H = 0.5 * (left[1:, 1:] + left[1:, 1:].T)
     nodes = field.nodes.size
+    # Evidence: log|Q / ratio^2| - log|N|, and the determinant of the whitening.
     gained = 0.5 * (field.log_determinant - 2.0 * nodes * np.log(ratio) - factor.log_determinant)
     whitening = -0.5 * sums.pairs * np.log(1.0 - rho * rho)
     quadratic = GaussianInformation(H, -left[1:, 0], float(left[0, 0]), float(sums.samples))

@@ -84,6 +84,7 @@ class GaussianField:
         """The Laplacian's eigenvalues, and the power of the field there before it is scaled to 1."""
         theta = np.pi * (np.arange(WAVES) + 0.5) / WAVES
         one = 4.0 * np.sin(0.5 * theta) ** 2
+        # Power of a cubic B-spline at these wave numbers (Fourier transform of its values at the nodes).
         spline = ((2.0 + np.cos(theta)) / 3.0) ** 2
         waves = one[:, None] + one
         power = np.prod([kappa2 + waves for kappa2 in self._kappa2], axis=0)
@@ -102,6 +103,7 @@ class GaussianField:
             (number[:-1, :], number[1:, :]),
             (number[:, :-1], number[:, 1:]),
         ]
+        # Graph Laplacian: neighbours along both axes of the box, where both nodes exist.
         a = np.concatenate([one[(one >= 0) & (other >= 0)] for one, other in pairs])
         b = np.concatenate([other[(one >= 0) & (other >= 0)] for one, other in pairs])
         n = self.nodes.size
@@ -155,6 +157,7 @@ class GaussianField:
         flat = self.nodes.basis(place)
         if not self.harmonic:
             return flat
+        # Upward continuation as a polynomial in the Laplacian: exp(-k h) ~ (b0 + b1 L + b2 L^2) / (p + L).
         b = self._deeper(np.broadcast_to(np.asarray(deeper, float), len(place)))
         rows, terms = csr_array(diags_array(b[0]) @ flat), flat
         for one in b[1:]:
@@ -174,6 +177,7 @@ class GaussianField:
         """Return b (3, n) at depths (n,), m below the nodes': exact at 0, interpolated between a few."""
         some = np.linspace(min(deeper.min(), 0.0), max(deeper.max(), 0.0), DEPTHS) if deeper.any() else [0.0]
         some = np.unique(np.append(some, 0.0))
+        # Least squares of exp(-k h) by the three terms, weighted by the field's power at each wave number.
         waves, power = (one.ravel() for one in self._spectrum)
         root = np.sqrt(power / power.sum())
         design = np.stack([root * waves**i / (POLE + waves) for i in range(3)], axis=1)

@@ -54,6 +54,7 @@ def log_evidence(
     `eta` is (h,), the gradient (h + 1,); `log_sigma` that of the noise in sensor nT. If the evidence is not
     finite, the first is -inf and the others are zero.
     """
+    # M = I + W H W / sigma^2, factorised in place.
     w = family.widths(eta)
     s2 = np.exp(2.0 * log_sigma)
     M = (w[:, None] * information.precision * w) / s2
@@ -62,6 +63,7 @@ def log_evidence(
     if info:
         return -np.inf, np.zeros(len(eta) + 1), 0.0
     Wb = w * information.vector / s2
+    # y = M^-1 W b / sigma^2; log Z as in the module's notes, with the prior of eta.
     y = dpotrs(factor, Wb)[0]
     off = (eta - family.centre) / family.spread
     value = (
@@ -71,6 +73,7 @@ def log_evidence(
         - np.log(np.diag(factor)).sum()
         - 0.5 * off @ off
     )
+    # The diagonal of M^-1 gives the gradient by the log widths and the number of determined unknowns.
     inverse = np.diag(dpotri(factor, overwrite_c=True)[0])
     z = w * y
     cost = information.constant - 2.0 * information.vector @ z + z @ information.precision @ z
@@ -83,6 +86,7 @@ def maximise_evidence(
     information: GaussianInformation, family: PriorFamily, eta: FloatArray, sigma: float
 ) -> Hyperparameters:
     """Climb from `eta` (h,) and `sigma` (sensor nT) to where the evidence is largest."""
+    # Climb in units of the hyperparameters' prior sigmas, so that BFGS starts from a good metric.
     middle = np.append(family.centre, np.log(sigma))
     scale = np.append(family.spread, LOG_SIGMA_SCALE)
 
@@ -108,6 +112,7 @@ def is_maximum(information: GaussianInformation, family: PriorFamily, widths: Hy
     def slope(point: FloatArray) -> FloatArray:
         return np.asarray(log_evidence(information, family, point[:-1], point[-1])[1] * scale)
 
+    # Hessian by central differences of the analytic gradient; all eigenvalues must show a maximum.
     bend = np.array([(slope(x + h) - slope(x - h)) / 2e-3 for h in 1e-3 * np.diag(scale)])
     values, vectors = np.linalg.eigh(-0.5 * (bend + bend.T))
     rise = 0.5 * np.sum((vectors.T @ slope(x)) ** 2 / np.maximum(values, 1e-300))

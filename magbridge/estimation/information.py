@@ -62,6 +62,8 @@ class GaussianInformation:
         scale = np.sqrt(np.diag(covariance))
         known = _scaled_inverse(prior_covariance, scale)
         found = _scaled_inverse(covariance, scale)
+        # Posterior precision = prior precision + data precision. Rounding can make the difference slightly
+        # negative where the data said nothing: such eigenvalues are zero.
         values, vectors = np.linalg.eigh(found - known)
         precision = (vectors * np.maximum(values, 0.0)) @ vectors.T
         vector = found @ (mean / scale) - known @ (prior_mean / scale)
@@ -131,6 +133,7 @@ class GaussianInformation:
         By the matrix inversion lemma the precision becomes
         ``L - L d (sigma^-2 + d^T L d)^-1 d^T L``.
         """
+        # Rank-one downdate: d is the direction, L d the change of the gradient along it.
         moved = self.precision @ direction
         share = moved / (sigma**-2 + direction @ moved)
         return GaussianInformation(
@@ -153,6 +156,7 @@ class GaussianInformation:
         ``-(c - eta^T (L + P)^-1 eta) / 2 - log|L + P| / 2 + log|P| / 2 - n log(2 pi) / 2``.
         """
         factor = cho_factor(self.precision + prior_precision, lower=True)
+        # eta^T (L + P)^-1 eta, by one Cholesky factor that also gives the determinant.
         explained = self.vector @ cho_solve(factor, self.vector)
         log_dets = np.linalg.slogdet(prior_precision)[1] - 2.0 * np.log(np.diag(factor[0])).sum()
         return float(0.5 * (explained - self.constant) + 0.5 * log_dets - 0.5 * self.n * np.log(2.0 * np.pi))
@@ -166,6 +170,7 @@ def covariance_of(precision: FloatArray) -> FloatArray:
     CalibrationError
         The precision is singular: a combination of the unknowns is free.
     """
+    # A precision with unit diagonal: unknowns in different units do not spoil the factorisation.
     scale = np.sqrt(np.diag(precision))
     try:
         factor, lower = cho_factor(precision / np.outer(scale, scale), lower=True)

@@ -71,6 +71,7 @@ class KalmanFilter:
             The states that F moves; by default all.
         """
         chosen = slice(None) if states is None else states
+        # Only the rows and columns of the chosen states change; the others are constant.
         P = self.covariance
         self.mean[chosen] = transition @ self.mean[chosen]
         P[chosen] = transition @ P[chosen]
@@ -92,6 +93,7 @@ class KalmanFilter:
             R, variance of the measurement's noise.
         """
         self.row = row
+        # S = h^T P h + R and v = e + h^T x; P h serves the gain as well.
         self._Ph = self.covariance @ row
         self.variance = float(row @ self._Ph) + noise
         self.innovation = residual + float(row @ self.mean)
@@ -105,6 +107,7 @@ class KalmanFilter:
         considered : slice or int array, optional
             States that the measurement must not change.
         """
+        # K = P h / S; considered states keep their mean, but their covariance stays in S (Schmidt 1966).
         gain = self._Ph / self.variance
         if considered is not None:
             gain[considered] = 0.0

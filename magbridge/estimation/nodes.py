@@ -50,6 +50,7 @@ class Nodes:
 
         `reach` is in strips of nodes.
         """
+        # Join strips until a block is as wide as the coupling reaches and large enough for dense algebra.
         count = (self.number >= 0).sum(axis=1)
         edges, nodes, strips = [0], 0, 0
         for here in count[count > 0].tolist():
@@ -76,6 +77,7 @@ class Nodes:
 
     def _around(self, place: FloatArray) -> tuple[IndexArray, FloatArray]:
         """Return the numbers (n, 4, 4) of the nodes around places (n, 2), -1 outside; the cells' shares."""
+        # Position in cells; the 4 x 4 nodes around it carry the cubic B-splines that are not zero there.
         u = (place - self.low) / self.spacing
         u = u[:, ::-1] if self.turned else u
         corner = np.floor(np.nan_to_num(u, nan=-9.0)).astype(np.intp)
@@ -92,6 +94,7 @@ class Nodes:
         number, share = self._around(place)
         good = np.asarray((number >= 0).all(axis=(1, 2)))
         n, share = len(place), np.where(good[:, None], share, 0.0)
+        # Tensor product of the splines (or their derivatives) along both axes.
         by = weights(share[:, 0])[first][:, None, :] * weights(share[:, 1])[second][None, :, :]
         by = np.where(good, by, 0.0) / self.spacing ** (first + second)
         number = np.maximum(number, 0).reshape(16 * n)
@@ -104,6 +107,7 @@ class Nodes:
 
 def nodes_near(place: FloatArray, spacing: float, pad: float) -> Nodes:
     """Return the nodes within about `pad` m of places (n, 2), m north and east."""
+    # Mark the cells of the track, dilate them by the pad, and number what is marked, strip by strip.
     around = int(np.ceil(pad / spacing)) + 2
     cells = np.floor(place / spacing).astype(np.intp)
     low = cells.min(axis=0) - around - 1

@@ -78,6 +78,7 @@ def normal_equations(
     """
     size = coefficients.size
     hessian, gradient, cost = np.zeros((size, size)), np.zeros(size), 0.0
+    # Sum over chunks: J^T W J, J^T W e and e^T W e, with residual and Jacobian whitened in order of time.
     whitening = Whitening(samples.steps, rho, white) if rho else None
     for start in range(0, len(samples.field), CHUNK_ROWS):
         part = samples.part(slice(start, start + CHUNK_ROWS))
@@ -126,12 +127,15 @@ def gauss_newton(
     normal = normal_at(z)
     value = _objective(normal, prior, noise, z)
     for step in range(steps):
+        # Gauss-Newton: (J^T J / sigma^2 + P) dz = -(J^T e / sigma^2 + P z).
         precision = normal.hessian / noise.sigma**2 + prior.precision
         gradient = normal.gradient / noise.sigma**2 + prior.precision @ z
         move = -_solve(precision, gradient)
+        # Twice the decrease that the quadratic model predicts; converged where it is below the tolerance.
         promised = -float(gradient @ move)
         if promised < tolerance:
             return Solution(z, normal, settled=True, steps=step)
+        # Shorten the step until the objective decreases.
         fraction = 1.0
         while True:
             tried = normal_at(z + fraction * move)

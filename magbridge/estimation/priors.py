@@ -140,10 +140,12 @@ def _log_widths(powers: Exponents, constant: FloatArray, design: FloatArray) -> 
     """Fill one monomial's rows, in place: the constants and eta's weights of its nine log widths."""
     degree = sum(powers)
     moved = [k for k, power in enumerate(powers) if power]
+    # Monomials without a mass: gain and soft iron in A, hard iron in T.
     if not moved:
         design[0, 0] = design[1:6, 1] = design[6:, 2] = 1.0
     elif len(moved) == 1:
         k = 3 + 3 * moved[0]
+        # A dipole at distance d, moved by s: term n over the first is (n + 1)(n + 2) / 6 (s / d)^(n - 1).
         constant[:] = np.log((degree + 1) * (degree + 2) / 6.0)
         design[6:, k] = design[:6, k + 1] = 1.0
         design[:, k + 2] = degree - 1

@@ -104,6 +104,7 @@ def jacobian(phi: FloatArray, g: FloatArray) -> FloatArray:
 
 def residuals_of(samples: ResidualSamples, coefficients: FloatArray) -> FloatArray:
     """Residual e (n,) alone, in bounded memory; arguments as for :func:`residuals`."""
+    # Chunks bound the memory of the Jacobian's intermediate arrays.
     pieces = [
         residuals(samples.part(slice(start, start + CHUNK_ROWS)), coefficients)[0]
         for start in range(0, len(samples.field), CHUNK_ROWS)

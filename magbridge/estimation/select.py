@@ -47,6 +47,7 @@ def select_blocks(
     price : float
         Nats that each must gain.
     """
+    # Exhaustive search: evidence of each choice of blocks, less the price of every offered one.
     first, free = _starts(family, groups)
 
     def score(kept: tuple[ParameterBlock, ...]) -> float:

@@ -122,6 +122,8 @@ class SequentialTest:
             ``v / sqrt(S)``.
         """
         self.count += 1
+        # An onset is replaced after its period, unless its change is likely; an outstanding innovation begins
+        # a new onset at once in the shortest period.
         unpromising = self.statistic < PROMISING_LOG_RATIO
         begins = (self.count > self._period) & unpromising
         if abs(normalised_innovation) > OUTSTANDING_SIGMA:
@@ -148,6 +150,7 @@ class SequentialTest:
             1-sigma of the amplitude that the model itself allows, in units of the change.
         """
         S = estimator.variance
+        # Response of the innovation to a unit change: the signature less what the filter has absorbed.
         phi = signatures + np.tensordot(estimator.row, self.absorbed, axes=1)
         self._phi = phi
         v = estimator.innovation
@@ -160,11 +163,13 @@ class SequentialTest:
             squared = min(v * v / S, MAX_SQUARED_INNOVATION)
             self._excess += (squared - self._excess) / EXCESS_NOISE_SAMPLES
             S *= max(1.0, self._excess)
+        # Exponential forgetting of old evidence.
         if self._keep < 1.0:
             self._M *= self._keep
             self._y *= self._keep
             self._squares *= self._keep
             self._samples *= self._keep
+        # Information of each row's amplitude: M = sum phi phi^T / S, y = sum phi v / S.
         self._M += phi[:, :, None] * phi[:, None, :] / S
         self._energy += signatures[:, :, None] * signatures[:, None, :]
         self._mean += (signatures - self._mean) / self.count[:, None]

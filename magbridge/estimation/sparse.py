@@ -43,6 +43,7 @@ class SparseFactor:
     def __init__(self, matrix: csr_array) -> None:
         n = matrix.shape[0]
         self._full: FloatArray | None = None
+        # A nearly full matrix: dense Cholesky is faster than any sparse one.
         if n <= SMALL and matrix.nnz > FULL * n * n:
             self._full, info = dpotrf(matrix.toarray(), lower=True, clean=True)
             if info:
@@ -56,6 +57,7 @@ class SparseFactor:
             )  # fmt: skip
         except RuntimeError as problem:
             raise np.linalg.LinAlgError("singular") from problem
+        # Without row exchanges U = D L^T: the matrix is positive definite if all pivots are positive.
         pivots = self._lu.U.diagonal()
         if not (pivots > 0.0).all():
             raise np.linalg.LinAlgError("not positive definite")
@@ -115,6 +117,7 @@ def inverse_blocks(matrix: csr_array, edges: IndexArray) -> InverseBlocks:
 
     LinAlgError: it is not positive definite.
     """
+    # Block Cholesky forward: D_i - M_i M_i^T = L_i L_i^T with M_i = B_i L_(i-1)^-T.
     diagonal: list[FloatArray] = []
     below: list[FloatArray] = []
     for i in range(len(edges) - 1):
@@ -128,6 +131,7 @@ def inverse_blocks(matrix: csr_array, edges: IndexArray) -> InverseBlocks:
         if info:
             raise np.linalg.LinAlgError("not positive definite")
         diagonal.append(L)
+    # Backward recursion for the blocks of the inverse (Takahashi; Rue & Held 2005, section 2.4).
     own: list[FloatArray] = [np.empty(0)] * len(diagonal)
     off_diagonal: list[FloatArray] = [np.empty(0)] * len(below)
     for i in reversed(range(len(diagonal))):

@@ -115,6 +115,7 @@ class TrackProcess:
 
         The course has changed by `turn`, rad, before that distance.
         """
+        # Matern 3/2 along the track, state (value, slope): F = exp(-x) [[1 + x, x / l], [-l x, 1 - x]], x = l d.
         rate = self._lambda
         x = min(rate * metres, 300.0)
         rho, interval = self._decay
@@ -122,9 +123,11 @@ class TrackProcess:
         fall = exp(-x)
         F[0, 0], F[0, 1] = fall * (1.0 + x), fall * x / rate
         F[1, 0], F[1, 1] = -fall * rate * x, fall * (1.0 - x)
+        # Only the slope along the new course is known after a turn.
         F[:, 1] *= cos(turn)
         F[2, 2] = rho ** min(seconds / interval, 1e4) if rho > 0.0 else 0.0
         F[3, 3] = 1.0
+        # A stationary process: the process noise restores the initial covariance.
         Q = self.initial - F @ self.initial @ F.T
         return F, np.asarray(0.5 * (Q + Q.T))
 
