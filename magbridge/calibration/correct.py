@@ -76,6 +76,7 @@ def correct(
             f"expected {len(calibration.channels)} channels ({', '.join(calibration.channels)}), "
             f"found {channels.shape[1]}"
         )
+    # Blocks that fit the cache. Effects have a state, so blocks are processed in order of time.
     out = np.empty((8, n))
     kernel, turn = calibration.kernel, omega(calibration)
     steps = begun(calibration)
@@ -86,6 +87,7 @@ def correct(
             prepared = _prepare_many(kernel, phi)
             hx, hy, hz = field[part].T
             out[:, part] = apply(hx, hy, hz, prepared, turn, np.sqrt)
+        # The flags of :class:`~.corrector.Corrector`, for arrays.
         quality = np.full(n, base_flags(calibration))
         for value, (low, high) in zip(channels.T, ranges(calibration), strict=False):
             quality |= np.where((value < low) | (value > high), EXTRAPOLATED, 0)
@@ -115,6 +117,7 @@ def vector_covariance(
             part = slice(start, start + CORRECTED_AT_ONCE)
             phi = _regressors(kernel, steps, field[part], channels[part], time[part])
             linear, V = _prepare_many(kernel, phi)
+            # d = H_r - T, then the six entries of V.
             d = field[part].T - np.stack(linear[9:12])
             for (i, j), value in zip(PAIRS, variances(d[0], d[1], d[2], V), strict=True):
                 out[part, i, j] = out[part, j, i] = value
@@ -152,6 +155,7 @@ def regressors(
 
 def _prepare_many(kernel: Kernel, phi: FloatArray) -> Any:
     """Prepare (m, n) regressors; if most repeat the sample before, once for each stretch of equal ones."""
+    # At rest the regressors of successive samples are equal: prepare each stretch once, and repeat it.
     new = np.ones(phi.shape[1], bool)
     new[1:] = (phi[:, 1:] != phi[:, :-1]).any(axis=0)
     if 2 * np.count_nonzero(new) > len(new):

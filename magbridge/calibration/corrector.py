@@ -84,11 +84,13 @@ class Corrector:
         float
             nT, by which the total field of the last sample changes; NaN if there was none.
         """
+        # Total field of the last sample by the old coefficients, for the change that is returned.
         before = apply(*self._field, self._prepared, self._omega)[0] if self._last else nan
         self.calibration, self._kernel, self._omega = calibration, calibration.kernel, omega(calibration)
         self._weights = [tuple(row) for row in self._kernel.weights.tolist()]
         self._values, self._asked, self._places, self._ends, self._there = None, ((), ()), {}, [], []
         self._wanted, self._base = len(calibration.channels), base_flags(calibration)
+        # Effects in common keep their steppers, hence their state; new ones begin with the last sample.
         del self._steps[len(calibration.effects) :]
         regressors = self._last[: len(self._weights)]
         for effect in calibration.effects[len(self._steps) :]:
@@ -135,6 +137,7 @@ class Corrector:
                 f"expected {self._wanted} values ({', '.join(self.calibration.channels)}), "
                 f"found {len(values)}"
             )
+        # The table's sums are computed only where a position or a regressor changed.
         hx, hy, hz = self._field = field
         self._time_us = time_us
         values = tuple(values)
@@ -148,6 +151,7 @@ class Corrector:
                 self._prepared = prepare(self._kernel.sums_of_one(regressors))
         F, sigma, x, y, z, sx, sy, sz = apply(hx, hy, hz, self._prepared, self._omega)
         quality |= self._flags
+        # No guess: without a finite field of plausible size there is no total, and sigma is infinite.
         if not F < MAX_MEASURED_NT:  # also NaN
             quality |= STALE_TELEMETRY if abs(hx) + abs(hy) + abs(hz) < MAX_MEASURED_NT else GAP
             F = x = y = z = nan
@@ -180,6 +184,7 @@ class Corrector:
         asked = positions, spans
         if asked != self._asked:
             self._asked = asked
+            # Coefficients at the ends of all spans; those of the previous call are kept.
             known = {place: self._there[n] for place, n in self._places.items()}
             places: dict[tuple[float, ...], int] = {}  # each once: most spans share an end
             self._ends = []
@@ -190,6 +195,7 @@ class Corrector:
                     self._ends.append((start, places.setdefault((*before, high, *after), len(places))))
             self._places = places
             self._there = [known.get(place) or self._linear_at(place) for place in places]
+        # |A (H_r - T)| at both ends of each span.
         totals = [_total(field, there) for there in self._there]
         return [totals[high] - totals[low] for low, high in self._ends]
 

@@ -50,6 +50,7 @@ def dipole_tensor(r: FloatArray) -> FloatArray:
     (..., 3, 3) array
         m^-3; times a moment (nT m³, with mu_0/4pi in it) it is the field at the sensor, nT.
     """
+    # G(r) = (3 u u^T - I) / r^3 with u = r / |r|
     distance = np.linalg.norm(r, axis=-1)[..., None, None]
     unit = r[..., :, None] / distance
     return np.asarray((3.0 * unit * np.swapaxes(unit, -1, -2) - np.eye(3)) / distance**3)
@@ -75,6 +76,7 @@ def dipole_columns(r: FloatArray, moment: FloatArray, induced: FloatArray, r_0: 
     columns = np.zeros((9, len(r), 9))
 
     def put(rows: FloatArray, G: FloatArray, moments: FloatArray, chi: FloatArray) -> None:
+        # Permanent moment: T = G m. Induced moment: H_r = B + G diag(chi) B, so a = -G diag(chi).
         rows[:, 6:] = G @ moments
         pulled = G * chi  # G diag(chi); of an unsymmetric A only the symmetric part shows in the magnitude
         rows[:, :6] = np.stack([-0.5 * (pulled[:, i, j] + pulled[:, j, i]) for i, j in PAIRS], axis=1)
@@ -104,6 +106,7 @@ def expand_dipole(values: FloatArray, order: int) -> FloatArray:
     -------
     (..., order + 1, s) array
     """
+    # Interpolate by Chebyshev polynomials (well conditioned), then convert to powers.
     n = values.shape[-2]
     nodes = chebyshev.chebpts1(n)
     fit = np.linalg.pinv(chebyshev.chebvander(nodes, order))
@@ -147,6 +150,7 @@ class Dipole(PositionTerm, frozen=True, kw_only=True):
         names = [parameter.name for parameter in parameters]
         k = names.index(self.parameter)
         parameter = parameters[k]
+        # Places of the mass at the Chebyshev nodes of the travel.
         p = parameter.centre + parameter.scale * chebyshev.chebpts1(4 * SERIES_ORDER)
         r = np.array(self.at) + p[:, None] * np.array(self.travel)
         if np.linalg.norm(r, axis=1).min() < 3.0 * parameter.scale * np.linalg.norm(self.travel):

@@ -55,6 +55,7 @@ def held(values: FloatArray, first: float) -> FloatArray:
     known = ~np.isnan(values)
     if known.all():
         return values
+    # Index of the last known value at each row; 0 stands for `first`.
     last = np.maximum.accumulate(np.where(known, np.arange(1, len(values) + 1), 0))
     return np.append(first, values)[last]
 
@@ -73,6 +74,7 @@ def lagged(time: FloatArray, values: FloatArray, lag: float, stages: int = 1) ->
     """
     if lag <= 0.0 or len(time) < 2:
         return values
+    # Exact solution for a step input: y moves by 1 - exp(-dt / tau) of its distance from x.
     share = -np.expm1(-np.diff(time) / (lag / stages))
     usual = float(np.median(share))
     even = np.abs(share - usual).max() <= 1e-6 * usual  # no gaps, and a clock that does not jitter
@@ -90,6 +92,7 @@ def _filtered(values: FloatArray, share: float) -> FloatArray:
 
 def _stepped(values: FloatArray, share: FloatArray) -> FloatArray:
     """Return the same (n,) with a fraction for each step, by doubling over 2, 4, 8 ... rows."""
+    # y_t = kept_t y_(t-1) + share_t x_t. Two such maps in series are one: combine pairs by doubling.
     y, kept = np.append(values[0], share * values[1:]), np.append(0.0, 1.0 - share)
     step = 1
     while step < len(y):
@@ -133,6 +136,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
     def columns(self, field: float) -> FloatArray:
         """One regressor, one slot for each axis."""
         columns = np.zeros((3, 1, 9))
+        # Slots 6 to 8 are T (offset), slots 0 to 2 the diagonal of a (scale).
         columns[:, 0, 6:9] = np.eye(3) * (self.on == "offset")
         columns[:, 0, 0:3] = np.eye(3) * (self.on == "scale")
         return columns
@@ -147,6 +151,7 @@ class ChannelEffect(SingleChannelEffect, frozen=True, kw_only=True):
             nonlocal then, first
             value = values[index]
             if not isnan(value):  # while the value is unknown, the last level holds
+                # Equilibrium at the start: a vehicle is switched on long before it dives.
                 if first or lag == 0.0:
                     levels[:], first = [value] * stages, False
                 else:
@@ -253,6 +258,7 @@ class SourcesEffect(PathEffect, frozen=True, kw_only=True):
 
     def regressors(self, x: Any) -> tuple[Any, ...]:
         """Return what each source does."""
+        # (1 + x_k^2)^(-3/2) without a power of a non-integer exponent.
         near = [1.0 / (1.0 + (x - self.apart * k) ** 2) for k in range(self.count)]
         return tuple(one * one**0.5 for one in near)
 
@@ -311,6 +317,7 @@ class LegendreEffect(Effect, frozen=True, kw_only=True):
 
 def _product(factors: Factors, values: Sequence[Any]) -> Any:
     """Return the product of the factors' polynomials, by Horner's scheme, of numbers or arrays."""
+    # Product over the positions of P_e(x), by Horner's scheme.
     product: Any = 1.0
     for k, centre, scale, polynomial in factors:
         x, value = (values[k] - centre) / scale, 0.0
@@ -361,6 +368,7 @@ class PlayEffect(MassEffect, frozen=True, kw_only=True):
             nonlocal y, p, first
             if not isnan(values[index]):
                 p = values[index]
+                # Play operator: y moves only where p leaves the dead band.
                 y = p if first else min(max(y, p - half), p + half)
                 first = False
             if order:
@@ -390,6 +398,7 @@ def play(values: FloatArray, width: float) -> FloatArray:
     Each row clips the output of the row before. Two such clips in series are one clip, so they are combined
     by doubling: over 2, 4, 8 ... rows.
     """
+    # Row t clips the output of row t - 1 to [p - w/2, p + w/2]; the first row begins in the middle.
     low, high = values - 0.5 * width, values + 0.5 * width
     low[:1] = high[:1] = values[:1]
     step = 1
@@ -426,6 +435,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
 
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             nonlocal last, then
+            # d theta / dt = W^T d phi / dt, with the backward difference of the monomials.
             now, before, apart = kernel.monomials(values, 1.0), last, time_us - then
             last, then = now, time_us
             if now == before or not before or not 0 < apart < MAX_INTERVAL:
@@ -439,6 +449,7 @@ class ClockEffect(Effect, frozen=True, kw_only=True):
 
     def batch(self, series: LogSeries) -> FloatArray:
         """(9, n) regressors."""
+        # The same backward difference for a log; across a gap or at a repeated time the rate is zero.
         monomials = np.stack(series.kernel.monomials([*series.values.values()], np.ones(len(series.time))))
         apart = 1e-6 * np.diff(series.time_us)
         joined = (apart > 0.0) & (apart < 1e-6 * MAX_INTERVAL)

@@ -85,6 +85,7 @@ def box_flight(
     interval = float(np.median(np.diff(time)))
     if interval <= 0.0 or 1.0 / interval < MIN_RATE_HZ:
         return None
+    # Amplitude of roll, pitch and yaw in the band of the manoeuvres: RMS over a window, times sqrt(2).
     turned = np.degrees(np.unwrap(np.radians(_filled(heading))))
     angles = np.stack([_filled(roll), _filled(pitch), turned], axis=1)
     if not np.isfinite(angles).all():
@@ -95,6 +96,7 @@ def box_flight(
     # The axis with the largest swing relative to the usual amplitude; -1 without a swing.
     axis = np.where(relative.max(axis=1) > MIN_AMPLITUDE_FRACTION, relative.argmax(axis=1), -1)
     axis[np.append(np.diff(time) > 3.0 * interval, False)] = -1
+    # Stretches with the same axis are candidates for a manoeuvre.
     edges = [0, *(np.flatnonzero(np.diff(axis)) + 1).tolist(), len(axis)]
     found = [
         Manoeuvre(MANOEUVRE_AXES[axis[begin]], float(turned[begin:end].mean() % 360.0), slice(begin, end))
@@ -112,6 +114,7 @@ def _one_for_each_heading(found: list[Manoeuvre]) -> tuple[Manoeuvre, ...]:
     """
     if not found:
         return ()
+    # Circular mean of four times the heading: headings a quarter turn from each other coincide.
     fourfold = np.exp(4j * np.radians([one.heading for one in found])).mean()
     first = float(np.degrees(np.angle(fourfold))) / 4.0
     longest: dict[tuple[int, str], Manoeuvre] = {}
@@ -140,6 +143,7 @@ def figure_of_merit(box: BoxFlight, measured: FloatArray, compensated: FloatArra
         ``before_nT`` and ``after_nT`` (sums), ``improvement_ratio``, ``manoeuvres`` (number), and
         ``peak_to_peak``: a list with axis, heading (deg), before and after (nT) of each.
     """
+    # Peak to peak of each manoeuvre in the band; their sum is the figure of merit.
     seen = [_band(_filled(values), box.interval) for values in (measured, compensated)]
     table: list[dict[str, Any]] = [
         {

@@ -80,6 +80,7 @@ def level_vector(vector: FloatArray, roll: FloatArray, pitch: FloatArray) -> Flo
         rad.
     """
     x, y, z = vector.T
+    # h = R_y(pitch) R_x(roll) b
     y_rolled = np.cos(roll) * y - np.sin(roll) * z
     z_rolled = np.sin(roll) * y + np.cos(roll) * z
     forward = np.cos(pitch) * x + np.sin(pitch) * z_rolled
@@ -140,6 +141,7 @@ def heading(
             ],
             axis=1,
         )
+        # sigma^2 = g^T V g + w^T Omega w + tilt + declination, all in rad^2 until the declination.
         variance = np.zeros(len(vector))
         if covariance is not None:
             variance += np.einsum("ni,nij,nj->n", gradient, covariance, gradient)
@@ -153,6 +155,7 @@ def heading(
         variance += (by_roll**2 + by_pitch**2) * np.radians(tilt_sigma_deg) ** 2
         sigma = np.degrees(np.sqrt(variance))
         sigma = np.hypot(sigma, np.nan_to_num(declination_sigma_deg))
+        # Nothing is worse known than a uniform angle.
         sigma = np.minimum(np.where(np.isnan(sigma), np.inf, sigma), UNIFORM_SIGMA_DEG)
     unknown = np.isnan(magnetic)
     return Heading(magnetic, (magnetic + declination) % 360.0, np.where(unknown, np.inf, sigma))
@@ -263,6 +266,7 @@ def published_covariance(
         nT^2, sum of the three components' published variances.
     """
     # trace of the boresight's part: tr(Omega) |b|^2 - b^T Omega b
+    # A third of the excess to each axis: excess = tr(published) - tr(V) - tr(boresight's part).
     length = np.einsum("ni,ni->n", vector, vector)
     known = np.trace(stated, axis1=1, axis2=2)
     known = known + np.trace(turn) * length - np.einsum("ni,ij,nj->n", vector, turn, vector)

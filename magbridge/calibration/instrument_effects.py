@@ -98,6 +98,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
             for k in range(3):
                 columns[k, k, 6 + k] = 1.0
         else:
+            # k_ij: channel j's rate adds to offset i.
             pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
             for k, (i, j) in enumerate(pairs):
                 columns[k, j, 6 + i] = 1.0
@@ -113,6 +114,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
             nonlocal before, slope, then, apart_before, count
             if hx + hy + hz - (hx + hy + hz) != 0.0:  # NaN: as if the sample had not come
                 return 0.0, 0.0, 0.0
+            # Second-order backward difference: slope + (slope - previous slope) h / (h + previous h).
             apart = 1e-6 * (time_us - then)
             if count == 0 or not 0.0 < apart < 1e-6 * MAX_INTERVAL:
                 before, then, count = (hx, hy, hz), time_us, 1
@@ -127,6 +129,7 @@ class RateEffect(Effect, frozen=True, kw_only=True):
 
     def batch(self, series: LogSeries) -> FloatArray:
         """(3, n) the same backward difference: a centred one correlates less with its own sample's noise."""
+        # Rates over the finite samples only, as the stepper skips the others.
         known = np.flatnonzero(np.isfinite(series.reading).all(axis=1))
         apart = 1e-6 * np.diff(series.time_us[known])
         joined = (apart > 0.0) & (apart < 1e-6 * MAX_INTERVAL)
@@ -174,6 +177,7 @@ class ResponseEffect(Effect, frozen=True, kw_only=True):
         def step(time_us: int, hx: float, hy: float, hz: float, values: Sequence[float]) -> tuple[float, ...]:
             if power:
                 return tuple((h / unit) ** power for h in (hx, hy, hz))
+            # Beyond the knee: a step of c_1 and a slope of c_2.
             over = sign * ((hx, hy, hz)[axis] - knee)
             return (sign, sign * over / unit) if over >= 0.0 else (0.0, 0.0)
 

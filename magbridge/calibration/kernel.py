@@ -80,6 +80,7 @@ class Kernel:
         Products are rounded and then added one after the other: a matrix product would round in an order
         that depends on the processor, and a replay on another computer must give the same bytes.
         """
+        # A product of regressors beyond this overflows; NaN is flagged further on.
         if max(phi) > MAX_REGRESSOR or min(phi) < -MAX_REGRESSOR:
             return [nan] * TABLE_SUMS
         psi = np.fromiter([phi[i] * phi[j] for i, j in self.pairs], float, len(self.pairs))
@@ -117,6 +118,7 @@ class Kernel:
             (value - centre) / scale
             for value, centre, scale in zip(values, self.centre, self.scale, strict=False)
         ]
+        # Each monomial is an earlier one times one position: one multiplication each.
         phi = [unit]
         for parent, k in self.parents:
             phi.append(phi[parent] * x[k])
@@ -149,15 +151,18 @@ def prepare(t: list[Any]) -> Prepared:
     ``L_ij,k = -(G_ik,j + G_jk,i)`` with ``G = S_a'T A'^T``, and ``O = A' S_TT A'^T``.
     """
     xx, xy, xz, yx, yy, yz, zx, zy, zz = t[0:9]
+    # G = S_a'T A'^T: covariance of the entries of A' with T, turned into body axes.
     G = []
     for k in range(48, 75, 3):
         x, y, z = t[k], t[k + 1], t[k + 2]
         G += [x * xx + y * xy + z * xz, x * yx + y * yy + z * yz, x * zx + y * zy + z * zz]
     sxx, syy, szz, sxy, sxz, syz = t[75:81]
+    # A' S_TT, with the symmetric S_TT in six entries.
     AS = []
     for k in range(0, 9, 3):
         x, y, z = t[k], t[k + 1], t[k + 2]
         AS += [sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z]
+    # For each entry of V: the quadratic form in d (Q, from the table), the linear part L and the constant O.
     V = []
     for e, (i, j) in enumerate(PAIRS):
         O = t[3 * i] * AS[3 * j] + t[3 * i + 1] * AS[3 * j + 1] + t[3 * i + 2] * AS[3 * j + 2]  # noqa: E741
@@ -201,13 +206,16 @@ def apply(
     The equations stand at the top of the module.
     """
     (xx, xy, xz, yx, yy, yz, zx, zy, zz, tx, ty, tz), V = prepared
+    # d = H_r - T and b = A' d
     dx, dy, dz = hx - tx, hy - ty, hz - tz
     bx = xx * dx + xy * dy + xz * dz
     by = yx * dx + yy * dy + yz * dz
     bz = zx * dx + zy * dy + zz * dz
+    # F = |b| and its direction u
     F = root(bx * bx + by * by + bz * bz)
     over = 1.0 / (F + 1e-300)  # a vector of length zero has no direction, but must not raise
     ux, uy, uz = bx * over, by * over, bz * over
+    # sigma_F^2 = u^T V u
     vxx, vyy, vzz, vxy, vxz, vyz = variances(dx, dy, dz, V)
     variance = (
         ux * ux * vxx + uy * uy * vyy + uz * uz * vzz

@@ -217,6 +217,7 @@ class Effect(Term, frozen=True, kw_only=True):
 
     def batch(self, series: LogSeries) -> FloatArray:
         """(r, n) regressors of a whole log, from a fresh state: by default those of :meth:`begin`."""
+        # The stepper is the definition; effects with a faster array form override this method.
         step = self.begin(tuple(series.values), series.kernel)
         values = np.reshape([*series.values.values()], (-1, len(series.time))).T.tolist()
         times = series.time_us.astype(np.int64).tolist()

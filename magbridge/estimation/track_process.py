@@ -115,7 +115,7 @@ class TrackProcess:
 
         The course has changed by `turn`, rad, before that distance.
         """
-        # Matern 3/2 along the track, state (value, slope): F = exp(-x) [[1 + x, x / l], [-l x, 1 - x]], x = l d.
+        # Matern 3/2 along the track, (value, slope): F = exp(-x) [[1 + x, x / l], [-l x, 1 - x]], x = l d.
         rate = self._lambda
         x = min(rate * metres, 300.0)
         rho, interval = self._decay

@@ -85,6 +85,7 @@ def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
     """Return the pitch (deg) that positions (k,) trim a vehicle to, linear in them; None if undetermined."""
     if data.attitude is None or not data.names:
         return None
+    # Linear regression of pitch on positions; unusable if it explains less than 90 % of the variance.
     known = np.isfinite(data.attitude[:, 1])
     pitch = np.degrees(data.attitude[known, 1])
     design = np.column_stack([np.ones(len(pitch)), data.parameters[known]])
@@ -99,6 +100,7 @@ def trim_of(data: Observations) -> Callable[[FloatArray], float] | None:
 def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray:
     """Return the (m, k) positions at which the masses of `data` are at rest; `parameters` give the scales."""
     scale = [parameter.scale for parameter in parameters]
+    # A sample is at rest if no mass moved before or after it.
     moving = (np.abs(np.diff(data.parameters, axis=0) / scale) > MAX_REST_FRACTION).any(axis=1)
     at_rest = np.ones(len(data), bool)
     at_rest[1:] &= ~moving
@@ -108,6 +110,7 @@ def settled(data: Observations, parameters: tuple[Parameter, ...]) -> FloatArray
 
 def candidate_runs(limits: Limits, parameters: tuple[Parameter, ...], levels: int) -> list[PlannedRun]:
     """Return every run that the vehicle can fly, on a grid of `levels` values of each position."""
+    # Grid over positions, pitch and roll; only positions near flown ones, and pitches near their trim.
     ends = limits.parameters or tuple((p.low, p.high) for p in parameters)
     rolls = np.unique(np.append(np.linspace(*limits.roll, 5), np.clip(0.0, *limits.roll)))
     found = []
@@ -161,6 +164,7 @@ def expected_calibration(
     """
     exponents = full_order(len(parameters), order)
     family = polynomial_prior(exponents, tuple(p.name for p in parameters), field)
+    # Prior covariance E diag(w^2) E^T at the centre of the hyperparameters.
     E = family.E * family.widths(family.centre)
     return Calibration(
         parameters=parameters,
@@ -196,6 +200,7 @@ class Design:
     def derivative(self, truth: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return monomials (n, m) and the residual's derivative (n, 9) at fields (n, 3), nT, body axes."""
         calibration = self.calibration
+        # Derivative of the residual at noise-free readings of the true field.
         phi = monomials(positions, calibration.parameters, self.exponents)
         reading = forward(calibration, truth, positions, np.zeros(len(truth)))
         size, alone = np.linalg.norm(truth, axis=1), np.full(len(truth), np.inf)
@@ -204,13 +209,16 @@ class Design:
 
     def factor(self, run: PlannedRun) -> FloatArray:
         """Return F (K, 9) of a run through all headings."""
+        # One spiral at fixed pitch and roll: its information is phi phi^T (x) G (see the module's notes).
         turn = np.linspace(0.0, 2.0 * np.pi, PLANNED_HEADINGS, endpoint=False)
         attitude = np.column_stack([np.radians([[run.roll, run.pitch]] * PLANNED_HEADINGS), turn])
         truth = field_body(attitude, np.tile(self.field_ned, (PLANNED_HEADINGS, 1)))
         phi, g = self.derivative(truth, np.tile(run.parameters, (PLANNED_HEADINGS, 1)))
         noise = self.calibration.noise
+        # Correlated noise: fewer samples count.
         share = effective_fraction(noise.autocorrelation, noise.white)
         weight = PLANNED_RUN_SAMPLES / PLANNED_HEADINGS / noise.sensor**2 * share
+        # F = phi (x) G^(1/2): a root of the information, so that the update has rank nine.
         values, vectors = np.linalg.eigh(g.T @ g * weight)
         return np.asarray(np.kron(phi[:1].T, vectors * np.sqrt(np.maximum(values, 0.0))), np.float64)
 
@@ -220,6 +228,7 @@ class Design:
 
     def covariance_after(self, C: FloatArray, F: FloatArray) -> FloatArray:
         """Return C' (K, K), the covariance after one more run."""
+        # Woodbury: C' = C - C F (I + F^T C F)^-1 F^T C.
         CF = C @ F
         return np.asarray(C - CF @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ CF, CF.T))
 
@@ -228,6 +237,7 @@ class Design:
         PC, before = self.points @ C, self.variances(C)
         found = []
         for F in factors:
+            # Variance at each point after the run: diag(P C P^T) minus diag(U (I + F^T C F)^-1 U^T).
             U = PC @ F
             reduction = np.einsum("ij,ji->i", U, np.linalg.solve(np.eye(F.shape[1]) + F.T @ C @ F, U.T))
             found.append(np.mean(np.maximum(before - reduction, 0.0) ** VARIANCE_POWER))
@@ -280,6 +290,7 @@ def plan(
         if not candidates:
             raise CalibrationError("plan: no pitch, roll and position lie within the vehicle's limits")
         factors = [design.factor(run) for run in candidates]
+        # Greedy choice: each run is the one that reduces the criterion most.
         chosen: list[int] = []
         C = calibration.covariance
         for _ in range(runs):

@@ -79,6 +79,7 @@ def propose(
     if not known.any() or data.place is None:
         raise CalibrationError("the mission needs roll, pitch, heading, latitude and longitude")
     time, place = data.time[known], data.place[known, :2]
+    # Speed, sampling and attitudes of the mission are those of the patterns.
     speed = float(np.median(np.hypot(*np.diff(place, axis=0).T) / np.maximum(np.diff(time), 1e-3)))
     if not speed > 0.0:
         raise CalibrationError("the mission does not move: no survey can be flown like it")
@@ -93,6 +94,7 @@ def propose(
         design = Design(calibration, mission, field)
         for name, course, bank in _patterns(len(rows), interval, speed, roll):
             flown = np.column_stack([attitude[as_flown, 0] + bank, attitude[as_flown, 1], course])
+            # Integrate speed and course to positions.
             step = speed * interval * np.stack([np.cos(course), np.sin(course)], axis=1)
             where = np.cumsum(step, axis=0)
             positions = data.parameters[known][as_flown]
@@ -106,6 +108,7 @@ def _patterns(
     n: int, interval: float, speed: float, roll: float
 ) -> Iterator[tuple[str, FloatArray, FloatArray]]:
     """Yield name, course and bank (n,), rad, of every pattern of n samples, at `interval` s."""
+    # Fraction of the survey at each sample; `level` flight has no bank.
     share, level = (np.arange(n) + 0.5) / n, np.zeros(n)
     bank = np.radians(roll) * np.where(np.arange(n) * 24 // n % 2, 1.0, -1.0)
     yield "straight ahead", np.zeros(n), level
@@ -142,12 +145,15 @@ def _expected(
     phi, g = design.derivative(truth, positions)
     names = tuple(one.name for one in calibration.parameters)
     family = polynomial_prior(design.exponents, names, calibration.reference.field)
+    # Rows of the self-calibrating survey: coefficients, crustal field on nodes, and an unknown level.
     D = np.column_stack([np.zeros(len(phi)), jacobian(phi, g) @ family.E, -np.ones(len(phi))])
     field = GaussianField(nodes_for(place, LENGTH, SMOOTH), LENGTH, SMOOTH)
     sums = sum_rows([LinearisedRows(D, -field.basis(place), np.zeros(len(phi), bool))])
+    # Eliminate the field; prior and data give the covariance of the coefficients.
     H = eliminate_field(sums, field, ROCK / noise, 0.0).quadratic.precision / noise**2
     prior = np.append(family.widths(family.centre), LEVEL_SIGMA_NT) ** -2.0
     P = covariance_of(H + np.diag(prior))[:-1, :-1]
+    # Error over the mission about its mean: the level cancels.
     points = (design.points - design.points.mean(axis=0)) @ family.E
     variance = np.einsum("ij,jk,ik->i", points, P, points)
     return float(np.sqrt(variance.mean())), float(np.sqrt(variance.max()))
