@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 from magbridge.bridge.bus_port import sensor_port
 from magbridge.bridge.learning import first_calibration, open_learner
 from magbridge.bridge.links import LINKS, open_link
-from magbridge.bridge.needs import unmet
 from magbridge.bridge.nmea import nmea_port
-from magbridge.bridge.sensor_stream import open_correction, open_drivers, other_calibrations
+from magbridge.bridge.sensor_stream import open_correction, open_drivers, other_calibrations, unmet
 from magbridge.calibration.model import Calibration
 from magbridge.config import Config, Sensor, load, parse
 from magbridge.errors import ConfigError, MagbridgeError

@@ -16,8 +16,7 @@ from threading import Thread
 
 from magbridge.bridge import states
 from magbridge.link.ftp import FtpServer
-from magbridge.link.log_transfer import LogTransfer
-from magbridge.link.tree import Tree
+from magbridge.link.tree import LogTransfer, Tree
 from magbridge.mavlink import Message, Spec, spec
 
 __all__ = ["FileServer"]

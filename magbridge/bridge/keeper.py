@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
 
 from magbridge.bridge import states
 from magbridge.bridge.events import StartEvent
@@ -12,11 +17,44 @@ from magbridge.bridge.live import LiveEdge
 from magbridge.bridge.pipeline import Pipeline
 from magbridge.config import Config
 from magbridge.errors import FormatError
-from magbridge.link import store
+from magbridge.files import atomic_path
 from magbridge.mavlink import readable_by_all
 from magbridge.mavlink.enums import MAV_SEVERITY
 
-__all__ = ["Keeper"]
+__all__ = ["Keeper", "StoredState", "load_state", "save_state"]
+
+Byte = Annotated[int, Meta(ge=0, le=255)]
+
+
+class StoredState(msgspec.Struct, frozen=True):
+    """The contents of the file."""
+
+    parameters: dict[str, Annotated[float, Meta(ge=-3e38, le=3e38)]] = {}
+    """Values that differ from the configuration's."""
+    signing_timestamp: Annotated[int, Meta(ge=0, lt=1 << 47)] = 0
+    """The last that may have been used (10 µs since 2015-01-01); 48 bits on the link."""
+    signing_streams: list[tuple[Byte, Byte, Byte, bool, Annotated[int, Meta(ge=0, lt=1 << 48)]]] = []
+    """The last time stamp accepted of each stream."""
+
+
+def load_state(path: str | Path) -> StoredState:
+    """Read the file; return an empty state if it does not exist.
+
+    FormatError: it is not what :func:`save_state` wrote.
+    """
+    try:
+        return msgspec.json.decode(Path(path).read_bytes(), type=StoredState)
+    except FileNotFoundError:
+        return StoredState()
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise FormatError(path, f"kept parameters as JSON: {error}") from error
+
+
+def save_state(path: str | Path, kept: StoredState) -> None:
+    """Write the file, whole or not at all, and sync it to the disk: power may be cut at any moment."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(kept), indent=2))
+
 
 STAMP_INTERVAL_US = 60_000_000
 """µs between two savings of the signing time stamps."""
@@ -36,9 +74,9 @@ class Keeper:
         self._path = config.resolve(config.link.parameters or f"{config.path.stem}.parameters.json")
         self._spoilt = False
         try:
-            self._kept = store.load(self._path)
+            self._kept = load_state(self._path)
         except (FormatError, OSError):  # no reason to keep a vehicle ashore
-            self._kept, self._spoilt = store.StoredState(), True
+            self._kept, self._spoilt = StoredState(), True
         self._key = config.resolve(config.link.signing_key) if config.link.signing_key else None
         self._saved_us = self._retry_us = self._revision = 0
         self._learned = kept_path(config)
@@ -78,14 +116,14 @@ class Keeper:
 
         At the `last` saving of a run, no stamp is reserved for frames still to be sent.
         """
-        kept = store.StoredState(pipeline.component.parameters.changed())
+        kept = StoredState(pipeline.component.parameters.changed())
         if signing := pipeline.signing:
             stamp = signing.last if last else signing.reserved(pipeline.component.codec.utc_us, self.AHEAD)
-            kept = store.StoredState(kept.parameters, stamp, signing.streams)
+            kept = StoredState(kept.parameters, stamp, signing.streams)
         if kept == self._kept:
             return True
         try:
-            store.save(self._path, kept)
+            save_state(self._path, kept)
         except OSError as error:
             self._notify(states.notice(f"parameters not kept: {error.strerror or error}"))
             return False

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Final
 
 from magbridge.align import Sample
 from magbridge.bridge import states
-from magbridge.bridge.changes import StateChanges
 from magbridge.bridge.events import Event, StartEvent
 from magbridge.bridge.heading import LiveHeading
 from magbridge.bridge.learning import LearningService, open_learner
-from magbridge.bridge.log_header import beginning, declarations
 from magbridge.bridge.position import Position
-from magbridge.bridge.recorder import Recorder
+from magbridge.bridge.recorder import Recorder, beginning, declarations
 from magbridge.bridge.sensor_stream import SensorStream, open_correction, open_drivers
+from magbridge.bridge.states import StateChanges
 from magbridge.calibration.file import calibration_id
 from magbridge.calibration.model import Calibration
 from magbridge.config import Align, Config

@@ -9,14 +9,13 @@ from math import nan
 
 import msgspec
 
-from magbridge.bridge.needs import check, check_channels
 from magbridge.bridge.sensor_line import SensorLine
 from magbridge.calibration.file import load
 from magbridge.calibration.model import Calibration
 from magbridge.calibration.scalar import ScalarSensor
-from magbridge.columns import COLUMNS
+from magbridge.columns import COLUMNS, may_be
 from magbridge.config import Align, Config, Sensor
-from magbridge.correction import Correction
+from magbridge.correction import TEMPERATURE, Correction
 from magbridge.errors import ConfigError
 from magbridge.learning import Learner
 from magbridge.link.component import Component
@@ -27,7 +26,47 @@ from magbridge.scalar_correction import CorrectedReading, ScalarCorrection
 from magbridge.sensors import Driver, is_scalar, open_driver
 from magbridge.sensors.clock import DeviceClock, Stamp
 
-__all__ = ["SensorStream", "open_correction", "open_drivers", "other_calibrations"]
+__all__ = [
+    "SensorStream", "check", "check_channels", "open_correction", "open_drivers", "other_calibrations",
+    "unmet",
+]  # fmt: skip
+
+
+def check(calibration: Calibration, config: Config) -> None:
+    """Check that the link will provide what the calibration needs.
+
+    ConfigError: a parameter that ``[telemetry]`` lacks, or that comes in another unit.
+    """
+    for error in unmet(calibration, config):
+        raise error
+
+
+def unmet(calibration: Calibration, config: Config) -> list[ConfigError]:
+    """Return an error for each need of the calibration that the link does not provide."""
+    units = calibration.units
+    return _unmet({name: units.get(name, "") for name in calibration.channels if name != TEMPERATURE}, config)
+
+
+def check_channels(units: Mapping[str, str], config: Config) -> None:
+    """Check that the link will provide telemetry channels in these units; raises as :func:`check`."""
+    for error in _unmet(units, config):
+        raise error
+
+
+def _unmet(units: Mapping[str, str], config: Config) -> list[ConfigError]:
+    """Return an error for each channel that ``[telemetry]`` lacks or has in another unit."""
+    errors = []
+    for name, expected_unit in units.items():
+        if name not in config.telemetry:
+            missing = "missing: the calibration needs this parameter"
+            errors.append(ConfigError(config.path, f"telemetry.{name}", missing))
+            continue
+        unit = config.telemetry[name].unit
+        if not may_be(unit, expected_unit):
+            expected = f"expected {expected_unit!r}, the calibration's unit, not {unit!r}"
+            errors.append(ConfigError(config.path, f"telemetry.{name}.unit", expected))
+    return errors
+
 
 RATE_SAMPLES = 64
 """Samples over which the sample rate is computed."""

@@ -12,8 +12,7 @@ from magbridge.link.authority import Authority
 from magbridge.link.commands import Commands
 from magbridge.link.message_rates import DEFAULT_RATES_HZ, LIMITS, MessageRates
 from magbridge.link.output import Announcer, Outbox, Timers
-from magbridge.link.parameter_service import ParameterService
-from magbridge.link.parameters import Parameters, Tunable, rates
+from magbridge.link.parameters import Parameters, ParameterService, Tunable, rates
 from magbridge.link.publish import PUBLISHED, Publisher
 from magbridge.link.reports import Condition, Reports
 from magbridge.link.requests import Stream, StreamRequests

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from magbridge.mavlink.codec import Codec
-from magbridge.mavlink.frame_log import FrameLogReader, FrameLogWriter
+from magbridge.mavlink.codec import Codec, FrameLogReader, FrameLogWriter
+from magbridge.mavlink.framing import SECRET
 from magbridge.mavlink.messages import BAD_DATA, REFUSED, Message, Spec, by_id, spec
-from magbridge.mavlink.secrets import SECRET
 from magbridge.mavlink.signing import Signing, Stream, load_key, readable_by_all
 from magbridge.mavlink.source import Source
 from magbridge.mavlink.tlog import LogReader, TlogRecord, pack_record, pack_records

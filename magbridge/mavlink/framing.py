@@ -6,6 +6,7 @@ header claimed, so that garbage that looks like a header swallows valid frames (
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 from magbridge.mavlink.dialect import (
@@ -18,8 +19,8 @@ from magbridge.mavlink.dialect import (
 from magbridge.mavlink.messages import MESSAGES, Message, spec
 
 __all__ = [
-    "EXTRA", "MAX_MESSAGE_ID", "NEEDS_MORE", "NOT_A_FRAME", "SIGNATURE", "SIGNED", "V1", "V2", "checksum",
-    "find_magic", "frame_end", "is_signed", "message",
+    "EXTRA", "MAX_MESSAGE_ID", "NEEDS_MORE", "NOT_A_FRAME", "SECRET", "SIGNATURE", "SIGNED", "V1", "V2",
+    "checksum", "find_magic", "frame_end", "is_signed", "message", "without_secret", "without_secrets",
 ]  # fmt: skip
 
 V1: Final = PROTOCOL_MARKER_V1
@@ -118,3 +119,33 @@ def is_signed(frame: bytes) -> bool:
 def _number(data: bytes, start: int) -> int:
     """Return the id of the message whose version 2 frame begins at ``data[start]``."""
     return data[start + 7] | data[start + 8] << 8 | data[start + 9] << 16
+
+
+SECRET = frozenset(
+    spec(name).id for name in ("SETUP_SIGNING", "AUTH_KEY", "CHANGE_OPERATOR_CONTROL", "WIFI_CONFIG_AP")
+)
+"""Ids of the messages with a key, a passkey or a password in them. The bridge accepts none over the link, so
+that a log or the memory keeps only the fact that they came."""
+SECRET_HEADER = re.compile(
+    rb"\xfd.{6}(?:" + b"|".join(re.escape(number.to_bytes(3, "little")) for number in SECRET) + rb")",
+    re.DOTALL,
+)
+
+
+def without_secret(frame: bytes) -> bytes:
+    """Return a frame of such a message with zeros for its payload, and the checksum that belongs to it."""
+    header = 10 if frame[0] == V2 else 6
+    number = int.from_bytes(frame[7:10], "little") if header == 10 else frame[5]
+    body = frame[1:header] + bytes(frame[1])
+    end = header + frame[1]
+    right = checksum(body, EXTRA[number])
+    return frame[:1] + body + right.to_bytes(2, "little") + frame[end + 2 :]
+
+
+def without_secrets(data: bytes) -> bytes:
+    """Return bytes that are not a whole frame, with zeros wherever the payload of such a message may be."""
+    for match in SECRET_HEADER.finditer(data):
+        begin = match.end()
+        end = min(begin + data[match.start() + 1], len(data))
+        data = data[:begin] + bytes(end - begin) + data[end:]
+    return data

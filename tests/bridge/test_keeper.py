@@ -8,9 +8,9 @@ from small import START, small_bridge
 
 from magbridge.bridge.events import StartEvent
 from magbridge.bridge.keeper import SAVE_US, Keeper
+from magbridge.bridge.keeper import load_state as kept
 from magbridge.calibration.model import Parameter
 from magbridge.config import load
-from magbridge.link.store import load as kept
 
 
 def test_a_flood_of_parameters_is_kept_once_a_second(tmp_path: Path) -> None:

@@ -15,9 +15,8 @@ from line import Line
 
 from magbridge.link import metadata
 from magbridge.link.ftp import BURST, DATA, EACH, FTP_HEADER, SESSIONS, Error, FtpServer, Opcode, Request
-from magbridge.link.log_transfer import LogTransfer
 from magbridge.link.metadata import crc32
-from magbridge.link.tree import Tree
+from magbridge.link.tree import LogTransfer, Tree
 from magbridge.mavlink import Codec
 from magbridge.mavlink.enums import MAV_CMD
 

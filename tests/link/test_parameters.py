@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from line import Line, MakeLine
 
+from magbridge.bridge.keeper import StoredState, load_state, save_state
 from magbridge.config import Align, Telemetry
 from magbridge.errors import FormatError
 from magbridge.link.message_rates import LIMITS
 from magbridge.link.parameters import Parameters, Tunable, alignment, rates, real32, telemetry_ages
-from magbridge.link.store import StoredState, load, save
 
 
 def write(link: Line, name: str, value: float, kind: int = 9) -> list[Any]:
@@ -151,10 +151,10 @@ def test_a_default_read_and_written_back_stays_exact() -> None:
 
 def test_store(tmp_path: Path) -> None:
     path = tmp_path / "parameters.json"
-    assert load(path) == StoredState()
+    assert load_state(path) == StoredState()
     kept = StoredState({"MB_GAP_FACTOR": real32(0.1)}, 12345678901234)
-    save(path, kept)
-    assert load(path) == kept
+    save_state(path, kept)
+    assert load_state(path) == kept
     assert [one.name for one in tmp_path.iterdir()] == ["parameters.json"]
 
 
@@ -172,4 +172,4 @@ def test_a_store_that_is_damaged(tmp_path: Path, content: str) -> None:
     path = tmp_path / "parameters.json"
     path.write_text(content)
     with pytest.raises(FormatError, match=r"parameters.json"):
-        load(path)
+        load_state(path)
