@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 import xarray as xr
+from demos import demo_log
 
 from magbridge.logs import write
-from sitl import load, simulate
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ from sitl import load, simulate
 )
 def test_stopped_in_the_middle_leaves_nothing(tmp_path: Path, number: signal.Signals, code: int) -> None:
     # their own times would not be the rows' any more
-    rows = simulate(load("demo"), 5)[[f"mag_{axis}" for axis in "xyz"]]
+    rows = demo_log()[[f"mag_{axis}" for axis in "xyz"]]
     long = [rows.assign_coords(time=rows["time"] + 1e5 * k) for k in range(20)]
     write(xr.concat(long, "time"), tmp_path / "long.nc")
     command = [sys.executable, "-m", "magbridge", "convert", "long.nc", "-o", "x.csv"]

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from demos import demo_log
 
 import magbridge as mb
 from magbridge.calibration.correct import CorrectedArrays
 from magbridge.calibration.model import Noise, identity
 from magbridge.records import Corrected
-from sitl import load, simulate
 
 WORD = re.compile(r"``(\w+)``")
 ASHORE = {
@@ -77,7 +77,7 @@ def test_importing_brings_nothing_heavy(imports: str, heavy: set[str]) -> None:
 
 @pytest.mark.parametrize("lacking", [[], ["reference_field"]], ids=["simulated", "as a vehicle's"])
 def test_from_a_log_to_corrected_samples(tmp_path: Path, lacking: list[str]) -> None:
-    deployment = simulate(load("demo"), 5).drop_vars(lacking)
+    deployment = demo_log().drop_vars(lacking)
     runs, survey = tmp_path / "runs.nc", tmp_path / "survey.nc"
     mb.write(deployment.isel(time=deployment["run"].to_numpy() < 11), runs)
     mb.write(deployment.isel(time=deployment["run"].to_numpy() >= 11), survey)
@@ -99,7 +99,7 @@ def test_from_a_log_to_corrected_samples(tmp_path: Path, lacking: list[str]) -> 
 
 
 def test_times_may_be_seconds_or_datetimes(tmp_path: Path) -> None:
-    log = simulate(load("demo"), 3).isel(time=slice(0, 400))
+    log = demo_log().isel(time=slice(0, 400))
     dated = log.assign_coords(time=(log["time"].to_numpy() * 1e9).astype("datetime64[ns]"))
     runs = [mb.observations(data, ("battpos",)) for data in (log, dated)]
     np.testing.assert_allclose(runs[0].time, runs[1].time, atol=1e-6)
@@ -138,7 +138,7 @@ def test_one_reading_or_arrays_of_them() -> None:
 
 def test_datetimes_of_every_channel_are_accepted(tmp_path: Path) -> None:
     """Axes with times of their own, as our own netCDF holds them and xarray decodes them."""
-    log = simulate(load("demo"), 3).isel(time=slice(0, 600))
+    log = demo_log().isel(time=slice(0, 600))
     mb.write(log, tmp_path / "own.nc")
     back = mb.read(tmp_path / "own.nc", decode_times=True)
     assert back["mag_time_x"].dtype.kind == back["time"].dtype.kind == "M"
@@ -169,7 +169,7 @@ def test_every_error_is_a_magbridge_error(
 
 
 def test_errors_about_a_dataset_are_magbridge_errors() -> None:
-    log = simulate(load("demo"), 3).isel(time=slice(0, 50))
+    log = demo_log().isel(time=slice(0, 50))
     with pytest.raises(mb.MagbridgeError, match="column 'time': expected this column"):
         mb.correct_rows(mb.Correction(None), log.rename(time="when"))
     with pytest.raises(mb.MagbridgeError, match="did you mean battpos"):

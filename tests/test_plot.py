@@ -7,15 +7,15 @@ from collections.abc import Iterator
 import matplotlib as mpl
 import numpy as np
 import pytest
+from demos import demo_log
 from matplotlib.figure import Figure
 
 import magbridge as mb
 from magbridge.calibration.fitting.observations import Observations
 from magbridge.field.grid import AnomalyGrid
-from sitl import load, simulate
 
 mpl.use("Agg")
-log = simulate(load("demo"), 5)
+log = demo_log()
 
 
 @pytest.fixture(autouse=True)

@@ -12,22 +12,19 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
+from demos import demo_log
 
 from magbridge.cli import main
 from magbridge.field.grid import AnomalyGrid
 from magbridge.logs import write
-from sitl import load, segments, simulate
+from sitl import segments
 
 PARAMETERS = ("--parameter", "battpos", "--parameter", "ballast")
 
 
 @pytest.fixture(scope="module")
 def runs() -> xr.Dataset:
-    return (
-        segments(simulate(load("demo"), 5))["calibration"]
-        .isel(time=slice(0, None, 4))
-        .drop_vars("reference_field")
-    )
+    return segments(demo_log())["calibration"].isel(time=slice(0, None, 4)).drop_vars("reference_field")
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +156,7 @@ def test_logs_of_two_vehicles_are_distinguished(
 
 def test_where_two_vehicles_leave_no_fit_at_all(runs: xr.Dataset, command: Command) -> None:
     """It was put down to too few attitudes."""
-    other = segments(simulate(load("demo"), 3))["calibration"].isel(time=slice(0, None, 4))
+    other = segments(demo_log(3))["calibration"].isel(time=slice(0, None, 4))
     write(runs, "one.csv")
     write(later(other.drop_vars("reference_field"), 1), "two.csv")
     fit = "calibrate", "one.csv", "two.csv", *PARAMETERS, "--method", "cubic", "-o", "cal.json"

@@ -138,7 +138,7 @@ def test_auto_is_near_the_noise_floor_out_of_sample(
     glider: Gliders, masses: int, noise: float, memory: float, geometry: bool
 ) -> None:
     ratios, spreads, correlations = [], [], []
-    for seed in range(4):
+    for seed in range(4 if (masses, memory) == (2, 0.0) else 2):
         one = glider(seed, masses, noise, memory)
         rng = np.random.default_rng(seed)
         vehicle = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from demos import demo_log
 from scipy.spatial.transform import Rotation
 
 import magbridge as mb
@@ -18,7 +19,6 @@ from magbridge.calibration.heading import (
     published_covariance,
 )
 from magbridge.errors import CalibrationError
-from sitl import load, simulate
 
 NED = np.array([16e3, -5e3, 49e3])
 TOTAL = float(np.linalg.norm(NED))
@@ -175,7 +175,7 @@ def test_a_sensor_mounted_upside_down_is_found() -> None:
 
 def test_correct_writes_the_heading_of_a_log_and_states_its_error() -> None:
     """The log's own headings are not used: they may come from the very compass that is calibrated."""
-    log = simulate(load("demo"), 4)
+    log = demo_log()
     true = log["heading"].to_numpy()
     without = log.drop_vars("heading")
     runs = mb.observations(without.isel(time=slice(0, 2250)), ("battpos", "ballast"))

@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from demos import demo_log
 
 from magbridge.cli import main
 from magbridge.logs import write
-from sitl import load, simulate
 
 
 @pytest.fixture(scope="session")
 def deployment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("deployment") / "deployment.csv"
-    write(simulate(load("demo"), 5), path)
+    write(demo_log(), path)
     return path
 
 

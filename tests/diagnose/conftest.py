@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import pytest
+from demos import demo
 from study import deployment
 
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.descriptions import Description, descriptions
 from magbridge.diagnose.diagnosis import Diagnosis
 from magbridge.diagnose.joint import fit_joint
 from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.survey import load_survey
-from sitl import load, simulate
-from sitl.dataset import segments
 
 
 @pytest.fixture(scope="session")
 def problem() -> Problem:
     """The demo's survey against the calibration of its own runs."""
-    scenario = load("demo")
-    parts = segments(simulate(scenario, 2))
-    learned = unfiltered(
-        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
-    )
-    calibration = fit(learned, "auto").calibration
-    return pose(load_survey([parts["survey"]], calibration), calibration)
+    return pose(load_survey([demo().survey], demo().calibration), demo().calibration)
 
 
 @pytest.fixture(scope="session")

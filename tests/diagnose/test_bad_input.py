@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import Command
+from demos import demo
 from disks import full_disk
 
 from magbridge.calibration.effects import ChannelEffect
 from magbridge.calibration.file import save
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import CalibratedSensor, Calibration
 from magbridge.diagnose.assessment import DiagnosisResult
 from magbridge.diagnose.report import page
@@ -25,14 +24,11 @@ from magbridge.diagnose.survey import load_survey
 from magbridge.errors import DataError, WriteError
 from magbridge.field.geodesy import offset, wrap
 from magbridge.logs import write
-from sitl import load, segments, simulate
 
 
 @pytest.fixture(scope="module")
 def plain() -> tuple[xr.Dataset, Calibration]:
-    parts = segments(simulate(load("demo"), 1))
-    calibration = fit(observations(parts["calibration"], ["battpos", "ballast"]), "auto").calibration
-    return parts["survey"], calibration
+    return demo().survey, demo().calibration
 
 
 def some(ds: xr.Dataset, count: int) -> xr.DataArray:

@@ -81,7 +81,7 @@ def test_samples_that_are_lost_hide_nothing() -> None:
     assert row["unexplained"] is None
 
 
-@pytest.mark.parametrize("name", ["current_field", "nonlinearity", "pressure_offset"])
+@pytest.mark.parametrize("name", ["nonlinearity", "pressure_offset"])
 def test_an_extension_against_a_map_does_no_harm(name: str) -> None:
     """Compare with the true field on its own log and on another day's with another offset."""
     row = blind("charted", (name,), 40.0, GLIDER, losses="surfacing", reference="map at its depth")

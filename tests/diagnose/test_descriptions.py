@@ -9,9 +9,6 @@ import pytest
 from posed import missed
 from scipy.stats import multivariate_normal
 
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.causes import CAUSES
 from magbridge.diagnose.causes.masses import ActuatorOrder, Hysteresis
 from magbridge.diagnose.descriptions import (
@@ -26,9 +23,6 @@ from magbridge.diagnose.descriptions import (
 )
 from magbridge.diagnose.joint import PRIOR_SIZES, Statistic, fit_joint
 from magbridge.diagnose.problem import Problem
-from magbridge.diagnose.run import diagnose
-from sitl import load, simulate
-from sitl.dataset import segments
 
 
 def test_ridge_is_the_marginal_likelihood_of_a_common_size() -> None:
@@ -52,17 +46,6 @@ def test_under_no_effect_twice_the_evidence_is_at_most_a_chi_square_of_one_freed
     X = rng.normal(size=(400, 40)) / np.arange(1, 41)
     statistic = Statistic(X.T @ X, np.ones((1, 40)))
     assert np.mean(statistic.ratio(X.T @ rng.normal(size=(400, 2000))) > 6.63) < 0.015
-
-
-@pytest.mark.parametrize("seed", [2, 5])
-def test_a_plain_survey_is_plain(seed: int) -> None:
-    """Other gliders than the demonstration's own, calibrated from their spirals."""
-    scenario = load("demo")
-    parts = segments(simulate(scenario, seed))
-    learned = unfiltered(
-        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
-    )
-    assert diagnose([parts["survey"]], fit(learned, "auto").calibration).diagnosis.verdict == "nothing_found"
 
 
 def test_a_converter_whose_steps_differ_is_described() -> None:

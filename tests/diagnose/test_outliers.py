@@ -4,40 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import xarray as xr
+from demos import demo
 from reported import section
 from scipy.signal import lfilter
 
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.calibration.fitting.observe import observations
-from magbridge.calibration.model import Calibration
 from magbridge.diagnose.joint import Joint
 from magbridge.diagnose.noise import fit_noise
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.search import Outliers, outliers
 from magbridge.diagnose.survey import MAX_LAG, Past
-from sitl import load, simulate
-from sitl.dataset import segments
 
 N = 5000
 SPIKE = np.array([0.0, 12.0, 0.0])
 PULSE = np.array([6.0, 12.0, 6.0])
 """Return a source that passes within a few samples, in units of the innovations."""
-
-
-Demo = tuple[Calibration, xr.Dataset, xr.Dataset]
-
-
-@pytest.fixture(scope="module")
-def demo() -> Demo:
-    """The demo's calibration, its survey, and its runs."""
-    scenario = load("demo")
-    parts = segments(simulate(scenario, 2))
-    learned = unfiltered(
-        observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner
-    )
-    return fit(learned, "auto").calibration, parts["survey"], parts["calibration"]
 
 
 def found(shape: np.ndarray, rows: np.ndarray, rho: float, seed: int, nu: float = 50.0) -> Outliers | None:
@@ -103,9 +83,9 @@ def test_next_to_a_gap_a_sample_has_no_neighbour() -> None:
 
 
 @pytest.mark.parametrize(("shape", "isolated"), [(SPIKE, True), (PULSE, False)])
-def test_a_diagnosis_names_isolated_samples_only(demo: Demo, shape: np.ndarray, isolated: bool) -> None:
+def test_a_diagnosis_names_isolated_samples_only(shape: np.ndarray, isolated: bool) -> None:
     """Beside others that are off it says that something was there for a moment."""
-    calibration, survey = demo[0], demo[1].copy()
+    calibration, survey = demo().calibration, demo().survey.copy()
     off = np.zeros(survey.sizes["time"])
     for row in (200, 900):
         off[row - 1 : row + 2] = 3.0 * shape
@@ -119,15 +99,15 @@ def test_a_diagnosis_names_isolated_samples_only(demo: Demo, shape: np.ndarray, 
 
 
 @pytest.mark.parametrize("beside_runs", [False, True])
-def test_a_relay_gets_no_name(demo: Demo, beside_runs: bool) -> None:
+def test_a_relay_gets_no_name(beside_runs: bool) -> None:
     """Nor does the remainder where noise of a long memory has absorbed the rest."""
-    calibration, survey = demo[0], demo[1].copy()
+    calibration, survey = demo().calibration, demo().survey.copy()
     n, rng = survey.sizes["time"], np.random.default_rng(5 if beside_runs else 4)
     at = np.sort(rng.integers(0, n, 14))
     relay = np.searchsorted(at, np.arange(n)) % 2
     for name, size in (("mag_x", 9.0), ("mag_y", -6.0), ("mag_z", 12.0)):
         survey[name] = survey[name] + size * relay
-    reported = diagnose([survey], calibration, training_logs=demo[2:] if beside_runs else ()).diagnosis
+    reported = diagnose([survey], calibration, training_logs=[demo().runs] if beside_runs else ()).diagnosis
     assert (reported.findings, reported.wrong) == ((), None)
     assert reported.unexplained is not None
     assert reported.unexplained.kind == "switching"

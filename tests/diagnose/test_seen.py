@@ -7,15 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from demos import demo
 from msgspec import structs
 from posed import calibrated, surveyed, walk
 from reported import section
 
 from magbridge.arrays import FloatArray
 from magbridge.calibration.effects import lagged
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.calibration.fitting.observe import observations
 from magbridge.calibration.model import Calibration
 from magbridge.cli.diagnose import causes_of
 from magbridge.diagnose.observed import memory, seen
@@ -23,8 +21,6 @@ from magbridge.diagnose.problem import Problem, pose
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from magbridge.diagnose.survey import TelemetryChannel
-from sitl import load, simulate
-from sitl.dataset import segments
 from sitl.signals import correlated
 
 N = 3000
@@ -109,12 +105,7 @@ def test_a_cause_does_not_follow_a_channel_of_the_other_causes(flown: Problem) -
 
 def _slow_log() -> tuple[xr.Dataset, Calibration, FloatArray]:
     """Return a survey with a slow error of the reference, a calibration that states it, and the error, nT."""
-    scenario = load("demo")
-    parts = segments(simulate(scenario, 2))
-    calibration = fit(
-        unfiltered(observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner)
-    ).calibration
-    survey = parts["survey"]
+    calibration, survey, _ = demo()
     noise = np.random.default_rng(9).normal(size=(survey.sizes["time"], 1))
     slow = 34.0 * correlated(noise, 0.99)[:, 0]
     loud = replace(calibration, noise=structs.replace(calibration.noise, sensor=34.0, autocorrelation=0.99))

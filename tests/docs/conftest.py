@@ -6,19 +6,20 @@ import shutil
 from pathlib import Path
 
 import pytest
+from demos import demo_log
 
 from magbridge.calibration.file import save
 from magbridge.calibration.fitting.fit import fit
 from magbridge.calibration.fitting.observe import observations
 from magbridge.logs import write
-from sitl import load, simulate
+from sitl import load
 from sitl.twin import Twin
 
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
-    log = simulate(load("demo"), 5)
+    log = demo_log().isel(time=slice(None, None, 3))
     for name in ("runs.nc", "flight.nc"):
         write(log, folder / name)
     for name in ("survey.nc", "glider.nc"):

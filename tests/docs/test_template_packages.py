@@ -10,18 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from demos import demo
 from pages import ROOT
 
-from magbridge.calibration.fitting.fit import fit
-from magbridge.calibration.fitting.lowpass import unfiltered
-from magbridge.calibration.fitting.observe import observations
 from magbridge.diagnose.causes import CAUSES, known
 from magbridge.diagnose.report.findings import findings
 from magbridge.diagnose.run import diagnose
 from magbridge.errors import PluginError
 from magbridge.sensors import open_driver
-from sitl import load, simulate
-from sitl.dataset import segments
 
 TEMPLATES = sorted(path.parent for path in ROOT.glob("examples/*/pyproject.toml"))
 
@@ -137,12 +133,7 @@ def test_the_cause_is_put_forward_found_and_explained(
 ) -> None:
     """One row is all: the search, the report and the findings take it like any other."""
     monkeypatch.syspath_prepend(str(installed))
-    scenario = load("demo")
-    parts = segments(simulate(scenario, 2))
-    calibration = fit(
-        unfiltered(observations(parts["calibration"], ("battpos", "ballast")), scenario.instrument.corner)
-    ).calibration
-    survey = parts["survey"]
+    calibration, survey, _ = demo()
     heater = (np.arange(survey.sizes["time"]) // 90 % 2).astype(float)
     hot = survey.assign(mag_z=survey["mag_z"] + 40.0 * heater, heater=("time", heater))
     result = diagnose([hot], calibration)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from demos import demo_log
 
 import magbridge as mb
-from sitl import load, simulate
 
 
 def test_there_and_back_keeps_every_number_and_unit() -> None:
-    log = simulate(load("demo"), 5).isel(time=slice(0, 50))
+    log = demo_log().isel(time=slice(0, 50))
     frame = mb.to_frame(log)
     assert str(frame.index.tz) == "UTC"
     back = mb.from_frame(frame, frame.attrs)

@@ -125,7 +125,7 @@ def test_a_fluxgate_and_a_slocum(real_data: Path, tmp_path: Path, command: Comma
     """Commands take the real telemetry of a deployment and a made fluxgate's log."""
     flight = sorted((real_data / "slocum_comet").glob("*.dbd"))
     glider = logs.read(flight)
-    time = np.arange(float(glider["time"][0]) + 60.0, float(glider["time"][0]) + 7_200.0, 2.0)
+    time = np.arange(float(glider["time"][0]) + 60.0, float(glider["time"][0]) + 5_400.0, 6.0)
     angles = [np.radians(np.interp(time, glider["time"], glider[name])) for name in ("roll", "pitch")]
     turning = np.unwrap(np.radians(glider["heading"].to_numpy()))
     angles.append(np.interp(time, glider["time"], turning))

@@ -1,0 +1,45 @@
+"""The demonstration's simulated deployments and their calibrations, each made once in a process."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import xarray as xr
+
+from magbridge.calibration.fitting.fit import fit
+from magbridge.calibration.fitting.lowpass import unfiltered
+from magbridge.calibration.fitting.observe import observations
+from magbridge.calibration.model import Calibration
+from sitl import load, simulate
+from sitl.dataset import segments
+
+__all__ = ["MASSES", "Demo", "demo", "demo_log"]
+
+MASSES = ("battpos", "ballast")
+
+
+class Demo(NamedTuple):
+    """A calibration by a deployment's own runs, its survey, and the runs; do not change the arrays."""
+
+    calibration: Calibration
+    survey: xr.Dataset
+    runs: xr.Dataset
+
+
+def demo_log(seed: int = 5) -> xr.Dataset:
+    """Return a copy of the whole deployment."""
+    return _simulated(seed).copy(deep=True)
+
+
+@cache
+def demo(seed: int = 2) -> Demo:
+    """Calibrate a deployment by its runs, with the instrument's filter undone."""
+    parts = segments(_simulated(seed))
+    learned = unfiltered(observations(parts["calibration"], MASSES), load("demo").instrument.corner)
+    return Demo(fit(learned, "auto").calibration, parts["survey"], parts["calibration"])
+
+
+@cache
+def _simulated(seed: int) -> xr.Dataset:
+    return simulate(load("demo"), seed)
